@@ -1,0 +1,1 @@
+"""One file per policy protocol. Each declares `Config` and `build`."""

@@ -1,0 +1,60 @@
+"""What a transport is: a source of observations (held by media) and a sink for commands (held by control)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from runtime.types import Observation, RobotCommand
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """What a transport can do; a deployment that asks for more is refused at set-up."""
+
+    moves_robot: bool  # commands reach something that can break: report-only safety is refused
+    ends: bool = False  # the source runs out (a recording)
+    measures_eef: bool = False
+    spaces: frozenset[str] = frozenset({"joint"})  # command spaces it can publish
+
+
+class Source(ABC):
+    """Delivers observations, newest by arrival."""
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Open what there is to open; raises TransportError with a sentence where that fails."""
+
+    @abstractmethod
+    def receive(self, timeout: float) -> Observation | None:
+        """The newest observation not yet delivered, waiting at most `timeout` seconds; None where there is none.
+
+        A malformed message is counted in `faults()` and skipped; it never ends the caller's loop.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release everything; safe to call twice."""
+
+    def begin_run(self) -> None:
+        """A run starts: a recording plays from its first frame; a live robot has nothing to do."""
+
+    def faults(self) -> dict[str, int]:
+        """Counts by name of what went wrong since connect, e.g. {"clock_backwards": 1, "malformed": 3}."""
+        return {}
+
+
+class Sink(ABC):
+    """Sends commands; never blocks the control tick."""
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Open what there is to open; raises TransportError with a sentence where that fails."""
+
+    @abstractmethod
+    def send(self, command: RobotCommand) -> None:
+        """Hand over one command without waiting for anybody."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release everything; safe to call twice."""

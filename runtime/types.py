@@ -1,0 +1,78 @@
+"""The nouns that every part of the runtime shares: observation, action chunk, command."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+Space = Literal["joint", "eef"]
+EEF_WIDTH = 8  # x, y, z [m], quaternion w, x, y, z, gripper: one arm's end-effector vector
+
+_EMPTY: Mapping[str, object] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What was known of the robot at one moment: joints, poses, and the newest picture of each camera.
+
+    Vectors are in the robot's group order: `qpos`, `qvel`, `effort` float32 [D] (rad, rad/s, Nm; grippers in
+    the robot's own unit), `eef` float32 [8 * arms] as measured by the robot. `pictures` are RGB uint8 [H, W, 3],
+    read-only, by observation key. All times are seconds on our own monotonic clock: `captured` holds one per
+    stream ("joints", "eef", and each camera key), `arrived` is when the newest part reached us.
+    """
+
+    sequence: int
+    arrived: float
+    captured: Mapping[str, float]
+    qpos: Float32
+    pictures: Mapping[str, UInt8]
+    qvel: Float32 | None = None
+    effort: Float32 | None = None
+    eef: Float32 | None = None
+    reported_action: Float32 | None = None  # [D] what the robot itself says it applied for this frame
+    reported_action_eef: Float32 | None = None  # [8 * arms] the same as poses
+    last: bool = False  # the source ends with this frame (a recording has played out)
+    step: int = -1  # the control tick it was assembled for; -1 until a tick has seen it
+    prompt: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ActionChunk:
+    """A policy's answer: rows of actions from the step of the observation on.
+
+    `actions` is float32 [H, W] in `space`: "joint" rows are [D] in group order, "eef" rows 8 per arm. `rate` is
+    the rows' own rate [Hz], None where it is the control rate. `model_actions` are the rows in the model's own
+    normalised space where the server returned them. `timing` holds the server's own figures [ms].
+    """
+
+    actions: Float32
+    space: Space = "joint"
+    rate: float | None = None
+    model_actions: Float32 | None = None
+    timing: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Conditioning:
+    """What the robot is already committed to, for policies that continue their own last chunk (RTC)."""
+
+    left_over: Float32  # [T, W] rows not yet consumed, in the policy's own space and rate
+    predicted_delay: int  # control steps until the answer is expected to arrive
+
+
+@dataclass(frozen=True, slots=True)
+class RobotCommand:
+    """One absolute target for the whole robot: float32 [D] in group order, for control tick `step`."""
+
+    action: Float32
+    step: int
+    time: float  # our monotonic clock [s]
