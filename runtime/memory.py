@@ -1,0 +1,153 @@
+"""Shared memory of the family: double-buffered records and byte rings, each with one writer.
+
+Knows nothing of robots. The memory is an anonymous file (memfd) whose descriptor the supervisor hands to its
+children: it has no name that could be left behind, and vanishes with the last process that holds it.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+
+import numpy as np
+
+_LENGTH_CRC = struct.Struct("<II")
+_ALIGN = 64  # one cache line, so that two writers never share one
+
+
+def word(memory: mmap.mmap, offset: int, kind: str = "q") -> memoryview:
+    """One aligned 8-byte cell ("q" integer, "d" float) that is always seen whole.
+
+    Not struct.pack_into: it clears the bytes before it writes them, and a reader can see the zeros.
+    """
+    return memoryview(memory)[offset : offset + 8].cast(kind)
+
+
+def aligned(size: int) -> int:
+    """`size` rounded up to whole cache lines."""
+    return (size + _ALIGN - 1) // _ALIGN * _ALIGN
+
+
+def create(size: int) -> int:
+    """A new anonymous shared file of `size` bytes; returns its descriptor, inheritable."""
+    descriptor = os.memfd_create("eva", 0)
+    os.ftruncate(descriptor, size)
+    return descriptor
+
+
+def attach(descriptor: int) -> mmap.mmap:
+    """The shared file behind an inherited descriptor, mapped for reading and writing."""
+    return mmap.mmap(descriptor, os.fstat(descriptor).st_size)
+
+
+class TornReadError(Exception):
+    """A record changed under the reader several times in a row; its writer is far faster than expected."""
+
+
+class Record:
+    """One structured record, double-buffered: a preempted writer never leaves it unreadable.
+
+    One process writes, any number read. The checksum makes a read right also where memory is weakly ordered.
+    """
+
+    def __init__(self, memory: mmap.mmap, offset: int, dtype: np.dtype[np.void]) -> None:
+        self._memory = memory
+        self._version = word(memory, offset)
+        self._offset = offset
+        self._dtype = dtype
+        self._slot = aligned(dtype.itemsize + 4)
+
+    @staticmethod
+    def size(dtype: np.dtype[np.void]) -> int:
+        """Bytes that a record of `dtype` takes in the shared file."""
+        return _ALIGN + 2 * aligned(dtype.itemsize + 4)
+
+    @property
+    def version(self) -> int:
+        """How often the record was written; 0 = never."""
+        return int(self._version[0])
+
+    def write(self, value: np.void) -> None:
+        """Make `value` the record's content; visible to readers whole or not at all."""
+        version = self.version + 1
+        start = self._offset + _ALIGN + (version & 1) * self._slot
+        payload = value.tobytes()
+        self._memory[start + 4 : start + 4 + len(payload)] = payload
+        self._memory[start : start + 4] = zlib.crc32(payload).to_bytes(4, "little")
+        self._version[0] = version
+
+    def read(self) -> np.void:
+        """The newest content, zeros if it was never written."""
+        for _ in range(100):
+            version = self.version
+            if version == 0:
+                return np.zeros((), self._dtype)[()]
+            start = self._offset + _ALIGN + (version & 1) * self._slot
+            checksum = self._memory[start : start + 4]
+            payload = self._memory[start + 4 : start + 4 + self._dtype.itemsize]
+            if zlib.crc32(payload).to_bytes(4, "little") == checksum:
+                return np.frombuffer(payload, self._dtype)[0]
+        raise TornReadError(f"record at offset {self._offset} could not be read in 100 tries")
+
+
+class Ring:
+    """A queue of byte messages with one writer and one reader; a full ring refuses, it never overwrites.
+
+    Messages become visible when the head moves, so a writer killed in the middle of one leaves no trace of it.
+    A restarted writer or reader goes on where the positions in the memory say.
+    """
+
+    def __init__(self, memory: mmap.mmap, offset: int, capacity: int) -> None:
+        self._memory = memory
+        self._head = word(memory, offset)
+        self._tail = word(memory, offset + _ALIGN)
+        self._data = offset + 2 * _ALIGN
+        self._capacity = capacity
+        self.refused = 0
+
+    @staticmethod
+    def size(capacity: int) -> int:
+        """Bytes that a ring for `capacity` bytes of messages takes in the shared file."""
+        return 2 * _ALIGN + aligned(capacity)
+
+    def push(self, payload: bytes) -> bool:
+        """Append one message; False (and counted in `refused`) where there is no room."""
+        head, tail = int(self._head[0]), int(self._tail[0])
+        needed = _LENGTH_CRC.size + len(payload)
+        if head - tail + needed > self._capacity:
+            self.refused += 1
+            return False
+        self._write(head, _LENGTH_CRC.pack(len(payload), zlib.crc32(payload)) + payload)
+        self._head[0] = head + needed
+        return True
+
+    def drain(self) -> Iterator[bytes]:
+        """Every message there is, oldest first; each is consumed when the next is asked for or the loop ends."""
+        while True:
+            head, tail = int(self._head[0]), int(self._tail[0])
+            if head == tail:
+                return
+            length, checksum = _LENGTH_CRC.unpack(self._read(tail, _LENGTH_CRC.size))
+            payload = self._read(tail + _LENGTH_CRC.size, length)
+            if zlib.crc32(payload) != checksum:
+                return  # the bytes are not all visible yet on a weakly ordered machine: next time
+            self._tail[0] = tail + _LENGTH_CRC.size + length
+            yield payload
+
+    def _write(self, position: int, data: bytes) -> None:
+        start = position % self._capacity
+        first = min(len(data), self._capacity - start)
+        self._memory[self._data + start : self._data + start + first] = data[:first]
+        if first < len(data):
+            self._memory[self._data : self._data + len(data) - first] = data[first:]
+
+    def _read(self, position: int, length: int) -> bytes:
+        start = position % self._capacity
+        first = min(length, self._capacity - start)
+        data = self._memory[self._data + start : self._data + start + first]
+        if first < length:
+            data += self._memory[self._data : self._data + length - first]
+        return data

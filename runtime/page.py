@@ -1,0 +1,266 @@
+"""What the family shares: the newest observation, control's status, heartbeats, the e-stop flag, rings, pictures.
+
+Every part has exactly one writer; the table in docs/architecture.md says which.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from runtime import memory
+from runtime.memory import Record, Ring, aligned
+from runtime.types import Observation, UInt8
+
+_LINE = 64
+PICTURE_SLOTS = 6
+RING_BYTES = {
+    "orders": 1 << 20,  # main -> control: orders and chunks
+    "minutes": 4 << 20,  # main -> media: begin, raw chunks, events, end
+    "ticks": 4 << 20,  # control -> media: one record per tick
+    "control_events": 1 << 19,  # control -> main
+    "media_events": 1 << 19,  # media -> main
+}
+PROCESSES = ("control", "main", "media", "guard")
+
+
+class EStop(IntEnum):
+    """The guard's word: nothing may be sent before it has read its latch."""
+
+    UNKNOWN = 0
+    CLEAR = 1
+    LATCHED = 2
+
+
+@dataclass(frozen=True, slots=True)
+class PageLayout:
+    """The sizes everything in the page follows from; equal in all four processes."""
+
+    dim: int
+    eef_dim: int
+    cameras: tuple[str, ...]
+    picture_bytes: int = 1920 * 1080 * 3
+
+    def observation_dtype(self) -> np.dtype[np.void]:
+        """The newest observation without its pictures: which slot of each camera holds them."""
+        d, e, c = self.dim, max(self.eef_dim, 1), max(len(self.cameras), 1)
+        return np.dtype(
+            [
+                ("sequence", "i8"),
+                ("arrived", "f8"),
+                ("joints_captured", "f8"),
+                ("eef_captured", "f8"),
+                ("has", "u1", 5),  # qvel, effort, eef, reported_action, reported_action_eef
+                ("last", "u1"),
+                ("qpos", "f4", d),
+                ("qvel", "f4", d),
+                ("effort", "f4", d),
+                ("eef", "f4", e),
+                ("reported_action", "f4", d),
+                ("reported_action_eef", "f4", e),
+                ("picture_captured", "f8", c),
+                ("picture_number", "i8", c),  # per camera; slot = number % PICTURE_SLOTS, 0 = none yet
+            ]
+        )
+
+    def control_dtype(self) -> np.dtype[np.void]:
+        """What control last did and how well it keeps time."""
+        return np.dtype(
+            [
+                ("step", "i8"),
+                ("planned", "f8"),
+                ("sequence", "i8"),  # Observation.sequence that tick `step` saw
+                ("order", "i8"),  # number of the newest order obeyed
+                ("run", "i8"),
+                ("behaviour", "S12"),
+                ("remaining", "i8"),  # steps on the timeline after this one
+                ("engaged", "u1"),  # commands are being sent each tick
+                ("moving", "u1"),
+                ("estop_obeyed", "u1"),
+                ("commanded", "f4", self.dim),
+                ("velocity", "f4", self.dim),
+                ("ticks", "i8"),
+                ("missed", "i8"),
+                ("refused_in_row", "i8"),
+                ("lateness_p50", "f8"),
+                ("lateness_p99", "f8"),
+                ("lateness_max", "f8"),
+                ("records_lost", "i8"),
+                ("scheduling", "S24"),
+            ]
+        )
+
+
+class Page:
+    """The shared memory of one station's family, or of a lockstep run in one process."""
+
+    def __init__(self, layout: PageLayout, shared: mmap.mmap) -> None:
+        self.layout = layout
+        self._shared = shared
+        offset = 0
+        self._beats = {name: memory.word(shared, _LINE * index, "d") for index, name in enumerate(PROCESSES)}
+        offset += _LINE * len(PROCESSES)
+        self._estop = offset
+        offset += _LINE
+        self.observation = Record(shared, offset, layout.observation_dtype())
+        offset += Record.size(layout.observation_dtype())
+        self.control = Record(shared, offset, layout.control_dtype())
+        offset += Record.size(layout.control_dtype())
+        self.rings: dict[str, Ring] = {}
+        for name, capacity in RING_BYTES.items():
+            self.rings[name] = Ring(shared, offset, capacity)
+            offset += Ring.size(capacity)
+        self.pictures = {}
+        for camera in layout.cameras:
+            self.pictures[camera] = PictureSlots(shared, offset, layout.picture_bytes)
+            offset += PictureSlots.size(layout.picture_bytes)
+
+    @staticmethod
+    def size(layout: PageLayout) -> int:
+        """Bytes of the shared file; pictures are sparse, so only what is used takes memory."""
+        fixed = _LINE * (len(PROCESSES) + 1)
+        fixed += Record.size(layout.observation_dtype()) + Record.size(layout.control_dtype())
+        fixed += sum(Ring.size(capacity) for capacity in RING_BYTES.values())
+        return fixed + len(layout.cameras) * PictureSlots.size(layout.picture_bytes)
+
+    @classmethod
+    def create(cls, layout: PageLayout) -> tuple[Page, int]:
+        """A new page and the descriptor that children inherit to attach to it."""
+        descriptor = memory.create(cls.size(layout))
+        return cls(layout, memory.attach(descriptor)), descriptor
+
+    @classmethod
+    def attach(cls, layout: PageLayout, descriptor: int) -> Page:
+        """The page behind an inherited descriptor."""
+        return cls(layout, memory.attach(descriptor))
+
+    def beat(self, process: str, now: float) -> None:
+        """Say that `process` is alive at `now` (our monotonic clock)."""
+        self._beats[process][0] = now
+
+    def last_beat(self, process: str) -> float:
+        """When `process` last said that it is alive; 0 = never."""
+        return float(self._beats[process][0])
+
+    @property
+    def estop(self) -> EStop:
+        """The guard's flag; control reads it before every send."""
+        return EStop(self._shared[self._estop])
+
+    def set_estop(self, state: EStop) -> None:
+        """Written by the guard alone."""
+        self._shared[self._estop] = int(state)
+
+    def publish_observation(self, observation: Observation, pictures: Mapping[str, int]) -> None:
+        """Media's half: the observation's numbers, and for each camera the number of its newest picture."""
+        record = np.zeros((), self.layout.observation_dtype())
+        record["sequence"], record["arrived"] = observation.sequence, observation.arrived
+        record["joints_captured"] = observation.captured.get("joints", observation.arrived)
+        record["eef_captured"] = observation.captured.get("eef", np.nan)
+        record["last"] = observation.last
+        record["qpos"] = observation.qpos
+        for index, name in enumerate(("qvel", "effort", "eef", "reported_action", "reported_action_eef")):
+            value = getattr(observation, name)
+            if value is not None:
+                record["has"][index] = 1
+                record[name] = value
+        for index, camera in enumerate(self.layout.cameras):
+            record["picture_captured"][index] = observation.captured.get(camera, np.nan)
+            record["picture_number"][index] = pictures.get(camera, 0)
+        self.observation.write(record[()])
+
+    def read_observation(self, cameras: Sequence[str]) -> Observation | None:
+        """The newest observation with the pictures of `cameras`, copied; None before the first one.
+
+        Where a picture was overwritten while it was copied, the newest observation is read again.
+        """
+        for _ in range(5):
+            record = self.observation.read()
+            if record["sequence"] == 0:
+                return None
+            pictures = self._pictures_of(record, cameras)
+            if pictures is not None:
+                return self._observation(record, pictures)
+        raise memory.TornReadError("pictures were overwritten five times while being copied")
+
+    def _pictures_of(self, record: np.void, cameras: Sequence[str]) -> dict[str, UInt8] | None:
+        pictures = {}
+        for camera in cameras:
+            number = int(record["picture_number"][self.layout.cameras.index(camera)])
+            if number == 0:
+                continue
+            picture = self.pictures[camera].read(number)
+            if picture is None:
+                return None
+            pictures[camera] = picture
+        return pictures
+
+    def _observation(self, record: np.void, pictures: dict[str, UInt8]) -> Observation:
+        names = ("qvel", "effort", "eef", "reported_action", "reported_action_eef")
+        optional = {
+            name: np.array(record[name]) if record["has"][index] else None for index, name in enumerate(names)
+        }
+        captured = {"joints": float(record["joints_captured"])}
+        if record["has"][2]:
+            captured["eef"] = float(record["eef_captured"])
+        for index, camera in enumerate(self.layout.cameras):
+            if record["picture_number"][index]:
+                captured[camera] = float(record["picture_captured"][index])
+        return Observation(
+            sequence=int(record["sequence"]),
+            arrived=float(record["arrived"]),
+            captured=captured,
+            qpos=np.array(record["qpos"]),
+            pictures=pictures,
+            last=bool(record["last"]),
+            **optional,
+        )
+
+
+class PictureSlots:
+    """The newest pictures of one camera; a reader notices when its slot was written again meanwhile."""
+
+    _SHAPE = struct.Struct("@iii")  # height, width, channels
+
+    def __init__(self, shared: mmap.mmap, offset: int, picture_bytes: int) -> None:
+        self._shared = shared
+        self._bytes = picture_bytes
+        stride = _LINE + aligned(picture_bytes)
+        self._at = [offset + slot * stride for slot in range(PICTURE_SLOTS)]
+        self._begun = [memory.word(shared, at) for at in self._at]
+        self._done = [memory.word(shared, at + 8) for at in self._at]
+
+    @staticmethod
+    def size(picture_bytes: int) -> int:
+        """Bytes that the slots of one camera take in the shared file."""
+        return PICTURE_SLOTS * (_LINE + aligned(picture_bytes))
+
+    def write(self, number: int, picture: UInt8) -> None:
+        """Store `picture` as number `number` (counted from 1); raises ValueError where it is too large."""
+        if picture.nbytes > self._bytes:
+            raise ValueError(f"picture of {picture.nbytes} bytes {picture.shape}; at most {self._bytes} fit")
+        slot = number % PICTURE_SLOTS
+        self._begun[slot][0] = number
+        self._SHAPE.pack_into(self._shared, self._at[slot] + 16, *picture.shape)
+        view = np.frombuffer(self._shared, np.uint8, picture.nbytes, self._at[slot] + _LINE)
+        view[:] = picture.reshape(-1)
+        self._done[slot][0] = number
+
+    def read(self, number: int) -> UInt8 | None:
+        """A copy of picture `number`, or None where it has been overwritten."""
+        slot = number % PICTURE_SLOTS
+        if self._done[slot][0] != number:
+            return None
+        height, width, channels = self._SHAPE.unpack_from(self._shared, self._at[slot] + 16)
+        size = height * width * channels
+        if self._begun[slot][0] != number:
+            return None
+        picture = np.frombuffer(self._shared, np.uint8, size, self._at[slot] + _LINE).copy()
+        if self._begun[slot][0] != number:
+            return None
+        return picture.reshape(height, width, channels)
