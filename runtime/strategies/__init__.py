@@ -1,0 +1,1 @@
+"""One file per inference strategy. Each declares `Config`, `query` and `merge`."""

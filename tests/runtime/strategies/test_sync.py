@@ -1,0 +1,28 @@
+import numpy as np
+
+from runtime.strategies import sync
+from runtime.strategies.base import Arrival, Progress
+from runtime.timeline import Timeline
+
+
+def test_every_action_is_executed_in_order_whatever_the_delay():
+    timeline = Timeline(1)
+    merged = sync.merge(sync.Config(), ())(timeline, Arrival(1, 10, np.arange(5.0)[:, None]), 40)
+    assert [timeline.at(40 + i).action[0] for i in range(5)] == [0, 1, 2, 3, 4]
+    assert merged.delay == 30
+    assert merged.mistimed == 0
+    assert merged.dropped == ""
+
+
+def test_the_execution_horizon_crops_the_chunk():
+    timeline = Timeline(1)
+    merged = sync.merge(sync.Config(execution_horizon=2), ())(timeline, Arrival(1, 0, np.ones((5, 1))), 3)
+    assert timeline.remaining(3) == 2
+    assert merged.targets.tolist() == [3, 4, -1, -1, -1]
+
+
+def test_it_asks_only_when_nothing_is_left_and_nothing_is_in_flight():
+    query = sync.query(sync.Config())
+    assert query.wants(Progress(0, False, 0.0))
+    assert not query.wants(Progress(1, False, 9.0))
+    assert not query.wants(Progress(0, True, 9.0))
