@@ -1,0 +1,225 @@
+"""The filter that every action passes before it is sent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from runtime.section import Section
+from runtime.types import Float64
+
+_TOLERANCE = 1e-6
+
+
+class WorkspaceBox(Section):
+    """A box in an arm's declared frame that its end effector must stay in [m]."""
+
+    lower: list[float] = Field(min_length=3, max_length=3)
+    upper: list[float] = Field(min_length=3, max_length=3)
+
+
+class SafetySettings(Section):
+    """Limits on every action; the defaults come from what a real demonstration reaches."""
+
+    report_only: bool = False
+    """Judge and report, but send actions as they are; refused for a transport that can move a robot."""
+    joint_age_s: float = Field(default=0.2, gt=0)
+    """Oldest joint measurement that a policy action may be based on [s]."""
+    picture_age_s: float = Field(default=0.5, gt=0)
+    """Oldest picture of any camera that a policy action may be based on [s]."""
+    following_error: float = Field(default=0.5, gt=0)
+    """Farthest that a target may be from the measured joints [rad]."""
+    jump: float = Field(default=0.5, gt=0)
+    """Farthest that an action may be from the last command [rad]."""
+    velocity_scale: float = Field(default=1.0, gt=0, le=1)
+    """Part of the robot's joint velocities that may be used."""
+    acceleration: float = Field(default=60.0, gt=0)
+    """Joint acceleration on the policy path [rad/s2]."""
+    motion_acceleration: float = Field(default=5.0, gt=0)
+    """Joint acceleration of motions of ours, such as homing [rad/s2]."""
+    motion_velocity_scale: float = Field(default=0.3, gt=0, le=1)
+    """Part of the joint velocities that motions of ours use."""
+    brake_acceleration: float = Field(default=20.0, gt=0)
+    """Deceleration of a stop or a halt [rad/s2]."""
+    refusals_to_hold: int = Field(default=10, ge=1)
+    """Refused actions in a row that lead to holding."""
+    workspace: dict[str, WorkspaceBox] = Field(default_factory=dict)
+    """Boxes by arm name; an action that leaves one is refused, never clamped."""
+
+
+@dataclass(frozen=True, slots=True)
+class RobotState:
+    """What an action is judged against: vectors float64 [D], times in seconds."""
+
+    previous: Float64  # last command sent
+    velocity: Float64  # of the commands
+    measured: Float64
+    elapsed: float  # since the last command, capped by the caller at 1.5 periods
+    joint_age: float = 0.0
+    picture_ages: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What may be sent: `action` float64 [D], or None where refused; `notes` say what was changed or why refused."""
+
+    action: Float64 | None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def refused(self) -> bool:
+        return self.action is None
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """The robot's bounds, float64 [D] each; `binary` marks dimensions that switch between two values."""
+
+    names: tuple[str, ...]
+    lower: Float64
+    upper: Float64
+    velocity: Float64
+    grippers: np.ndarray  # bool [D]: own unit, not radians
+    binary: np.ndarray  # bool [D]
+
+
+Path = Literal["policy", "motion"]
+
+
+class SafetyFilter:
+    """Judges actions in a fixed order: finite, ages, workspace, following error, jump, reachability, joint limits.
+
+    Reachability makes the command satisfy velocity, acceleration and joint limits in one step: the velocity is
+    bounded so that the joint can still stop before its limit with the same acceleration, also at changing tick
+    lengths (v dt + v^2 / 2a <= distance), so that no limit undoes another.
+    """
+
+    def __init__(
+        self,
+        settings: SafetySettings,
+        limits: Limits,
+        outside: Callable[[Float64], tuple[str, ...]] | None = None,
+    ) -> None:
+        self._settings = settings
+        self._limits = limits
+        self._outside = outside  # names the arms whose end effector leaves its box
+        self._angles = ~limits.grippers
+
+    def judge(self, action: Float64, state: RobotState, path: Path = "policy") -> Verdict:
+        """The verdict on `action` [D]; with report-only the action comes back unchanged, with the notes."""
+        refusal = self._refusal(action, state, path)
+        if refusal:
+            return Verdict(action if self._settings.report_only and _usable(action, state) else None, (refusal,))
+        reachable, notes = self._reachable(action, state, path)
+        violation = self._violation(reachable, state)
+        if self._settings.report_only:
+            return Verdict(action, notes + self._excess(action))
+        if violation:
+            return Verdict(None, (*notes, violation))
+        return Verdict(reachable, notes)
+
+    def _refusal(self, action: Float64, state: RobotState, path: Path) -> str:
+        if not _usable(action, state):
+            return _unusable(action, self._limits)
+        if path == "motion":
+            return ""
+        return (
+            self._stale(state) or self._leaves_box(action) or self._runs_away(action, state) or self._jumps(action, state)
+        )
+
+    def _stale(self, state: RobotState) -> str:
+        settings = self._settings
+        if state.joint_age > settings.joint_age_s:
+            return f"joints are {state.joint_age:.2f} s old, allowed {settings.joint_age_s:g}"
+        for camera, age in state.picture_ages.items():
+            if not age <= settings.picture_age_s:  # also refuses NaN: a picture that never came
+                return f"picture {camera} is {age:.2f} s old, allowed {settings.picture_age_s:g}"
+        return ""
+
+    def _leaves_box(self, action: Float64) -> str:
+        arms = self._outside(action) if self._outside else ()
+        return f"{', '.join(arms)} would leave the workspace box" if arms else ""
+
+    def _runs_away(self, action: Float64, state: RobotState) -> str:
+        error = np.where(self._angles, np.abs(action - state.measured), 0.0)
+        worst = int(error.argmax())
+        if error[worst] <= self._settings.following_error:
+            return ""
+        # A blocked arm must still be allowed to come back towards where it is measured.
+        if abs(action[worst] - state.measured[worst]) < abs(state.previous[worst] - state.measured[worst]):
+            return ""
+        name, allowed = self._limits.names[worst], self._settings.following_error
+        return f"{name} would be {error[worst]:.2f} rad from where it is measured, allowed {allowed:g}"
+
+    def _jumps(self, action: Float64, state: RobotState) -> str:
+        jump = np.where(self._angles, np.abs(action - state.previous), 0.0)
+        worst = int(jump.argmax())
+        if jump[worst] <= self._settings.jump:
+            return ""
+        return f"{self._limits.names[worst]} jumps {jump[worst]:.2f} rad, allowed {self._settings.jump:g}"
+
+    def _reachable(self, action: Float64, state: RobotState, path: Path) -> tuple[Float64, tuple[str, ...]]:
+        limits, dt = self._limits, state.elapsed
+        a = self._settings.acceleration
+        scale = self._settings.velocity_scale
+        top = limits.velocity * scale
+        up = np.minimum(top, _stopping_speed(limits.upper - state.previous, a, dt))
+        down = -np.minimum(top, _stopping_speed(state.previous - limits.lower, a, dt))
+        fastest = np.minimum(up, state.velocity + a * dt)
+        slowest = np.maximum(down, state.velocity - a * dt)
+        # Where the two contradict (a limit was changed, a stall), braking as hard as allowed wins.
+        braking = state.velocity - np.sign(state.velocity) * np.minimum(a * dt, np.abs(state.velocity))
+        crossed = slowest > fastest
+        fastest, slowest = np.where(crossed, braking, fastest), np.where(crossed, braking, slowest)
+        wanted = (action - state.previous) / dt
+        velocity = np.clip(wanted, slowest, fastest)
+        changed = np.abs(velocity - wanted) * dt > _TOLERANCE
+        reachable = np.where(changed, state.previous + velocity * dt, action)
+        binary = limits.binary
+        reachable = np.where(binary, np.clip(action, limits.lower, limits.upper), reachable)
+        notes = tuple(
+            f"{limits.names[i]} limited from {action[i]:.4f} to {reachable[i]:.4f}"
+            for i in np.flatnonzero(np.abs(reachable - action) > _TOLERANCE)
+        )
+        return reachable, notes
+
+    def _violation(self, action: Float64, state: RobotState) -> str:
+        limits = self._limits
+        excess = _outside(action, limits)
+        worse = (excess > _TOLERANCE) & (excess > _outside(state.previous, limits) + _TOLERANCE)
+        if not worse.any():
+            return ""
+        i = int(np.flatnonzero(worse)[0])
+        return f"{limits.names[i]} {action[i]:.4f} is outside {limits.lower[i]:g}..{limits.upper[i]:g}"
+
+    def _excess(self, action: Float64) -> tuple[str, ...]:
+        limits = self._limits
+        return tuple(
+            f"{limits.names[i]} {action[i]:.4f} is outside {limits.lower[i]:g}..{limits.upper[i]:g}"
+            for i in np.flatnonzero(_outside(action, limits) > _TOLERANCE)
+        )
+
+
+def _usable(action: Float64, state: RobotState) -> bool:
+    return action.shape == state.previous.shape and bool(np.isfinite(action).all())
+
+
+def _unusable(action: Float64, limits: Limits) -> str:
+    if action.shape != limits.lower.shape:
+        return f"action has shape {action.shape}, expected {limits.lower.shape}"
+    i = int(np.flatnonzero(~np.isfinite(action))[0])
+    return f"{limits.names[i]} is {action[i]}"
+
+
+def _outside(action: Float64, limits: Limits) -> Float64:
+    return np.maximum(np.maximum(limits.lower - action, action - limits.upper), 0.0)
+
+
+def _stopping_speed(distance: Float64, acceleration: float, dt: float) -> Float64:
+    """The largest v with v dt + v^2 / (2 a) <= distance: after this step the joint can still stop in time."""
+    d = np.maximum(distance, 0.0)
+    return np.asarray(acceleration * (np.sqrt(dt * dt + 2.0 * d / acceleration) - dt))

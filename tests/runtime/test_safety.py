@@ -1,0 +1,133 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from runtime.safety import Limits, RobotState, SafetyFilter, SafetySettings
+
+NAMES = ("arm.joint0", "arm.joint1", "arm.gripper")
+LIMITS = Limits(
+    names=NAMES,
+    lower=np.array([-1.0, 0.0, 0.0]),
+    upper=np.array([1.0, 3.0, 0.1]),
+    velocity=np.array([3.0, 3.0, 1.0]),
+    grippers=np.array([False, False, True]),
+    binary=np.zeros(3, bool),
+)
+DT = 1 / 30
+
+
+def state(previous=(0.0, 1.0, 0.05), velocity=(0.0, 0.0, 0.0), measured=None, **changes) -> RobotState:
+    previous = np.array(previous, float)
+    measured = previous if measured is None else np.array(measured, float)
+    return RobotState(previous, np.array(velocity, float), measured, changes.pop("elapsed", DT), **changes)
+
+
+def judge(action, where=None, path="policy", limits=LIMITS, outside=None, **options):
+    return SafetyFilter(SafetySettings(**options), limits, outside).judge(
+        np.array(action, float), where or state(), path
+    )
+
+
+def test_a_reachable_action_passes_unchanged_to_the_last_bit():
+    action = np.array([0.01, 1.01, 0.051])
+    verdict = judge(action)
+    assert (verdict.action == action).all()
+    assert verdict.notes == ()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_it_refuses_what_is_not_finite_and_names_the_joint(value):
+    verdict = judge([0.0, value, 0.0])
+    assert verdict.refused
+    assert "arm.joint1" in verdict.notes[0]
+
+
+def test_it_refuses_a_wrong_dimension():
+    assert "shape (2,), expected (3,)" in judge([0.0, 0.0]).notes[0]
+
+
+def test_it_refuses_on_old_joints_and_on_old_pictures_each_by_its_own_bound():
+    assert "joints are 0.25 s old, allowed 0.2" in judge([0, 1, 0.05], state(joint_age=0.25)).notes[0]
+    assert not judge([0, 1, 0.05], state(picture_ages={"cam": 0.25})).refused
+    assert "picture cam is 0.60 s old" in judge([0, 1, 0.05], state(picture_ages={"cam": 0.6})).notes[0]
+    assert judge([0, 1, 0.05], state(picture_ages={"cam": float("nan")})).refused
+
+
+def test_a_motion_of_ours_needs_no_pictures():
+    assert not judge([0, 1, 0.05], state(picture_ages={"cam": 9.0}, joint_age=9.0), path="motion").refused
+
+
+def test_a_target_never_runs_away_from_a_blocked_arm_but_may_come_back():
+    blocked = state(previous=(0.6, 1, 0.05), measured=(0.0, 1, 0.05))
+    assert "from where it is measured" in judge([0.62, 1, 0.05], blocked).notes[0]
+    assert not judge([0.55, 1, 0.05], blocked).refused
+
+
+def test_it_refuses_a_jump():
+    assert "jumps 0.60 rad" in judge([0.0, 1.6, 0.05], state(measured=(0, 1.3, 0.05))).notes[0]
+
+
+def test_a_workspace_box_refuses_and_never_clamps():
+    verdict = judge([0, 1, 0.05], outside=lambda action: ("left_arm",))
+    assert verdict.refused
+    assert "left_arm would leave the workspace box" in verdict.notes
+
+
+def test_velocity_is_limited_and_the_note_says_from_what_to_what():
+    verdict = judge([0.0, 1.4, 0.05], state(velocity=(0, 3.0, 0)))
+    assert verdict.action[1] == pytest.approx(1 + 3.0 * DT)
+    assert verdict.notes == ("arm.joint1 limited from 1.4000 to 1.1000",)
+
+
+def test_a_gripper_beyond_its_range_is_brought_back_into_it():
+    verdict = judge([0, 1, 0.103], state(previous=(0, 1, 0.1)))
+    assert verdict.action[2] == pytest.approx(0.1)
+
+
+def test_a_binary_gripper_switches_at_once():
+    limits = Limits(LIMITS.names, LIMITS.lower, LIMITS.upper, LIMITS.velocity, LIMITS.grippers, LIMITS.grippers)
+    verdict = judge([0, 1, 0.1], state(previous=(0, 1, 0.0)), limits=limits)
+    assert verdict.action[2] == 0.1
+    assert verdict.notes == ()
+
+
+def test_report_only_sends_the_action_as_it_is_and_lists_what_it_would_have_done():
+    verdict = judge([0, 1, 0.103], report_only=True, where=state(previous=(0, 1, 0.1)))
+    assert verdict.action[2] == 0.103
+    assert "arm.gripper 0.1030 is outside 0..0.1" in verdict.notes
+
+
+def test_report_only_still_refuses_what_cannot_be_sent():
+    assert judge([np.nan, 0, 0], report_only=True).refused
+
+
+def test_an_arm_that_starts_outside_its_limits_may_stay_or_come_back_but_not_go_further():
+    outside = state(previous=(0, -0.02, 0.05))
+    assert not judge([0, -0.02, 0.05], outside).refused
+    assert not judge([0, 0.0, 0.05], outside).refused
+    verdict = judge([0, -0.05, 0.05], outside)
+    assert verdict.refused or verdict.action[1] >= -0.02 - 1e-9
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(st.floats(-5, 5), min_size=30, max_size=120),
+    st.lists(st.floats(0.2, 1.5), min_size=120, max_size=120),
+    st.floats(2.0, 60.0),
+)
+def test_whatever_is_asked_the_limits_hold_together(asked, stretches, acceleration):
+    """Velocity, acceleration and joint limits at once, at changing tick lengths: none undoes another."""
+    limits = Limits(("j",), np.array([-1.0]), np.array([1.0]), np.array([3.0]), np.zeros(1, bool), np.zeros(1, bool))
+    options = SafetySettings(acceleration=acceleration, jump=100.0, following_error=100.0)
+    safety = SafetyFilter(options, limits)
+    previous, velocity = np.zeros(1), np.zeros(1)
+    for target, stretch in zip(asked, stretches, strict=False):
+        dt = DT * stretch
+        verdict = safety.judge(np.array([target]), RobotState(previous, velocity, previous, dt))
+        assert not verdict.refused
+        new = (verdict.action - previous) / dt
+        assert abs(new[0]) <= 3.0 + 1e-4
+        assert abs(new[0] - velocity[0]) <= acceleration * dt + 1e-4
+        assert -1.0 - 1e-6 <= verdict.action[0] <= 1.0 + 1e-6
+        previous, velocity = verdict.action, new
