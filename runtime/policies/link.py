@@ -1,0 +1,188 @@
+"""One websocket to a policy server: a first frame on connect, then strictly one request and one answer.
+
+Replies carry no id, so a connection whose answer did not come in time is dropped and never used again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+from runtime.errors import PolicyError
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
+
+_CLOSE_TIMEOUT = 0.5  # seconds for the closing handshake; a server busy with inference does not answer it
+
+
+class PolicyTimeout(PolicyError):
+    """The server did not answer within the deadline; the connection is dropped."""
+
+
+class PolicyGone(PolicyError):
+    """The server closed the connection; it may have restarted."""
+
+
+class WebsocketLink:
+    """A connection that can be opened again until it is aborted; for one thread, except for `abort`."""
+
+    def __init__(self, url: str, headers: Mapping[str, str], connect_deadline: float) -> None:
+        self._url = url
+        self._headers = dict(headers)
+        self._connect_deadline = connect_deadline
+        self._stack = contextlib.ExitStack()
+        self._connection: ClientConnection | None = None
+        self._aborted = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a connection is held; the peer may have gone since."""
+        return self._connection is not None
+
+    def open(self) -> bytes:
+        """Connect anew and return the server's first frame; both within the connect deadline."""
+        self.drop()
+        deadline = time.monotonic() + self._connect_deadline
+        self._connection = self._connect()
+        with self._dropping_on_error():
+            if self._aborted:
+                raise PolicyError(f"the connection to {self._url} was closed from our side")
+            return self._receive(self._connection, deadline, "its metadata", self._connect_deadline)
+
+    def exchange(self, request: bytes, seconds: float) -> bytes:
+        """The answer to `request`; PolicyTimeout after `seconds`, PolicyGone, or the server's error."""
+        connection = self._connection
+        if connection is None:
+            raise PolicyError(f"there is no connection to {self._url}; connect first")
+        deadline = time.monotonic() + seconds
+        with self._dropping_on_error():
+            self._send(connection, request, seconds)
+            return self._receive(connection, deadline, "an answer", seconds)
+
+    def abort(self) -> None:
+        """Unblock, from another thread, whoever waits here: they raise PolicyError, and so does all that follows.
+
+        Only the handshake itself is not interrupted; it ends within the connect deadline.
+        """
+        self._aborted = True
+        connection = self._connection
+        if connection is not None:
+            _shut(connection)
+
+    def drop(self) -> None:
+        """End the connection without waiting for the server's consent; safe to call twice."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            _shut(connection)
+        self._stack.close()
+
+    def _connect(self) -> ClientConnection:
+        from websockets.exceptions import InvalidStatus, InvalidURI, WebSocketException
+        from websockets.sync.client import connect
+
+        try:
+            return self._stack.enter_context(
+                connect(
+                    self._url,
+                    additional_headers=self._headers,
+                    compression=None,
+                    max_size=None,
+                    # A server that computes on its event loop answers no pings.
+                    ping_interval=None,
+                    proxy=None,
+                    open_timeout=self._connect_deadline,
+                    close_timeout=_CLOSE_TIMEOUT,
+                )
+            )
+        except ConnectionRefusedError as error:
+            raise PolicyError(
+                f"no policy server listens at {self._url}: start it, or correct policy.url"
+            ) from error
+        except socket.gaierror as error:
+            raise PolicyError(
+                f"the host of {self._url} is not known: correct policy.url ({error})"
+            ) from error
+        except TimeoutError as error:
+            raise PolicyTimeout(
+                f"{self._url} gave no websocket handshake within {self._connect_deadline:g} s: "
+                "the host is unreachable, or what listens there is stuck or no websocket server"
+            ) from error
+        except InvalidStatus as error:
+            raise PolicyError(
+                f"{self._url} refused the websocket with HTTP {error.response.status_code}: "
+                "another web server listens there, or the path or the API key is wrong; correct policy.url"
+            ) from error
+        except InvalidURI as error:
+            raise PolicyError(f"{self._url} is no websocket address, e.g. ws://127.0.0.1:8000") from error
+        except (WebSocketException, OSError, EOFError) as error:
+            raise PolicyError(
+                f"what listens at {self._url} does not speak websocket ({error}): "
+                "check host, port and policy.kind"
+            ) from error
+
+    def _send(self, connection: ClientConnection, request: bytes, seconds: float) -> None:
+        """Send, but not for ever: a server that stopped reading leaves our socket full."""
+        from websockets.exceptions import ConnectionClosed
+
+        fired = threading.Event()
+
+        def cut() -> None:
+            fired.set()
+            _shut(connection)
+
+        watchdog = threading.Timer(seconds, cut)
+        watchdog.daemon = True
+        watchdog.start()
+        try:
+            connection.send(request)
+        except ConnectionClosed as error:
+            if fired.is_set():
+                raise PolicyTimeout(f"{self._url} did not take the request within {seconds:g} s") from error
+            raise self._gone(error) from error
+        finally:
+            watchdog.cancel()
+
+    def _receive(self, connection: ClientConnection, deadline: float, what: str, seconds: float) -> bytes:
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            answer = connection.recv(timeout=max(0.0, deadline - time.monotonic()))
+        except TimeoutError as error:
+            raise PolicyTimeout(
+                f"{self._url} did not send {what} within {seconds:g} s; the connection is dropped"
+            ) from error
+        except ConnectionClosed as error:
+            raise self._gone(error) from error
+        if isinstance(answer, str):
+            raise PolicyError(f"the policy server at {self._url} reports an error: {_headline(answer)}")
+        return answer
+
+    def _gone(self, error: Exception) -> PolicyError:
+        if self._aborted:
+            return PolicyError(f"the connection to {self._url} was closed from our side")
+        return PolicyGone(f"the policy server at {self._url} closed the connection: {error}")
+
+    @contextlib.contextmanager
+    def _dropping_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self.drop()
+            raise
+
+
+def _shut(connection: ClientConnection) -> None:
+    """Wake every thread that waits on this socket; it is of no use afterwards."""
+    with contextlib.suppress(OSError):
+        connection.socket.shutdown(socket.SHUT_RDWR)
+
+
+def _headline(text: str) -> str:
+    """A traceback's last line first, because that is the sentence; then the whole of it."""
+    lines = text.strip().splitlines() or ["(an empty text)"]
+    return lines[-1] if len(lines) == 1 else f"{lines[-1].strip()}\n{text.strip()}"

@@ -1,0 +1,282 @@
+"""The openpi websocket protocol: metadata on connect, then one observation map, one map of actions.
+
+Source: openpi's websocket_policy_server and openpi-client. The request's layout is declared in the
+configuration, so that the ALOHA, DROID and LIBERO layouts are settings and not code.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from runtime import codecs
+from runtime.clock import Clock
+from runtime.errors import CodecError, ConfigurationError, PolicyError
+from runtime.policies.base import Policy, PolicyInfo
+from runtime.policies.link import PolicyGone, PolicyTimeout, WebsocketLink
+from runtime.policies.pictures import Layout, Resize, fitted, laid_out
+from runtime.policies.rows import action_rows
+from runtime.section import Section
+from runtime.types import ActionChunk, Conditioning, Float32, Observation, Space
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Pixels = Annotated[int, Field(ge=8, le=4096)]
+Size = Annotated[list[Pixels], Field(min_length=2, max_length=2)]
+Dims = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
+
+ANSWER_LIMIT = 64 * 1024 * 1024  # bytes; a chunk of 50 rows is some kilobytes
+_SPACES: dict[object, Space] = {"joint": "joint", "qpos": "joint", "eef": "eef"}
+
+
+class Config(Section):
+    """A policy server that speaks the openpi websocket protocol."""
+
+    kind: Literal["openpi"] = "openpi"
+    url: Annotated[str, Field(pattern=r"^wss?://.+")] = "ws://127.0.0.1:8000"
+    api_key_env: str | None = None
+    """Environment variable with the API key; the key itself would end up in every recording's manifest."""
+    connect_deadline: Seconds = 5.0
+    first_inference_deadline: Seconds = 120.0
+    """For the first answer after a server was reached: it may have to compile its model."""
+    inference_deadline: Seconds = 2.0
+    action_space: Space = "joint"
+    """What the rows of the answer are: joint targets, or 8 numbers of pose and gripper per arm."""
+    observation_space: Space = "joint"
+    """What is sent as state: joints, or poses."""
+    cameras: dict[str, str] | None = None
+    """Observation key = request key; without it all of the robot's cameras under their own keys."""
+    images_key: str = "images"
+    """The map that holds the pictures; "" puts them into the request itself (DROID, LIBERO)."""
+    image_size: Size | None = Field(default_factory=lambda: [224, 224])
+    """Height and width the policy was trained with."""
+    resize: Resize | Literal["none"] = "pad"
+    """"pad" keeps the aspect on black, "stretch" does not, "none" sends pictures as they are."""
+    image_layout: Layout = "chw"
+    state_key: str = "state"
+    """"" sends no whole state."""
+    state_parts: dict[str, Dims] = Field(default_factory=dict)
+    """Further request keys and the places of the state vector they take (DROID: joints and gripper apart)."""
+    prompt_key: str = "prompt"
+
+
+def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> OpenpiPolicy:
+    """The policy, not yet connected; ConfigurationError where the request's layout does not fit the robot."""
+    return OpenpiPolicy(config, robot)
+
+
+class OpenpiPolicy(Policy):
+    """One connection; a timed-out one is dropped, and the next `infer` opens another.
+
+    Deadlines are real seconds whatever the clock, because a server on a wire knows no other. The long first
+    deadline holds again after the server has closed the connection (it may have restarted), but not after
+    a timeout: a mute server is found out quickly the second time.
+    """
+
+    def __init__(self, config: Config, robot: Robot) -> None:
+        self._config = config
+        self._cameras = _cameras(config, robot)
+        self._state_width = _width(config.observation_space, robot)
+        self._width = _width(config.action_space, robot)
+        _check_parts(config, self._state_width)
+        self._headers = _headers(config)
+        self._link = self._new_link()
+        self._lock = threading.Lock()
+        self._closed = False
+        self._warm = False
+
+    def connect(self) -> PolicyInfo:
+        """Reach the server and read its metadata; an open connection is replaced."""
+        with self._lock:
+            self._closed = False
+            self._warm = False
+            self._link.drop()
+            self._link = self._new_link()
+            return self._open()
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        """The chunk; `timing` has the server's figures [ms] and our `round_trip_ms`; no conditioning."""
+        if conditioning is not None:
+            raise PolicyError(
+                "plain openpi servers drop RTC conditioning without a word; choose an RTC protocol"
+            )
+        request = codecs.pack(self.request(observation))
+        with self._lock:
+            if self._closed:
+                raise PolicyError(f"the policy at {self._config.url} is closed; connect first")
+            if not self._link.is_open:
+                self._open()
+            started = time.monotonic()
+            reply = self._unpacked(self._exchange(request), "an answer")
+            round_trip = 1e3 * (time.monotonic() - started)
+        return self._chunk(reply, round_trip)
+
+    def reset(self) -> None:
+        """Nothing to forget: the protocol has no reset, and no answer depends on an earlier one."""
+
+    def close(self) -> None:
+        """Drop the connection; an `infer` that waits in another thread raises PolicyError at once."""
+        self._closed = True
+        self._link.abort()
+        with self._lock:
+            self._closed = True
+            self._link.drop()
+
+    def request(self, observation: Observation) -> dict[str, object]:
+        """The request map for an observation, in the declared layout."""
+        config = self._config
+        state = self._state(observation)
+        request: dict[str, object] = {config.state_key: state} if config.state_key else {}
+        request |= {key: state[dims] for key, dims in config.state_parts.items()}
+        pictures = {key: self._picture(observation, camera) for camera, key in self._cameras.items()}
+        request |= {config.images_key: pictures} if config.images_key else pictures
+        if config.prompt_key:
+            request[config.prompt_key] = observation.prompt
+        return request
+
+    def _state(self, observation: Observation) -> Float32:
+        state = observation.qpos if self._config.observation_space == "joint" else observation.eef
+        if state is None:
+            raise PolicyError('policy.observation_space is "eef" but the observation has no poses')
+        if state.shape != (self._state_width,):
+            raise PolicyError(f"the state has shape {list(state.shape)}; expected [{self._state_width}]")
+        return np.ascontiguousarray(state, dtype=np.float32)
+
+    def _picture(self, observation: Observation, camera: str) -> np.ndarray[Any, Any]:
+        picture = observation.pictures.get(camera)
+        if picture is None:
+            given = ", ".join(observation.pictures) or "none"
+            raise PolicyError(f"the observation has no picture {camera!r}; it has {given}")
+        config = self._config
+        if config.image_size is not None and config.resize != "none":
+            picture = fitted(picture, config.image_size[0], config.image_size[1], config.resize)
+        return laid_out(picture, config.image_layout)
+
+    def _new_link(self) -> WebsocketLink:
+        return WebsocketLink(self._config.url, self._headers, self._config.connect_deadline)
+
+    def _open(self) -> PolicyInfo:
+        metadata = self._unpacked(self._link.open(), "metadata")
+        try:
+            space = self._checked_space(metadata, "metadata")
+        except PolicyError:
+            self._link.drop()
+            raise
+        horizon = metadata.get("action_horizon")
+        return PolicyInfo(
+            name=str(metadata.get("name", "openpi")),
+            action_space=space,
+            horizon=horizon if type(horizon) is int else None,
+            metadata=metadata,
+        )
+
+    def _exchange(self, request: bytes) -> bytes:
+        config = self._config
+        seconds = config.inference_deadline if self._warm else config.first_inference_deadline
+        try:
+            answer = self._link.exchange(request, seconds)
+        except (PolicyGone, PolicyTimeout) as error:
+            self._warm = isinstance(error, PolicyTimeout)
+            raise
+        self._warm = True
+        return answer
+
+    def _unpacked(self, payload: bytes, what: str) -> dict[str, Any]:
+        try:
+            message = codecs.unpack(payload, ANSWER_LIMIT)
+        except CodecError as error:
+            self._link.drop()
+            raise PolicyError(
+                f"{self._config.url} sent {what} that is not the openpi protocol: {error}"
+            ) from error
+        if not isinstance(message, dict):
+            self._link.drop()
+            raise PolicyError(
+                f"{self._config.url} sent {what} that is a {type(message).__name__}; expected a map"
+            )
+        return message
+
+    def _chunk(self, reply: Mapping[str, Any], round_trip: float) -> ActionChunk:
+        if "actions" not in reply:
+            raise PolicyError(
+                f"the answer has no 'actions'; it has {', '.join(map(str, reply)) or 'nothing'}"
+            )
+        self._checked_space(reply, "answer")
+        origin = reply.get("origin_actions")
+        return ActionChunk(
+            actions=action_rows("actions", reply["actions"], self._width),
+            space=self._config.action_space,
+            model_actions=None if origin is None else action_rows("origin_actions", origin),
+            timing=_timing(reply) | {"round_trip_ms": round_trip},
+        )
+
+    def _checked_space(self, message: Mapping[str, Any], where: str) -> Space | None:
+        """The action space the server names; it may not contradict the configured one."""
+        if message.get("action_mode") is None:
+            return None
+        mode = message["action_mode"]
+        space = _SPACES.get(mode) if isinstance(mode, str) else None
+        if space is None:
+            raise PolicyError(
+                f"the server's {where} has action_mode {mode!r}; allowed: {', '.join(map(str, _SPACES))}"
+            )
+        if space != self._config.action_space:
+            raise PolicyError(
+                f"the server's {where} says that actions are {space!r}, policy.action_space is "
+                f"{self._config.action_space!r}; correct the one that is wrong"
+            )
+        return space
+
+
+def _cameras(config: Config, robot: Robot) -> dict[str, str]:
+    known = [camera.key for camera in robot.cameras]
+    if config.cameras is None:
+        return {key: key for key in known}
+    unknown = [key for key in config.cameras if key not in known]
+    if unknown:
+        raise ConfigurationError(
+            f"policy.cameras names {', '.join(unknown)}; cameras of {robot.name}: {', '.join(known)}"
+        )
+    return dict(config.cameras)
+
+
+def _width(space: Space, robot: Robot) -> int:
+    return robot.dim if space == "joint" else robot.eef_dim
+
+
+def _check_parts(config: Config, width: int) -> None:
+    for key, dims in config.state_parts.items():
+        if max(dims) >= width:
+            raise ConfigurationError(
+                f"policy.state_parts.{key} = {dims} leaves the state; allowed: 0 to {width - 1}"
+            )
+
+
+def _headers(config: Config) -> dict[str, str]:
+    if config.api_key_env is None:
+        return {}
+    key = os.environ.get(config.api_key_env)
+    if not key:
+        raise ConfigurationError(
+            f"policy.api_key_env names {config.api_key_env}, which is not set in the environment"
+        )
+    return {"Authorization": f"Api-Key {key}"}
+
+
+def _timing(reply: Mapping[str, Any]) -> dict[str, float]:
+    """The server's figures [ms] as "server.infer_ms", "policy.infer_ms"; what is no number is left out."""
+    timing: dict[str, float] = {}
+    for group in ("server", "policy"):
+        figures = reply.get(f"{group}_timing")
+        for name, figure in figures.items() if isinstance(figures, dict) else ():
+            if isinstance(figure, int | float | np.number):
+                timing[f"{group}.{name}"] = float(figure)
+    return timing

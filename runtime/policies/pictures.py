@@ -1,0 +1,40 @@
+"""Pictures as policies want them: resized as in their training, in their layout."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from runtime.types import UInt8
+
+Resize = Literal["pad", "stretch"]
+Layout = Literal["chw", "hwc"]
+
+
+def fitted(picture: UInt8, height: int, width: int, how: Resize) -> UInt8:
+    """RGB uint8 [height, width, 3] from [H, W, 3], bilinear with Pillow because policies are trained with it.
+
+    "pad" keeps the aspect and centres the picture on black; sides are rounded down, as openpi does it.
+    """
+    from PIL import Image
+
+    rows, columns = picture.shape[:2]
+    if (rows, columns) == (height, width):
+        return picture
+    image = Image.fromarray(picture)
+    bilinear = Image.Resampling.BILINEAR
+    if how == "stretch":
+        return np.asarray(image.resize((width, height), bilinear))
+    ratio = max(columns / width, rows / height)
+    inner_width, inner_height = max(1, int(columns / ratio)), max(1, int(rows / ratio))
+    top, left = (height - inner_height) // 2, (width - inner_width) // 2
+    canvas = np.zeros((height, width, 3), np.uint8)
+    inner = np.asarray(image.resize((inner_width, inner_height), bilinear))
+    canvas[top : top + inner_height, left : left + inner_width] = inner
+    return canvas
+
+
+def laid_out(picture: UInt8, layout: Layout) -> UInt8:
+    """The picture in memory order: [H, W, 3] for "hwc", [3, H, W] for "chw"."""
+    return np.ascontiguousarray(picture if layout == "hwc" else picture.transpose(2, 0, 1))

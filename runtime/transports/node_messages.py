@@ -1,0 +1,210 @@
+"""What an execution node says in one message: checked against the robot, or refused by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from runtime import codecs
+from runtime.errors import CodecError
+from runtime.types import EEF_WIDTH, Float32, UInt8
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+Encoding = Literal["bgr", "rgb"]
+
+
+class MessageRefused(CodecError):
+    """A message that cannot be used; `fault` is the name under which it is counted."""
+
+    def __init__(self, fault: str, text: str) -> None:
+        super().__init__(text)
+        self.fault = fault
+
+
+@dataclass(frozen=True, slots=True)
+class NodeStatus:
+    """What the node says of itself; the simulated one says all of it, older nodes the hil fields only."""
+
+    holding: bool | None = None  # its own command deadline has passed; it holds position
+    refused: Mapping[str, int] = MappingProxyType({})  # commands it refused, by reason
+    master: str | None = None  # whose commands it obeys
+    hil_supported: bool = False
+    hil_active: bool = False
+    hil_error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeFrame:
+    """One complete observation as sent: `stamp` in the node's own clock [s], pictures in its own `encoding`.
+
+    `remarks` are (fault, text) of optional parts that were left out because they are unusable.
+    """
+
+    stamp: float
+    qpos: Float32
+    pictures: Mapping[str, UInt8]
+    encoding: Encoding
+    eef: Float32 | None
+    action: Float32 | None
+    action_eef: Float32 | None
+    sequence: int | None
+    status: NodeStatus
+    remarks: tuple[tuple[str, str], ...] = field(default=())
+
+
+class NodeMessages:
+    """Reads the node's messages for one robot; `disabled` cameras are neither required nor delivered."""
+
+    def __init__(self, robot: Robot, encoding: Encoding, disabled: frozenset[str], limit: int) -> None:
+        self._robot = robot
+        self._encoding = encoding
+        self._cameras = tuple(camera.key for camera in robot.cameras if camera.key not in disabled)
+        self._eef_width = EEF_WIDTH * len(robot.arms)
+        self._limit = limit
+
+    def read(self, payload: bytes) -> NodeFrame:
+        """The frame of one message; raises MessageRefused where a part that control needs is missing."""
+        message = self._message(payload)
+        remarks: list[tuple[str, str]] = []
+        return NodeFrame(
+            stamp=_stamp(message),
+            qpos=self._qpos(message),
+            pictures=self._pictures(message),
+            encoding=self._encoding_of(message),
+            eef=self._optional(remarks, "eef", self._eef, message.get("eef")),
+            action=self._optional(remarks, "action", self._action, message.get("action")),
+            action_eef=self._optional(remarks, "action_eef", self._poses, message.get("action_eef")),
+            sequence=_sequence(message),
+            status=_status(message),
+            remarks=tuple(remarks),
+        )
+
+    def _message(self, payload: bytes) -> dict[Any, Any]:
+        try:
+            message = codecs.unpack(payload, self._limit)
+        except CodecError as error:
+            raise MessageRefused("malformed", str(error)) from error
+        if not isinstance(message, dict):
+            raise MessageRefused("malformed", f"a message is a {type(message).__name__}; expected a map")
+        return message
+
+    def _qpos(self, message: Mapping[Any, Any]) -> Float32:
+        state = _map(message, "state")
+        missing = [group.name for group in self._robot.groups if group.name not in state]
+        if missing:
+            given = ", ".join(map(str, state)) or "none"
+            raise MessageRefused("missing_group", f"state lacks {', '.join(missing)}; it has {given}")
+        parts = [_vector(f"state.{g.name}", state[g.name], g.dof) for g in self._robot.groups]
+        return np.concatenate(parts)
+
+    def _pictures(self, message: Mapping[Any, Any]) -> dict[str, UInt8]:
+        images = _map(message, "images")
+        missing = [key for key in self._cameras if key not in images]
+        if missing:
+            given = ", ".join(map(str, images)) or "none"
+            raise MessageRefused("missing_camera", f"images lack {', '.join(missing)}; they have {given}")
+        return {key: _picture(key, images[key]) for key in self._cameras}
+
+    def _encoding_of(self, message: Mapping[Any, Any]) -> Encoding:
+        given = message.get("encoding", self._encoding)
+        if given == "bgr":
+            return "bgr"
+        if given == "rgb":
+            return "rgb"
+        raise MessageRefused("unknown_encoding", f"encoding is {given!r}; allowed: 'bgr', 'rgb'")
+
+    def _optional(
+        self, remarks: list[tuple[str, str]], name: str, read: Any, given: object
+    ) -> Float32 | None:
+        """The part as read, None where it is absent or unusable; the latter leaves a remark."""
+        if given is None:
+            return None
+        try:
+            part: Float32 = read(name, given)
+        except MessageRefused as error:
+            remarks.append((f"{name}_unusable", str(error)))
+            return None
+        return part
+
+    def _eef(self, name: str, given: object) -> Float32:
+        if not isinstance(given, dict):
+            raise MessageRefused("malformed", f"{name} is a {type(given).__name__}; expected a map by arm")
+        missing = [arm.name for arm in self._robot.arms if arm.name not in given]
+        if missing:
+            raise MessageRefused("missing_group", f"{name} lacks {', '.join(missing)}")
+        parts = [_vector(f"{name}.{arm.name}", given[arm.name], EEF_WIDTH) for arm in self._robot.arms]
+        return self._poses(name, np.concatenate(parts) if parts else np.empty(0, np.float32))
+
+    def _poses(self, name: str, given: object) -> Float32:
+        vector = _vector(name, given, self._eef_width)
+        norms = np.linalg.norm(vector.reshape(-1, EEF_WIDTH)[:, 3:7], axis=1)
+        if (np.abs(norms - 1.0) > 0.05).any():  # some nodes send zeros where they know no pose
+            raise MessageRefused(
+                "malformed", f"{name} has quaternions of length {norms.round(3).tolist()}; expected 1"
+            )
+        return vector
+
+    def _action(self, name: str, given: object) -> Float32:
+        return _vector(name, given, self._robot.dim)
+
+
+def _stamp(message: Mapping[Any, Any]) -> float:
+    stamp = message.get("t")
+    if isinstance(stamp, bool) or not isinstance(stamp, int | float) or not math.isfinite(stamp):
+        raise MessageRefused("malformed", f"t is {stamp!r}; expected seconds of the node's monotonic clock")
+    return float(stamp)
+
+
+def _map(message: Mapping[Any, Any], key: str) -> Mapping[Any, Any]:
+    given = message.get(key)
+    if not isinstance(given, dict):
+        raise MessageRefused("malformed", f"{key} is a {type(given).__name__}; expected a map")
+    return given
+
+
+def _vector(name: str, given: object, width: int) -> Float32:
+    if not isinstance(given, np.ndarray) or given.dtype.kind != "f":
+        kind = given.dtype.str if isinstance(given, np.ndarray) else type(given).__name__
+        raise MessageRefused("wrong_dtype", f"{name} is {kind}; expected a float32 array")
+    if given.shape != (width,):
+        raise MessageRefused("wrong_dimension", f"{name} has shape {list(given.shape)}; expected [{width}]")
+    vector = given.astype(np.float32)
+    if not np.isfinite(vector).all():
+        raise MessageRefused("not_finite", f"{name} has {vector.tolist()}; expected finite numbers")
+    return vector
+
+
+def _picture(key: str, given: object) -> UInt8:
+    if not isinstance(given, np.ndarray) or given.dtype != np.uint8:
+        kind = given.dtype.str if isinstance(given, np.ndarray) else type(given).__name__
+        raise MessageRefused("wrong_dtype", f"images.{key} is {kind}; expected a uint8 array")
+    if given.ndim != 3 or given.shape[2] != 3 or given.size == 0:
+        raise MessageRefused(
+            "wrong_dimension", f"images.{key} has shape {list(given.shape)}; expected [H, W, 3]"
+        )
+    return given
+
+
+def _sequence(message: Mapping[Any, Any]) -> int | None:
+    given = message.get("seq")
+    return given if type(given) is int else None
+
+
+def _status(message: Mapping[Any, Any]) -> NodeStatus:
+    holding, refused, master = message.get("holding"), message.get("refused"), message.get("master")
+    counts = refused.items() if isinstance(refused, dict) else ()
+    return NodeStatus(
+        holding=holding if isinstance(holding, bool) else None,
+        refused={str(reason): n for reason, n in counts if type(n) is int},
+        master=master if isinstance(master, str) else None,
+        hil_supported=message.get("hil_supported") is True,
+        hil_active=message.get("hil_active") is True,
+        hil_error=str(message.get("hil_error", "")),
+    )
