@@ -1,0 +1,166 @@
+"""What a deployment file may say: one declarative table per part."""
+
+from __future__ import annotations
+
+import os
+from functools import reduce
+from operator import or_
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field
+
+from runtime.plugins import variants
+from runtime.recording.settings import RecordingSettings
+from runtime.safety import SafetySettings
+from runtime.section import Section
+
+
+def _variants_of(package: str) -> Any:
+    """The union of every variant's Config, told apart by `kind`; a new file in the package joins by itself."""
+    configs = [module.Config for module in variants(package).values()]
+    union = reduce(or_, configs)
+    return Annotated[union, Field(discriminator="kind")] if len(configs) > 1 else union
+
+
+TransportConfig = _variants_of("runtime.transports")
+PolicyConfig = _variants_of("runtime.policies")
+StrategyConfig = _variants_of("runtime.strategies")
+
+
+def _loopback(host: str) -> str:
+    if host not in ("127.0.0.1", "localhost", "::1"):
+        raise ValueError("must be a loopback address (127.0.0.1): the bus has no keys of its own yet")
+    return host
+
+
+class ControlSettings(Section):
+    """The control loop."""
+
+    rate: float | None = Field(default=None, gt=0, le=1000)
+    """Ticks per second [Hz]; the robot's own rate where it is not given."""
+    realtime: Literal["auto", "off"] = "auto"
+    """"auto" asks for SCHED_FIFO and locked memory and says what it got; "off" does not ask."""
+    realtime_priority: int = Field(default=20, ge=1, le=99)
+    heartbeat_timeout_s: float = Field(default=1.0, gt=0)
+    """Silence of main or guard after which control holds [s]."""
+    orphan_hold_s: float = Field(default=5.0, ge=0, le=8)
+    """How long control goes on holding after its supervisor has died [s]."""
+    starvation_hold_s: float = Field(default=1.0, gt=0)
+    """Time without any planned action after which `running` becomes `holding` [s]."""
+
+
+class SpaceSettings(Section):
+    """Action spaces."""
+
+    policy: Literal["joint", "eef"] = "joint"
+    """Space of the policy's rows: joints, or 8 numbers per arm."""
+    observation: Literal["joint", "eef"] = "joint"
+    """Space of the state that the policy is shown."""
+
+
+class SetupSettings(Section):
+    """What `setup` does."""
+
+    home: bool = True
+    """Drive to the pose before the policy is warmed up; skipped where the transport moves no robot."""
+    pose: str = "home"
+    """Named pose of the robot to home to."""
+    warmup_chunks: int = Field(default=2, ge=1)
+    """Inferences before the first run; the first compiles the model on many servers."""
+    observation_timeout_s: float = Field(default=10.0, gt=0)
+    """How long to wait for a complete first observation [s]."""
+
+
+class RunSettings(Section):
+    """A run."""
+
+    duration_s: float | None = Field(default=None, gt=0)
+    """Time after which a run ends by itself [s]; until it is stopped where it is not given."""
+    mode: Literal["continuous"] = "continuous"
+
+
+class RecordingChoice(RecordingSettings):
+    """Recording of every run."""
+
+    enabled: bool = True
+    fps: float | None = Field(default=None, gt=0)
+    """Rows per second of the dataset grid; the control rate where it is not given."""
+    kind: Literal["rollout", "demonstration"] = "rollout"
+    on_failure: Literal["hold", "continue"] = "hold"
+    """What a run does when its recording fails: an unrecorded run is no evidence."""
+
+
+class PublishSettings(Section):
+    """The LeRobot dataset that finished episodes go to."""
+
+    dataset: str | None = None
+    """Folder of the dataset, relative to the data folder; nothing is published where it is not given."""
+
+
+class LeaseSettings(Section):
+    """Who may command, and for how long."""
+
+    ttl_s: float = Field(default=5.0, gt=0)
+    """Time after which a lease that is not renewed ends and the robot holds [s]."""
+
+
+class BusSettings(Section):
+    """Sockets that the web, the terminal and scripts talk to."""
+
+    host: Annotated[str, AfterValidator(_loopback)] = "127.0.0.1"
+    command_port: int = Field(default=0, ge=0, le=65535)
+    state_port: int = Field(default=0, ge=0, le=65535)
+    camera_port: int = Field(default=0, ge=0, le=65535)
+    estop_port: int = Field(default=0, ge=0, le=65535)
+    preview_rate: float = Field(default=15.0, ge=0, le=60)
+    """JPEG previews per second and camera [Hz]; 0 for none."""
+    preview_height: int = Field(default=240, ge=60, le=1080)
+
+
+class LockstepSettings(Section):
+    """One process on a virtual clock."""
+
+    delay_ticks: int = Field(default=0, ge=0)
+    """Ticks between an observation and the arrival of its chunk."""
+
+
+class Deployment(Section):
+    """One station: a robot, a way to it, a policy, and how they are brought together."""
+
+    station: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")
+    robot: str
+    """Name of a folder in robots/, or a path to such a folder."""
+    task: str = ""
+    """The instruction given to the policy."""
+    operator: str = ""
+    data_dir: str | None = None
+    """Where episodes and datasets lie; $EVA_DATA_DIR or ./data where it is not given."""
+    transport: TransportConfig
+    policy: PolicyConfig
+    strategy: StrategyConfig = Field(default_factory=lambda: variants("runtime.strategies")["async"].Config())
+    control: ControlSettings = ControlSettings()
+    space: SpaceSettings = SpaceSettings()
+    setup: SetupSettings = SetupSettings()
+    run: RunSettings = RunSettings()
+    safety: SafetySettings = SafetySettings()
+    recording: RecordingChoice = RecordingChoice()
+    publish: PublishSettings = PublishSettings()
+    lease: LeaseSettings = LeaseSettings()
+    bus: BusSettings = BusSettings()
+    lockstep: LockstepSettings = LockstepSettings()
+
+    @property
+    def data(self) -> Path:
+        """The absolute data folder."""
+        return Path(self.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
+
+    @property
+    def station_dir(self) -> Path:
+        """Folder of the station's latch, command journal and endpoints."""
+        return self.data / "stations" / self.station
+
+    @property
+    def episodes_dir(self) -> Path:
+        """Folder of the journals."""
+        return self.data / "episodes"

@@ -1,0 +1,72 @@
+"""Who may command: one holder at a time, by epoch and time to live."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """A lease as it stands: who, in which epoch, until when on our monotonic clock."""
+
+    holder: str
+    epoch: int
+    until: float
+
+
+class Lease:
+    """At most one holder; a higher epoch takes over, a lower one is refused, silence ends it."""
+
+    def __init__(self, ttl: float) -> None:
+        self._ttl = ttl
+        self._held: Held | None = None
+        self._epoch = 0  # of the newest lease there ever was
+
+    def current(self, now: float) -> Held | None:
+        """The lease that is valid at `now`."""
+        return self._held if self._held and now < self._held.until else None
+
+    @property
+    def epoch(self) -> int:
+        return self._epoch
+
+    def claim(self, holder: str, epoch: int, now: float) -> str:
+        """Take or keep the lease; "" where granted, else the reason for the refusal."""
+        held = self.current(now)
+        if held and held.holder == holder and epoch in (0, held.epoch):
+            self._held = Held(holder, held.epoch, now + self._ttl)
+            return ""
+        if epoch == 0:  # a terminal: takes a free lease, never somebody's
+            if held:
+                return f"{held.holder} holds the lease for another {held.until - now:.1f} s"
+            epoch = self._epoch + 1
+        if epoch <= self._epoch:
+            return f"epoch {epoch} is over, the lease is in epoch {self._epoch}"
+        self._epoch = epoch
+        self._held = Held(holder, epoch, now + self._ttl)
+        return ""
+
+    def renew(self, holder: str, epoch: int, now: float) -> str:
+        """Extend the lease; "" where done, else the reason."""
+        refusal = self.check(holder, epoch, now)
+        if not refusal:
+            self._held = Held(holder, epoch, now + self._ttl)
+        return refusal
+
+    def give_up(self, holder: str, epoch: int, now: float) -> str:
+        """End the lease before its time."""
+        refusal = self.check(holder, epoch, now)
+        if not refusal:
+            self._held = None
+        return refusal
+
+    def check(self, holder: str, epoch: int, now: float) -> str:
+        """"" where this holder may command at `now`, else the reason why not."""
+        held = self.current(now)
+        if held is None:
+            return "nobody holds the lease: claim it first"
+        if held.holder != holder:
+            return f"{held.holder} holds the lease"
+        if held.epoch != epoch:
+            return f"epoch {epoch} is not the lease's epoch {held.epoch}"
+        return ""

@@ -1,0 +1,236 @@
+"""Every message between our processes: inside the family, and between the runtime and its clients.
+
+A message is a frozen dataclass; on the wire it is a map of its fields with its class name under "type".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.codecs import pack, unpack
+from runtime.errors import CodecError
+from runtime.types import Float32, Float64
+
+# --- main -> control ---------------------------------------------------------------------------------------
+
+OrderKind = Literal["silent", "hold", "follow", "motion"]
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What control is to do from its next tick on."""
+
+    number: int
+    kind: OrderKind
+    run: int = 0  # the run that is open, 0 where none is; chunks of another run are ignored
+    goal: Float64 | None = None  # [D] end of a "motion"
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class PostedChunk:
+    """A chunk in command space at control rate, not yet merged: float64 [H, D], row 0 for `observation_step`."""
+
+    chunk_id: int
+    run: int
+    observation_step: int
+    rows: Float64
+
+
+# --- control -> main and media -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class TickDone:
+    """One tick as control did it; times on our monotonic clock."""
+
+    step: int
+    run: int
+    planned: float
+    sent: float
+    sequence: int
+    source: str
+    qpos: Float32
+    smoothed: Float32 | None
+    executed: Float32 | None
+    chunk_ids: list[int]
+    weights: list[float]
+    notes: list[str]
+    refused: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkMerged:
+    """Where control put a chunk; fields as in strategies.base.Merged."""
+
+    chunk_id: int
+    run: int
+    arrival_step: int
+    delay: int
+    targets: NDArray[np.int64]
+    mistimed: int
+    dropped: str
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened, in one sentence; `kind` is what programs look at."""
+
+    kind: str
+    text: str
+    time: float
+    step: int = -1
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
+# --- main -> media -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class BeginEpisode:
+    """Open an episode and let the source play from its start; `run` 0 records whatever control does."""
+
+    run: int
+    manifest: Mapping[str, Any] | None  # None: a run that is not recorded
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyAnswer:
+    """A chunk as the policy gave it; `source_rows` [H'] says which row each posted row was made from."""
+
+    chunk_id: int
+    run: int
+    observation_step: int
+    actions: Float32
+    space: str
+    source_rows: NDArray[np.int64]
+    inference_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class EndEpisode:
+    """Close the open episode."""
+
+    status: str
+    reason: str
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+# --- media -> main -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeOpened:
+    """The recorder is ready (or could not be: `error`)."""
+
+    run: int
+    uuid: str
+    path: str
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeClosed:
+    """An episode is on disk, or what there is of it."""
+
+    uuid: str
+    path: str
+    status: str
+    reason: str
+    rows: int
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class MediaReport:
+    """What media sees, a few times a second."""
+
+    time: float
+    rates: Mapping[str, float]  # measured [Hz] per stream
+    faults: Mapping[str, int]
+    rows: int
+    recording: str  # uuid of the open episode, "" where none is
+    repeated: int
+
+
+# --- clients <-> runtime -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A discrete request of a person or a program.
+
+    `boot` and `sequence` are those of the snapshot it was decided by; `valid_until` is in the runtime's own
+    clock, as counted on from that snapshot. `holder` and `epoch` say under which lease it is given.
+    """
+
+    uuid: str
+    kind: str
+    args: Mapping[str, Any] = field(default_factory=dict)
+    user: str = ""
+    holder: str = ""
+    epoch: int = 0
+    boot: str = ""
+    sequence: int = 0
+    valid_until: float = float("inf")
+
+
+AckStatus = Literal["accepted", "refused", "done", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class Ack:
+    """The answer to a command; `allowed` names the commands that would be accepted now."""
+
+    uuid: str
+    status: AckStatus
+    reason: str = ""
+    allowed: list[str] = field(default_factory=list)
+    boot: str = ""
+    sequence: int = 0
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
+Message = (
+    Order
+    | PostedChunk
+    | TickDone
+    | ChunkMerged
+    | Event
+    | BeginEpisode
+    | PolicyAnswer
+    | EndEpisode
+    | EpisodeOpened
+    | EpisodeClosed
+    | MediaReport
+    | Command
+    | Ack
+)
+_TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Message.__args__}
+_FIELDS = {kind: tuple(f.name for f in fields(kind)) for kind in _TYPES.values()}
+
+
+def encode(message: Message) -> bytes:
+    """The message as bytes."""
+    kind = type(message)
+    return pack({"type": kind.__name__} | {name: getattr(message, name) for name in _FIELDS[kind]})
+
+
+def decode(payload: bytes) -> Message:
+    """The message in `payload`; raises CodecError naming what does not fit. Unknown fields are ignored."""
+    content = unpack(payload)
+    if not isinstance(content, dict) or content.get("type") not in _TYPES:
+        given = content.get("type") if isinstance(content, dict) else type(content).__name__
+        raise CodecError(f"message type {given!r} is unknown; known: {', '.join(_TYPES)}")
+    kind = _TYPES[content["type"]]
+    known = {name: content[name] for name in _FIELDS[kind] if name in content}
+    try:
+        message: Message = kind(**known)
+    except TypeError as error:
+        raise CodecError(f"message {content['type']}: {error}") from None
+    return message

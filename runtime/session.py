@@ -1,0 +1,266 @@
+"""The one state machine of a station: which command is allowed when, and what follows from what happens."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+
+from runtime.errors import RuntimeFault
+from runtime.lease import Lease
+from runtime.messages import Ack, AckStatus, Command
+
+
+class State(StrEnum):
+    """The session's state; one word each, the same everywhere."""
+
+    DISCONNECTED = "disconnected"
+    IDLE = "idle"
+    SETTING_UP = "setting_up"
+    READY = "ready"
+    RUNNING = "running"
+    HOLDING = "holding"
+    FAULTED = "faulted"
+
+
+class Happening(StrEnum):
+    """What the session is told of by the rest of the runtime."""
+
+    CONNECTED = "connected"  # a complete observation arrived
+    LINK_LOST = "link_lost"  # observations have been missing for long
+    SETUP_DONE = "setup_done"
+    SETUP_FAILED = "setup_failed"
+    HELD = "held"  # control holds, for a reason of its own
+    RUN_ENDED = "run_ended"  # the run is over by itself: its time, its source
+    LEASE_ENDED = "lease_ended"
+    ESTOPPED = "estopped"
+    RELEASED = "released"
+    FAMILY_DIED = "family_died"  # a process of the family was restarted
+
+
+class Effects(ABC):
+    """What the session makes happen; implemented by main, recorded by tests. Each raises RuntimeFault to refuse."""
+
+    @abstractmethod
+    def begin_setup(self) -> None: ...
+
+    @abstractmethod
+    def cancel_setup(self, reason: str) -> None: ...
+
+    @abstractmethod
+    def begin_run(self) -> None: ...
+
+    @abstractmethod
+    def hold(self, reason: str) -> None:
+        """Decelerate, hold, stop asking the policy; a run stays open."""
+
+    @abstractmethod
+    def resume_run(self) -> None: ...
+
+    @abstractmethod
+    def end_run(self, status: str, reason: str) -> None:
+        """Decelerate, hold, close the run and its episode; nothing to do where no run is open."""
+
+    @abstractmethod
+    def go_home(self) -> None: ...
+
+    @abstractmethod
+    def release_estop(self) -> None: ...
+
+    @abstractmethod
+    def start_recording(self) -> None: ...
+
+    @abstractmethod
+    def stop_recording(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A command: the states it is allowed in, the state after it, what it does."""
+
+    allowed: tuple[State, ...]
+    after: State | None
+    effect: Callable[[Effects], None]
+
+
+S = State
+COMMANDS: dict[str, Rule] = {
+    "setup": Rule((S.IDLE, S.READY), S.SETTING_UP, lambda e: e.begin_setup()),
+    "run": Rule((S.READY,), S.RUNNING, lambda e: e.begin_run()),
+    "stop": Rule(
+        (S.RUNNING, S.HOLDING, S.READY), S.READY, lambda e: e.end_run("finished", "stopped by the operator")
+    ),
+    "halt": Rule((S.RUNNING, S.HOLDING), S.HOLDING, lambda e: e.hold("halted by the operator")),
+    "resume": Rule((S.HOLDING,), S.RUNNING, lambda e: e.resume_run()),
+    "home": Rule((S.READY,), S.SETTING_UP, lambda e: e.go_home()),
+    "release": Rule((S.FAULTED,), None, lambda e: e.release_estop()),
+    "record_start": Rule((S.IDLE, S.READY), None, lambda e: e.start_recording()),
+    "record_stop": Rule((S.IDLE, S.READY, S.HOLDING), None, lambda e: e.stop_recording()),
+}
+# While it is being set up, both stopping commands mean the same: cancel.
+CANCELLING = ("stop", "halt")
+STOPPING = ("stop", "halt", "estop")  # never stale
+LEASE_COMMANDS = ("lease_claim", "lease_renew", "lease_give_up")
+
+# What happens by itself: (happening, state) -> the state after it. Pairs that are not here change nothing.
+HAPPENINGS: dict[tuple[Happening, State], State] = {
+    (Happening.CONNECTED, S.DISCONNECTED): S.IDLE,
+    (Happening.LINK_LOST, S.IDLE): S.DISCONNECTED,
+    (Happening.LINK_LOST, S.READY): S.DISCONNECTED,
+    (Happening.LINK_LOST, S.SETTING_UP): S.DISCONNECTED,
+    (Happening.SETUP_DONE, S.SETTING_UP): S.READY,
+    (Happening.SETUP_FAILED, S.SETTING_UP): S.IDLE,
+    (Happening.HELD, S.RUNNING): S.HOLDING,
+    (Happening.HELD, S.SETTING_UP): S.IDLE,
+    (Happening.RUN_ENDED, S.RUNNING): S.READY,
+    (Happening.RUN_ENDED, S.HOLDING): S.READY,
+    (Happening.LEASE_ENDED, S.RUNNING): S.HOLDING,
+    (Happening.LEASE_ENDED, S.SETTING_UP): S.IDLE,
+    (Happening.RELEASED, S.FAULTED): S.IDLE,
+    **{(Happening.ESTOPPED, state): S.FAULTED for state in State if state is not S.FAULTED},
+    **{
+        (Happening.FAMILY_DIED, state): S.IDLE
+        for state in (S.READY, S.RUNNING, S.HOLDING, S.SETTING_UP)
+    },
+}
+
+
+class Session:
+    """Holds the state; `handle` and `observe` are the only places that change it."""
+
+    def __init__(self, effects: Effects, lease: Lease, boot: str, now: Callable[[], float]) -> None:
+        self._effects = effects
+        self._lease = lease
+        self._boot = boot
+        self._now = now
+        self.state = State.DISCONNECTED
+        self.reason = "waiting for the first observation"
+        self.sequence = 0
+        self._answers: dict[str, Ack] = {}
+
+    def remember(self, answers: dict[str, Ack]) -> None:
+        """Answers given before a restart: the same uuid gets the same answer again."""
+        self._answers = answers | self._answers
+
+    def allowed(self) -> list[str]:
+        """The commands that would be accepted now."""
+        commands = [kind for kind, rule in COMMANDS.items() if self.state in rule.allowed]
+        if self.state is State.SETTING_UP:
+            commands.extend(CANCELLING)
+        return [*commands, "estop"]
+
+    def handle(self, command: Command) -> Ack:
+        """The answer to `command`; repeated uuids get the first answer again."""
+        if command.uuid in self._answers:
+            return self._answers[command.uuid]
+        refusal = self._refusal(command)
+        if not refusal:
+            refusal = self._carry_out(command)
+        ack = self._ack(command, "refused" if refusal else "accepted", refusal)
+        if command.kind != "lease_renew":  # a stream, not a discrete command: nothing to repeat
+            self._answers[command.uuid] = ack
+        return ack
+
+    def observe(self, happening: Happening, reason: str = "") -> bool:
+        """Tell the session what happened; True where the state changed."""
+        after = HAPPENINGS.get((happening, self.state))
+        if after is None:
+            return False
+        before = self.state
+        if happening in (Happening.HELD, Happening.LEASE_ENDED, Happening.LINK_LOST):
+            self._stop_for(before, reason)
+        elif happening in (Happening.ESTOPPED, Happening.FAMILY_DIED):
+            self._interrupt(before, reason)
+        elif happening is Happening.RUN_ENDED:
+            self._effects.end_run("finished", reason)
+        self._enter(after, reason)
+        return True
+
+    def _stop_for(self, before: State, reason: str) -> None:
+        if before is State.SETTING_UP:
+            self._effects.cancel_setup(reason)
+        self._effects.hold(reason)
+
+    def _interrupt(self, before: State, reason: str) -> None:
+        if before is State.SETTING_UP:
+            self._effects.cancel_setup(reason)
+        self._effects.end_run("interrupted", reason)
+
+    def _refusal(self, command: Command) -> str:
+        if command.kind in LEASE_COMMANDS:
+            return ""
+        if command.kind not in COMMANDS and command.kind != "estop":
+            return f"unknown command {command.kind!r}; known: {', '.join([*COMMANDS, 'estop', *LEASE_COMMANDS])}"
+        if command.kind not in STOPPING:
+            stale = self._staleness(command)
+            if stale:
+                return stale
+        if command.kind != "estop":
+            refusal = self._lease.check(command.holder, command.epoch, self._now())
+            if refusal:
+                return refusal
+        return self._not_now(command.kind)
+
+    def _staleness(self, command: Command) -> str:
+        if command.boot != self._boot:
+            return "stale: it was decided before the runtime was restarted"
+        if command.sequence < self.sequence:
+            return f"stale: the state has changed since it was decided (now {self.state}: {self.reason})"
+        if self._now() > command.valid_until:
+            return "stale: it arrived after its deadline"
+        return ""
+
+    def _not_now(self, kind: str) -> str:
+        if kind in self.allowed():
+            return ""
+        return f"{kind} is not allowed while {self.state} ({self.reason}); allowed: {', '.join(self.allowed())}"
+
+    def _carry_out(self, command: Command) -> str:
+        if command.kind in LEASE_COMMANDS:
+            return self._lease_command(command)
+        if command.kind == "estop":
+            return "the e-stop has a socket of its own: send it to the guard"
+        if self.state is State.SETTING_UP and command.kind in CANCELLING:
+            self._effects.cancel_setup("cancelled by the operator")
+            self._enter(State.IDLE, "set-up cancelled by the operator")
+            return ""
+        rule = COMMANDS[command.kind]
+        try:
+            rule.effect(self._effects)
+        except RuntimeFault as error:
+            return str(error)
+        if rule.after:
+            self._enter(rule.after, _REASONS.get(command.kind, ""))
+        return ""
+
+    def _lease_command(self, command: Command) -> str:
+        now = self._now()
+        before = self._lease.current(now)
+        act = {
+            "lease_claim": self._lease.claim,
+            "lease_renew": self._lease.renew,
+            "lease_give_up": self._lease.give_up,
+        }[command.kind]
+        refusal = act(command.holder, command.epoch, now)
+        after = self._lease.current(now)
+        if (before and before.epoch) != (after and after.epoch):
+            self.sequence += 1
+        return refusal
+
+    def _enter(self, state: State, reason: str) -> None:
+        self.state, self.reason = state, reason
+        self.sequence += 1
+
+    def _ack(self, command: Command, status: AckStatus, reason: str) -> Ack:
+        held = self._lease.current(self._now())
+        data = {"epoch": held.epoch, "holder": held.holder} if held else {}
+        return Ack(command.uuid, status, reason, self.allowed(), self._boot, self.sequence, data)
+
+
+_REASONS = {
+    "stop": "stopped by the operator",
+    "halt": "halted by the operator: resume or stop",
+    "home": "going home",
+    "setup": "setting up",
+}

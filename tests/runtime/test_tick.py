@@ -1,0 +1,325 @@
+import mmap
+
+import numpy as np
+import pytest
+
+from runtime.clock import VirtualClock
+from runtime.messages import ChunkMerged, Event, Order, PostedChunk, TickDone, decode, encode
+from runtime.page import EStop, Page, PageLayout
+from runtime.safety import Limits, SafetyFilter, SafetySettings
+from runtime.strategies import overlap, sync
+from runtime.tick import Tick, TickSettings
+from runtime.transports.base import Sink
+from runtime.types import Observation
+
+DIM, PERIOD = 2, 1 / 30
+
+
+class RecordingSink(Sink):
+    def __init__(self):
+        self.sent = []
+
+    def connect(self):
+        pass
+
+    def send(self, command):
+        self.sent.append(command.action.copy())
+
+    def close(self):
+        pass
+
+
+class Bench:
+    """A tick with everything around it under the test's hand."""
+
+    def __init__(self, merge=None, **safety):
+        layout = PageLayout(DIM, 8, ("cam",), 300)
+        shared = mmap.mmap(-1, Page.size(layout))
+        self.page, self.clock, self.sink = Page(layout, shared), VirtualClock(100.0), RecordingSink()
+        self.page.set_estop(EStop.CLEAR)
+        self.step, self.order, self.sequence = 0, 0, 0
+        self.measured = np.zeros(DIM)
+        self.merge = merge or overlap.merge(overlap.Config(), ())
+        self.safety = SafetySettings(**safety)
+        self.tick = self.new_tick()
+        self.feed = self.alive = True
+
+    def new_tick(self):
+        limits = Limits(
+            ("a", "b"), np.full(2, -2.0), np.full(2, 2.0), np.full(2, 3.0), np.zeros(2, bool), np.zeros(2, bool)
+        )
+        settings = TickSettings(
+            PERIOD, np.full(2, 1.0), limits.lower, limits.upper, limits.binary, self.safety, 1.0, 1.0
+        )
+        return Tick(
+            self.page, self.sink, SafetyFilter(self.safety, limits), self.merge, settings, self.clock.now
+        )
+
+    def observe(self, **changes):
+        self.sequence += 1
+        now = self.clock.now()
+        fields = {
+            "sequence": self.sequence,
+            "arrived": now,
+            "captured": {"joints": now, "cam": now},
+            "qpos": self.measured.astype(np.float32),
+            "pictures": {},
+        }
+        self.page.publish_observation(Observation(**(fields | changes)), {"cam": self.sequence})
+
+    def say(self, kind, **fields):
+        self.order += 1
+        self.page.rings["orders"].push(encode(Order(self.order, kind, **fields)))
+
+    def chunk(self, number, rows, step=None, run=1):
+        rows = np.asarray(rows, float)
+        self.page.rings["orders"].push(encode(PostedChunk(number, run, self.step if step is None else step, rows)))
+
+    def run(self, ticks=1, stretch=1.0):
+        for _ in range(ticks):
+            if self.alive:
+                self.page.beat("main", self.clock.now())
+                self.page.beat("guard", self.clock.now())
+            if self.feed:
+                self.observe()
+            self.tick(self.step, self.clock.now())
+            self.step += 1
+            self.clock.advance(PERIOD * stretch)
+            if self.sink.sent:
+                self.measured = self.sink.sent[-1].astype(float)
+
+    def said(self, kind=None):
+        found = [decode(m) for m in self.page.rings["control_events"].drain()]
+        return [m for m in found if isinstance(m, Event) and kind in (None, m.kind)]
+
+    def records(self):
+        return [m for m in map(decode, self.page.rings["ticks"].drain()) if isinstance(m, TickDone)]
+
+    @property
+    def behaviour(self):
+        return bytes(self.page.control.read()["behaviour"]).decode()
+
+
+@pytest.fixture
+def bench():
+    return Bench()
+
+
+def wave(count, speed=0.5, start=0.0):
+    return np.column_stack([start + speed * PERIOD * np.arange(count)] * DIM)
+
+
+def following(bench, rows=None):
+    bench.say("follow", run=1)
+    bench.chunk(1, wave(60) if rows is None else rows)
+    bench.run()
+    return bench
+
+
+def test_a_new_control_keeps_silent(bench):
+    bench.run(5)
+    assert bench.sink.sent == []
+    assert bench.behaviour == "silent"
+
+
+def test_nothing_is_sent_before_the_guard_has_read_its_latch():
+    bench = Bench()
+    bench.page.set_estop(EStop.UNKNOWN)
+    following(bench)
+    bench.run(3)
+    assert bench.sink.sent == []
+
+
+def test_the_action_for_a_step_is_sent_at_that_step(bench):
+    following(bench)
+    bench.run(9)
+    assert np.allclose(bench.sink.sent, wave(10), atol=1e-6)
+
+
+def test_a_stop_decelerates_and_then_the_held_target_is_sent_on_every_tick(bench):
+    following(bench, wave(60, speed=1.5))
+    bench.run(9)
+    bench.say("hold")
+    bench.run(30)
+    sent = np.array(bench.sink.sent)[:, 0]
+    assert len(sent) == 40
+    steps = np.diff(sent[9:])
+    assert (np.diff(steps) <= 1e-6).all()  # slowing down only
+    assert (steps >= -1e-7).all()  # never back
+    assert (sent[-20:] == sent[-1]).all()
+
+
+def test_a_motion_arrives_holds_and_says_so(bench):
+    bench.say("motion", goal=np.array([0.5, -0.5]))
+    bench.run(60)
+    assert np.allclose(bench.sink.sent[-1], [0.5, -0.5], atol=1e-6)
+    assert [e.kind for e in bench.said("motion_done")] == ["motion_done"]
+    assert bench.behaviour == "hold"
+
+
+def test_a_motion_is_interrupted_within_one_tick(bench):
+    bench.say("motion", goal=np.array([1.5, 0.0]))
+    bench.run(20)
+    bench.say("hold")
+    bench.run()
+    assert bench.behaviour == "hold"
+
+
+def test_the_e_stop_sends_the_measured_position_and_refuses_everything_else(bench):
+    following(bench)
+    bench.run(5)
+    bench.page.set_estop(EStop.LATCHED)
+    bench.measured = np.array([0.07, 0.03])
+    bench.observe()
+    bench.feed = False
+    bench.say("motion", goal=np.array([1.0, 1.0]))
+    bench.run(3)
+    assert np.allclose(bench.sink.sent[-1], [0.07, 0.03])
+    assert bench.page.control.read()["estop_obeyed"]
+    assert bench.said("estopped")
+
+
+def test_the_e_stop_repeats_the_last_position_where_the_measurement_is_old(bench):
+    following(bench)
+    bench.run(5)
+    bench.feed = False
+    bench.run(15)
+    last = bench.sink.sent[-1]
+    bench.page.set_estop(EStop.LATCHED)
+    bench.measured = np.array([1.0, 1.0])
+    bench.run(1)
+    assert (bench.sink.sent[-1] == last).all()
+
+
+def test_releasing_the_e_stop_holds_and_does_not_go_on(bench):
+    following(bench)
+    bench.page.set_estop(EStop.LATCHED)
+    bench.run(2)
+    bench.page.set_estop(EStop.CLEAR)
+    bench.run(10)
+    assert bench.behaviour == "hold"
+    assert (np.array(bench.sink.sent[-5:]) == bench.sink.sent[-1]).all()
+
+
+def test_refused_actions_in_a_row_lead_to_holding_never_to_silence(bench):
+    following(bench, np.vstack([wave(3), np.full((40, 2), 1.9)]))  # a jump that is refused
+    bench.run(20)
+    assert len(bench.sink.sent) == 21
+    assert bench.behaviour == "hold"
+    held = bench.said()
+    assert [e.kind for e in held] == ["refused", "refusals"]
+    assert "10 actions refused in a row" in held[1].text
+
+
+def test_nan_from_the_policy_is_never_sent(bench):
+    rows = wave(60)
+    rows[5:] = np.nan
+    following(bench, rows)
+    bench.run(20)
+    assert np.isfinite(bench.sink.sent).all()
+    assert bench.behaviour == "hold"
+
+
+def test_old_observations_lead_to_holding_with_the_reason(bench):
+    following(bench, wave(90))
+    bench.feed = False
+    bench.run(20)
+    assert bench.behaviour == "hold"
+    assert "joints are" in bench.said("refusals")[0].text
+
+
+def test_a_dead_main_makes_control_hold_and_keep_sending(bench):
+    following(bench, wave(90))
+    bench.alive = False
+    bench.run(40)
+    assert bench.behaviour == "hold"
+    assert "main" in bench.said("family")[0].text
+    assert len(bench.sink.sent) == 41
+
+
+def test_starvation_is_named_slows_down_and_recovers_by_itself(bench):
+    following(bench, wave(5))
+    bench.run(10)
+    assert [e.kind for e in bench.said()] == ["starved"]
+    assert bench.behaviour == "follow"
+    here = bench.sink.sent[-1][0]
+    bench.chunk(2, wave(30, start=here))
+    bench.run(5)
+    assert [e.kind for e in bench.said()] == ["recovered"]
+
+
+def test_starvation_becomes_holding_after_its_time(bench):
+    following(bench, wave(5))
+    bench.run(45)
+    assert bench.behaviour == "hold"
+    assert "no usable chunk" in bench.said("starvation")[0].text
+
+
+def test_waiting_is_no_starvation_for_sync_and_every_action_is_executed_in_order():
+    bench = Bench(sync.merge(sync.Config(), ()))
+    following(bench, wave(5))
+    bench.run(50)
+    assert bench.behaviour == "follow"
+    assert bench.said() == []
+    bench.chunk(2, wave(5, start=bench.sink.sent[-1][0]), step=6)
+    bench.run(10)
+    executed = [r.executed[0] for r in bench.records() if r.source == "policy"]
+    assert len(executed) == 10
+
+
+def test_a_stall_of_half_a_second_is_skipped_not_caught_up(bench):
+    following(bench, wave(120, speed=0.6))
+    bench.run(10)
+    bench.step += 15
+    bench.clock.advance(0.5)
+    bench.run(10)
+    moves = np.abs(np.diff(np.array(bench.sink.sent)[:, 0]))
+    assert len(bench.sink.sent) == 21
+    assert moves.max() <= 3.0 * 1.5 * PERIOD + 1e-6  # velocity limit times the capped elapsed time
+    assert bench.sink.sent[-1][0] == pytest.approx(wave(120, 0.6)[bench.step - 1, 0], abs=1e-5)
+
+
+def test_chunks_of_a_run_that_is_over_are_ignored(bench):
+    following(bench)
+    bench.say("hold", run=0)
+    bench.chunk(9, wave(30, start=1.0))
+    bench.run(3)
+    merged = [decode(m) for m in bench.page.rings["control_events"].drain()]
+    assert [m.dropped for m in merged if isinstance(m, ChunkMerged)] == [
+        "",
+        "control is not following that run any more",
+    ]
+
+
+def test_a_restarted_control_goes_on_holding_where_it_stood(bench):
+    following(bench)
+    bench.run(10)
+    last = bench.sink.sent[-1]
+    bench.tick = bench.new_tick()
+    bench.run(3)
+    assert bench.behaviour == "hold"
+    assert np.allclose(bench.sink.sent[-1], last)
+
+
+def test_a_brake_at_speed_stops_before_the_joint_limit(bench):
+    bench = Bench(following_error=9.0, jump=9.0)
+    following(bench, wave(90, speed=2.9))
+    bench.run(16)
+    bench.chunk(2, np.full((30, 2), 2.0))
+    bench.run(3)
+    bench.say("hold")
+    bench.run(30)
+    assert np.max(bench.sink.sent) <= 2.0 + 1e-6
+
+
+def test_each_tick_is_written_down_with_its_source_and_its_makers(bench):
+    following(bench)
+    bench.run(2)
+    bench.say("hold", run=1)
+    bench.run(1)
+    records = bench.records()
+    assert [r.source for r in records] == ["policy", "policy", "policy", "hold"]
+    assert records[1].chunk_ids == [1]
+    assert records[3].run == 1
+    assert records[3].smoothed is None
+    assert (records[2].executed == bench.sink.sent[2]).all()
