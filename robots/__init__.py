@@ -1,0 +1,8 @@
+"""Robots, declared and not coded: a folder each with robot.toml, URDF and README; loader; chain."""
+
+from robots.chain import Chain
+from robots.errors import RobotError
+from robots.loading import load, names
+from robots.robot import EEF_FIELDS, Camera, Gripper, Group, Robot
+
+__all__ = ["EEF_FIELDS", "Camera", "Chain", "Gripper", "Group", "Robot", "RobotError", "load", "names"]

@@ -1,0 +1,166 @@
+"""The kinematic chain from a frame to a tip: forward kinematics and the geometric Jacobian."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from robots.errors import RobotError
+from robots.rotations import Float64, quaternion_of_matrix
+from robots.urdf import Joint, Urdf
+
+_NEXT = np.array([1, 2, 0])
+_AFTER = np.array([2, 0, 1])
+
+
+class Chain:
+    """The joints between two links of a URDF, driven by `joints` [n] (rad; prismatic: m), all others pinned.
+
+    Each moving joint's transform is linear in (1, cos v, sin v, v), so all of them come out of one product
+    with a table made once; a mimic is driven by the joint it follows. Raises RobotError where a joint on the
+    way is neither driven, pinned nor a mimic of such a one, or where a driven one moves nothing.
+    """
+
+    def __init__(
+        self,
+        urdf: Urdf,
+        frame: str,
+        tip: str,
+        joints: Sequence[str],
+        pinned: Mapping[str, float] | None = None,
+    ) -> None:
+        self.frame = frame
+        self.tip = tip
+        self.joints = tuple(joints)
+        self._path = urdf.path
+        self._build(urdf, pinned or {})
+
+    @property
+    def size(self) -> int:
+        """How many numbers drive the chain."""
+        return len(self.joints)
+
+    def forward(self, q: Float64) -> Float64:
+        """The tip in the frame, transforms [..., 4, 4], for joints [..., n]."""
+        steps = self._steps(q)
+        transform = steps[..., 0, :, :]
+        for index in range(1, steps.shape[-3]):
+            transform = transform @ steps[..., index, :, :]
+        tip: Float64 = transform @ self._tail
+        return tip
+
+    def pose(self, q: Float64) -> Float64:
+        """The tip in the frame, [..., 7] = x, y, z [m], unit quaternion w, x, y, z with w >= 0."""
+        tip = self.forward(q)
+        pose = np.empty((*tip.shape[:-2], 7))
+        pose[..., :3] = tip[..., :3, 3]
+        pose[..., 3:] = quaternion_of_matrix(tip[..., :3, :3])
+        return pose
+
+    def jacobian(self, q: Float64) -> tuple[Float64, Float64]:
+        """The tip [4, 4] and d(position, rotation vector)/dq [6, n] in the frame's axes, at q [n]."""
+        steps = self._steps(q)
+        frames = np.empty_like(steps)
+        frames[0] = steps[0]
+        for index in range(1, len(steps)):
+            np.matmul(frames[index - 1], steps[index], out=frames[index])
+        tip = frames[-1] @ self._tail
+        # A turn about its own axis leaves a joint's axis and origin where they were.
+        axes = (frames[:, :3, :3] @ self._axes)[..., 0]
+        arms = tip[:3, 3] - frames[:, :3, 3]
+        turns = axes[:, _NEXT] * arms[:, _AFTER] - axes[:, _AFTER] * arms[:, _NEXT]
+        columns = np.empty((6, len(steps)))
+        columns[:3] = np.where(self._slides, axes, turns).T
+        columns[3:] = np.where(self._slides, 0.0, axes).T
+        return tip, columns if self._plain else columns @ self._coupling
+
+    def _steps(self, q: Float64) -> Float64:
+        """Transforms [..., moving joints, 4, 4], each with the fixed ones before it folded in."""
+        if q.shape[-1:] != (self.size,):
+            raise RobotError(
+                f"{self._path}: the chain {self.frame} to {self.tip} was given joints of shape {q.shape}; "
+                f"allowed: [..., {self.size}] for {', '.join(self.joints)}"
+            )
+        values = q if self._plain else q @ self._coupling.T + self._offsets
+        terms = np.empty((*values.shape, 1, 4))
+        terms[..., 0, 0] = 1.0
+        terms[..., 0, 1] = np.cos(values)
+        terms[..., 0, 2] = np.sin(values)
+        terms[..., 0, 3] = values
+        steps: Float64 = (terms @ self._table).reshape(*values.shape, 4, 4)
+        return steps
+
+    def _build(self, urdf: Urdf, pinned: Mapping[str, float]) -> None:
+        tables, axes, slides, rows, offsets = [], [], [], [], []
+        fixed = np.eye(4)
+        for joint in urdf.between(self.frame, self.tip):
+            fixed = fixed @ joint.origin
+            if joint.kind == "fixed":
+                continue
+            row, offset = self._drive(urdf, joint, pinned)
+            table = _table(fixed, joint)
+            if not row.any():
+                fixed = np.tensordot([1.0, np.cos(offset), np.sin(offset), offset], table, axes=1).reshape(
+                    4, 4
+                )
+                continue
+            tables.append(table)
+            axes.append(joint.axis)
+            slides.append(joint.kind == "prismatic")
+            rows.append(row)
+            offsets.append(offset)
+            fixed = np.eye(4)
+        self._tail = fixed
+        self._coupling = np.array(rows).reshape(-1, self.size)
+        idle = [name for index, name in enumerate(self.joints) if not self._coupling[:, index].any()]
+        if idle or not self.joints:
+            raise RobotError(
+                f"{urdf.path}: {idle or 'no joint'} on the way from {self.frame} to {self.tip} moves it"
+            )
+        self._table = np.array(tables)  # [moving, 4, 16]
+        self._axes = np.array(axes)[..., None]  # [moving, 3, 1]
+        self._slides = np.array(slides)[:, None]
+        self._offsets = np.array(offsets)
+        square = len(rows) == self.size
+        self._plain = square and bool((self._coupling == np.eye(self.size)).all()) and not self._offsets.any()
+
+    def _drive(self, urdf: Urdf, joint: Joint, pinned: Mapping[str, float]) -> tuple[Float64, float]:
+        """How the joint follows q: its value is row [n] . q + offset."""
+        row = np.zeros(self.size)
+        factor, offset = 1.0, 0.0
+        seen = [joint.name]
+        while joint.mimic and joint.name not in self.joints and joint.name not in pinned:
+            offset += factor * joint.mimic.offset
+            factor *= joint.mimic.multiplier
+            joint = urdf.joint(joint.mimic.joint)
+            if joint.name in seen:
+                raise RobotError(f"{urdf.path}: joints {', '.join(seen)} mimic each other in a circle")
+            seen.append(joint.name)
+        if joint.name in self.joints:
+            row[self.joints.index(joint.name)] = factor
+            return row, offset
+        if joint.name not in pinned:
+            raise RobotError(
+                f"{urdf.path}: joint {joint.name!r} lies between {self.frame} and {self.tip}, not driven; "
+                "name it among the group's urdf_joints or give its value under pinned"
+            )
+        return row, offset + factor * pinned[joint.name]
+
+
+def _table(fixed: Float64, joint: Joint) -> Float64:
+    """Four matrices [4, 16] whose sum weighted by (1, cos v, sin v, v) is `fixed` times the joint's motion.
+
+    A rotation about the unit vector a is a a^T + (I - a a^T) cos v + [a]x sin v (Rodrigues).
+    """
+    table = np.zeros((4, 4, 4))
+    if joint.kind == "prismatic":
+        table[0] = np.eye(4)
+        table[3, :3, 3] = joint.axis
+    else:
+        x, y, z = joint.axis
+        along = np.outer(joint.axis, joint.axis)
+        table[0, :3, :3], table[0, 3, 3] = along, 1.0
+        table[1, :3, :3] = np.eye(3) - along
+        table[2, :3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    return np.asarray(fixed @ table).reshape(4, 16)

@@ -1,0 +1,133 @@
+"""What a robot.toml may say: one model per table, strict, every key documented."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from robots.errors import RobotError
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
+Quadruple = Annotated[list[float], Field(min_length=4, max_length=4)]
+Positive = Annotated[float, Field(gt=0)]
+Reason = Annotated[str, Field(min_length=1)]
+
+
+class Table(BaseModel):
+    """A table of robot.toml: nothing is coerced, unknown keys are errors that list the known ones."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _know_every_key(cls, given: Any) -> Any:
+        unknown = sorted(set(given) - set(cls.model_fields)) if isinstance(given, dict) else []
+        if unknown:
+            raise PydanticCustomError(
+                "unknown_key",
+                "unknown key {unknown}; allowed: {allowed}",
+                {"unknown": ", ".join(unknown), "allowed": ", ".join(cls.model_fields)},
+            )
+        return given
+
+
+class GripperTable(Table):
+    """A group's gripper, one number in the robot's own unit."""
+
+    index: Annotated[int, Field(ge=0)]
+    """Its place inside the group, from 0."""
+    unit: Annotated[str, Field(min_length=1)]
+    """The unit of its number on the wire."""
+    lower: float
+    upper: float
+    open: float
+    close: float
+    velocity: Positive
+    """In units per second."""
+    binary: bool = False
+    """Whether it knows only open and close."""
+    threshold: float | None = None
+    """Where a binary gripper switches; a value at or above it means open if `open` is above `close`."""
+
+
+class MountTable(Table):
+    """Where the group's `frame` stands in the scene; drawing only, never kinematics."""
+
+    xyz: Triple
+    wxyz: Quadruple
+
+
+class OverrideTable(Table):
+    """Limits that replace the URDF's for one joint, and why."""
+
+    joint: str
+    lower: float | None = None
+    upper: float | None = None
+    velocity: Positive | None = None
+    reason: Reason
+
+
+class GroupTable(Table):
+    """Joints that travel together on the wire, in this order."""
+
+    name: Name
+    joints: Annotated[list[str], Field(min_length=1)]
+    """Names on the wire, the gripper's included."""
+    urdf_joints: list[str]
+    """Their names in the URDF, in the same order, without the gripper."""
+    gripper: GripperTable | None = None
+    frame: str | None = None
+    """The link in which the end effector's pose is expressed."""
+    eef_link: str | None = None
+    """The link that is the end effector."""
+    pinned: dict[str, float] = {}
+    """Values of URDF joints between `frame` and `eef_link` that the group does not move."""
+    mount: MountTable | None = None
+    overrides: list[OverrideTable] = []
+
+
+class RobotTable(Table):
+    """The whole robot.toml."""
+
+    title: Annotated[str, Field(min_length=1)]
+    urdf: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+\.urdf$")]
+    """File name of the URDF in the same folder."""
+    limits_source: Reason
+    """Where the joint limits come from."""
+    control_rate: Positive
+    """Commands per second that the robot is run at unless a deployment says otherwise."""
+    cameras: dict[Name, Name]
+    """Logical name = observation key."""
+    groups: Annotated[list[GroupTable], Field(min_length=1)]
+    poses: dict[Name, dict[str, list[float]]]
+    """Named poses, a vector per group; "home" is required."""
+
+
+def read(path: Path) -> RobotTable:
+    """The tables of the file; RobotError lists every wrong key with what was given and what is allowed."""
+    try:
+        with path.open("rb") as file:
+            given = tomllib.load(file)
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise RobotError(f"{path}: cannot be read as TOML: {error}") from error
+    try:
+        return RobotTable.model_validate(given)
+    except ValidationError as error:
+        sentences = "\n".join(f"{path}: {_sentence(detail)}" for detail in error.errors())
+        raise RobotError(sentences) from error
+
+
+def _sentence(detail: ErrorDetails) -> str:
+    key = ".".join(str(part) for part in detail["loc"]) or "top level"
+    if detail["type"] == "unknown_key":
+        return f"{key}: {detail['msg']}"
+    if detail["type"] == "missing":
+        return f"{key}: required and absent"
+    return f"{key} = {detail['input']!r}: {detail['msg']}"

@@ -1,0 +1,224 @@
+"""Makes a Robot of a folder with robot.toml and a URDF, and checks one against the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from robots import description, urdf
+from robots.chain import Chain
+from robots.description import GripperTable, GroupTable, MountTable, OverrideTable, RobotTable
+from robots.errors import RobotError
+from robots.robot import Camera, Gripper, Group, Robot
+from robots.rotations import Float64
+from robots.urdf import Urdf
+
+_HERE = Path(__file__).resolve().parent
+_FILE = "robot.toml"
+
+
+def names() -> tuple[str, ...]:
+    """The robots that come with the program."""
+    return tuple(sorted(path.parent.name for path in _HERE.glob(f"*/{_FILE}")))
+
+
+def load(robot: str | Path) -> Robot:
+    """The robot of that name or in that folder; RobotError says which file and key, given, allowed."""
+    folder = _folder(robot)
+    file = folder / _FILE
+    table = description.read(file)
+    tree = urdf.read(folder / table.urdf)
+    _refuse_twice(file, "groups", [group.name for group in table.groups])
+    _refuse_twice(file, "cameras", list(table.cameras.values()))
+    groups: list[Group] = []
+    limits: list[_Limits] = []
+    for entry in table.groups:
+        group = _group(file, tree, entry, start=groups[-1].slice.stop if groups else 0)
+        groups.append(group)
+        limits.append(_limits(file, tree, entry))
+    lower, upper, velocity = (
+        _frozen([number for part in limits for number in getattr(part, side)])
+        for side in ("lower", "upper", "velocity")
+    )
+    return Robot(
+        name=folder.name,
+        title=table.title,
+        folder=folder,
+        urdf=tree.path,
+        groups=tuple(groups),
+        cameras=tuple(Camera(name, key) for name, key in table.cameras.items()),
+        poses=_poses(file, table, groups, lower, upper),
+        lower=lower,
+        upper=upper,
+        velocity=velocity,
+        control_rate=table.control_rate,
+        limits_source=table.limits_source,
+        overrides=tuple(sentence for part in limits for sentence in part.overrides),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Limits:
+    lower: list[float]
+    upper: list[float]
+    velocity: list[float]
+    overrides: list[str]
+
+
+def _folder(robot: str | Path) -> Path:
+    if isinstance(robot, str) and robot in names():
+        return _HERE / robot
+    folder = Path(robot)
+    if not (folder / _FILE).is_file():
+        raise RobotError(f"no robot {str(robot)!r}; known: {', '.join(names())}, or a folder with {_FILE}")
+    return folder.resolve()
+
+
+def _frozen(numbers: Sequence[float]) -> Float64:
+    array = np.array(numbers, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+def _refuse_twice(file: Path, key: str, given: list[str]) -> None:
+    twice = sorted({name for name in given if given.count(name) > 1})
+    if twice:
+        raise RobotError(f"{file}: {key}: {', '.join(twice)} more than once; each is allowed once")
+
+
+def _group(file: Path, tree: Urdf, table: GroupTable, start: int) -> Group:
+    key = f"{file}: groups.{table.name}"
+    _refuse_twice(file, f"groups.{table.name}.joints", table.joints)
+    gripper = None if table.gripper is None else _gripper(key, table.gripper, len(table.joints))
+    movers = len(table.joints) - (gripper is not None)
+    if len(table.urdf_joints) != movers:
+        raise RobotError(
+            f"{key}.urdf_joints names {len(table.urdf_joints)} joints; allowed: {movers}, one per joint"
+        )
+    for name in table.urdf_joints:
+        joint = tree.joint(name)
+        if joint.kind == "fixed" or joint.mimic is not None:
+            raise RobotError(
+                f"{key}.urdf_joints: {name} is fixed or a mimic; allowed: joints that move by themselves"
+            )
+    return Group(
+        name=table.name,
+        joints=tuple(table.joints),
+        urdf_joints=tuple(table.urdf_joints),
+        gripper=gripper,
+        eef_link=table.eef_link,
+        frame=table.frame,
+        chain=_chain(key, tree, table),
+        mount=_mount(key, table.mount),
+        slice=slice(start, start + len(table.joints)),
+    )
+
+
+def _gripper(key: str, table: GripperTable, dof: int) -> Gripper:
+    if table.index >= dof:
+        raise RobotError(f"{key}.gripper.index = {table.index}; allowed: 0 to {dof - 1}")
+    for name, value in (("open", table.open), ("close", table.close)):
+        if not table.lower <= value <= table.upper:
+            raise RobotError(f"{key}.gripper.{name} = {value}; allowed: {table.lower} to {table.upper}")
+    if table.open == table.close:
+        raise RobotError(f"{key}.gripper.open = {table.open} is also close; allowed: two different values")
+    if table.binary != (table.threshold is not None):
+        raise RobotError(f"{key}.gripper.threshold = {table.threshold}; needed if and only if binary = true")
+    low, high = sorted((table.open, table.close))
+    if table.threshold is not None and not low < table.threshold < high:
+        raise RobotError(f"{key}.gripper.threshold = {table.threshold}; allowed: between {low} and {high}")
+    return Gripper(**table.model_dump(exclude={"velocity"}))
+
+
+def _chain(key: str, tree: Urdf, table: GroupTable) -> Chain | None:
+    if table.eef_link is None and table.frame is None and not table.pinned:
+        return None
+    if table.eef_link is None or table.frame is None or table.gripper is None:
+        raise RobotError(
+            f"{key}: eef_link, frame and gripper make an arm together; allowed: all three or no eef_link"
+        )
+    return Chain(tree, table.frame, table.eef_link, table.urdf_joints, table.pinned)
+
+
+def _mount(key: str, table: MountTable | None) -> Float64:
+    if table is None:
+        return _frozen([0, 0, 0, 1, 0, 0, 0])
+    norm = float(np.linalg.norm(table.wxyz))
+    if abs(norm - 1) > 1e-6:
+        raise RobotError(f"{key}.mount.wxyz has length {norm}; allowed: 1 within 1e-6")
+    return _frozen([*table.xyz, *(part / norm for part in table.wxyz)])
+
+
+def _limits(file: Path, tree: Urdf, table: GroupTable) -> _Limits:
+    """The limits of a group's joints, of its URDF joints or the override, and of the gripper table."""
+    key = f"{file}: groups.{table.name}"
+    _refuse_twice(file, f"groups.{table.name}.overrides", [override.joint for override in table.overrides])
+    overrides = {override.joint: override for override in table.overrides}
+    wire = list(table.joints)
+    if table.gripper is not None:
+        del wire[table.gripper.index]
+    for name in overrides:
+        if name not in wire:
+            raise RobotError(f"{key}.overrides names joint {name!r}; allowed: {', '.join(wire)}")
+    limits = _Limits([], [], [], [])
+    for name, urdf_name in zip(wire, table.urdf_joints, strict=True):
+        for side, values in (("lower", limits.lower), ("upper", limits.upper), ("velocity", limits.velocity)):
+            given: float | None = getattr(tree.joint(urdf_name), side)
+            value = _overridden(f"{table.name}.{name}", side, given, overrides.get(name), limits.overrides)
+            if value is None:
+                raise RobotError(
+                    f"{key}: joint {name!r}: the URDF gives no {side} for {urdf_name}; needed: an override"
+                )
+            values.append(value)
+        if limits.lower[-1] >= limits.upper[-1] or limits.velocity[-1] <= 0:
+            raise RobotError(
+                f"{key}: joint {name!r} has range {limits.lower[-1]} to {limits.upper[-1]} at velocity "
+                f"{limits.velocity[-1]}; allowed: lower < upper, velocity > 0"
+            )
+    if table.gripper is not None:
+        limits.lower.insert(table.gripper.index, table.gripper.lower)
+        limits.upper.insert(table.gripper.index, table.gripper.upper)
+        limits.velocity.insert(table.gripper.index, table.gripper.velocity)
+    return limits
+
+
+def _overridden(
+    joint: str, side: str, given: float | None, override: OverrideTable | None, sentences: list[str]
+) -> float | None:
+    replacement: float | None = None if override is None else getattr(override, side)
+    if override is None or replacement is None:
+        return given
+    sentences.append(f"{joint} {side} {given} -> {replacement}: {override.reason}")
+    return replacement
+
+
+def _poses(
+    file: Path, table: RobotTable, groups: list[Group], lower: Float64, upper: Float64
+) -> dict[str, Float64]:
+    if "home" not in table.poses:
+        raise RobotError(f"{file}: poses: {', '.join(table.poses) or 'none'} given; needed: home")
+    return {
+        name: _pose(f"{file}: poses.{name}", parts, groups, lower, upper)
+        for name, parts in table.poses.items()
+    }
+
+
+def _pose(
+    key: str, parts: dict[str, list[float]], groups: list[Group], lower: Float64, upper: Float64
+) -> Float64:
+    if list(parts) != [group.name for group in groups]:
+        raise RobotError(
+            f"{key} gives {', '.join(parts)}; needed: {', '.join(group.name for group in groups)}"
+        )
+    for group in groups:
+        if len(parts[group.name]) != group.dof:
+            raise RobotError(f"{key}.{group.name} has {len(parts[group.name])} numbers; needed: {group.dof}")
+        for joint, value, low, high in zip(
+            group.joints, parts[group.name], lower[group.slice], upper[group.slice], strict=True
+        ):
+            if not low <= value <= high:
+                raise RobotError(f"{key}.{group.name}: {joint} = {value}; allowed: {low} to {high}")
+    return _frozen([value for group in groups for value in parts[group.name]])

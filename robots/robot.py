@@ -1,0 +1,168 @@
+"""A robot as the rest of the program sees it: groups of joints, cameras, poses, limits, one flat vector."""
+
+from __future__ import annotations
+
+import builtins
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from robots.chain import Chain
+from robots.errors import RobotError
+from robots.rotations import Float64
+
+EEF_FIELDS = ("x", "y", "z", "qw", "qx", "qy", "qz", "gripper")
+
+
+@dataclass(frozen=True, slots=True)
+class Gripper:
+    """One number of a group in the robot's own `unit`; `index` is its place inside the group."""
+
+    index: int
+    open: float
+    close: float
+    lower: float
+    upper: float
+    unit: str
+    binary: bool
+    threshold: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Group:
+    """Joints that travel together; `joints` are names on the wire, `slice` their place in the robot's vector.
+
+    `urdf_joints` name the same joints in the URDF, without the gripper; `chain` leads from `frame` to
+    `eef_link`; all three are None where the group has no end effector. `mount` [7] (x, y, z, qw, qx, qy, qz)
+    places the frame in a scene for drawing; kinematics never uses it.
+    """
+
+    name: str
+    joints: tuple[str, ...]
+    urdf_joints: tuple[str, ...]
+    gripper: Gripper | None
+    eef_link: str | None
+    frame: str | None
+    chain: Chain | None
+    mount: Float64
+    slice: builtins.slice
+
+    @property
+    def dof(self) -> int:
+        """How many numbers the group has, its gripper included."""
+        return len(self.joints)
+
+    @property
+    def gripper_dim(self) -> int | None:
+        """The gripper's place in the robot's vector."""
+        return None if self.gripper is None else int(self.slice.start) + self.gripper.index
+
+    @property
+    def joint_dims(self) -> NDArray[np.intp]:
+        """The places of `urdf_joints` in the robot's vector."""
+        dims = np.arange(self.slice.start, self.slice.stop)
+        return dims if self.gripper is None else np.delete(dims, self.gripper.index)
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A camera's logical `name` and the `key` under which observations carry its picture."""
+
+    name: str
+    key: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Robot:
+    """A robot description; vectors are in group order, rad and rad/s, grippers in their own unit.
+
+    `lower`, `upper`, `velocity` and every pose are read-only float64 [dim]. `overrides` are sentences, one
+    for each limit that differs from the URDF.
+    """
+
+    name: str
+    title: str
+    folder: Path
+    urdf: Path
+    groups: tuple[Group, ...]
+    cameras: tuple[Camera, ...]
+    poses: dict[str, Float64]
+    lower: Float64
+    upper: Float64
+    velocity: Float64
+    control_rate: float
+    limits_source: str
+    overrides: tuple[str, ...]
+
+    @property
+    def dim(self) -> int:
+        """Length of the robot's vector."""
+        return sum(group.dof for group in self.groups)
+
+    @property
+    def arms(self) -> tuple[Group, ...]:
+        """The groups with a gripper and an end-effector link; each has one 8-vector."""
+        return tuple(group for group in self.groups if group.chain is not None)
+
+    @property
+    def eef_dim(self) -> int:
+        """Length of the end-effector vector, 8 per arm."""
+        return len(EEF_FIELDS) * len(self.arms)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """A name for every number of the robot's vector, "group.joint"."""
+        return tuple(f"{group.name}.{joint}" for group in self.groups for joint in group.joints)
+
+    @property
+    def eef_names(self) -> tuple[str, ...]:
+        """A name for every number of the end-effector vector, "arm.x" ... "arm.qz", "arm.gripper"."""
+        return tuple(f"{arm.name}.{field}" for arm in self.arms for field in EEF_FIELDS)
+
+    @property
+    def gripper_dims(self) -> tuple[int, ...]:
+        """The places of all grippers in the robot's vector."""
+        return tuple(group.gripper_dim for group in self.groups if group.gripper_dim is not None)
+
+    @property
+    def binary_dims(self) -> tuple[int, ...]:
+        """The places of the grippers that know only open and close."""
+        binary = [group for group in self.groups if group.gripper is not None and group.gripper.binary]
+        return tuple(group.gripper_dim for group in binary if group.gripper_dim is not None)
+
+    def group(self, name: str) -> Group:
+        """The group of that name; RobotError lists the names where there is none."""
+        for group in self.groups:
+            if group.name == name:
+                return group
+        raise RobotError(
+            f"{self.name} has no group {name!r}; it has {', '.join(g.name for g in self.groups)}"
+        )
+
+    def split(self, vector: ArrayLike) -> dict[str, NDArray[Any]]:
+        """Views of [..., dim] by group, each [..., dof]."""
+        array = np.asarray(vector)
+        if array.shape[-1:] != (self.dim,):
+            raise RobotError(
+                f"{self.name}: a vector of shape {array.shape} was given; allowed: [..., {self.dim}]"
+            )
+        return {group.name: array[..., group.slice] for group in self.groups}
+
+    def join(self, parts: Mapping[str, ArrayLike]) -> NDArray[np.float32]:
+        """The float32 vector [..., dim] of parts [..., dof] by group; every group exactly once."""
+        if set(parts) != {group.name for group in self.groups}:
+            allowed = ", ".join(group.name for group in self.groups)
+            raise RobotError(
+                f"{self.name}: groups {', '.join(parts) or 'none'} were given; needed: {allowed}"
+            )
+        arrays = [np.asarray(parts[group.name], dtype=np.float32) for group in self.groups]
+        for group, array in zip(self.groups, arrays, strict=True):
+            if array.shape[-1:] != (group.dof,):
+                raise RobotError(
+                    f"{self.name}: group {group.name} was given {array.shape}; allowed: [..., {group.dof}]"
+                )
+        return np.concatenate(arrays, axis=-1)

@@ -1,0 +1,195 @@
+"""Reads the kinematic tree of a URDF: links, joints, origins, axes, limits, mimics; no shapes, no masses."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from robots.errors import RobotError
+from robots.rotations import Float64, matrix_of_rpy
+
+KINDS = ("fixed", "revolute", "continuous", "prismatic")
+
+
+@dataclass(frozen=True, slots=True)
+class Mimic:
+    """This joint's position is multiplier * (position of `joint`) + offset."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Joint:
+    """One joint: `origin` [4, 4] places the joint in its parent link, `axis` is a unit vector [3] there.
+
+    Limits in rad and rad/s (prismatic: m and m/s), None where not declared; infinite if continuous.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: Float64
+    axis: Float64
+    lower: float | None
+    upper: float | None
+    velocity: float | None
+    mimic: Mimic | None
+
+
+@dataclass(frozen=True, slots=True)
+class Urdf:
+    """A tree of links: `joints` by name in the file's order, `root` the one link without a parent."""
+
+    path: Path
+    root: str
+    links: frozenset[str]
+    joints: Mapping[str, Joint]
+
+    def joint(self, name: str) -> Joint:
+        """The joint of that name; RobotError lists the names where there is none."""
+        if name not in self.joints:
+            raise RobotError(f"{self.path}: no joint {name!r}; it has {', '.join(self.joints)}")
+        return self.joints[name]
+
+    def between(self, frame: str, tip: str) -> tuple[Joint, ...]:
+        """The joints from link `frame` out to link `tip`; RobotError where `tip` does not hang on `frame`."""
+        for link in (frame, tip):
+            if link not in self.links:
+                raise RobotError(f"{self.path}: no link {link!r}; it has {', '.join(sorted(self.links))}")
+        above = {joint.child: joint for joint in self.joints.values()}
+        chain: list[Joint] = []
+        link = tip
+        while link != frame:
+            if link not in above:
+                raise RobotError(f"{self.path}: link {tip!r} does not hang on link {frame!r}")
+            chain.append(above[link])
+            link = above[link].parent
+        return tuple(reversed(chain))
+
+
+def read(path: Path) -> Urdf:
+    """The kinematic tree in the file; RobotError names the file, the joint and what is wrong with it."""
+    try:
+        robot = ET.parse(path).getroot()
+    except (OSError, ET.ParseError) as error:
+        raise RobotError(f"{path}: cannot be read as URDF: {error}") from error
+    if robot.tag != "robot":
+        raise RobotError(f"{path}: the outermost element is <{robot.tag}>; a URDF has <robot>")
+    links = [_text(path, link, "name") for link in robot.findall("link")]
+    joints = [_joint(path, element) for element in robot.findall("joint")]
+    _refuse_twice(path, "link", links)
+    _refuse_twice(path, "joint", [joint.name for joint in joints])
+    root = _root(path, links, joints)
+    return Urdf(path, root, frozenset(links), {joint.name: joint for joint in joints})
+
+
+def _joint(path: Path, element: ET.Element) -> Joint:
+    name = _text(path, element, "name")
+    kind = element.get("type")
+    if kind not in KINDS:
+        raise RobotError(f"{path}: joint {name!r} has type {kind!r}; allowed: {', '.join(KINDS)}")
+    lower, upper, velocity = (_limit(path, element, name, key) for key in ("lower", "upper", "velocity"))
+    return Joint(
+        name=name,
+        kind=kind,
+        parent=_end(path, element, name, "parent"),
+        child=_end(path, element, name, "child"),
+        origin=_origin(path, element, name),
+        axis=_axis(path, element, name),
+        lower=-math.inf if kind == "continuous" else lower,
+        upper=math.inf if kind == "continuous" else upper,
+        velocity=velocity,
+        mimic=_mimic(path, element, name),
+    )
+
+
+def _text(path: Path, element: ET.Element, key: str) -> str:
+    value = element.get(key)
+    if not value:
+        raise RobotError(f"{path}: a <{element.tag}> has no {key!r}")
+    return value
+
+
+def _end(path: Path, element: ET.Element, name: str, which: str) -> str:
+    end = element.find(which)
+    if end is None or not end.get("link"):
+        raise RobotError(f"{path}: joint {name!r} names no {which} link")
+    return _text(path, end, "link")
+
+
+def _numbers(path: Path, name: str, what: str, text: str, count: int) -> list[float]:
+    try:
+        values = [float(part) for part in text.split()]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        raise RobotError(f"{path}: joint {name!r}: {what} is {text!r}; allowed: {count} finite number(s)")
+    return values
+
+
+def _origin(path: Path, element: ET.Element, name: str) -> Float64:
+    matrix = np.eye(4)
+    origin = element.find("origin")
+    if origin is not None:
+        roll, pitch, yaw = _numbers(path, name, "origin rpy", origin.get("rpy", "0 0 0"), 3)
+        matrix[:3, :3] = matrix_of_rpy(roll, pitch, yaw)
+        matrix[:3, 3] = _numbers(path, name, "origin xyz", origin.get("xyz", "0 0 0"), 3)
+    return matrix
+
+
+def _axis(path: Path, element: ET.Element, name: str) -> Float64:
+    declared = element.find("axis")
+    text = "1 0 0" if declared is None else declared.get("xyz", "1 0 0")  # the default of the URDF format
+    axis = np.array(_numbers(path, name, "axis xyz", text, 3))
+    length = float(np.linalg.norm(axis))
+    if length < 1e-9:
+        raise RobotError(f"{path}: joint {name!r}: axis xyz is {text!r}; allowed: a vector that is not zero")
+    return np.asarray(axis / length, dtype=np.float64)
+
+
+def _limit(path: Path, element: ET.Element, name: str, key: str) -> float | None:
+    limit = element.find("limit")
+    text = None if limit is None else limit.get(key)
+    return None if text is None else _numbers(path, name, f"limit {key}", text, 1)[0]
+
+
+def _mimic(path: Path, element: ET.Element, name: str) -> Mimic | None:
+    mimic = element.find("mimic")
+    if mimic is None:
+        return None
+    multiplier = _numbers(path, name, "mimic multiplier", mimic.get("multiplier", "1"), 1)[0]
+    offset = _numbers(path, name, "mimic offset", mimic.get("offset", "0"), 1)[0]
+    return Mimic(_text(path, mimic, "joint"), multiplier, offset)
+
+
+def _refuse_twice(path: Path, what: str, names: list[str]) -> None:
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise RobotError(f"{path}: {what} {', '.join(twice)} declared more than once")
+
+
+def _root(path: Path, links: list[str], joints: list[Joint]) -> str:
+    """The one link that every other hangs on."""
+    children = [joint.child for joint in joints]
+    _refuse_twice(path, "the joint above link", children)
+    names = {joint.name for joint in joints}
+    for joint in joints:
+        for link in (joint.parent, joint.child):
+            if link not in links:
+                raise RobotError(f"{path}: joint {joint.name!r} names link {link!r}, which is not declared")
+        if joint.mimic and joint.mimic.joint not in names:
+            raise RobotError(
+                f"{path}: joint {joint.name!r} mimics {joint.mimic.joint!r}, which is not declared"
+            )
+    roots = [link for link in links if link not in children]
+    if len(roots) != 1:
+        raise RobotError(f"{path}: the links without a parent are {roots}; allowed: exactly one")
+    return roots[0]
