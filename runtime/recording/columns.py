@@ -1,0 +1,121 @@
+"""Records to Arrow columns: one function per table, called once per batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from runtime.recording.base import ExecutedTick, RawChunk, Row
+from runtime.recording.layout import Layout
+from runtime.types import Float32
+
+
+class RecordedRow(NamedTuple):
+    """A row without its pictures, and the cameras whose frame repeats the one before."""
+
+    row: Row
+    repeated: frozenset[str]
+
+
+def rows_columns(layout: Layout, records: Sequence[RecordedRow]) -> dict[str, Any]:
+    """The columns of rows.arrow."""
+    rows = [record.row for record in records]
+    columns: dict[str, Any] = {
+        "index": [row.index for row in rows],
+        "step": [row.step for row in rows],
+        "time": [row.index / layout.fps for row in rows],
+        "tick_time": [row.tick_time - layout.started for row in rows],
+        "sequence": [row.sequence for row in rows],
+        "qpos": _vectors([row.qpos for row in rows], layout.dim),
+        "action": _vectors([row.action for row in rows], layout.dim),
+        "eef_measured": [row.eef_measured for row in rows],
+        "eef_action_reported": [row.eef_action_reported for row in rows],
+        "control_source": [row.control_source for row in rows],
+        "intervention": [row.intervention for row in rows],
+    }
+    for name in layout.streams:
+        columns[name] = _vectors([getattr(row, name) for row in rows], layout.width(name))
+    for stream in layout.capture_streams:
+        times = [row.captured.get(stream, float("nan")) - layout.started for row in rows]
+        columns[f"capture_time.{stream}"] = times
+    for camera in layout.cameras:
+        columns[f"repeated.{camera}"] = [camera in record.repeated for record in records]
+    return columns
+
+
+def ticks_columns(layout: Layout, ticks: Sequence[ExecutedTick]) -> dict[str, Any]:
+    """The columns of ticks.arrow."""
+    return {
+        "step": [tick.step for tick in ticks],
+        "planned": [tick.planned - layout.started for tick in ticks],
+        "sent": [tick.sent - layout.started for tick in ticks],
+        "sequence": [tick.sequence for tick in ticks],
+        "control_source": [tick.control_source for tick in ticks],
+        "qpos": _vectors([tick.qpos for tick in ticks], layout.dim),
+        "executed": _vectors([tick.executed for tick in ticks], layout.dim),
+        "changes": [tick.changes for tick in ticks],
+        "refused": [tick.refused for tick in ticks],
+        "chunk_id": [_leading(tick) for tick in ticks],
+    }
+
+
+def smoothed_columns(layout: Layout, ticks: Sequence[ExecutedTick]) -> dict[str, Any]:
+    """The columns of smoothed.arrow; every tick has `smoothed`."""
+    return {
+        "step": [tick.step for tick in ticks],
+        "smoothed": _vectors([tick.smoothed for tick in ticks], layout.dim),
+        "chunk_ids": [tick.chunk_ids for tick in ticks],
+        "weights": [tick.weights for tick in ticks],
+    }
+
+
+def raw_columns(layout: Layout, chunks: Sequence[RawChunk]) -> dict[str, Any]:
+    """The columns of raw.arrow."""
+    del layout  # a chunk has the policy's own width
+    lengths = [len(chunk.actions) for chunk in chunks]
+
+    def each(values: Sequence[object]) -> list[object]:
+        return [value for value, length in zip(values, lengths, strict=True) for _ in range(length)]
+
+    widths = [
+        chunk.actions.shape[1] for chunk, length in zip(chunks, lengths, strict=True) for _ in range(length)
+    ]
+    numbers = np.concatenate([chunk.actions.ravel() for chunk in chunks])
+    return {
+        "chunk_id": each([chunk.chunk_id for chunk in chunks]),
+        "observation_step": each([chunk.observation_step for chunk in chunks]),
+        "arrival_step": each([chunk.arrival_step for chunk in chunks]),
+        "index": [index for length in lengths for index in range(length)],
+        "target_step": np.concatenate([chunk.target_steps for chunk in chunks]),
+        "action": pa.ListArray.from_arrays(np.cumsum([0, *widths], dtype=np.int32), numbers),
+        "space": each([chunk.space for chunk in chunks]),
+        "delay": each([chunk.delay for chunk in chunks]),
+        "mistimed": each([chunk.mistimed for chunk in chunks]),
+        "inference_ms": each([chunk.inference_ms for chunk in chunks]),
+    }
+
+
+COLUMNS: Mapping[str, Callable[[Layout, Any], dict[str, Any]]] = {
+    "rows": rows_columns,
+    "ticks": ticks_columns,
+    "smoothed": smoothed_columns,
+    "raw": raw_columns,
+}
+
+
+def _vectors(values: Sequence[Float32 | None], width: int) -> Any:
+    missing = np.array([value is None for value in values])
+    numbers = np.zeros((len(values), width), dtype=np.float32)
+    for position, value in enumerate(values):
+        if value is not None:
+            numbers[position] = value
+    mask = pa.array(missing) if missing.any() else None
+    return pa.FixedSizeListArray.from_arrays(pa.array(numbers.ravel()), width, mask=mask)
+
+
+def _leading(tick: ExecutedTick) -> int:
+    """The chunk with the largest weight, the newest of equals; -1 where there is none."""
+    return max(zip(tick.weights, tick.chunk_ids, strict=True), default=(0.0, -1))[1]

@@ -1,0 +1,236 @@
+"""The journal of an episode: rows, ticks, chunks, events and pictures into one folder, while they happen."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+
+from runtime.errors import RecordingError
+from runtime.recording.admission import admit_chunk, admit_row, admit_tick
+from runtime.recording.base import ExecutedTick, Journal, Outcome, RawChunk, Record, Row
+from runtime.recording.columns import RecordedRow
+from runtime.recording.files import disk_fault, document, require_room, sync_folder, write_whole
+from runtime.recording.fragments import count_frames
+from runtime.recording.layout import Layout
+from runtime.recording.settings import RecordingSettings
+from runtime.recording.summary import summarise
+from runtime.recording.tables import read_table, rows_schema
+from runtime.recording.video import CameraEncoder
+from runtime.recording.writer import DiskWriter, Faults
+
+_LEAST_DISK_SECONDS = 1.0  # for the last writes, also where the encoders took all of the drain's time
+
+
+class EpisodeJournal(Journal):
+    """Writes `root`/<uuid>/, one episode after the other; one thread appends.
+
+    A full encoder queue or a missing picture makes a flagged repeat, so that `append` never waits for an
+    encoder. With `patient` (lockstep has no deadline) it waits for a place, up to settings.drain_timeout_s.
+    Pictures are handed over, not copied: they must not change any more.
+    """
+
+    def __init__(
+        self, root: Path, settings: RecordingSettings | None = None, *, patient: bool = False
+    ) -> None:
+        self._root = root
+        self._settings = settings or RecordingSettings()
+        self._patience = self._settings.drain_timeout_s if patient else 0.0
+        self._recording: _Recording | None = None
+
+    @property
+    def folder(self) -> Path | None:
+        """The folder of the episode that is being recorded."""
+        return self._recording.folder if self._recording else None
+
+    def begin(self, manifest: Mapping[str, object]) -> None:
+        if self._recording is not None:
+            raise RecordingError(f"episode {self._recording.folder} has not ended, a second one cannot begin")
+        layout = Layout.of(manifest)
+        text = document(manifest, "the manifest", indent=1)
+        require_room(self._root, self._settings.min_free_bytes)
+        folder = _create(self._root, layout.uuid)
+        try:
+            write_whole(folder / "manifest.json", text)
+            self._recording = _Recording(folder, layout, self._settings, self._patience)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)  # it is ours and empty: no row was ever taken
+            raise
+
+    def append(self, record: Record) -> None:
+        self._begun().append(record)
+
+    def mark(self, event: Mapping[str, object]) -> None:
+        self._begun().mark(event)
+
+    def end(self, outcome: Outcome) -> None:
+        """Drain, close every file, and rename the outcome into place last.
+
+        The figures found (frames, duration_s, ...) win over `outcome.details`. An error of a thread makes the
+        status "failed"; it is raised, after everything else was saved, unless `append` has told it already.
+        """
+        recording, self._recording = self._begun(), None
+        recording.end(outcome)
+
+    def _begun(self) -> _Recording:
+        if self._recording is None:
+            raise RecordingError(f"no episode has begun in {self._root}")
+        return self._recording
+
+
+def _create(root: Path, name: str) -> Path:
+    folder = root / name
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        folder.mkdir()
+        sync_folder(root)
+    except FileExistsError:
+        raise RecordingError(f"episode {folder} exists already; an episode is never written twice") from None
+    except OSError as error:
+        raise disk_fault("creating", folder, error) from error
+    return folder
+
+
+def lock(folder: Path) -> int | None:
+    """A descriptor that marks `folder` as being written until it is closed; None where another one does so.
+
+    The kernel lets go of it however its process ends.
+    """
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise disk_fault("opening", folder, error) from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        return None
+    except OSError as error:
+        os.close(descriptor)
+        raise disk_fault("locking", folder, error) from error
+    return descriptor
+
+
+def _locked(folder: Path) -> int:
+    descriptor = lock(folder)
+    if descriptor is None:
+        raise RecordingError(f"episode {folder} is being written by another process")
+    return descriptor
+
+
+class _Recording:
+    """One episode between begin and end."""
+
+    def __init__(self, folder: Path, layout: Layout, settings: RecordingSettings, patience: float) -> None:
+        self.folder = folder
+        self._layout = layout
+        self._settings = settings
+        self._patience = patience
+        self._rows = 0
+        self._faults = Faults()
+        self._encoders: dict[str, CameraEncoder] = {}
+        with ExitStack() as undo:
+            self._lock = _locked(folder)
+            undo.callback(os.close, self._lock)
+            for camera, size in layout.cameras.items():
+                path = folder / f"{camera}.mp4"
+                encoder = CameraEncoder(camera, path, size, layout.fps, settings)
+                self._encoders[camera] = encoder
+                undo.callback(encoder.cancel)
+            files = [encoder.file for encoder in self._encoders.values()]
+            self._writer = DiskWriter(folder, layout, settings, files, self._faults)
+            undo.pop_all()
+
+    def append(self, record: Record) -> None:
+        self._tell()
+        if isinstance(record, Row):
+            self._append_row(record)
+        elif isinstance(record, ExecutedTick):
+            tick = admit_tick(self._layout, record)
+            self._writer.add("ticks", tick, self._patience)
+            if tick.smoothed is not None:
+                self._writer.add("smoothed", tick, self._patience)
+        elif isinstance(record, RawChunk):
+            chunk = admit_chunk(record)
+            if chunk.actions.size:
+                self._writer.add("raw", chunk, self._patience)
+        else:
+            raise RecordingError(
+                f"a journal takes Row, ExecutedTick and RawChunk, not {type(record).__name__}"
+            )
+
+    def _append_row(self, row: Row) -> None:
+        kept = admit_row(self._layout, row, self._rows)
+        repeated = [
+            camera
+            for camera, encoder in self._encoders.items()
+            if not encoder.put(row.pictures[camera], self._patience)
+        ]
+        self._rows += 1
+        self._writer.add("rows", RecordedRow(kept, frozenset(repeated)), self._patience)
+
+    def mark(self, event: Mapping[str, object]) -> None:
+        self._tell()
+        self._writer.add_line(document(event, "an event"))
+
+    def end(self, outcome: Outcome) -> None:
+        deadline = time.monotonic() + self._settings.drain_timeout_s
+        stuck = self._drain(deadline)
+        last = max(deadline, time.monotonic() + _LEAST_DISK_SECONDS)
+        if not self._writer.finish(last, leave=[encoder.file for encoder in stuck]):
+            self._faults.report(
+                RecordingError(f"the disk did not take the end of episode {self.folder} in time")
+            )
+            self._faults.tell()
+        write_whole(
+            self.folder / "outcome.json", document(self._conclusion(outcome, stuck), "the outcome", indent=1)
+        )
+        if not stuck:  # a stuck encoder may still write: the folder stays marked until our process ends
+            os.close(self._lock)
+        if not self._faults.told:
+            self._faults.tell()
+
+    def _drain(self, deadline: float) -> list[CameraEncoder]:
+        """End all encoders; returns those that did not end in time."""
+        for encoder in self._encoders.values():
+            encoder.finish()
+        stuck = [encoder for encoder in self._encoders.values() if not encoder.drain(deadline)]
+        for encoder in stuck:
+            self._faults.report(encoder.abandon())
+        for encoder in self._encoders.values():
+            if encoder.failure is not None:
+                self._faults.report(encoder.failure)
+        return stuck
+
+    def _conclusion(self, outcome: Outcome, stuck: list[CameraEncoder]) -> dict[str, object]:
+        rows = self._rows
+        status, reason, fault = outcome.status, outcome.reason, self._faults.first
+        if fault is not None:
+            table = read_table(self.folder / "rows.arrow", rows_schema(self._layout))
+            rows, status = table.table.num_rows, "failed"
+            reason = reason if str(fault) in reason else "; ".join(filter(None, (reason, str(fault))))
+        videos = {
+            camera: count_frames(encoder.path) if encoder.failure or encoder in stuck else encoder.frames
+            for camera, encoder in self._encoders.items()
+        }
+        frames = min([rows, *videos.values()])
+        summary = summarise(self.folder / "rows.arrow", self._layout, frames)
+        return {
+            **outcome.details,
+            "status": status,
+            "reason": reason,
+            "ended_wall": outcome.ended_wall,
+            **summary.fields(),
+            "rows": rows,
+            "video_frames": videos,
+        }
+
+    def _tell(self) -> None:
+        for encoder in self._encoders.values():
+            if encoder.failure is not None:
+                self._faults.report(encoder.failure)
+        self._faults.tell()

@@ -1,0 +1,156 @@
+"""Files that survive a kill: append-only ones without half writes, and documents renamed into place."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from runtime.errors import RecordingError
+
+_FULL = {errno.ENOSPC: "disk full", errno.EDQUOT: "disk quota used up", errno.EFBIG: "file too large"}
+
+
+class AppendFile:
+    """A file that only grows, by whole writes: one that fails midway is cut away again.
+
+    One thread writes; another one may sync at the same time. Errors of the disk become RecordingError.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.size = 0
+        self._synced = 0
+        try:
+            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise disk_fault("creating", path, error) from error
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Append all of `data`, or nothing."""
+        view = memoryview(data)
+        written = 0
+        try:
+            while written < len(view):
+                written += os.write(self._descriptor, view[written:])
+        except OSError as error:
+            if written:
+                self._cut()
+            raise disk_fault("writing", self.path, error) from error
+        self.size += written
+
+    def sync(self) -> None:
+        """Wait until what was written is on the disk; at once where nothing is new."""
+        size = self.size
+        if size == self._synced:
+            return
+        try:
+            os.fdatasync(self._descriptor)
+        except OSError as error:
+            raise disk_fault("syncing", self.path, error) from error
+        self._synced = size
+
+    def _cut(self) -> None:
+        try:
+            os.ftruncate(self._descriptor, self.size)
+            os.lseek(self._descriptor, self.size, os.SEEK_SET)
+        except OSError as error:
+            raise disk_fault("cutting half a write from", self.path, error) from error
+
+    def close(self) -> None:
+        """Close without syncing."""
+        os.close(self._descriptor)
+
+
+def disk_fault(doing: str, path: Path, error: OSError) -> RecordingError:
+    """The error for a person: what failed, on which file, why, and how much room there is."""
+    what = _FULL.get(error.errno or 0, "disk error")
+    reason = error.strerror or str(error)
+    folder = _existing(path)
+    try:
+        room = f"{shutil.disk_usage(folder).free} bytes free in {folder}"
+    except OSError as unknown:
+        room = f"free space of {folder} unknown ({unknown.strerror})"
+    return RecordingError(f"{what} while {doing} {path}: {reason}; {room}")
+
+
+def require_room(folder: Path, wanted: int) -> None:
+    """Raise RecordingError where the disk of `folder` has less than `wanted` bytes left for us."""
+    try:
+        free = shutil.disk_usage(_existing(folder)).free
+    except OSError as error:
+        raise disk_fault("measuring", folder, error) from error
+    if free < wanted:
+        raise RecordingError(
+            f"too little room to record in {folder}: {free} bytes free, at least {wanted} wanted "
+            "(recording.min_free_bytes); free some space or record elsewhere"
+        )
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Put `data` at `path` so that there is the old file or all of the new one, also after a power cut."""
+    draft = path.with_name(f".{path.name}.draft")
+    try:
+        with open(draft, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(draft, path)
+        sync_folder(path.parent)
+    except OSError as error:
+        draft.unlink(missing_ok=True)
+        raise disk_fault("writing", path, error) from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names inside `folder` durable."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def document(value: Mapping[str, object], name: str, *, indent: int | None = None) -> bytes:
+    """`value` as JSON; numpy values become plain ones, numbers that are not finite become null."""
+    try:
+        return json.dumps(_plain(value), indent=indent, ensure_ascii=False, allow_nan=False).encode()
+    except (TypeError, ValueError, UnicodeEncodeError) as error:
+        raise RecordingError(f"{name} cannot be written as JSON: {error}") from error
+
+
+def read_document(path: Path) -> dict[str, object]:
+    """The JSON object in `path`; RecordingError where it is absent, torn or something else."""
+    try:
+        value = json.loads(path.read_bytes())
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise RecordingError(f"{path} is not a whole JSON document: {error}") from error
+    if not isinstance(value, dict):
+        raise RecordingError(f"{path} holds {type(value).__name__}, must hold one JSON object")
+    return value
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_plain(item) for item in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def _existing(path: Path) -> Path:
+    return next((folder for folder in (path, *path.parents) if folder.is_dir()), Path("/"))

@@ -1,0 +1,112 @@
+"""What a manifest promises about an episode: the widths of its vectors, its cameras, its columns."""
+
+from __future__ import annotations
+
+import math
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+from runtime.errors import RecordingError
+
+VECTOR_STREAMS = ("qvel", "effort", "eef", "eef_action")
+FORMAT = 1
+
+_Kind = TypeVar("_Kind")
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The part of a manifest that decides how the files look; `cameras` maps a key to (height, width)."""
+
+    uuid: str
+    fps: float
+    dim: int
+    eef_dim: int
+    started: float  # our monotonic clock [s]; the tables count from here
+    cameras: Mapping[str, tuple[int, int]]
+    streams: tuple[str, ...]  # those of VECTOR_STREAMS that are recorded
+    capture_streams: tuple[str, ...]
+
+    def width(self, vector: str) -> int:
+        """Numbers in the vector of that name."""
+        return self.eef_dim if vector in ("eef", "eef_action") else self.dim
+
+    @classmethod
+    def of(cls, manifest: Mapping[str, object]) -> Layout:
+        """Read it from a manifest; RecordingError names the key that is missing or wrong."""
+        if manifest.get("format", FORMAT) != FORMAT:
+            raise _wrong("format", manifest["format"], str(FORMAT))
+        robot = _get(manifest, "robot", dict)
+        streams = _get(manifest, "streams", dict)
+        chosen = tuple(name for name in VECTOR_STREAMS if streams.get(name) is True)
+        poses = any(name.startswith("eef") for name in chosen)
+        return cls(
+            uuid=_uuid(manifest),
+            fps=_rate(manifest, "fps"),
+            dim=_count(robot, "dim"),
+            eef_dim=_count(robot, "eef_dim") if poses else 0,
+            started=_number(manifest, "started_monotonic"),
+            cameras={key: _camera(key, value) for key, value in _get(manifest, "cameras", dict).items()},
+            streams=chosen,
+            capture_streams=tuple(str(name) for name in _get(manifest, "capture_streams", list)),
+        )
+
+
+def _wrong(key: str, given: object, allowed: str) -> RecordingError:
+    return RecordingError(f"manifest: {key} is {given!r}, must be {allowed}")
+
+
+def _get(table: Mapping[str, object], key: str, kind: type[_Kind]) -> _Kind:
+    value = table.get(key)
+    if isinstance(value, tuple) and kind is list:
+        value = list(value)
+    if isinstance(value, Mapping) and kind is dict:
+        value = dict(value)
+    if not isinstance(value, kind):
+        raise _wrong(key, value, f"a {kind.__name__}")
+    return value
+
+
+def _number(table: Mapping[str, object], key: str) -> float:
+    value = table.get(key)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise _wrong(key, value, "a finite number")
+    return float(value)
+
+
+def _rate(table: Mapping[str, object], key: str) -> float:
+    value = _number(table, key)
+    if not 1 <= value <= 1000:
+        raise _wrong(key, value, "from 1 to 1000 Hz")
+    return value
+
+
+def _count(table: Mapping[str, object], key: str) -> int:
+    value = table.get(key)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise _wrong(key, value, "a whole number from 1")
+    return value
+
+
+def _uuid(manifest: Mapping[str, object]) -> str:
+    value = _get(manifest, "uuid", str)
+    try:
+        parsed = uuid.UUID(value)
+    except ValueError:
+        raise _wrong("uuid", value, "a UUID") from None
+    if value not in (str(parsed), parsed.hex):
+        raise _wrong("uuid", value, f"a UUID in lower case, as {parsed}")
+    return value
+
+
+def _camera(key: str, size: object) -> tuple[int, int]:
+    if not key or key.startswith(".") or "/" in key or "\0" in key:
+        raise _wrong("cameras", key, "keys that can name a file: not empty, no slash, no leading dot")
+    if not isinstance(size, Mapping):
+        raise _wrong(f"cameras.{key}", size, "a table with width and height")
+    height, width = _count(size, "height"), _count(size, "width")
+    if height % 2 or width % 2:
+        raise _wrong(f"cameras.{key}", f"{width}x{height}", "even in width and height (yuv420p)")
+    return height, width

@@ -1,0 +1,106 @@
+"""Opens an episode's folder: manifest, outcome, tables and videos, cut to what belongs together."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from runtime.errors import RecordingError
+from runtime.recording.files import read_document
+from runtime.recording.layout import Layout
+from runtime.recording.tables import SCHEMAS, read_table
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """One episode as it lies on disk; tables are pyarrow.Table with the columns of runtime.recording.tables.
+
+    `rows` has exactly `frames` rows, and frame k of every video belongs to row k for k < `frames`; it may
+    have more. Without an outcome the episode is being written or was cut off: then `frames` only counts rows,
+    and videos may still lack some of them.
+    """
+
+    path: Path
+    layout: Layout
+    manifest: Mapping[str, object]
+    outcome: Mapping[str, object] | None
+    frames: int
+    rows: Any
+    ticks: Any
+    smoothed: Any
+    raw: Any
+    events: tuple[Mapping[str, object], ...]
+    videos: Mapping[str, Path]
+
+
+def open_episode(path: Path) -> Episode:
+    """Read the episode in folder `path`; RecordingError names the file that is absent or damaged."""
+    manifest = read_document(path / "manifest.json")
+    layout = Layout.of(manifest)
+    outcome = read_document(path / "outcome.json") if (path / "outcome.json").exists() else None
+    tables = {
+        name: read_table(path / f"{name}.arrow", schema(layout)).table for name, schema in SCHEMAS.items()
+    }
+    frames = tables["rows"].num_rows if outcome is None else _frames(path, outcome, tables["rows"].num_rows)
+    return Episode(
+        path=path,
+        layout=layout,
+        manifest=manifest,
+        outcome=outcome,
+        frames=frames,
+        rows=tables["rows"].slice(0, frames),
+        ticks=tables["ticks"],
+        smoothed=tables["smoothed"],
+        raw=tables["raw"],
+        events=tuple(json.loads(line) for line in read_events(path / "events.jsonl").lines),
+        videos={camera: _video(path, camera) for camera in layout.cameras},
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class EventsRead:
+    """The whole lines of an event log, and how many were torn."""
+
+    lines: tuple[bytes, ...]
+    torn: int
+
+
+def read_events(path: Path) -> EventsRead:
+    """Every line that is one JSON object; an absent log has none."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return EventsRead((), 0)
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+    lines = data.split(b"\n")
+    whole = tuple(line for line in lines[:-1] if _is_object(line))
+    return EventsRead(whole, len(lines) - len(whole) - (not lines[-1]))
+
+
+def _is_object(line: bytes) -> bool:
+    try:
+        return isinstance(json.loads(line), dict)
+    except ValueError:
+        return False
+
+
+def _frames(path: Path, outcome: Mapping[str, object], rows: int) -> int:
+    frames = outcome.get("frames")
+    if isinstance(frames, bool) or not isinstance(frames, int) or frames < 0:
+        raise RecordingError(f"{path / 'outcome.json'}: frames is {frames!r}, must be a whole number from 0")
+    if rows < frames:
+        raise RecordingError(
+            f"{path / 'rows.arrow'} is damaged: {rows} rows readable, its outcome says {frames}"
+        )
+    return frames
+
+
+def _video(path: Path, camera: str) -> Path:
+    video = path / f"{camera}.mp4"
+    if not video.is_file():
+        raise RecordingError(f"{video} is absent, but the manifest lists camera {camera}")
+    return video

@@ -1,0 +1,88 @@
+"""What an outcome says about the rows of an episode, read back from its table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from runtime.recording.layout import Layout
+
+HELD = ("hold", "none")  # sources under which nobody asked the robot for anything
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """Figures over the first `frames` rows. `skew` is the spread of the capture times within a row [s]."""
+
+    frames: int
+    duration_s: float  # held rows excluded
+    held_rows: int
+    repeated: Mapping[str, int]  # per camera
+    skew_mean_s: float | None  # None where no row has two known capture times
+    skew_max_s: float | None
+
+    def fields(self) -> dict[str, object]:
+        """As they stand in outcome.json."""
+        return {
+            "frames": self.frames,
+            "duration_s": self.duration_s,
+            "held_rows": self.held_rows,
+            "repeated": dict(self.repeated),
+            "skew": {"mean_s": self.skew_mean_s, "max_s": self.skew_max_s},
+        }
+
+
+def summarise(path: Path, layout: Layout, frames: int) -> Summary:
+    """Read the first `frames` rows of a whole rows.arrow batch by batch, so that memory stays constant."""
+    tally = _Tally(layout)
+    with pa.OSFile(str(path)) as file:
+        for batch in pa.ipc.open_stream(file):
+            if tally.frames >= frames:
+                break
+            tally.add(batch.slice(0, frames - tally.frames))
+    return tally.summary()
+
+
+class _Tally:
+    def __init__(self, layout: Layout) -> None:
+        self.frames = 0
+        self._layout = layout
+        self._held = 0
+        self._repeated = dict.fromkeys(layout.cameras, 0)
+        self._spread_sum, self._spread_count, self._spread_max = 0.0, 0, -math.inf
+
+    def add(self, batch: Any) -> None:
+        self.frames += batch.num_rows
+        self._held += sum(source in HELD for source in batch.column("control_source").to_pylist())
+        for camera in self._repeated:
+            self._repeated[camera] += batch.column(f"repeated.{camera}").true_count
+        spread = self._spread(batch)
+        if spread.size:
+            self._spread_sum += float(spread.sum())
+            self._spread_count += spread.size
+            self._spread_max = max(self._spread_max, float(spread.max()))
+
+    def _spread(self, batch: Any) -> Any:
+        streams = self._layout.capture_streams
+        if len(streams) < 2:
+            return np.empty(0)
+        times = np.stack([batch.column(f"capture_time.{stream}").to_numpy() for stream in streams])
+        times = times[:, np.isfinite(times).sum(axis=0) >= 2]
+        return np.nanmax(times, axis=0) - np.nanmin(times, axis=0) if times.size else np.empty(0)
+
+    def summary(self) -> Summary:
+        known = self._spread_count > 0
+        return Summary(
+            frames=self.frames,
+            duration_s=(self.frames - self._held) / self._layout.fps,
+            held_rows=self._held,
+            repeated=self._repeated,
+            skew_mean_s=self._spread_sum / self._spread_count if known else None,
+            skew_max_s=self._spread_max if known else None,
+        )

@@ -1,0 +1,222 @@
+"""The tables of an episode: their Arrow schemas, a stream writer that a kill cannot spoil, and its reader."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from runtime.errors import RecordingError
+from runtime.recording.columns import COLUMNS
+from runtime.recording.files import AppendFile, write_whole
+from runtime.recording.layout import Layout
+
+END_OF_STREAM = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # Arrow columnar format, "IPC streaming format"
+
+
+def rows_schema(layout: Layout) -> Any:
+    """rows.arrow: one row per step of the dataset's grid; frame k of every video belongs to row k."""
+    vectors = [pa.field(name, _vector(layout.width(name))) for name in layout.streams]
+    captures = [pa.field(f"capture_time.{stream}", pa.float64()) for stream in layout.capture_streams]
+    repeats = [pa.field(f"repeated.{camera}", pa.bool_()) for camera in layout.cameras]
+    return pa.schema(
+        [
+            pa.field("index", pa.int64()),
+            pa.field("step", pa.int64()),
+            pa.field("time", pa.float64()),
+            pa.field("tick_time", pa.float64()),
+            pa.field("sequence", pa.int64()),
+            pa.field("qpos", _vector(layout.dim)),
+            pa.field("action", _vector(layout.dim)),
+            *vectors,
+            pa.field("eef_measured", pa.bool_()),
+            pa.field("eef_action_reported", pa.bool_()),
+            pa.field("control_source", pa.string()),
+            pa.field("intervention", pa.bool_()),
+            *captures,
+            *repeats,
+        ]
+    )
+
+
+def ticks_schema(layout: Layout) -> Any:
+    """ticks.arrow, the executed stream: a row per control tick, `executed` null where nothing was sent."""
+    return pa.schema(
+        [
+            pa.field("step", pa.int64()),
+            pa.field("planned", pa.float64()),
+            pa.field("sent", pa.float64()),
+            pa.field("sequence", pa.int64()),
+            pa.field("control_source", pa.string()),
+            pa.field("qpos", _vector(layout.dim)),
+            pa.field("executed", _vector(layout.dim)),
+            pa.field("changes", pa.list_(pa.string())),
+            pa.field("refused", pa.bool_()),
+            pa.field("chunk_id", pa.int64()),
+        ]
+    )
+
+
+def smoothed_schema(layout: Layout) -> Any:
+    """smoothed.arrow: what the timeline asked for, where it did, with the chunks that made it."""
+    return pa.schema(
+        [
+            pa.field("step", pa.int64()),
+            pa.field("smoothed", _vector(layout.dim)),
+            pa.field("chunk_ids", pa.list_(pa.int64())),
+            pa.field("weights", pa.list_(pa.float64())),
+        ]
+    )
+
+
+def raw_schema(layout: Layout) -> Any:
+    """raw.arrow: one row per row of every chunk, in the policy's own space and width."""
+    return pa.schema(
+        [
+            pa.field("chunk_id", pa.int64()),
+            pa.field("observation_step", pa.int64()),
+            pa.field("arrival_step", pa.int64()),
+            pa.field("index", pa.int64()),
+            pa.field("target_step", pa.int64()),
+            pa.field("action", pa.list_(pa.float32())),
+            pa.field("space", pa.string()),
+            pa.field("delay", pa.int64()),
+            pa.field("mistimed", pa.int64()),
+            pa.field("inference_ms", pa.float64()),
+        ]
+    )
+
+
+SCHEMAS: Mapping[str, Callable[[Layout], Any]] = {
+    "rows": rows_schema,
+    "ticks": ticks_schema,
+    "smoothed": smoothed_schema,
+    "raw": raw_schema,
+}
+
+
+def _vector(width: int) -> Any:
+    return pa.list_(pa.float32(), width)
+
+
+class TableWriter:
+    """One Arrow IPC stream: records wait in memory until `flush` turns them into one batch and one write.
+
+    Any thread may add; one thread flushes, syncs and closes.
+    """
+
+    def __init__(self, folder: Path, name: str, layout: Layout) -> None:
+        self._layout = layout
+        self._schema = SCHEMAS[name](layout)
+        self._columns = COLUMNS[name]
+        self._waiting: deque[Any] = deque()
+        self._unwritten = b""
+        self.file = AppendFile(folder / f"{name}.arrow")
+        try:
+            self.file.write(self._schema.serialize().to_pybytes())
+        except RecordingError:
+            self.file.close()
+            raise
+
+    @property
+    def waiting(self) -> int:
+        """Records that are only in memory."""
+        return len(self._waiting)
+
+    def add(self, record: object) -> None:
+        """Take one record; neither it nor its arrays may change any more."""
+        self._waiting.append(record)
+
+    def flush(self) -> None:
+        """Write what waits as one record batch; where that fails it is kept for the next attempt."""
+        if not self._unwritten:
+            records = [self._waiting.popleft() for _ in range(len(self._waiting))]
+            self._unwritten = self._batch(records) if records else b""
+        if self._unwritten:
+            self.file.write(self._unwritten)
+            self._unwritten = b""
+
+    def finish(self) -> None:
+        """Write what waits and the mark of the stream's end."""
+        while self._unwritten or self._waiting:
+            self.flush()
+        self.file.write(END_OF_STREAM)
+
+    def _batch(self, records: Sequence[Any]) -> bytes:
+        columns = self._columns(self._layout, records)
+        arrays = [_array(columns[field.name], field.type) for field in self._schema]
+        data: bytes = pa.RecordBatch.from_arrays(arrays, schema=self._schema).serialize().to_pybytes()
+        return data
+
+
+def _array(values: Any, kind: Any) -> Any:
+    return values if isinstance(values, pa.Array) else pa.array(values, kind)
+
+
+@dataclass(frozen=True, slots=True)
+class TableRead:
+    """What could be read of a table: its whole batches, and what is wrong with the rest."""
+
+    table: Any  # pyarrow.Table
+    torn_bytes: int  # after the last whole batch, its end mark aside
+    closed: bool  # the end mark is there and nothing follows
+
+
+def read_table(path: Path, schema: Any) -> TableRead:
+    """Read an Arrow stream up to its torn tail; an absent or headless file counts as empty.
+
+    A batch also ends the table where its columns contradict themselves, or where `index` of rows.arrow does
+    not go on by ones: a power cut can leave zeros in place of data. RecordingError where the file cannot be
+    read at all or has other columns than `schema`.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        data = b""
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+    source = pa.BufferReader(data)
+    try:
+        stream = pa.ipc.open_stream(source)
+    except (pa.ArrowInvalid, OSError):
+        return TableRead(schema.empty_table(), len(data), False)
+    if not stream.schema.equals(schema):
+        raise RecordingError(
+            f"{path} has other columns than its manifest says: {_difference(stream.schema, schema)}"
+        )
+    batches, end = _whole_batches(stream, source, counted=path.stem == "rows")
+    mark = data[end : end + len(END_OF_STREAM)] == END_OF_STREAM
+    torn = len(data) - end - (len(END_OF_STREAM) if mark else 0)
+    return TableRead(pa.Table.from_batches(batches, schema=schema), torn, mark and torn == 0)
+
+
+def _whole_batches(stream: Any, source: Any, *, counted: bool) -> tuple[list[Any], int]:
+    batches: list[Any] = []
+    end, rows = source.tell(), 0
+    while True:
+        try:
+            batch = stream.read_next_batch()
+            batch.validate(full=True)
+        except (StopIteration, pa.ArrowInvalid, OSError):
+            return batches, end
+        if counted and not np.array_equal(batch.column("index"), np.arange(rows, rows + batch.num_rows)):
+            return batches, end
+        batches.append(batch)
+        end, rows = source.tell(), rows + batch.num_rows
+
+
+def _difference(given: Any, expected: Any) -> str:
+    strange = [str(field) for field in given if field not in list(expected)]
+    absent = [str(field) for field in expected if field not in list(given)]
+    return f"{', '.join(strange) or 'none'} in the place of {', '.join(absent) or 'another order'}"
+
+
+def write_table(path: Path, table: Any) -> None:
+    """Put a whole, closed Arrow stream at `path`, atomically."""
+    batches = [batch.serialize().to_pybytes() for batch in table.to_batches()]
+    write_whole(path, b"".join([table.schema.serialize().to_pybytes(), *batches, END_OF_STREAM]))

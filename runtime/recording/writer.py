@@ -1,0 +1,150 @@
+"""The journal's own thread: it alone waits for the disk, writes what has gathered, and syncs every file."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from runtime.errors import RecordingError
+from runtime.recording.files import AppendFile, require_room
+from runtime.recording.layout import Layout
+from runtime.recording.settings import RecordingSettings
+from runtime.recording.tables import SCHEMAS, TableWriter
+
+MOST_WAITING = 16384  # records of one table in memory: 80 s of ticks at 200 Hz
+_MANY = 1024  # from here on the thread does not wait for its period to end
+
+
+class Faults:
+    """The first error of any thread of a recording; kept until the caller has been told."""
+
+    def __init__(self) -> None:
+        self.first: RecordingError | None = None
+        self.told = False
+
+    def report(self, error: RecordingError) -> None:
+        """Keep `error`, or note it on the one that came first."""
+        if self.first is None:
+            self.first = error
+        elif error is not self.first:
+            self.first.add_note(str(error))
+
+    def tell(self) -> None:
+        """Raise what was reported, every time."""
+        if self.first is not None:
+            self.told = True
+            raise RecordingError(str(self.first)) from self.first
+
+
+class DiskWriter:
+    """Tables and events of one episode, written and synced together with `others` every flush period."""
+
+    def __init__(
+        self,
+        folder: Path,
+        layout: Layout,
+        settings: RecordingSettings,
+        others: Sequence[AppendFile],
+        faults: Faults,
+    ) -> None:
+        self._folder = folder
+        self._settings = settings
+        self._faults = faults
+        self._closing = threading.Event()
+        self._wake = threading.Event()
+        self._lines: deque[bytes] = deque()
+        self._unwritten_lines = b""
+        self._left: Sequence[AppendFile] = ()
+        self._tables: dict[str, TableWriter] = {}
+        with ExitStack() as undo:
+            self._events = AppendFile(folder / "events.jsonl")
+            undo.callback(self._events.close)
+            for name in SCHEMAS:
+                self._tables[name] = TableWriter(folder, name, layout)
+                undo.callback(self._tables[name].file.close)
+            undo.pop_all()
+        self._files = [self._events, *(table.file for table in self._tables.values()), *others]
+        self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
+        self._thread.start()
+
+    def add(self, table: str, record: object, patience: float = 0.0) -> None:
+        """Queue one record; RecordingError where the disk has not taken any for too long."""
+        writer = self._tables[table]
+        writer.add(record)
+        if writer.waiting >= _MANY:
+            self._wake.set()
+            self._hold_back(writer, patience)
+
+    def add_line(self, line: bytes) -> None:
+        """Queue one line of events.jsonl."""
+        self._lines.append(line + b"\n")
+
+    def finish(self, deadline: float, leave: Sequence[AppendFile] = ()) -> bool:
+        """Write and sync everything, end the streams, close the files but those in `leave`.
+
+        False where the disk has not done so by `deadline` (time.monotonic).
+        """
+        self._left = leave
+        self._closing.set()
+        self._wake.set()
+        self._thread.join(max(0.0, deadline - time.monotonic()))
+        return not self._thread.is_alive()
+
+    def _hold_back(self, writer: TableWriter, patience: float) -> None:
+        deadline = time.monotonic() + patience
+        while writer.waiting >= _MANY and time.monotonic() < deadline and self._faults.first is None:
+            time.sleep(0.001)
+        if writer.waiting >= MOST_WAITING:
+            self._faults.report(
+                RecordingError(
+                    f"the disk does not keep up: {writer.waiting} records wait for {writer.file.path}"
+                )
+            )
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            self._wake.wait(self._settings.flush_period_s)
+            self._wake.clear()
+            if self._faults.first is None:
+                self._attempt(self._flush)
+        self._finish()
+
+    def _flush(self) -> None:
+        self._write_lines()
+        for table in self._tables.values():
+            table.flush()
+        self._sync()
+        require_room(self._folder, self._settings.min_free_bytes)
+
+    def _finish(self) -> None:
+        """Save what can be saved: one file that fails does not keep the others from being closed properly."""
+        self._attempt(self._write_lines)
+        for table in self._tables.values():
+            self._attempt(table.finish)
+        for file in self._files:
+            self._attempt(file.sync)
+            if file not in self._left:
+                self._attempt(file.close)
+
+    def _sync(self) -> None:
+        for file in self._files:
+            file.sync()
+
+    def _write_lines(self) -> None:
+        if not self._unwritten_lines:
+            self._unwritten_lines = b"".join(self._lines.popleft() for _ in range(len(self._lines)))
+        if self._unwritten_lines:
+            self._events.write(self._unwritten_lines)
+            self._unwritten_lines = b""
+
+    def _attempt(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except RecordingError as error:
+            self._faults.report(error)
+        except Exception as error:  # a record that no column takes, a descriptor that is gone: say so, go on
+            self._faults.report(RecordingError(f"episode {self._folder}: {error!r}"))
