@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import robots
+from robots import RobotError, load
+
+Edit = Callable[..., Path]
+FIRST = 'eef_link = "gripper_base"\n'
+OVERRIDE = '[[groups.overrides]]\njoint = "{joint}"\n{key} = {value}\nreason = "the mount is in the way"\n'
+
+
+def test_the_piper_comes_with_the_program() -> None:
+    assert "agilex_piper" in robots.names()
+    robot = load("agilex_piper")
+    assert robot.name == "agilex_piper"
+    assert robot.dim == 14
+    assert robot.control_rate == 30.0
+
+
+def test_a_folder_is_as_good_as_a_name(edited: Edit) -> None:
+    folder = edited()
+    assert load(folder).name == "copy"
+    assert load(str(folder)).joint_names == load("agilex_piper").joint_names
+
+
+def test_an_unknown_robot_is_answered_with_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match=r"no robot 'pipper'; known: .*agilex_piper"):
+        load("pipper")
+    with pytest.raises(RobotError, match=r"or a folder with robot\.toml"):
+        load(tmp_path)
+
+
+def test_every_robot_that_comes_with_the_program_loads_and_has_a_readme() -> None:
+    for name in robots.names():
+        robot = load(name)
+        assert (robot.folder / "README.md").is_file()
+        assert robot.lower.shape == robot.upper.shape == robot.velocity.shape == (robot.dim,)
+
+
+def test_limits_come_from_the_urdf_and_grippers_from_the_file() -> None:
+    robot = load("agilex_piper")
+    lower = [-2.618, 0.0, -2.967, -1.745, -1.22, -2.0944, 0.0]
+    upper = [2.618, 3.14, 0.0, 1.745, 1.22, 2.0944, 0.1]
+    velocity = [5.0, 5.0, 5.0, 5.0, 5.0, 3.0, 1.0]
+    np.testing.assert_array_equal(robot.lower, lower * 2)
+    np.testing.assert_array_equal(robot.upper, upper * 2)
+    np.testing.assert_array_equal(robot.velocity, velocity * 2)
+    assert robot.overrides == ()
+
+
+def test_an_override_replaces_a_limit_of_one_arm_and_keeps_its_reason(edited: Edit) -> None:
+    override = OVERRIDE.format(joint="joint5", key="upper", value=1.5)
+    robot = load(edited(("[groups.mount]", override + "\n[groups.mount]")))
+    assert robot.upper[5] == 1.5
+    assert robot.upper[12] == 2.0944
+    assert robot.overrides == ("left_arm.joint5 upper 2.0944 -> 1.5: the mount is in the way",)
+
+
+def test_nothing_that_was_loaded_can_be_changed_by_accident() -> None:
+    robot = load("agilex_piper")
+    for array in (robot.lower, robot.upper, robot.velocity, robot.poses["home"], robot.groups[0].mount):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+
+
+def test_a_robot_travels_between_processes() -> None:
+    robot = load("agilex_piper")
+    copy = pickle.loads(pickle.dumps(robot))
+    assert copy.joint_names == robot.joint_names
+    q = np.full(6, 0.3)
+    np.testing.assert_array_equal(copy.arms[1].chain.pose(q), robot.arms[1].chain.pose(q))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('name = "right_arm"', 'name = "left_arm"', "groups: left_arm more than once"),
+        ('right_wrist = "cam_right_wrist"', 'right_wrist = "cam_high"', "cameras: cam_high more than once"),
+        ('"joint5", "joint6"]\nurdf', '"joint5", "joint5"]\nurdf', "left_arm.joints: joint5 more than once"),
+        ('"joint5", "joint6"]\nframe', '"joint5"]\nframe', "urdf_joints names 5 joints; allowed: 6"),
+        ('"joint5", "joint6"]\nframe', '"joint5", "joint9"]\nframe', "no joint 'joint9'; it has joint1"),
+        ('"joint5", "joint6"]\nframe', '"joint5", "joint8"]\nframe', "joint8 is fixed or a mimic"),
+        ('"joint5", "joint6"]\nframe', '"joint5", "joint7"]\nframe', "'joint6' lies between base_link and"),
+        (FIRST, 'eef_link = "hand"\n', "no link 'hand'"),
+        (FIRST, "", "eef_link, frame and gripper make an arm together"),
+        ("index = 6", "index = 7", "left_arm.gripper.index = 7; allowed: 0 to 6"),
+        ("open = 0.1", "open = 0.2", "left_arm.gripper.open = 0.2; allowed: 0.0 to 0.1"),
+        ("open = 0.1", "open = 0.0", "open = 0.0 is also close"),
+        ("binary = false", "binary = true", "threshold = None; needed if and only if binary = true"),
+        ("binary = false", "threshold = 0.05", "threshold = 0.05; needed if and only if binary = true"),
+        ("binary = false", "binary = true\nthreshold = 0.1", "threshold = 0.1; allowed: between 0.0 and 0.1"),
+        ("wxyz = [0.7071067811865476", "wxyz = [0.5", "mount.wxyz has length"),
+        ("[poses.home]", "[poses.start]", "poses: start given; needed: home"),
+        ("left_arm = [0.0,", "arm = [0.0,", "poses.home gives arm, right_arm; needed: left_arm, right_arm"),
+        ("left_arm = [0.0,", "left_arm = [", "poses.home.left_arm has 6 numbers; needed: 7"),
+        ("left_arm = [0.0, 0.0", "left_arm = [0.0, -0.1", "joint1 = -0.1; allowed: 0.0 to 3.14"),
+    ],
+)
+def test_what_does_not_fit_together_is_named(edited: Edit, old: str, new: str, said: str) -> None:
+    folder = edited((old, new))
+    with pytest.raises(RobotError) as error:
+        load(folder)
+    assert said in str(error.value)
+    assert str(folder) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("joint", "key", "value", "said"),
+    [
+        ("joint6", "upper", 1.0, "overrides names joint 'joint6'; allowed: joint0,"),
+        ("joint1", "upper", -1.0, "joint 'joint1' has range 0.0 to -1.0"),
+        ("joint1", "velocity", 0.0, "Input should be greater than 0"),
+    ],
+)
+def test_an_override_that_makes_no_sense_is_refused(
+    edited: Edit, joint: str, key: str, value: float, said: str
+) -> None:
+    override = OVERRIDE.format(joint=joint, key=key, value=value)
+    with pytest.raises(RobotError) as error:
+        load(edited(("[groups.mount]", override + "\n[groups.mount]")))
+    assert said in str(error.value)
+
+
+def test_a_joint_without_a_limit_needs_an_override(edited: Edit) -> None:
+    folder = edited()
+    file = folder / "agilex_piper.urdf"
+    limit = '<limit lower="-2.0944" upper="2.0944" velocity="3.0" effort="100.0"/>'
+    text = file.read_text()
+    assert limit in text
+    file.write_text(text.replace(limit, ""))
+    with pytest.raises(RobotError, match="'joint5': the URDF gives no lower for joint6; needed: an override"):
+        load(folder)

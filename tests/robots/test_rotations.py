@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+from robots import rotations
+
+angles = st.floats(-math.pi, math.pi)
+quaternions = arrays(np.float64, 4, elements=st.floats(-1, 1)).filter(lambda q: np.linalg.norm(q) > 1e-3)
+
+
+@given(angles, angles, angles)
+def test_rpy_turns_about_fixed_axes_in_the_order_x_y_z(roll: float, pitch: float, yaw: float) -> None:
+    expected = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
+    np.testing.assert_allclose(rotations.matrix_of_rpy(roll, pitch, yaw), expected, atol=1e-12)
+
+
+@given(quaternions)
+def test_a_quaternion_survives_the_way_over_a_matrix_with_w_not_negative(given_: np.ndarray) -> None:
+    unit = given_ / np.linalg.norm(given_)
+    back = rotations.quaternion_of_matrix(rotations.matrix_of_quaternion(unit))
+    assert back[0] >= 0
+    assert abs(np.linalg.norm(back) - 1) < 1e-12
+    assert abs(abs(unit @ back) - 1) < 1e-12
+
+
+@given(arrays(np.float64, 3, elements=st.floats(-1.8, 1.8)))
+def test_a_rotation_vector_is_recovered_from_its_matrix(vector: np.ndarray) -> None:
+    found = rotations.rotation_vector(Rotation.from_rotvec(vector).as_matrix())
+    np.testing.assert_allclose(found, vector, atol=1e-9)
+
+
+@pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, -1], [0.6, 0, 0.8]])
+def test_half_a_turn_has_the_length_pi(axis: list[float]) -> None:
+    vector = rotations.rotation_vector(Rotation.from_rotvec(np.array(axis) * math.pi).as_matrix())
+    assert np.linalg.norm(vector) == pytest.approx(math.pi, abs=1e-9)
+    assert abs(vector @ np.array(axis)) == pytest.approx(math.pi, abs=1e-9)
+
+
+def test_batches_give_what_single_calls_give() -> None:
+    matrices = Rotation.random(12, random_state=3).as_matrix().reshape(3, 4, 3, 3)
+    together = rotations.quaternion_of_matrix(matrices)
+    vectors = rotations.rotation_vector(matrices)
+    for index in np.ndindex(3, 4):
+        np.testing.assert_array_equal(together[index], rotations.quaternion_of_matrix(matrices[index]))
+        np.testing.assert_allclose(vectors[index], rotations.rotation_vector(matrices[index]), atol=1e-15)

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robots import RobotError, urdf
+
+LINKS = '<link name="a"/><link name="b"/>'
+JOINT = '<joint name="j" type="{kind}"><parent link="a"/><child link="b"/>{rest}</joint>'
+
+
+def write(folder: Path, body: str, tag: str = "robot") -> Path:
+    path = folder / "thing.urdf"
+    path.write_text(f'<{tag} name="thing">{body}</{tag}>')
+    return path
+
+
+def test_defaults_are_those_of_the_format(tmp_path: Path) -> None:
+    tree = urdf.read(write(tmp_path, LINKS + JOINT.format(kind="continuous", rest="")))
+    joint = tree.joint("j")
+    assert tree.root == "a"
+    np.testing.assert_array_equal(joint.axis, [1, 0, 0])
+    np.testing.assert_array_equal(joint.origin, np.eye(4))
+    assert (joint.lower, joint.upper, joint.velocity, joint.mimic) == (-math.inf, math.inf, None, None)
+
+
+def test_everything_declared_is_read_at_full_precision(tmp_path: Path) -> None:
+    rest = (
+        '<origin xyz="0.1234567890123 2 3" rpy="0 0 0.5"/><axis xyz="0 3 4"/>'
+        '<limit lower="-1.5" upper="2.5" velocity="3.5"/><mimic joint="k" multiplier="-2" offset="0.25"/>'
+    )
+    body = LINKS + '<link name="c"/>' + JOINT.format(kind="revolute", rest=rest)
+    body += '<joint name="k" type="prismatic"><parent link="b"/><child link="c"/></joint>'
+    joint = urdf.read(write(tmp_path, body)).joint("j")
+    assert joint.origin[0, 3] == 0.1234567890123
+    assert joint.origin[1, 0] == math.sin(0.5)
+    np.testing.assert_allclose(joint.axis, [0, 0.6, 0.8])
+    assert (joint.lower, joint.upper, joint.velocity) == (-1.5, 2.5, 3.5)
+    assert joint.mimic == urdf.Mimic("k", -2.0, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("", "links without a parent are []"),
+        (LINKS, "links without a parent are ['a', 'b']"),
+        (LINKS + JOINT.format(kind="planar", rest=""), "type 'planar'; allowed: fixed, revolute"),
+        (LINKS + JOINT.format(kind="revolute", rest='<axis xyz="0 0 0"/>'), "axis xyz is '0 0 0'"),
+        (LINKS + JOINT.format(kind="revolute", rest='<axis xyz="0 0"/>'), "allowed: 3 finite number"),
+        (LINKS + JOINT.format(kind="revolute", rest='<origin xyz="0 x 0"/>'), "origin xyz is '0 x 0'"),
+        (LINKS + JOINT.format(kind="revolute", rest='<limit lower="nan"/>'), "limit lower is 'nan'"),
+        (
+            LINKS + JOINT.format(kind="revolute", rest='<mimic joint="z"/>'),
+            "mimics 'z', which is not declared",
+        ),
+        ('<link name="a"/>' + JOINT.format(kind="fixed", rest=""), "names link 'b', which is not declared"),
+        (LINKS + JOINT.format(kind="fixed", rest="") * 2, "joint j declared more than once"),
+        (LINKS + '<joint name="j" type="fixed"><child link="b"/></joint>', "'j' names no parent link"),
+        (LINKS + '<joint type="fixed"/>', "a <joint> has no 'name'"),
+        (LINKS + '<link name="a"/>' + JOINT.format(kind="fixed", rest=""), "link a declared more than once"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, body: str, said: str) -> None:
+    path = write(tmp_path, body)
+    with pytest.raises(RobotError) as error:
+        urdf.read(path)
+    assert said in str(error.value)
+    assert str(path) in str(error.value)
+
+
+def test_a_file_that_is_no_urdf_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match="cannot be read as URDF"):
+        urdf.read(tmp_path / "absent.urdf")
+    (tmp_path / "torn.urdf").write_text("<robot><link")
+    with pytest.raises(RobotError, match="cannot be read as URDF"):
+        urdf.read(tmp_path / "torn.urdf")
+    with pytest.raises(RobotError, match="outermost element is <sdf>"):
+        urdf.read(write(tmp_path, LINKS, tag="sdf"))
+
+
+def test_a_joint_or_link_that_is_not_there_is_answered_with_those_that_are(tmp_path: Path) -> None:
+    tree = urdf.read(write(tmp_path, LINKS + JOINT.format(kind="fixed", rest="")))
+    with pytest.raises(RobotError, match="no joint 'wrist'; it has j"):
+        tree.joint("wrist")
+    with pytest.raises(RobotError, match="no link 'hand'; it has a, b"):
+        tree.between("a", "hand")
+    with pytest.raises(RobotError, match="'a' does not hang on link 'b'"):
+        tree.between("b", "a")
