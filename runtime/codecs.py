@@ -122,8 +122,9 @@ def _scalar(fields: Mapping[Any, Any]) -> object:
     if not isinstance(data, _SCALARS):
         raise CodecError(f"a numpy scalar's data are {type(data).__name__}; expected a number or a string")
     try:
-        return dtype.type(data)
-    except (TypeError, ValueError, OverflowError) as error:
+        with np.errstate(over="raise"):
+            return dtype.type(data)
+    except (TypeError, ValueError, ArithmeticError) as error:
         raise CodecError(f"{data!r} is no {dtype.str}: {error}") from error
 
 
