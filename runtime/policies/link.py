@@ -65,7 +65,7 @@ class WebsocketLink:
             return self._receive(connection, deadline, "an answer", seconds)
 
     def abort(self) -> None:
-        """Unblock, from another thread, whoever waits here: they raise PolicyError, and so does all that follows.
+        """Unblock, from another thread, whoever waits here: they raise PolicyError, now and later.
 
         Only the handshake itself is not interrupted; it ends within the connect deadline.
         """

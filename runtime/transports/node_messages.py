@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -33,7 +32,7 @@ class NodeStatus:
     """What the node says of itself; the simulated one says all of it, older nodes the hil fields only."""
 
     holding: bool | None = None  # its own command deadline has passed; it holds position
-    refused: Mapping[str, int] = MappingProxyType({})  # commands it refused, by reason
+    refused: Mapping[str, int] = field(default_factory=dict)  # commands it refused, by reason
     master: str | None = None  # whose commands it obeys
     hil_supported: bool = False
     hil_active: bool = False
@@ -56,7 +55,7 @@ class NodeFrame:
     action_eef: Float32 | None
     sequence: int | None
     status: NodeStatus
-    remarks: tuple[tuple[str, str], ...] = field(default=())
+    remarks: tuple[tuple[str, str], ...] = ()
 
 
 class NodeMessages:

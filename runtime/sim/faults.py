@@ -1,0 +1,56 @@
+"""The ways in which a stand-in policy server can misbehave on purpose."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+
+NAMES = {
+    "mute_on_connect": "accepts and never sends its metadata",
+    "mute_on_infer": "answers :N requests, then none",
+    "text_first": "sends a text frame where the metadata belong",
+    "http_404": "refuses the websocket with HTTP 404",
+    "close_mid_reply": "answers :N requests, then ends the connection within an answer",
+    "die": "answers :N requests, then the process ends",
+    "late_reply": "answers the second request :S seconds late (3), all others in time",
+    "wrong_dim": "rows are one number short",
+    "nan": "one number is NaN, at row 3, column 2",
+    "empty": "no rows at all",
+    "bad_array_dialect": "arrays as the package msgpack_numpy writes them",
+    "object_array": "an array of pickled objects",
+    "exception": "a traceback as text, then close code 1011",
+    "batched": "actions [1, T, D]",
+    "two_batches": "actions [2, T, D]",
+    "single_row": "actions [D]",
+    "action_mode": "says that its actions are :MODE",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One of NAMES; `argument` is what stood after the colon."""
+
+    name: str
+    argument: str = ""
+
+    def number(self, default: float) -> float:
+        """The argument as a number."""
+        return float(self.argument) if self.argument else default
+
+
+NONE = Fault("none")
+
+
+def parse(text: str) -> Fault:
+    """A fault from NAME[:ARG], for argparse."""
+    name, _, argument = text.partition(":")
+    if name not in NAMES:
+        raise argparse.ArgumentTypeError(f"{name!r} is no fault; allowed: {', '.join(NAMES)}")
+    if argument and name != "action_mode":
+        try:
+            float(argument)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(
+                f"{name}:{argument}: expected a number after the colon"
+            ) from error
+    return Fault(name, argument)

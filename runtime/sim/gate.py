@@ -1,0 +1,100 @@
+"""What a careful execution node lets through: one master, finite targets within limits, a deadline."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+from runtime import codecs
+from runtime.errors import CodecError
+from runtime.types import Float64
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+Control = Literal["collect_start", "collect_stop", "hil_start", "hil_stop"]
+ANONYMOUS = "anonymous"  # older clients do not say who they are
+MASTER_SILENCE = 1.0  # s after which another client may take over
+_TOLERANCE = 1e-5  # limits travel as float32
+_MESSAGE_LIMIT = 1024 * 1024  # bytes; a command has a few hundred
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """A message that counts: a target [D] to go to, or a control word."""
+
+    target: Float64 | None = None
+    control: Control | None = None
+
+
+class Gate:
+    """Judges commands by their arrival on our own clock; `refused` counts what it sent away, by reason."""
+
+    def __init__(self, robot: Robot, deadline: float) -> None:
+        self._robot = robot
+        self._deadline = deadline
+        self._heard = float("-inf")  # the master's last message, accepted or not
+        self._accepted = float("-inf")
+        self.master: str | None = None
+        self.refused: Counter[str] = Counter()
+
+    def judge(self, payload: bytes, arrival: float) -> Accepted | None:
+        """The message if it may take effect, else None and one more in `refused`."""
+        message = self._message(payload)
+        if message is None or not self._rules(message, arrival):
+            return None
+        word = message.get("target", "real")
+        if word == "real":
+            return self._target(message, arrival)
+        if word in get_args(Control):
+            return Accepted(control=word)
+        if word != "sim":
+            self.refused["unknown_target"] += 1
+        return None
+
+    def silent(self, now: float) -> bool:
+        """Whether no target was accepted within the deadline: the robot has to hold."""
+        return now - self._accepted > self._deadline
+
+    def _message(self, payload: bytes) -> dict[Any, Any] | None:
+        try:
+            message = codecs.unpack(payload, _MESSAGE_LIMIT)
+        except CodecError:
+            message = None
+        if not isinstance(message, dict) or not isinstance(message.get("target", "real"), str):
+            self.refused["malformed"] += 1
+            return None
+        return message
+
+    def _rules(self, message: dict[Any, Any], arrival: float) -> bool:
+        """The first to speak rules until it is silent for a second."""
+        name = message.get("master")
+        name = name if isinstance(name, str) else ANONYMOUS
+        if self.master != name and self.master is not None and arrival - self._heard <= MASTER_SILENCE:
+            self.refused["other_master"] += 1
+            return False
+        self.master = name
+        self._heard = arrival
+        return True
+
+    def _target(self, message: dict[Any, Any], arrival: float) -> Accepted | None:
+        action = message.get("action")
+        reason = self._wrong(action)
+        if reason:
+            self.refused[reason] += 1
+            return None
+        self._accepted = arrival
+        return Accepted(target=np.clip(np.asarray(action, np.float64), self._robot.lower, self._robot.upper))
+
+    def _wrong(self, action: object) -> str:
+        if not isinstance(action, np.ndarray) or action.dtype.kind != "f":
+            return "malformed"
+        if action.shape != (self._robot.dim,):
+            return "dimension"
+        if not np.isfinite(action).all():
+            return "not_finite"
+        low, high = self._robot.lower - _TOLERANCE, self._robot.upper + _TOLERANCE
+        return "" if ((action >= low) & (action <= high)).all() else "limits"

@@ -1,0 +1,256 @@
+"""A simulated execution node: `python -m runtime.sim.node --robot NAME`; speaks what real nodes speak.
+
+Each tick: take the newest command, move the plant, publish one observation. Beyond the plain protocol it
+says its frame number (`seq`), colour order (`encoding`), whom it obeys (`master`), what it `refused`, by
+reason, and whether it is `holding` because nobody commands it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import zmq
+
+from runtime import codecs
+from runtime.clock import Clock, MonotonicClock
+from runtime.errors import RuntimeFault, SetupError
+from runtime.sim import standin
+from runtime.sim.gate import Accepted, Gate
+from runtime.sim.gestures import Gesture
+from runtime.sim.pictures import Scene
+from runtime.sim.plant import Plant, poses
+from runtime.transports.zmq import is_loopback
+from runtime.types import UInt8
+
+if TYPE_CHECKING:
+    from threading import Event
+
+    from robots import Robot
+
+_QUEUED_FRAMES = 4
+_DRAINED_COMMANDS = 1000  # per tick; a flood must not stop the publishing
+_LONGEST_STEP = 0.2  # s; a node that was stopped does not make up for it in one leap
+_GARBAGE = b"\x85\xa1t"  # a map of five that ends after half an entry
+_NO_LEADER = "the simulated node has no leader arm"
+
+
+class Node:
+    """One robot behind two sockets; `open`, then `tick` at the rate, then `close`."""
+
+    def __init__(self, robot: Robot, options: argparse.Namespace, clock: Clock) -> None:
+        known = [camera.key for camera in robot.cameras]
+        for key in (options.freeze_camera, options.drop_camera):
+            if key is not None and key not in known:
+                raise SetupError(f"{robot.name} has no camera {key!r}; it has {', '.join(known)}")
+        self._robot = robot
+        self._options = options
+        self._clock = clock
+        self._plant = Plant(robot)
+        self._gate = Gate(robot, options.deadline)
+        self._scene = Scene(robot, options.height, options.width, options.seed)
+        self._leader = Gesture(robot, options.seed)
+        self._leader_phase: float | None = None  # None unless it collects
+        self._hil_error = ""
+        self._frozen: UInt8 | None = None
+        self._holding = True
+        self._sequence = 0
+        self._publisher: zmq.Socket[bytes] | None = None
+        self._subscriber: zmq.Socket[bytes] | None = None
+
+    def open(self) -> dict[str, str]:
+        """Bind both sockets and return their real addresses."""
+        self._publisher = self._bound(zmq.PUB, self._options.obs_endpoint)
+        self._subscriber = self._bound(zmq.SUB, self._options.action_endpoint)
+        self._subscriber.setsockopt(zmq.SUBSCRIBE, b"")
+        return {"obs_endpoint": _address(self._publisher), "action_endpoint": _address(self._subscriber)}
+
+    def tick(self, seconds: float) -> None:
+        """Obey, move for `seconds`, publish."""
+        self._obey()
+        self._move(seconds)
+        self._publish()
+
+    def close(self) -> None:
+        """Release the sockets; safe to call twice."""
+        for socket in (self._publisher, self._subscriber):
+            if socket is not None:
+                socket.close(linger=0)
+        self._publisher = self._subscriber = None
+
+    def _bound(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
+        if not self._options.insecure_link and not is_loopback(endpoint):
+            raise SetupError(
+                f"{endpoint} can be reached from other machines; add --insecure-link to allow it"
+            )
+        socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
+        socket.setsockopt(zmq.SNDHWM, _QUEUED_FRAMES)
+        try:
+            socket.bind(endpoint)
+        except zmq.ZMQError as error:
+            socket.close(linger=0)
+            raise SetupError(f"cannot bind {endpoint}: {error}") from error
+        return socket
+
+    def _obey(self) -> None:
+        """Judge everything that has come; of the targets only the newest counts."""
+        newest = None
+        for payload in self._commands():
+            accepted = self._gate.judge(payload, self._clock.now())
+            if accepted is not None and accepted.control is not None:
+                self._control(accepted)
+            elif accepted is not None:
+                newest = accepted.target
+        if newest is not None and self._leader_phase is not None:
+            self._gate.refused["collecting"] += 1
+        elif newest is not None:
+            self._plant.target = newest
+
+    def _commands(self) -> list[bytes]:
+        assert self._subscriber is not None
+        payloads: list[bytes] = []
+        with contextlib.suppress(zmq.Again):
+            while len(payloads) < _DRAINED_COMMANDS:
+                payloads.append(self._subscriber.recv(zmq.NOBLOCK))
+        return payloads
+
+    def _control(self, accepted: Accepted) -> None:
+        """Control words come several times; a repetition changes nothing."""
+        if accepted.control == "collect_start" and self._leader_phase is None:
+            self._leader_phase = self._leader.phase_of(self._plant.q)
+        elif accepted.control == "collect_stop" and self._leader_phase is not None:
+            self._leader_phase = None
+            self._plant.hold()
+        elif accepted.control == "hil_start":
+            self._hil_error = _NO_LEADER
+        elif accepted.control == "hil_stop":
+            self._hil_error = ""
+
+    def _move(self, seconds: float) -> None:
+        silent = self._gate.silent(self._clock.now())
+        if self._leader_phase is not None:
+            self._leader_phase += self._leader.turn(seconds)
+            self._plant.target = self._leader.towards(self._leader_phase, self._plant.target, seconds)
+        elif silent and not self._holding:
+            self._plant.hold()
+        self._holding = silent and self._leader_phase is None
+        self._plant.advance(seconds)
+
+    def _publish(self) -> None:
+        assert self._publisher is not None
+        every = self._options.malformed_every
+        payload = codecs.pack(self._observation())
+        if every and self._sequence % every == every - 1:
+            payload = _GARBAGE
+        self._sequence += 1
+        with contextlib.suppress(zmq.Again):  # nobody takes them fast enough: the next frame is newer
+            self._publisher.send(payload, zmq.NOBLOCK, copy=False)
+
+    def _observation(self) -> dict[str, object]:
+        robot, q = self._robot, self._plant.q
+        message: dict[str, object] = {
+            "t": self._clock.now() + self._options.clock_offset,
+            "images": self._pictures(),
+            "state": {name: part.astype(np.float32) for name, part in robot.split(q).items()},
+            "eef": poses(robot, q),
+        }
+        if self._leader_phase is not None:
+            applied = self._plant.target
+            message["action"] = applied.astype(np.float32)
+            message["action_eef"] = np.concatenate(list(poses(robot, applied).values()))
+        message |= {"hil_supported": False, "hil_active": False}
+        if self._hil_error:
+            message["hil_error"] = self._hil_error
+        message |= {"proto": 1, "seq": self._sequence, "encoding": "bgr", "holding": self._holding}
+        return message | {"refused": dict(self._gate.refused), "master": self._gate.master or ""}
+
+    def _pictures(self) -> dict[str, UInt8]:
+        pictures = self._scene.draw(self._sequence, self._clock.now(), self._plant.q)
+        frozen = self._options.freeze_camera
+        if frozen is not None:
+            if self._frozen is None:
+                self._frozen = pictures[frozen]
+            pictures[frozen] = self._frozen
+        pictures.pop(self._options.drop_camera, None)
+        return pictures
+
+
+def run(node: Node, clock: Clock, rate: float, told: Event) -> None:
+    """Tick on absolute deadlines until told to end; missed ticks are skipped, not made up for."""
+    period = 1.0 / rate
+    due = last = clock.now()
+    while not told.is_set():
+        clock.sleep_until(due)
+        now = clock.now()
+        node.tick(min(now - last, _LONGEST_STEP))
+        last = now
+        due += period * (1 + max(0, int((clock.now() - due) / period)))
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    line = argparse.ArgumentParser(
+        prog="python -m runtime.sim.node", description="A simulated execution node."
+    )
+    line.add_argument("--robot", required=True, help="name of a folder in robots/, or a path")
+    line.add_argument("--obs-endpoint", default="tcp://127.0.0.1:5555", help="port 0 takes a free one")
+    line.add_argument("--action-endpoint", default="tcp://127.0.0.1:5556", help="port 0 takes a free one")
+    line.add_argument("--insecure-link", action="store_true", help="allow addresses beyond this machine")
+    line.add_argument("--rate", type=_positive, default=30.0, help="observations per second")
+    line.add_argument("--width", type=int, default=640)
+    line.add_argument("--height", type=int, default=480)
+    line.add_argument(
+        "--deadline", type=_positive, default=0.3, help="seconds without a command until it holds"
+    )
+    line.add_argument("--seed", type=int, default=0, help="grain of the pictures, gestures of the leader")
+    line.add_argument(
+        "--freeze-camera", metavar="KEY", help="fault: this camera sends its first picture forever"
+    )
+    line.add_argument("--drop-camera", metavar="KEY", help="fault: this camera is missing")
+    line.add_argument(
+        "--malformed-every", type=int, default=0, metavar="N", help="fault: each Nth message is cut"
+    )
+    line.add_argument(
+        "--clock-offset", type=float, default=0.0, metavar="S", help="added to the node's clock"
+    )
+    standin.add_arguments(line)
+    return line
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a node until SIGTERM, SIGINT or the end of the lifeline."""
+    import robots
+
+    options = parser().parse_args(arguments)
+    told = standin.ending(options.lifeline)
+    clock = MonotonicClock()
+    try:
+        node = Node(robots.load(options.robot), options, clock)
+        with contextlib.closing(node):
+            standin.announce(node.open(), options.ready_file)
+            run(node, clock, options.rate, told)
+    except (RuntimeFault, robots.RobotError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+def _address(socket: zmq.Socket[bytes]) -> str:
+    raw = socket.getsockopt(zmq.LAST_ENDPOINT)
+    assert isinstance(raw, bytes)
+    return raw.rstrip(b"\0").decode()
+
+
+def _positive(text: str) -> float:
+    number = float(text)
+    if not 0 < number < 1e6:
+        raise argparse.ArgumentTypeError(f"{text} is not above zero")
+    return number
+
+
+if __name__ == "__main__":
+    sys.exit(main())

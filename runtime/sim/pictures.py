@@ -1,0 +1,98 @@
+"""Moving test pictures, BGR: a still background, its name, blocks that follow the joints, a frame number.
+
+The top strip carries the frame number as black and white cells: whoever receives a picture, also after
+compression, can tell which frame it is. The bottom row has a red, a green and a blue patch, in this order.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from runtime.types import Float64, UInt8
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+_BITS = 24
+_STRIP = 1 / 30  # of the height
+_BLUE, _GREEN, _RED = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+_BLOCKS = ((60, 60, 235), (60, 200, 60), (220, 140, 40), (40, 200, 230))  # BGR, one per group in turn
+
+
+class Scene:
+    """Draws all cameras of a robot at [height, width]; `seed` makes the grain of the backgrounds."""
+
+    def __init__(self, robot: Robot, height: int, width: int, seed: int = 0) -> None:
+        self._robot = robot
+        self._span = np.maximum(robot.upper - robot.lower, 1e-9)
+        grain = np.random.default_rng(seed)
+        self._backgrounds = {
+            camera.key: _background(camera.key, index, height, width, grain)
+            for index, camera in enumerate(robot.cameras)
+        }
+
+    def draw(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
+        """One BGR uint8 [H, W, 3] per camera key for joints [D] at a time; fresh memory each time."""
+        places = np.clip((q - self._robot.lower) / self._span, 0.0, 1.0)
+        pictures = {}
+        for index, (key, background) in enumerate(self._backgrounds.items()):
+            picture = background.copy()
+            self._blocks(picture, places, index)
+            _sweep(picture, seconds + index)
+            _write_number(picture, frame)
+            pictures[key] = picture
+        return pictures
+
+    def _blocks(self, picture: UInt8, places: Float64, camera: int) -> None:
+        """A block per group in a column of its own, moved by two joints, as wide as its gripper is open."""
+        height, width = picture.shape[:2]
+        side = height // 8
+        for index, group in enumerate(self._robot.groups):
+            inside = places[group.slice]
+            x = int(width * (index + 0.1 + 0.6 * inside[camera % len(inside)]) / len(self._robot.groups))
+            y = int(height * (0.15 + 0.6 * inside[(camera + 1) % len(inside)]))
+            wide = side if group.gripper is None else int(side * (0.4 + inside[group.gripper.index]))
+            picture[y : y + side, x : x + wide] = _BLOCKS[index % len(_BLOCKS)]
+
+
+def frame_number(picture: UInt8) -> int:
+    """The number in the top strip; any size, any colour order."""
+    height, width = picture.shape[:2]
+    row = max(0, int(height * _STRIP / 2))
+    columns = ((np.arange(_BITS) + 0.5) * width / _BITS).astype(int)
+    bits = picture[row, columns].mean(axis=-1) > 127
+    return int(bits @ (1 << np.arange(_BITS)))
+
+
+def _write_number(picture: UInt8, number: int) -> None:
+    height, width = picture.shape[:2]
+    bits = (number >> np.arange(_BITS)) & 1
+    cells = (np.arange(width) * _BITS) // width
+    picture[: int(height * _STRIP)] = (255 * bits[cells])[:, None].astype(np.uint8)
+
+
+def _sweep(picture: UInt8, seconds: float) -> None:
+    """A white bar that crosses the picture in four seconds: it moves also while the robot stands."""
+    height, width = picture.shape[:2]
+    x = int(width * (seconds % 4.0) / 4.0)
+    picture[int(height * 0.86) : int(height * 0.89), x : x + width // 20] = 255
+
+
+def _background(key: str, index: int, height: int, width: int, grain: np.random.Generator) -> UInt8:
+    shade = np.linspace(70, 130, height)[:, None, None] + np.array([18, 0, -18]) * (index - 1)
+    shaded = np.broadcast_to(shade, (height, width, 3)) + grain.integers(-6, 7, (height, width, 1))
+    picture: UInt8 = np.clip(shaded, 0, 255).astype(np.uint8)
+    third = width // 3
+    for place, colour in enumerate((_RED, _GREEN, _BLUE)):
+        picture[int(height * 0.94) :, place * third : (place + 1) * third] = colour
+    return _labelled(picture, key)
+
+
+def _labelled(picture: UInt8, text: str) -> UInt8:
+    from PIL import Image, ImageDraw
+
+    image = Image.fromarray(picture)
+    ImageDraw.Draw(image).text((10, picture.shape[0] // 12), text, fill=(235, 235, 235))
+    return np.array(image)

@@ -1,0 +1,50 @@
+"""A robot of numbers: every joint follows its target with a lag and never faster than its limit."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from runtime.types import EEF_WIDTH, Float32, Float64
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+LAG = 0.06  # s, the time constant of each joint
+
+
+class Plant:
+    """Joints `q` float64 [D] that start at home; `target` is where they are going."""
+
+    def __init__(self, robot: Robot, lag: float = LAG) -> None:
+        self._robot = robot
+        self._lag = lag
+        self.q: Float64 = robot.poses["home"].copy()
+        self.target: Float64 = self.q.copy()
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass: first order towards the target, limited in velocity."""
+        wish = (self.target - self.q) * -math.expm1(-seconds / self._lag)
+        reach = self._robot.velocity * seconds
+        self.q = self.q + np.clip(wish, -reach, reach)
+
+    def hold(self) -> None:
+        """Stay where it is."""
+        self.target = self.q.copy()
+
+
+def poses(robot: Robot, q: Float64) -> dict[str, Float32]:
+    """The end-effector vector float32 [8] of each arm at joints [D]: its pose and its gripper."""
+    return {arm.name: _pose(robot, arm.name, q) for arm in robot.arms}
+
+
+def _pose(robot: Robot, name: str, q: Float64) -> Float32:
+    arm = robot.group(name)
+    assert arm.chain is not None
+    assert arm.gripper_dim is not None
+    vector = np.empty(EEF_WIDTH, np.float32)
+    vector[:7] = arm.chain.pose(q[arm.joint_dims])
+    vector[7] = q[arm.gripper_dim]
+    return vector

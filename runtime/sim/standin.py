@@ -1,0 +1,45 @@
+"""What every stand-in process does alike: say where it is, and end when it is told or left alone."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options that all stand-ins share."""
+    parser.add_argument(
+        "--ready-file", type=Path, help="write the addresses there as JSON, once they are open"
+    )
+    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends")
+
+
+def announce(ready: Mapping[str, object], path: Path | None) -> None:
+    """Print the addresses as one JSON line, and write them to `path` whole or not at all."""
+    line = json.dumps(dict(ready))
+    print(line, flush=True)
+    if path is not None:
+        draft = path.with_name(f"{path.name}.{os.getpid()}")
+        draft.write_text(line + "\n")
+        draft.replace(path)
+
+
+def ending(lifeline: bool) -> threading.Event:
+    """An event that SIGTERM, SIGINT and, if asked for, the end of standard input set; main thread only."""
+    told = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: told.set())
+    if lifeline:
+        threading.Thread(target=_watch, args=(told,), name="lifeline", daemon=True).start()
+    return told
+
+
+def _watch(told: threading.Event) -> None:
+    while os.read(0, 4096):
+        pass
+    told.set()
