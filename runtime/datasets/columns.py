@@ -1,0 +1,136 @@
+"""From the rows of a journal to the columns of a dataset: names, types, and what is derived from the grid."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.datasets.features import INDEX_COLUMNS, Feature, Features, arrow_schema, scalar, stored, vector
+from runtime.datasets.journal import RecordedJournal
+from runtime.datasets.stats import Statistic, column_statistic
+from runtime.errors import RecordingError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Columns = dict[str, NDArray[Any]]
+
+# Beyond the state and the action no name starts with `observation` or `action`: LeRobot would take any such
+# column as an input or an output of the policy.
+EXTRA_VECTORS = {
+    "eef_state": "eef",
+    "eef_action": "eef_action",
+    "joint_velocity": "qvel",
+    "joint_effort": "effort",
+}
+TIMESTAMP_TOLERANCE = 1e-4  # of LeRobot: distance of neighbouring timestamps from 1 / fps [s]
+
+
+def column_features(journal: RecordedJournal, with_success: bool) -> Features:
+    """The declared features of the episode's columns, without its videos."""
+    robot = journal.manifest["robot"]
+    features: Features = {
+        "observation.state": vector(robot["joint_names"]),
+        "action": vector(robot["joint_names"]),
+    }
+    for name, stream in EXTRA_VECTORS.items():
+        if journal.has_stream(stream):
+            features[name] = vector(robot["eef_names" if stream.startswith("eef") else "joint_names"])
+    features["tick_time"] = scalar("float64")
+    for stream in journal.episode.layout.capture_streams:
+        features[f"capture_time.{stream}"] = scalar("float64")
+    features["control_source"] = scalar("string")
+    features |= {name: scalar("bool") for name in _flags(journal)}
+    features["next.done"] = scalar("bool")
+    if with_success:
+        features["next.success"] = scalar("bool")
+    return features | {name: scalar(dtype) for name, dtype in INDEX_COLUMNS.items()}
+
+
+def _flags(journal: RecordedJournal) -> list[str]:
+    flags = ["intervention"]
+    flags += ["eef_measured"] if journal.has_stream("eef") else []
+    flags += ["eef_action_reported"] if journal.has_stream("eef_action") else []
+    return flags + [f"repeated.{camera}" for camera in journal.cameras]
+
+
+def recorded_columns(journal: RecordedJournal, features: Mapping[str, Feature]) -> Columns:
+    """The columns of `features` that the journal holds or that follow from the grid."""
+    columns: Columns = {
+        "observation.state": journal.finite_vectors("qpos"),
+        "action": journal.finite_vectors("action"),
+    }
+    for name, stream in EXTRA_VECTORS.items():
+        if name in features:
+            columns[name] = journal.vectors(stream)
+    same = ["tick_time", "control_source", *_flags(journal)]
+    for name in same + [name for name in features if name.startswith("capture_time.")]:
+        columns[name] = journal.scalars(name)
+    columns["frame_index"] = np.arange(journal.frames, dtype=np.int64)
+    columns["timestamp"] = timestamps(journal.frames, journal.fps)
+    columns["next.done"] = columns["frame_index"] == journal.frames - 1
+    return columns
+
+
+def placed_columns(
+    columns: Columns, *, episode_index: int, first_index: int, task_index: int, success: bool | None
+) -> Columns:
+    """`columns` and those that depend on the episode's place; `success` None: no such column."""
+    frames = len(columns["frame_index"])
+    placed = columns | {
+        "episode_index": np.full(frames, episode_index, dtype=np.int64),
+        "index": np.arange(first_index, first_index + frames, dtype=np.int64),
+        "task_index": np.full(frames, task_index, dtype=np.int64),
+    }
+    if success is not None:
+        placed["next.success"] = columns["next.done"] & success
+    return placed
+
+
+def timestamps(frames: int, fps: float) -> NDArray[np.float32]:
+    """frame / fps as float32 [N]; raises RecordingError where LeRobot would refuse them as uneven.
+
+    float32 gets too coarse for LeRobot's check of neighbouring rows after about 17 minutes.
+    """
+    exact = (np.arange(frames) / fps).astype(np.float32)
+    if frames > 1 and np.abs(np.diff(exact) - 1 / fps).max() > TIMESTAMP_TOLERANCE:
+        raise RecordingError(
+            f"{frames} frames at {fps} Hz are too long for one episode: in a float32 timestamp "
+            f"neighbouring rows differ from 1 / fps by more than {TIMESTAMP_TOLERANCE} s after 1024 s"
+        )
+    return exact
+
+
+def table(columns: Columns, features: Mapping[str, Feature]) -> pa.Table:
+    """The parquet table: exactly the stored features, in their order and types."""
+    import pyarrow as pa
+
+    schema = arrow_schema(features)
+    arrays = []
+    for field in schema:
+        values = columns[field.name]
+        if pa.types.is_fixed_size_list(field.type):
+            flat = pa.array(values.reshape(-1), type=field.type.value_type)
+            arrays.append(pa.FixedSizeListArray.from_arrays(flat, type=field.type))
+        else:
+            arrays.append(pa.array(values.reshape(-1), type=field.type, from_pandas=False))
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def column_statistics(columns: Columns, features: Mapping[str, Feature]) -> dict[str, Statistic]:
+    """Statistics of every stored column that has any.
+
+    Strings have none. A column whose name contains "image" gets none either: LeRobot takes each such entry
+    for one of pictures and refuses the dataset where its shape is another.
+    """
+    statistics = {}
+    for key, feature in stored(features).items():
+        if feature["dtype"] == "string" or "image" in key:
+            continue
+        statistic = column_statistic(columns[key])
+        if statistic is not None:
+            statistics[key] = statistic
+    return statistics

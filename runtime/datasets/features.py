@@ -1,0 +1,114 @@
+"""How a column is declared in info.json and stored in parquet, so that both always say the same."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from runtime.errors import RecordingError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Feature = dict[str, Any]
+Features = dict[str, Feature]
+
+INDEX_COLUMNS = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+
+
+def scalar(dtype: str) -> Feature:
+    """One value per row: float32, float64, int64, bool or string."""
+    return {"dtype": dtype, "shape": [1], "names": None}
+
+
+def vector(names: Sequence[str]) -> Feature:
+    """One float32 vector per row, its entries named."""
+    return {"dtype": "float32", "shape": [len(names)], "names": list(names)}
+
+
+def video(height: int, width: int, fps: float, codec: str, pixels: str) -> Feature:
+    """One RGB picture per row, stored in an mp4 file beside the rows."""
+    return {
+        "dtype": "video",
+        "shape": [height, width, 3],
+        "names": ["height", "width", "channels"],
+        "info": {
+            "video.height": height,
+            "video.width": width,
+            "video.codec": codec,
+            "video.pix_fmt": pixels,
+            "video.is_depth_map": False,
+            "video.fps": plain_rate(fps),
+            "video.channels": 3,
+            "has_audio": False,
+        },
+    }
+
+
+def plain_rate(fps: float) -> int | float:
+    """A whole rate as int, as other readers expect it."""
+    return int(fps) if float(fps).is_integer() else float(fps)
+
+
+def stored(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    """The features that have a parquet column: all but the videos."""
+    return {key: feature for key, feature in features.items() if feature["dtype"] != "video"}
+
+
+def arrow_type(key: str, feature: Mapping[str, Any]) -> pa.DataType:
+    """The parquet type of one declared feature; raises RecordingError for one that has none."""
+    import pyarrow as pa
+
+    types = {
+        "float32": pa.float32(),
+        "float64": pa.float64(),
+        "int64": pa.int64(),
+        "bool": pa.bool_(),
+        "string": pa.string(),
+    }
+    dtype, shape = feature["dtype"], list(feature["shape"])
+    if dtype not in types or len(shape) != 1:
+        raise RecordingError(
+            f"feature {key!r} is {dtype!r} of shape {shape}, stored are {sorted(types)} with one axis"
+        )
+    return types[dtype] if shape == [1] else pa.list_(types[dtype], shape[0])
+
+
+def arrow_schema(features: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
+    """The schema of an episode's parquet file, with metadata from which `datasets` knows the features."""
+    import pyarrow as pa
+
+    columns = stored(features)
+    declared = {key: _hugging_face(feature) for key, feature in columns.items()}
+    metadata = {"huggingface": json.dumps({"info": {"features": declared}})}
+    return pa.schema(
+        [pa.field(key, arrow_type(key, feature)) for key, feature in columns.items()], metadata=metadata
+    )
+
+
+def _hugging_face(feature: Mapping[str, Any]) -> dict[str, Any]:
+    value = {"dtype": feature["dtype"], "_type": "Value"}
+    length = feature["shape"][0]
+    return value if length == 1 else {"feature": value, "length": length, "_type": "Sequence"}
+
+
+def differences(stated: Mapping[str, Mapping[str, Any]], new: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What distinguishes the features of a dataset from those of a new episode, one sentence each."""
+    found = [f"the dataset has no {key!r}" for key in new if key not in stated]
+    found += [f"the episode has no {key!r}" for key in stated if key not in new]
+    for key in stated:
+        if key not in new:
+            continue
+        found += [
+            f"{key!r} has {aspect} {stated[key].get(aspect)} in the dataset, {new[key].get(aspect)} here"
+            for aspect in ("dtype", "shape", "names")
+            if stated[key].get(aspect) != new[key].get(aspect)
+        ]
+    return found

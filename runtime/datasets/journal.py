@@ -1,0 +1,103 @@
+"""A recorded episode as publication needs it: finished, and its columns as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from runtime.errors import RecordingError
+from runtime.recording.reader import Episode, open_episode
+from runtime.types import Float32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedJournal:
+    """A finished episode: what its manifest and outcome say, and its rows column by column."""
+
+    episode: Episode
+    manifest: Mapping[str, Any]
+    outcome: Mapping[str, Any]
+
+    @property
+    def folder(self) -> Path:
+        return self.episode.path
+
+    @property
+    def uuid(self) -> str:
+        return self.episode.layout.uuid
+
+    @property
+    def robot(self) -> str:
+        return str(self.manifest["robot"]["name"])
+
+    @property
+    def task(self) -> str:
+        return str(self.manifest.get("task", ""))
+
+    @property
+    def fps(self) -> float:
+        return self.episode.layout.fps
+
+    @property
+    def frames(self) -> int:
+        """Rows of the dataset grid; each has one picture per camera."""
+        return self.episode.frames
+
+    @property
+    def cameras(self) -> Mapping[str, tuple[int, int]]:
+        """(height, width) by camera key."""
+        return self.episode.layout.cameras
+
+    def has_stream(self, name: str) -> bool:
+        """Whether the vector stream `name` was recorded."""
+        return name in self.episode.layout.streams
+
+    def vectors(self, name: str) -> Float32:
+        """Column `name` as float32 [N, W], NaN in rows where it is unknown."""
+        width = self.episode.layout.width(name)
+        column = self._column(name)
+        known = np.asarray(column.is_valid().to_numpy(zero_copy_only=False), dtype=np.bool_)
+        values = np.full((self.frames, width), np.nan, dtype=np.float32)
+        values[known] = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
+        return values
+
+    def finite_vectors(self, name: str) -> Float32:
+        """Column `name` as float32 [N, W]; raises RecordingError naming the first row that is not finite."""
+        values = self.vectors(name)
+        broken = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if len(broken):
+            row = int(broken[0])
+            raise RecordingError(f"{self.folder}: {name} of row {row} is not finite: {values[row].tolist()}")
+        return values
+
+    def scalars(self, name: str) -> np.ndarray[Any, Any]:
+        """Column `name` as an array [N]; raises RecordingError where it has gaps."""
+        column = self._column(name)
+        if column.null_count:
+            raise RecordingError(f"{self.folder}: {name} is missing in {column.null_count} rows")
+        return np.asarray(column.to_numpy(zero_copy_only=False))
+
+    def _column(self, name: str) -> Any:
+        return self.episode.rows.column(name).combine_chunks()
+
+
+def read_journal(folder: Path) -> RecordedJournal:
+    """The finished episode in `folder`; raises RecordingError where it is none, or not yet finished."""
+    episode = open_episode(folder)
+    if episode.outcome is None:
+        raise RecordingError(f"{folder} has no outcome.json: it is being recorded, or wants repair")
+    robot = episode.manifest["robot"]
+    widths = {"joint_names": episode.layout.dim}
+    if any(name.startswith("eef") for name in episode.layout.streams):
+        widths["eef_names"] = episode.layout.eef_dim
+    for key, width in widths.items():
+        names = robot.get(key) if isinstance(robot, Mapping) else None
+        if not isinstance(names, list) or len(names) != width:
+            raise RecordingError(
+                f"{folder / 'manifest.json'}: robot.{key} is {names!r}, must be {width} names"
+            )
+    return RecordedJournal(episode, episode.manifest, episode.outcome)

@@ -1,0 +1,40 @@
+"""Which column of a LeRobot dataset holds what; datasets of other people name theirs as they please."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field, field_validator
+
+from runtime.section import Section
+
+
+class ColumnMapping(Section):
+    """Column names of one dataset. An empty string says that the dataset has no such column."""
+
+    state: str = "observation.state"
+    """Measured joint positions, [D] in group order."""
+    eef: str | None = None
+    """Measured end-effector poses, 8 per arm."""
+    velocity: str | None = None
+    """Measured joint velocities, [D]."""
+    effort: str | None = None
+    """Measured joint efforts, [D]."""
+    action: str | None = "action"
+    """Commanded joint positions, [D]."""
+    action_eef: str | None = None
+    """Commanded end-effector poses, 8 per arm."""
+    videos: dict[str, str] | None = None
+    """Video key by camera key; absent: `observation.images.<camera key>` for every camera."""
+    capture_time: dict[str, str] = Field(default_factory=dict)
+    """Column of capture times [s] by stream ("joints", "eef", or a camera key)."""
+
+    @field_validator("eef", "velocity", "effort", "action", "action_eef", mode="before")
+    @classmethod
+    def _empty_is_absent(cls, value: Any) -> Any:
+        return None if value == "" else value
+
+
+def video_key(camera: str) -> str:
+    """The video key that LeRobot's conventions give a camera."""
+    return f"observation.images.{camera}"

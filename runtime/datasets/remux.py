@@ -1,0 +1,77 @@
+"""Turns a recorded video into a dataset's: the same coded pictures in a file that can be sought in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from runtime.errors import RecordingError
+
+if TYPE_CHECKING:
+    import av
+
+
+@dataclass(frozen=True, slots=True)
+class VideoFacts:
+    """What a video is, as its stream says."""
+
+    height: int
+    width: int
+    codec: str
+    pixels: str
+
+
+def remux(source: Path, target: Path, frames: int, fps: float) -> VideoFacts:
+    """Copy the first `frames` coded pictures of `source` to `target`, frame k at k / fps, index at the front.
+
+    Nothing is re-encoded. Raises RecordingError where the source has fewer frames, does not start with a key
+    frame, or has B-frames (its coded order would not be the order of the rows).
+    """
+    import av
+
+    rate = Fraction(fps).limit_denominator(10_000)
+    copied = 0
+    try:
+        with (
+            av.open(str(source)) as recorded,
+            av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as container,
+        ):
+            stream = recorded.streams.video[0]
+            copy = container.add_stream_from_template(stream)
+            copy.time_base = 1 / rate
+            for packet in _in_order(source, recorded, frames):
+                packet.pts = packet.dts = copied
+                packet.duration = 1
+                packet.time_base = 1 / rate
+                packet.stream = copy
+                container.mux(packet)
+                copied += 1
+            facts = VideoFacts(stream.height, stream.width, stream.codec.canonical_name, str(stream.pix_fmt))
+    except (av.FFmpegError, OSError, IndexError) as error:
+        raise RecordingError(f"{source} cannot be copied after frame {copied}: {error}") from error
+    if copied != frames:
+        raise RecordingError(f"{source} has {copied} frames for {frames} rows")
+    return facts
+
+
+def _in_order(source: Path, recorded: av.container.InputContainer, frames: int) -> Iterator[Any]:
+    """The first `frames` packets of the video; raises where decoding order is not presentation order."""
+    newest: int | None = None
+    taken = 0
+    for packet in recorded.demux(recorded.streams.video[0]):
+        if taken == frames:
+            return
+        if packet.pts is None:
+            continue
+        if newest is None and not packet.is_keyframe:
+            raise RecordingError(f"{source} does not start with a key frame")
+        if newest is not None and packet.pts <= newest:
+            raise RecordingError(
+                f"{source} has B-frames at frame {taken}: it was not written by our recorder"
+            )
+        newest = packet.pts
+        taken += 1
+        yield packet

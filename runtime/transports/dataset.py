@@ -1,0 +1,216 @@
+"""A recorded episode as a robot: it plays at its own pace and nothing that is sent to it moves."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from runtime.clock import Clock
+from runtime.datasets.mapping import ColumnMapping, video_key
+from runtime.errors import RecordingError, SetupError, TransportError
+from runtime.section import Section
+from runtime.transports.base import Capabilities, Sink, Source
+from runtime.types import EEF_WIDTH, Observation, RobotCommand, UInt8
+
+if TYPE_CHECKING:
+    from robots import Robot
+    from runtime.datasets.pictures import Pictures
+    from runtime.datasets.reader import RecordedEpisode
+
+TOLERANCE = 1e-6  # a frame counts as due this much early [s]: due times are sums of floats
+
+
+class Config(Section):
+    """Plays one episode of a LeRobot v2.x dataset."""
+
+    kind: Literal["dataset"] = "dataset"
+    path: str
+    """Folder of the dataset."""
+    episode: int = Field(default=0, ge=0)
+    """Index of the episode in the dataset."""
+    start_frame: int = Field(default=0, ge=0)
+    """Row with which a run begins."""
+    mapping: ColumnMapping = ColumnMapping()
+    """Names of the dataset's columns."""
+
+
+class DatasetSource(Source):
+    """Frame k of the episode, due at the start of the run plus k / fps on the given clock.
+
+    Until `begin_run` the first frame is delivered again and again, at most at the recording's rate, as if the
+    robot stood there now. A reader that comes late gets the newest frame due; those it missed are counted as
+    `skipped_frames`. The last frame says so, and nothing follows it. Row k comes with picture k of every
+    camera: pictures are decoded by frame number, the next ones while waiting for them to be due.
+    """
+
+    def __init__(self, config: Config, robot: Robot, clock: Clock) -> None:
+        self._config = config
+        self._robot = robot
+        self._clock = clock
+        self._episode: RecordedEpisode | None = None
+        self._pictures: dict[str, Pictures] = {}
+        self._sequence = 0
+        self._skipped = 0
+        self._start: float | None = None  # of the run; None: before it
+        self._next = 0  # frames of the run delivered or skipped
+        self._standing_due = float("-inf")
+
+    def connect(self) -> None:
+        """Open the episode; raises TransportError, or SetupError where it does not fit the robot."""
+        from runtime.datasets.reader import open_dataset
+
+        self.close()
+        try:
+            episode = open_dataset(self._config.path).episode(self._config.episode, self._mapping())
+            self._check(episode)
+            for camera in episode.videos:
+                self._pictures[camera] = episode.pictures(camera)
+            self._episode = episode
+            self._decode(self._config.start_frame)
+        except RecordingError as error:
+            self.close()
+            raise TransportError(str(error)) from error
+
+    def _mapping(self) -> ColumnMapping:
+        mapping = self._config.mapping
+        if mapping.videos is not None:
+            return mapping
+        return mapping.model_copy(
+            update={"videos": {camera.key: video_key(camera.key) for camera in self._robot.cameras}}
+        )
+
+    def _check(self, episode: RecordedEpisode) -> None:
+        where = f"{self._config.path}, episode {self._config.episode}"
+        joints, poses = self._robot.dim, EEF_WIDTH * len(self._robot.arms)
+        widths = {
+            "state": (episode.qpos, joints),
+            "velocity": (episode.qvel, joints),
+            "effort": (episode.effort, joints),
+            "action": (episode.action, joints),
+            "eef": (episode.eef, poses),
+            "action_eef": (episode.action_eef, poses),
+        }
+        for name, (rows, width) in widths.items():
+            if rows is not None and rows.shape[1] != width:
+                raise SetupError(
+                    f"{where}: the {name} column is {rows.shape[1]} wide, {self._robot.name} needs {width}"
+                )
+        if self._config.start_frame >= episode.length:
+            raise SetupError(
+                f"{where} has frames 0 to {episode.length - 1}, start_frame is {self._config.start_frame}"
+            )
+
+    def begin_run(self) -> None:
+        """Frame 0 of the run is due now."""
+        self._start = self._clock.now()
+        self._next = 0
+
+    def receive(self, timeout: float) -> Observation | None:
+        episode = self._episode
+        if episode is None:
+            raise TransportError(f"the dataset {self._config.path} is not connected")
+        deadline = self._clock.now() + max(timeout, 0.0)
+        if self._start is None:
+            return self._receive_standing(episode, deadline)
+        return self._receive_running(episode, self._start, deadline)
+
+    def _receive_standing(self, episode: RecordedEpisode, deadline: float) -> Observation | None:
+        if not self._wait(self._standing_due, deadline):
+            return None
+        now = self._clock.now()
+        self._standing_due = now + 1 / episode.fps
+        return self._observation(episode, self._config.start_frame, now)
+
+    def _receive_running(self, episode: RecordedEpisode, start: float, deadline: float) -> Observation | None:
+        frames = episode.length - self._config.start_frame
+        if self._next >= frames:
+            self._clock.sleep_until(deadline)
+            return None
+        due = start + self._next / episode.fps
+        if self._clock.now() + TOLERANCE < due:
+            self._decode(self._config.start_frame + self._next)
+        if not self._wait(due, deadline):
+            return None
+        newest = int((self._clock.now() + TOLERANCE - start) * episode.fps)
+        frame = min(max(newest, self._next), frames - 1)
+        self._skipped += frame - self._next
+        self._next = frame + 1
+        return self._observation(episode, self._config.start_frame + frame, start + frame / episode.fps)
+
+    def _wait(self, due: float, deadline: float) -> bool:
+        """Wait until `due` but not beyond `deadline`; whether it is due then."""
+        if self._clock.now() + TOLERANCE < due:
+            self._clock.sleep_until(min(due, deadline))
+        return self._clock.now() + TOLERANCE >= due
+
+    def _decode(self, row: int) -> dict[str, UInt8]:
+        return {camera: pictures[row] for camera, pictures in self._pictures.items()}
+
+    def _observation(self, episode: RecordedEpisode, row: int, due: float) -> Observation:
+        try:
+            pictures = self._decode(row)
+        except RecordingError as error:
+            raise TransportError(str(error)) from error
+        arrived = self._clock.now()
+        captured = min(due, arrived)
+        self._sequence += 1
+        return Observation(
+            sequence=self._sequence,
+            arrived=arrived,
+            captured=dict.fromkeys(self._streams(episode), captured),
+            qpos=episode.qpos[row],
+            pictures=pictures,
+            qvel=None if episode.qvel is None else episode.qvel[row],
+            effort=None if episode.effort is None else episode.effort[row],
+            eef=None if episode.eef is None else episode.eef[row],
+            reported_action=None if episode.action is None else episode.action[row],
+            reported_action_eef=None if episode.action_eef is None else episode.action_eef[row],
+            last=row == episode.length - 1 and self._start is not None,
+            prompt=episode.task,
+        )
+
+    def _streams(self, episode: RecordedEpisode) -> tuple[str, ...]:
+        eef = () if episode.eef is None else ("eef",)
+        return ("joints", *eef, *self._pictures)
+
+    def faults(self) -> dict[str, int]:
+        return {"skipped_frames": self._skipped}
+
+    def close(self) -> None:
+        for pictures in self._pictures.values():
+            pictures.close()
+        self._pictures.clear()
+        self._episode = None
+
+
+class DatasetSink(Sink):
+    """Counts the commands and sends nothing."""
+
+    def __init__(self) -> None:
+        self.commands = 0
+
+    def connect(self) -> None:
+        """Nothing to open."""
+
+    def send(self, command: RobotCommand) -> None:
+        """Count `command`."""
+        self.commands += 1
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+def capabilities(config: Config) -> Capabilities:
+    """A recording moves nothing and ends; it measures poses where the mapping names their column."""
+    return Capabilities(moves_robot=False, ends=True, measures_eef=config.mapping.eef is not None)
+
+
+def source(config: Config, robot: Robot, clock: Clock) -> DatasetSource:
+    """The episode as a source of observations."""
+    return DatasetSource(config, robot, clock)
+
+
+def sink(config: Config, robot: Robot, clock: Clock) -> DatasetSink:
+    """A sink that moves nothing."""
+    return DatasetSink()

@@ -1,0 +1,438 @@
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import uuid
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from runtime.datasets import staging
+from runtime.datasets.consistency import check
+from runtime.datasets.mapping import ColumnMapping
+from runtime.datasets.published import publish
+from runtime.datasets.reader import open_dataset
+from runtime.errors import RecordingError
+from runtime.recording.reader import open_episode
+from tests.runtime.datasets.small import CAMERAS, JOINTS, picture, record, row, seen
+
+STRANGER = Path(__file__).parents[2] / "conformance" / "read_lerobot_v21.py"
+WHOLE = ColumnMapping(
+    eef="eef_state", velocity="joint_velocity", effort="joint_effort", action_eef="eef_action"
+)
+
+
+def stranger(dataset: Path) -> dict[str, Any]:
+    """What a program that knows only the format reads, in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, "-I", str(STRANGER), str(dataset)], capture_output=True, text=True, check=True
+    )
+    report: dict[str, Any] = json.loads(done.stdout)
+    return report
+
+
+def info(dataset: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((dataset / "meta/info.json").read_text())
+    return content
+
+
+def table(dataset: Path, index: int = 0) -> Any:
+    return pq.read_table(dataset / f"data/chunk-000/episode_{index:06d}.parquet")
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_rows_and_pictures_come_back_exactly(tmp_path: Path) -> None:
+    done = publish(record(tmp_path / "episodes", frames=20), tmp_path / "set")
+    assert (done.episode_index, done.frames, done.created) == (0, 20, True)
+    episode = open_dataset(tmp_path / "set").episode(0, WHOLE)
+    assert (episode.length, episode.fps, episode.task) == (20, 30.0, "stack the cups")
+    for k in range(20):
+        made = row(k)
+        for stored, given in (
+            (episode.qpos, made.qpos),
+            (episode.action, made.action),
+            (episode.qvel, made.qvel),
+            (episode.effort, made.effort),
+            (episode.eef, made.eef),
+            (episode.action_eef, made.eef_action),
+        ):
+            assert stored is not None
+            assert np.array_equal(stored[k], given)
+    for camera in CAMERAS:
+        with episode.pictures(camera) as pictures:
+            assert [seen(pictures[k]) for k in range(20)] == list(range(20))
+            assert len(pictures) == 20
+    assert check(tmp_path / "set") == []
+
+
+def test_a_program_that_knows_only_the_format_reads_the_same(tmp_path: Path) -> None:
+    episodes = [record(tmp_path / "episodes", frames=n, seed=n) for n in (20, 7, 12)]
+    for episode in episodes:
+        publish(episode, tmp_path / "set")
+    report = stranger(tmp_path / "set")
+    assert report["broken"] == []
+    assert (report["total_episodes"], report["total_frames"], report["fps"]) == (3, 39, 30)
+    assert report["policy_outputs"] == ["action"]
+    assert report["policy_inputs"] == ["observation.state", *(f"observation.images.{c}" for c in CAMERAS)]
+    for read, n in zip(report["episodes"], (20, 7, 12), strict=True):
+        rows = [row(k, seed=n) for k in range(n)]
+        assert (read["length"], read["tasks"]) == (n, ["stack the cups"])
+        assert read["sums"]["observation.state"] == pytest.approx(
+            float(sum(r.qpos.sum() for r in rows)), abs=1e-4
+        )
+        assert read["sums"]["action"] == pytest.approx(float(sum(r.action.sum() for r in rows)), abs=1e-4)
+        for camera in CAMERAS:
+            expected = [float(picture(k).mean()) for k in range(n)]
+            assert read["brightness"][f"observation.images.{camera}"] == pytest.approx(expected, abs=2)
+
+
+def test_the_columns_are_named_and_typed_as_declared(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes"), tmp_path / "set")
+    features = info(tmp_path / "set")["features"]
+    assert features["observation.state"]["names"] == list(JOINTS)
+    assert features["observation.images.cam_high"]["info"]["video.codec"] == "h264"
+    stored = [key for key, feature in features.items() if feature["dtype"] != "video"]
+    assert table(tmp_path / "set").column_names == stored
+    assert {k: features[k]["dtype"] for k in ("capture_time.joints", "control_source", "intervention")} == {
+        "capture_time.joints": "float64",
+        "control_source": "string",
+        "intervention": "bool",
+    }
+    assert "next.success" not in features
+
+
+def test_times_of_capture_and_flags_are_kept(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes", frames=5), tmp_path / "set")
+    read = table(tmp_path / "set")
+    high, wrist = (read[f"capture_time.{c}"].to_numpy() for c in CAMERAS)
+    assert np.allclose(high, 0.49 + np.arange(5) / 30)
+    assert np.flatnonzero(np.isnan(wrist)).tolist() == [1]
+    assert read["control_source"].to_pylist() == ["hold", *["policy"] * 4]
+    assert read["next.done"].to_pylist() == [False] * 4 + [True]
+    assert read["eef_action_reported"].to_pylist() == [True, False, True, False, True]
+    assert read["repeated.cam_high"].to_pylist() == [False] * 5
+    statistic = lines(tmp_path / "set/meta/episodes_stats.jsonl")[0]["stats"]["capture_time.cam_wrist"]
+    assert statistic["count"] == [4]
+
+
+def test_timestamps_are_the_float32_of_frame_over_fps(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes", frames=20, fps=24.0), tmp_path / "set")
+    stamps = table(tmp_path / "set")["timestamp"].to_numpy()
+    assert stamps.dtype == np.float32
+    assert np.array_equal(stamps, (np.arange(20) / 24.0).astype(np.float32))
+    assert info(tmp_path / "set")["fps"] == 24
+
+
+def test_a_fractional_rate_is_kept(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes", frames=20, fps=12.5), tmp_path / "set")
+    assert info(tmp_path / "set")["fps"] == 12.5
+    assert stranger(tmp_path / "set")["broken"] == []
+
+
+def test_our_own_line_says_where_poses_come_from(tmp_path: Path) -> None:
+    episode = record(tmp_path / "episodes", frames=4, details={"operator": "ann"})
+    publish(episode, tmp_path / "set")
+    (line,) = lines(tmp_path / "set/meta/eva_episodes.jsonl")
+    assert (line["episode_index"], line["uuid"]) == (0, episode.name)
+    assert (line["eef_state"], line["eef_action"]) == ("measured", "mixed")
+    assert (line["outcome"]["status"], line["outcome"]["operator"]) == ("finished", "ann")
+    assert line["configuration_hash"] == "abc"
+
+
+def test_gr00t_finds_its_groups(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes", frames=4), tmp_path / "set")
+    modality = json.loads((tmp_path / "set/meta/modality.json").read_text())
+    groups = {"left_arm": {"start": 0, "end": 3}, "right_arm": {"start": 3, "end": 6}}
+    assert (modality["state"], modality["action"]) == (groups, groups)
+    assert modality["video"]["cam_high"] == {"original_key": "observation.images.cam_high"}
+
+
+def test_an_edited_modality_file_is_kept(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes", frames=4), tmp_path / "set")
+    (tmp_path / "set/meta/modality.json").write_text("{}")
+    publish(record(tmp_path / "episodes", frames=4), tmp_path / "set")
+    assert (tmp_path / "set/meta/modality.json").read_text() == "{}"
+
+
+def test_tasks_are_numbered_once(tmp_path: Path) -> None:
+    for task in ("stack", "sort", "stack"):
+        publish(record(tmp_path / "episodes", frames=3, task=task), tmp_path / "set")
+    assert [line["task"] for line in lines(tmp_path / "set/meta/tasks.jsonl")] == ["stack", "sort"]
+    assert [set(table(tmp_path / "set", k)["task_index"].to_pylist()) for k in range(3)] == [{0}, {1}, {0}]
+
+
+def test_chunks_are_as_large_as_the_info_says(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes", frames=3), tmp_path / "set")
+    (tmp_path / "set/meta/info.json").write_text(json.dumps(info(tmp_path / "set") | {"chunks_size": 2}))
+    for _ in range(2):
+        publish(record(tmp_path / "episodes", frames=3), tmp_path / "set")
+    assert (tmp_path / "set/data/chunk-001/episode_000002.parquet").is_file()
+    assert info(tmp_path / "set")["total_chunks"] == 2
+    assert check(tmp_path / "set") == []
+    assert stranger(tmp_path / "set")["broken"] == []
+
+
+def test_the_same_episode_again_is_written_anew_in_its_place(tmp_path: Path) -> None:
+    first, second = (record(tmp_path / "episodes", frames=n, seed=n) for n in (6, 8))
+    for episode in (first, second):
+        publish(episode, tmp_path / "set", success=True)
+    other = tmp_path / "set/data/chunk-000/episode_000001.parquet"
+    before = other.read_bytes()
+    done = publish(first, tmp_path / "set", success=False)
+    assert (done.episode_index, done.created) == (0, False)
+    assert table(tmp_path / "set")["next.success"].to_pylist() == [False] * 6
+    assert other.read_bytes() == before
+    assert [line["success"] for line in lines(tmp_path / "set/meta/eva_episodes.jsonl")] == [False, True]
+    assert info(tmp_path / "set")["total_episodes"] == 2
+    assert check(tmp_path / "set") == []
+
+
+def test_success_marks_the_last_row(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes", frames=4, details={"success": True}), tmp_path / "set")
+    assert table(tmp_path / "set")["next.success"].to_pylist() == [False, False, False, True]
+
+
+def test_a_dataset_that_tells_success_takes_no_episode_without(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes", frames=4), tmp_path / "set", success=True)
+    with pytest.raises(RecordingError, match=r"next\.success.*is not known"):
+        publish(record(tmp_path / "episodes", frames=4), tmp_path / "set")
+
+
+def test_a_dataset_that_does_not_tell_success_keeps_it_in_our_own_line(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes", frames=4), tmp_path / "set")
+    publish(record(tmp_path / "episodes", frames=4), tmp_path / "set", success=True)
+    assert "next.success" not in table(tmp_path / "set", 1).column_names
+    assert [line["success"] for line in lines(tmp_path / "set/meta/eva_episodes.jsonl")] == [None, True]
+
+
+def test_an_unknown_vector_is_not_a_number_and_not_counted(tmp_path: Path) -> None:
+    episode = record(tmp_path / "episodes", frames=5, rows={2: {"effort": None}})
+    publish(episode, tmp_path / "set")
+    effort = open_dataset(tmp_path / "set").episode(0, WHOLE).effort
+    assert effort is not None
+    assert np.flatnonzero(np.isnan(effort).any(axis=1)).tolist() == [2]
+    statistic = lines(tmp_path / "set/meta/episodes_stats.jsonl")[0]["stats"]["joint_effort"]
+    assert statistic["count"] == [4]
+    assert check(tmp_path / "set") == []
+
+
+def test_a_camera_called_image_does_not_spoil_the_statistics(tmp_path: Path) -> None:
+    cameras = {"wrist_image": {"width": 64, "height": 48}}
+    episode = record(
+        tmp_path / "episodes", frames=4, cameras=cameras, capture_streams=["joints", "wrist_image"]
+    )
+    publish(episode, tmp_path / "set")
+    stats = lines(tmp_path / "set/meta/episodes_stats.jsonl")[0]["stats"]
+    assert [key for key in stats if "image" in key] == ["observation.images.wrist_image"]
+    assert stranger(tmp_path / "set")["broken"] == []
+
+
+@pytest.mark.parametrize("count", [0, 1, 4])
+def test_any_number_of_cameras_will_do(tmp_path: Path, count: int) -> None:
+    cameras = {f"camera{n}": {"width": 64, "height": 48} for n in range(count)}
+    publish(record(tmp_path / "episodes", frames=4, cameras=cameras, capture_streams=[]), tmp_path / "set")
+    assert check(tmp_path / "set") == []
+    assert stranger(tmp_path / "set")["broken"] == []
+
+
+def test_the_pictures_are_copied_and_not_coded_again(tmp_path: Path) -> None:
+    import av
+
+    def coded(path: Path) -> list[bytes]:
+        with av.open(str(path)) as container:
+            return [bytes(packet) for packet in container.demux(video=0) if packet.size]
+
+    episode = record(tmp_path / "episodes", frames=12)
+    publish(episode, tmp_path / "set")
+    video = tmp_path / "set/videos/chunk-000/observation.images.cam_high/episode_000000.mp4"
+    assert coded(video) == coded(open_episode(episode).videos["cam_high"])[:12]
+
+
+@pytest.mark.parametrize("status", ["interrupted", "failed"])
+def test_what_was_not_finished_wants_to_be_asked_for(tmp_path: Path, status: str) -> None:
+    episode = record(tmp_path / "episodes", frames=4, status=status)
+    with pytest.raises(RecordingError, match=f"{status}: the operator said so.*--include-interrupted"):
+        publish(episode, tmp_path / "set")
+    assert publish(episode, tmp_path / "set", include_interrupted=True).frames == 4
+
+
+def test_what_is_still_recorded_is_refused(tmp_path: Path) -> None:
+    episode = record(tmp_path / "episodes", frames=4)
+    (episode / "outcome.json").unlink()
+    with pytest.raises(RecordingError, match=r"no outcome\.json"):
+        publish(episode, tmp_path / "set", include_interrupted=True)
+    assert not (tmp_path / "set").exists()
+
+
+def test_an_episode_without_rows_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="no rows"):
+        publish(record(tmp_path / "episodes", frames=0), tmp_path / "set")
+
+
+def test_a_state_that_is_not_finite_is_refused_with_its_row(tmp_path: Path) -> None:
+    broken = {3: {"action": np.array([0, np.nan, 0, 0, 0, 0], np.float32)}}
+    with pytest.raises(RecordingError, match="action of row 3 is not finite"):
+        publish(record(tmp_path / "episodes", frames=5, rows=broken), tmp_path / "set")
+    assert not (tmp_path / "set/meta/info.json").exists()
+    assert publish(record(tmp_path / "episodes", frames=5), tmp_path / "set").episode_index == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"fps": 25.0}, "fps is 30.0 in the dataset, 25.0 here"),
+        ({"cameras": {"cam_high": {"width": 64, "height": 48}}}, "has no 'observation.images.cam_wrist'"),
+        ({"streams": {"eef": True}}, "the episode has no 'joint_velocity'"),
+        (
+            {"cameras": {c: {"width": 32, "height": 48} for c in CAMERAS}},
+            r"has shape \[48, 64, 3\] in the dataset",
+        ),
+    ],
+)
+def test_other_features_are_refused_with_every_difference(
+    tmp_path: Path, changes: dict[str, Any], named: str
+) -> None:
+    publish(record(tmp_path / "episodes", frames=3), tmp_path / "set")
+    other = None
+    if "cameras" in changes:
+        size = next(iter(changes["cameras"].values()))
+        pixels = np.zeros((size["height"], size["width"], 3), np.uint8)
+        other = {k: {"pictures": dict.fromkeys(changes["cameras"], pixels)} for k in range(3)}
+    with pytest.raises(RecordingError, match=named):
+        publish(record(tmp_path / "episodes", frames=3, rows=other, **changes), tmp_path / "set")
+    assert check(tmp_path / "set") == []
+
+
+def test_another_robot_is_refused(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes", frames=3), tmp_path / "set")
+    from tests.runtime.datasets.small import manifest
+
+    other = manifest()["robot"] | {"name": "large"}
+    with pytest.raises(RecordingError, match="robot_type is 'small' in the dataset, 'large' here"):
+        publish(record(tmp_path / "episodes", frames=3, robot=other), tmp_path / "set")
+
+
+def test_a_folder_with_other_things_in_it_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("precious")
+    episode = record(tmp_path / "episodes", frames=3)
+    with pytest.raises(RecordingError, match=r"no dataset and not empty.*thesis\.tex"):
+        publish(episode, tmp_path)
+
+
+def test_an_episode_of_another_length_is_refused_in_its_place(tmp_path: Path) -> None:
+    name = str(uuid.uuid4())
+    publish(record(tmp_path / "a", frames=5, uuid=name), tmp_path / "set")
+    with pytest.raises(RecordingError, match=r"has 6 rows, published .* has 5"):
+        publish(record(tmp_path / "b", frames=6, uuid=name), tmp_path / "set")
+
+
+def _publish_until(episode: Path, dataset: Path, steps: int) -> None:
+    """Publish in a process that dies, as by a power cut, at rename number `steps`."""
+    real, left = os.replace, steps
+
+    def replace(source: Any, target: Any) -> None:
+        nonlocal left
+        if Path(target).name != staging.PLAN:
+            if left == 0:
+                os._exit(9)
+            left -= 1
+        real(source, target)
+
+    staging.os.replace = replace  # type: ignore[assignment]
+    publish(episode, dataset)
+    os._exit(0)
+
+
+def _die(episode: Path, dataset: Path, steps: int) -> int:
+    context = multiprocessing.get_context("spawn")
+    process = context.Process(target=_publish_until, args=(episode, dataset, steps))
+    process.start()
+    process.join()
+    assert process.exitcode is not None
+    return process.exitcode
+
+
+# tasks, two videos, parquet, statistics twice, our lines, episodes, info (the first adds modality.json)
+RENAMES = 9
+
+
+@pytest.mark.parametrize("steps", range(RENAMES))
+def test_a_crash_at_any_rename_leaves_the_old_contents_and_a_second_run_completes(
+    tmp_path: Path, steps: int
+) -> None:
+    dataset = tmp_path / "set"
+    publish(record(tmp_path / "episodes", frames=6), dataset)
+    old = stranger(dataset)
+    episode = record(tmp_path / "episodes", frames=8, seed=8)
+    assert _die(episode, dataset, steps) == 9
+    assert stranger(dataset) == old
+    assert [entry.length for entry in open_dataset(dataset).episodes] == [6]
+    done = publish(episode, dataset)
+    assert (done.episode_index, done.created) == (1, True)
+    assert check(dataset) == []
+    assert stranger(dataset)["broken"] == []
+
+
+def test_one_more_rename_than_that_is_not_needed(tmp_path: Path) -> None:
+    dataset = tmp_path / "set"
+    publish(record(tmp_path / "episodes", frames=6), dataset)
+    assert _die(record(tmp_path / "episodes", frames=8), dataset, RENAMES) == 0
+
+
+@pytest.mark.parametrize("steps", [0, 5, RENAMES])
+def test_a_crash_at_the_very_first_episode_leaves_no_dataset(tmp_path: Path, steps: int) -> None:
+    dataset = tmp_path / "set"
+    episode = record(tmp_path / "episodes", frames=4)
+    assert _die(episode, dataset, steps) == 9
+    assert not (dataset / "meta/info.json").exists()
+    assert publish(episode, dataset).episode_index == 0
+    assert check(dataset) == []
+
+
+def test_another_episode_after_a_crash_takes_the_index_and_leaves_no_traces(tmp_path: Path) -> None:
+    dataset = tmp_path / "set"
+    publish(record(tmp_path / "episodes", frames=6), dataset)
+    lost = record(tmp_path / "episodes", frames=8, seed=8)
+    assert _die(lost, dataset, RENAMES - 1) == 9
+    assert check(dataset) != []
+    assert publish(record(tmp_path / "episodes", frames=5, seed=5), dataset).episode_index == 1
+    assert check(dataset) == []
+    assert publish(lost, dataset).episode_index == 2
+    assert [entry.length for entry in open_dataset(dataset).episodes] == [6, 5, 8]
+    assert stranger(dataset)["broken"] == []
+
+
+@pytest.mark.parametrize("steps", [1, 4, 8])
+def test_a_crash_while_writing_anew_leaves_a_dataset_that_opens(tmp_path: Path, steps: int) -> None:
+    dataset = tmp_path / "set"
+    episodes = [record(tmp_path / "episodes", frames=n, seed=n) for n in (6, 8)]
+    for episode in episodes:
+        publish(episode, dataset)
+    assert _die(episodes[0], dataset, steps) == 9
+    assert stranger(dataset)["broken"] == []
+    assert publish(episodes[0], dataset).created is False
+    assert check(dataset) == []
+
+
+def test_two_publishers_at_once_get_two_indices(tmp_path: Path) -> None:
+    dataset = tmp_path / "set"
+    context = multiprocessing.get_context("spawn")
+    episodes = [record(tmp_path / "episodes", frames=4, seed=n) for n in range(3)]
+    processes = [context.Process(target=publish, args=(episode, dataset)) for episode in episodes]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert sorted(line["uuid"] for line in lines(dataset / "meta/eva_episodes.jsonl")) == sorted(
+        episode.name for episode in episodes
+    )
+    assert check(dataset) == []
