@@ -56,10 +56,11 @@ class EpisodeJournal(Journal):
         folder = _create(self._root, layout.uuid)
         try:
             write_whole(folder / "manifest.json", text)
-            self._recording = _Recording(folder, layout, self._settings, self._patience)
+            recording = _Recording(folder, layout, self._settings, self._patience)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)  # it is ours and empty: no row was ever taken
             raise
+        self._recording = recording
 
     def append(self, record: Record) -> None:
         self._begun().append(record)
@@ -186,11 +187,12 @@ class _Recording:
                 RecordingError(f"the disk did not take the end of episode {self.folder} in time")
             )
             self._faults.tell()
-        write_whole(
-            self.folder / "outcome.json", document(self._conclusion(outcome, stuck), "the outcome", indent=1)
-        )
-        if not stuck:  # a stuck encoder may still write: the folder stays marked until our process ends
-            os.close(self._lock)
+        try:
+            conclusion = document(self._conclusion(outcome, stuck), "the outcome", indent=1)
+            write_whole(self.folder / "outcome.json", conclusion)
+        finally:
+            if not stuck:  # a stuck encoder may still write: the folder stays marked until our process ends
+                os.close(self._lock)
         if not self._faults.told:
             self._faults.tell()
 

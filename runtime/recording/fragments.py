@@ -49,9 +49,9 @@ def count_frames(path: Path) -> int:
 
 
 def _count(container: Any) -> int:
-    if not container.streams.video:
+    stream = next(iter(container.streams.video), None)
+    if stream is None or stream.codec_context is None:  # a header whose tables are gone
         return 0
-    stream = container.streams.video[0]
     before = 0
     groups: list[list[Any]] = []
     for packet in _packets(container, stream):

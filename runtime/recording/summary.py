@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from runtime.errors import RecordingError
 from runtime.recording.layout import Layout
 
 HELD = ("hold", "none")  # sources under which nobody asked the robot for anything
@@ -39,13 +40,18 @@ class Summary:
 
 
 def summarise(path: Path, layout: Layout, frames: int) -> Summary:
-    """Read the first `frames` rows of a whole rows.arrow batch by batch, so that memory stays constant."""
+    """Read the first `frames` rows of rows.arrow batch by batch, so that memory stays constant.
+
+    RecordingError where that many cannot be read.
+    """
     tally = _Tally(layout)
-    with pa.OSFile(str(path)) as file:
-        for batch in pa.ipc.open_stream(file):
-            if tally.frames >= frames:
-                break
-            tally.add(batch.slice(0, frames - tally.frames))
+    try:
+        with pa.OSFile(str(path)) as file:
+            batches = pa.ipc.open_stream(file)
+            while tally.frames < frames:
+                tally.add(batches.read_next_batch().slice(0, frames - tally.frames))
+    except (StopIteration, pa.ArrowInvalid, OSError) as error:
+        raise RecordingError(f"{path}: {tally.frames} rows readable, {frames} expected: {error!r}") from error
     return tally.summary()
 
 

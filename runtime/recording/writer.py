@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from runtime.errors import RecordingError
-from runtime.recording.files import AppendFile, require_room
+from runtime.recording.files import AppendFile, require_room, sync_folder
 from runtime.recording.layout import Layout
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.tables import SCHEMAS, TableWriter
@@ -106,6 +106,7 @@ class DiskWriter:
             )
 
     def _run(self) -> None:
+        self._attempt(lambda: sync_folder(self._folder))  # the names of all files that begin created
         while not self._closing.is_set():
             self._wake.wait(self._settings.flush_period_s)
             self._wake.clear()

@@ -1,0 +1,94 @@
+import math
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from runtime.recording.columns import RecordedRow
+from runtime.recording.layout import Layout
+from runtime.recording.tables import SCHEMAS, TableWriter, read_table
+
+from .samples import CAMERAS, chunk, manifest, row, tick
+
+LAYOUT = Layout.of(manifest())
+
+
+def written(folder: Path, name: str, *records: object) -> pa.Table:
+    writer = TableWriter(folder, name, LAYOUT)
+    for record in records:
+        writer.add(record)
+    writer.finish()
+    writer.file.close()
+    return read_table(folder / f"{name}.arrow", SCHEMAS[name](LAYOUT)).table
+
+
+def test_a_row_keeps_every_field_and_times_count_from_the_start(tmp_path: Path) -> None:
+    records = [
+        RecordedRow(row(0, eef=None), frozenset(CAMERAS[:1])),
+        RecordedRow(row(1, control_source="hold", intervention=True), frozenset()),
+    ]
+    found = written(tmp_path, "rows", *records).to_pylist()
+    assert found[1] == {
+        "index": 1,
+        "step": 3,
+        "time": 1 / 30,
+        "tick_time": pytest.approx(1 / 30),
+        "sequence": 1,
+        "qpos": [1, 1, 1],
+        "action": [1.5, 1.5, 1.5],
+        "qvel": [0, 0, 0],
+        "eef": [0] * 8,
+        "eef_action": [1] * 8,
+        "eef_measured": True,
+        "eef_action_reported": False,
+        "control_source": "hold",
+        "intervention": True,
+        "capture_time.joints": pytest.approx(1 / 30 - 0.01),
+        f"capture_time.{CAMERAS[0]}": pytest.approx(1 / 30 - 0.03),
+        f"capture_time.{CAMERAS[1]}": pytest.approx(1 / 30 - 0.02),
+        f"repeated.{CAMERAS[0]}": False,
+        f"repeated.{CAMERAS[1]}": False,
+    }
+    assert found[0]["eef"] is None
+    assert found[0][f"repeated.{CAMERAS[0]}"] is True
+
+
+def test_an_unknown_capture_time_is_not_a_number(tmp_path: Path) -> None:
+    found = written(tmp_path, "rows", RecordedRow(row(0, captured={"joints": 1000.5}), frozenset()))
+    assert found.column("capture_time.joints").to_pylist() == [0.5]
+    assert math.isnan(found.column(f"capture_time.{CAMERAS[0]}")[0].as_py())
+
+
+def test_a_tick_is_split_into_what_was_asked_for_and_what_was_done(tmp_path: Path) -> None:
+    quiet = tick(2, smoothed=None, executed=None, chunk_ids=(), weights=(), changes=("stale",), refused=True)
+    executed = written(tmp_path, "ticks", tick(1), quiet).to_pylist()
+    assert executed[0]["executed"] == [1.5, 1.5, 1.5]
+    assert executed[0]["chunk_id"] == 5
+    assert executed[0]["planned"] == pytest.approx(0.01)
+    assert executed[0]["sent"] == pytest.approx(0.011)
+    assert executed[1]["executed"] is None
+    assert executed[1]["chunk_id"] == -1
+    assert executed[1]["refused"] is True
+    assert executed[1]["changes"] == ["stale"]
+    smoothed = written(tmp_path, "smoothed", tick(1)).to_pylist()
+    assert smoothed == [
+        {"step": 1, "smoothed": [1.25, 1.25, 1.25], "chunk_ids": [4, 5], "weights": [0.25, 0.75]}
+    ]
+
+
+def test_chunks_of_any_width_become_one_row_per_action(tmp_path: Path) -> None:
+    found = written(tmp_path, "raw", chunk(1, horizon=2, width=3), chunk(2, horizon=1, width=1)).to_pylist()
+    assert [line["chunk_id"] for line in found] == [1, 1, 2]
+    assert [line["index"] for line in found] == [0, 1, 0]
+    assert [line["target_step"] for line in found] == [-1, 11, -1]
+    assert [line["action"] for line in found] == [[0, 1, 2], [3, 4, 5], [0]]
+    assert {(line["space"], line["delay"], line["inference_ms"]) for line in found} == {("joint", 1, 42.5)}
+
+
+def test_numbers_survive_bit_by_bit(tmp_path: Path) -> None:
+    values = np.array([np.nan, -0.0, 1e-42], dtype=np.float32)
+    found = (
+        written(tmp_path, "ticks", tick(0, qpos=values)).column("qpos").combine_chunks().flatten().to_numpy()
+    )
+    assert found.tobytes() == values.tobytes()

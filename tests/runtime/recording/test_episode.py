@@ -1,0 +1,359 @@
+import errno
+import json
+import os
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.errors import RecordingError
+from runtime.recording.base import Outcome
+from runtime.recording.episode import EpisodeJournal
+from runtime.recording.fragments import count_frames
+from runtime.recording.reader import open_episode
+from runtime.recording.repair import repair
+from runtime.recording.settings import RecordingSettings
+from runtime.recording.video import FragmentedVideo
+
+from .samples import CAMERAS, HEIGHT, SETTINGS, WIDTH, chunk, manifest, numbers, row, tick
+
+FINISHED = Outcome("finished", "stopped by the operator", 1.7e9 + 10, {"success": True, "frames": "mine"})
+
+
+def begun(root: Path, settings: RecordingSettings = SETTINGS, **options: Any) -> tuple[EpisodeJournal, Path]:
+    journal = EpisodeJournal(root, settings, **options)
+    journal.begin(manifest())
+    assert journal.folder is not None
+    return journal, journal.folder
+
+
+def small(**changes: Any) -> RecordingSettings:
+    return SETTINGS.model_copy(update=changes)
+
+
+class Stuck:
+    """An encoder that stands still at one camera until it is let go."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, camera: str) -> None:
+        self.free = threading.Event()
+        real = FragmentedVideo.encode
+
+        def encode(video: FragmentedVideo, picture: np.ndarray | None) -> None:
+            if threading.current_thread().name == f"encoder {camera}":
+                self.free.wait(60.0)
+            real(video, picture)
+
+        monkeypatch.setattr(FragmentedVideo, "encode", encode)
+
+
+def refuse(monkeypatch: pytest.MonkeyPatch, name: str, code: int = errno.ENOSPC) -> None:
+    """Let writes to files of that name fail."""
+    real = os.write
+
+    def write(descriptor: int, data: Any) -> int:
+        if os.readlink(f"/proc/self/fd/{descriptor}").endswith(name):
+            raise OSError(code, os.strerror(code))
+        return real(descriptor, data)
+
+    monkeypatch.setattr(os, "write", write)
+
+
+def append_for_ever(journal: EpisodeJournal) -> None:
+    for k in range(100_000):
+        journal.append(row(k))
+        journal.append(tick(k))
+        journal.mark({"k": k})
+
+
+def fill(path: Path) -> None:
+    """Take all the room that is left on a disk."""
+    with open(path, "wb") as file:
+        while True:
+            file.write(bytes(4096))
+            file.flush()
+
+
+def test_a_whole_episode_comes_back(tmp_path: Path) -> None:
+    journal, folder = begun(tmp_path / "episodes")
+    given = json.loads((folder / "manifest.json").read_text())
+    assert folder.name == given["uuid"]
+    journal.mark({"kind": "started", "delay": np.float64(0.5)})
+    for k in range(40):
+        journal.append(row(k, control_source="hold" if k >= 30 else "policy"))
+        journal.append(tick(3 * k))
+        journal.append(tick(3 * k + 1, smoothed=None))
+    journal.append(chunk(1))
+    journal.mark({"kind": "stopped"})
+    journal.end(FINISHED)
+    assert journal.folder is None
+    episode = open_episode(folder)
+    assert episode.manifest == given
+    assert episode.frames == 40
+    assert episode.rows.column("index").to_pylist() == list(range(40))
+    assert [numbers(episode.videos[camera]) for camera in CAMERAS] == [list(range(1, 41))] * 2
+    assert (episode.ticks.num_rows, episode.smoothed.num_rows, episode.raw.num_rows) == (80, 40, 4)
+    assert episode.events == ({"kind": "started", "delay": 0.5}, {"kind": "stopped"})
+    assert episode.outcome == {
+        "success": True,
+        "status": "finished",
+        "reason": "stopped by the operator",
+        "ended_wall": 1.7e9 + 10,
+        "frames": 40,
+        "duration_s": pytest.approx(1.0),
+        "held_rows": 10,
+        "repeated": dict.fromkeys(CAMERAS, 0),
+        "skew": {"mean_s": pytest.approx(0.02), "max_s": pytest.approx(0.02)},
+        "rows": 40,
+        "video_frames": dict.fromkeys(CAMERAS, 40),
+    }
+
+
+def test_the_manifest_is_there_before_the_first_row(tmp_path: Path) -> None:
+    journal, folder = begun(tmp_path)
+    episode = open_episode(folder)
+    assert episode.outcome is None
+    assert episode.frames == 0
+    journal.end(FINISHED)
+
+
+def test_unknown_keys_of_the_manifest_are_kept(tmp_path: Path) -> None:
+    journal = EpisodeJournal(tmp_path, SETTINGS)
+    given = manifest(operator="ada", scene={"name": "table"})
+    journal.begin(given)
+    journal.end(FINISHED)
+    assert open_episode(tmp_path / given["uuid"]).manifest == given
+
+
+def test_one_journal_writes_episode_after_episode(tmp_path: Path) -> None:
+    journal = EpisodeJournal(tmp_path, SETTINGS)
+    for _ in range(2):
+        journal.begin(manifest())
+        journal.append(row(0))
+        journal.end(FINISHED)
+    assert [open_episode(folder).frames for folder in tmp_path.iterdir()] == [1, 1]
+
+
+def test_an_episode_is_never_written_twice(tmp_path: Path) -> None:
+    journal = EpisodeJournal(tmp_path, SETTINGS)
+    given = manifest()
+    journal.begin(given)
+    journal.append(row(0))
+    journal.end(FINISHED)
+    with pytest.raises(RecordingError, match=f"{given['uuid']} exists already"):
+        journal.begin(given)
+    assert open_episode(tmp_path / given["uuid"]).frames == 1
+
+
+def test_begin_and_end_come_in_turns(tmp_path: Path) -> None:
+    journal = EpisodeJournal(tmp_path, SETTINGS)
+    for call in (lambda: journal.append(row(0)), lambda: journal.mark({}), lambda: journal.end(FINISHED)):
+        with pytest.raises(RecordingError, match="no episode has begun"):
+            call()
+    journal.begin(manifest())
+    with pytest.raises(RecordingError, match="has not ended"):
+        journal.begin(manifest())
+    journal.end(FINISHED)
+
+
+def test_a_begin_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
+    journal = EpisodeJournal(tmp_path, SETTINGS)
+    threads = threading.active_count()
+    descriptors = len(os.listdir("/proc/self/fd"))
+    sizes = {CAMERAS[0]: {"width": WIDTH, "height": HEIGHT}, CAMERAS[1]: {"width": 65536, "height": 2}}
+    with pytest.raises(RecordingError, match=f"camera {CAMERAS[1]}: no encoder"):
+        journal.begin(manifest(cameras=sizes))
+    assert list(tmp_path.iterdir()) == []
+    assert threading.active_count() == threads
+    assert len(os.listdir("/proc/self/fd")) == descriptors
+    journal.begin(manifest())
+    journal.end(FINISHED)
+
+
+def test_too_little_room_refuses_to_begin(tmp_path: Path) -> None:
+    journal = EpisodeJournal(tmp_path, small(min_free_bytes=1 << 60))
+    with pytest.raises(RecordingError, match=f"at least {1 << 60} wanted"):
+        journal.begin(manifest())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_refused_row_leaves_rows_and_frames_together(tmp_path: Path) -> None:
+    journal, folder = begun(tmp_path)
+    journal.append(row(0))
+    wrong = {CAMERAS[0]: row(1).pictures[CAMERAS[0]], CAMERAS[1]: np.zeros((8, 8, 3), np.uint8)}
+    with pytest.raises(RecordingError, match="wrist gave uint8"):
+        journal.append(row(1, pictures=wrong))
+    journal.append(row(1))
+    journal.end(FINISHED)
+    episode = open_episode(folder)
+    assert episode.frames == 2
+    assert [numbers(video) for video in episode.videos.values()] == [[1, 2], [1, 2]]
+
+
+def test_a_missing_picture_repeats_the_last_one_and_is_flagged(tmp_path: Path) -> None:
+    journal, folder = begun(tmp_path)
+    for k in range(6):
+        pictures = dict(row(k).pictures)
+        if k in (0, 3):
+            pictures[CAMERAS[0]] = None
+        journal.append(row(k, pictures=pictures))
+    journal.end(FINISHED)
+    episode = open_episode(folder)
+    assert numbers(episode.videos[CAMERAS[0]]) == [0, 2, 3, 3, 5, 6]
+    assert numbers(episode.videos[CAMERAS[1]]) == [1, 2, 3, 4, 5, 6]
+    flags = episode.rows.column(f"repeated.{CAMERAS[0]}").to_pylist()
+    assert flags == [True, False, False, True, False, False]
+    assert episode.outcome is not None
+    assert episode.outcome["repeated"] == {CAMERAS[0]: 2, CAMERAS[1]: 0}
+
+
+def test_an_encoder_that_falls_behind_costs_flagged_repeats_and_no_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stuck = Stuck(monkeypatch, CAMERAS[0])
+    journal, folder = begun(tmp_path, small(queue_frames=3))
+    for k in range(100):
+        journal.append(row(k, pictures={**row(k).pictures, CAMERAS[1]: None}))
+    stuck.free.set()
+    journal.end(FINISHED)
+    episode = open_episode(folder)
+    flags = episode.rows.column(f"repeated.{CAMERAS[0]}").to_pylist()
+    shown = numbers(episode.videos[CAMERAS[0]])
+    assert len(shown) == episode.frames == 100
+    assert 96 <= sum(flags) <= 97  # three wait, and one may be in the encoder's hands
+    for k in range(100):
+        assert shown[k] == (shown[k - 1] if flags[k] else k + 1)
+
+
+def test_a_patient_journal_repeats_nothing(tmp_path: Path) -> None:
+    journal, folder = begun(tmp_path, small(queue_frames=1), patient=True)
+    for k in range(200):
+        journal.append(row(k))
+    journal.end(FINISHED)
+    episode = open_episode(folder)
+    assert episode.outcome is not None
+    assert episode.outcome["repeated"] == dict.fromkeys(CAMERAS, 0)
+    assert numbers(episode.videos[CAMERAS[1]]) == list(range(1, 201))
+
+
+def test_a_failing_encoder_is_named_at_the_next_append_and_the_rest_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = FragmentedVideo.encode
+
+    def failing(video: FragmentedVideo, picture: np.ndarray | None) -> None:
+        if threading.current_thread().name == f"encoder {CAMERAS[0]}" and video.frames == 20:
+            raise ValueError("lost its mind")
+        real(video, picture)
+
+    monkeypatch.setattr(FragmentedVideo, "encode", failing)
+    journal, folder = begun(tmp_path, patient=True)
+    with pytest.raises(RecordingError, match=f"camera {CAMERAS[0]}.*lost its mind") as raised:
+        append_for_ever(journal)
+    with pytest.raises(RecordingError, match=f"camera {CAMERAS[0]}"):
+        journal.append(tick(0))
+    journal.end(Outcome("failed", str(raised.value), 1.7e9))
+    episode = open_episode(folder)
+    assert episode.frames == 20
+    assert episode.outcome is not None
+    assert episode.outcome["status"] == "failed"
+    assert episode.outcome["reason"] == str(raised.value)
+    rows = episode.outcome["rows"]
+    assert rows > 20
+    assert episode.outcome["video_frames"] == {CAMERAS[0]: 20, CAMERAS[1]: rows}
+    assert numbers(episode.videos[CAMERAS[1]]) == list(range(1, rows + 1))
+
+
+def test_an_encoder_that_never_ends_is_named_and_the_rest_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stuck = Stuck(monkeypatch, CAMERAS[0])
+    journal, folder = begun(tmp_path, small(drain_timeout_s=0.1))
+    for k in range(5):
+        journal.append(row(k))
+    with pytest.raises(RecordingError, match=f"camera {CAMERAS[0]}: the encoder did not end in time"):
+        journal.end(FINISHED)
+    stuck.free.set()
+    episode = open_episode(folder)
+    assert episode.frames == 0
+    assert episode.outcome is not None
+    assert episode.outcome["status"] == "failed"
+    assert episode.outcome["reason"].startswith("stopped by the operator; camera")
+    assert episode.outcome["rows"] == 5
+    assert numbers(episode.videos[CAMERAS[1]]) == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("name", ["rows.arrow", "ticks.arrow", f"{CAMERAS[1]}.mp4", "events.jsonl"])
+def test_a_file_that_cannot_be_written_is_named_and_the_rest_stays_readable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    journal, folder = begun(tmp_path, patient=True)
+    refuse(monkeypatch, name)
+    with pytest.raises(RecordingError, match="disk full while writing") as raised:
+        append_for_ever(journal)
+    assert name in str(raised.value)
+    assert "bytes free in" in str(raised.value)
+    journal.end(Outcome("failed", str(raised.value), 1.7e9))
+    monkeypatch.undo()
+    episode = open_episode(folder)
+    assert episode.outcome is not None
+    assert episode.outcome["status"] == "failed"
+    assert episode.frames == (0 if name in ("rows.arrow", f"{CAMERAS[1]}.mp4") else episode.outcome["rows"])
+    assert numbers(episode.videos[CAMERAS[0]]) == list(range(1, count_frames(episode.videos[CAMERAS[0]]) + 1))
+
+
+def test_a_fault_found_only_at_the_end_is_raised_by_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal, folder = begun(tmp_path, small(flush_period_s=1.0))
+    journal.append(row(0))
+    refuse(monkeypatch, "rows.arrow", errno.EIO)
+    with pytest.raises(RecordingError, match=r"disk error while writing .*rows\.arrow"):
+        journal.end(FINISHED)
+    monkeypatch.undo()
+    assert open_episode(folder).outcome["status"] == "failed"  # type: ignore[index]
+
+
+def test_a_disk_that_is_really_full_is_named_and_what_was_written_stays_readable(small_disk: Path) -> None:
+    journal, folder = begun(small_disk / "episodes", patient=True)
+    ballast = small_disk / "ballast"
+    ballast.write_bytes(bytes(700_000))
+    with pytest.raises(RecordingError, match="disk full while writing") as raised:
+        append_for_ever(journal)
+    assert str(folder) in str(raised.value)
+    ballast.unlink()
+    journal.end(Outcome("failed", str(raised.value), 1.7e9))
+    episode = open_episode(folder)
+    assert episode.frames > 0
+    assert episode.rows.column("index").to_pylist() == list(range(episode.frames))
+    for video in episode.videos.values():
+        assert numbers(video)[: episode.frames] == list(range(1, episode.frames + 1))
+
+
+def test_an_outcome_that_finds_no_room_is_an_error_and_repair_completes_it_later(small_disk: Path) -> None:
+    journal, folder = begun(small_disk, patient=True)
+    for k in range(60):
+        journal.append(row(k))
+    ballast = small_disk / "ballast"
+    with pytest.raises(OSError, match="No space"):
+        fill(ballast)
+    with pytest.raises(RecordingError, match="disk full while writing"):
+        journal.end(FINISHED)
+    assert not (folder / "outcome.json").exists()
+    ballast.unlink()
+    report = repair(folder)
+    assert report.verdict == "repaired"
+    episode = open_episode(folder)
+    assert episode.frames == report.frames
+    for video in episode.videos.values():
+        assert numbers(video)[: episode.frames] == list(range(1, episode.frames + 1))
+
+
+def test_something_that_is_no_record_is_refused(tmp_path: Path) -> None:
+    journal, _ = begun(tmp_path)
+    with pytest.raises(RecordingError, match="not dict"):
+        journal.append({"index": 0})  # type: ignore[arg-type]
+    with pytest.raises(RecordingError, match="an event cannot be written"):
+        journal.mark({"what": object()})
+    journal.end(FINISHED)
