@@ -50,15 +50,6 @@ class ControlSettings(Section):
     """Time without any planned action after which `running` becomes `holding` [s]."""
 
 
-class SpaceSettings(Section):
-    """Action spaces."""
-
-    policy: Literal["joint", "eef"] = "joint"
-    """Space of the policy's rows: joints, or 8 numbers per arm."""
-    observation: Literal["joint", "eef"] = "joint"
-    """Space of the state that the policy is shown."""
-
-
 class SetupSettings(Section):
     """What `setup` does."""
 
@@ -140,7 +131,6 @@ class Deployment(Section):
     policy: PolicyConfig
     strategy: StrategyConfig = Field(default_factory=lambda: variants("runtime.strategies")["async"].Config())
     control: ControlSettings = ControlSettings()
-    space: SpaceSettings = SpaceSettings()
     setup: SetupSettings = SetupSettings()
     run: RunSettings = RunSettings()
     safety: SafetySettings = SafetySettings()

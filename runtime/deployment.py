@@ -44,7 +44,9 @@ def resolve(tree: Mapping[str, Any], origin: Mapping[Key, str], source: str) -> 
     try:
         deployment = Deployment.model_validate(tree)
     except ValidationError as invalid:
-        raise ConfigurationError("\n".join(_sentence(e, tree, origin, source) for e in invalid.errors())) from None
+        raise ConfigurationError(
+            "\n".join(_sentence(e, tree, origin, source) for e in invalid.errors())
+        ) from None
     canonical = deployment.model_dump(mode="json")
     text = json.dumps(canonical, sort_keys=True, separators=(",", ":"))
     return Resolved(deployment, canonical, hashlib.sha256(text.encode()).hexdigest())
@@ -163,7 +165,9 @@ def _allowed(key: Key, tree: Mapping[str, Any]) -> list[str]:
         at = at.get(name, {})
         fields = [m.model_fields[name].annotation for m in models if name in m.model_fields]
         models = [leaf for field in fields for leaf in _models(field)]
-    chosen = [m for m in models if "kind" in m.model_fields and m.model_fields["kind"].default == at.get("kind")]
+    chosen = [
+        m for m in models if "kind" in m.model_fields and m.model_fields["kind"].default == at.get("kind")
+    ]
     return sorted({name for model in (chosen or models) for name in model.model_fields})
 
 

@@ -61,7 +61,7 @@ class Lease:
         return refusal
 
     def check(self, holder: str, epoch: int, now: float) -> str:
-        """"" where this holder may command at `now`, else the reason why not."""
+        """ "" where this holder may command at `now`, else the reason why not."""
         held = self.current(now)
         if held is None:
             return "nobody holds the lease: claim it first"

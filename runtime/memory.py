@@ -38,9 +38,9 @@ def create(size: int) -> int:
     return descriptor
 
 
-def attach(descriptor: int) -> mmap.mmap:
-    """The shared file behind an inherited descriptor, mapped for reading and writing."""
-    return mmap.mmap(descriptor, os.fstat(descriptor).st_size)
+def attach(descriptor: int, size: int = 0) -> mmap.mmap:
+    """The shared file behind an inherited descriptor, mapped for reading and writing: its first `size` bytes or all."""
+    return mmap.mmap(descriptor, size or os.fstat(descriptor).st_size)
 
 
 class TornReadError(Exception):

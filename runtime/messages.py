@@ -234,3 +234,14 @@ def decode(payload: bytes) -> Message:
     except TypeError as error:
         raise CodecError(f"message {content['type']}: {error}") from None
     return message
+
+
+def event_row(event: Event) -> dict[str, Any]:
+    """An event as a line of the episode's log."""
+    return {
+        "kind": event.kind,
+        "text": event.text,
+        "time": event.time,
+        "step": event.step,
+        "data": dict(event.data),
+    }

@@ -105,7 +105,11 @@ class Page:
         offset = 0
         self._beats = {name: memory.word(shared, _LINE * index, "d") for index, name in enumerate(PROCESSES)}
         offset += _LINE * len(PROCESSES)
+        self._generations = {
+            name: memory.word(shared, _LINE * index + 8) for index, name in enumerate(PROCESSES)
+        }
         self._estop = offset
+        self._release = memory.word(shared, offset + 8)
         offset += _LINE
         self.observation = Record(shared, offset, layout.observation_dtype())
         offset += Record.size(layout.observation_dtype())
@@ -116,17 +120,21 @@ class Page:
             self.rings[name] = Ring(shared, offset, capacity)
             offset += Ring.size(capacity)
         self.pictures = {}
-        for camera in layout.cameras:
+        for camera in layout.cameras if len(shared) >= self.size(layout) else ():
             self.pictures[camera] = PictureSlots(shared, offset, layout.picture_bytes)
             offset += PictureSlots.size(layout.picture_bytes)
 
-    @staticmethod
-    def size(layout: PageLayout) -> int:
+    @classmethod
+    def size(cls, layout: PageLayout) -> int:
         """Bytes of the shared file; pictures are sparse, so only what is used takes memory."""
+        pictures = len(layout.cameras) * PictureSlots.size(layout.picture_bytes)
+        return cls._size_of_numbers(layout) + pictures
+
+    @staticmethod
+    def _size_of_numbers(layout: PageLayout) -> int:
         fixed = _LINE * (len(PROCESSES) + 1)
         fixed += Record.size(layout.observation_dtype()) + Record.size(layout.control_dtype())
-        fixed += sum(Ring.size(capacity) for capacity in RING_BYTES.values())
-        return fixed + len(layout.cameras) * PictureSlots.size(layout.picture_bytes)
+        return fixed + sum(Ring.size(capacity) for capacity in RING_BYTES.values())
 
     @classmethod
     def create(cls, layout: PageLayout) -> tuple[Page, int]:
@@ -135,9 +143,9 @@ class Page:
         return cls(layout, memory.attach(descriptor)), descriptor
 
     @classmethod
-    def attach(cls, layout: PageLayout, descriptor: int) -> Page:
-        """The page behind an inherited descriptor."""
-        return cls(layout, memory.attach(descriptor))
+    def attach(cls, layout: PageLayout, descriptor: int, pictures: bool = True) -> Page:
+        """The page behind an inherited descriptor; without `pictures` for who locks its memory (control)."""
+        return cls(layout, memory.attach(descriptor, 0 if pictures else cls._size_of_numbers(layout)))
 
     def beat(self, process: str, now: float) -> None:
         """Say that `process` is alive at `now` (our monotonic clock)."""
@@ -146,6 +154,23 @@ class Page:
     def last_beat(self, process: str) -> float:
         """When `process` last said that it is alive; 0 = never."""
         return float(self._beats[process][0])
+
+    def generation(self, process: str) -> int:
+        """How often the supervisor has started `process`; a change means that it died and was restarted."""
+        return int(self._generations[process][0])
+
+    def set_generation(self, process: str, count: int) -> None:
+        """Written by the supervisor alone."""
+        self._generations[process][0] = count
+
+    @property
+    def releases(self) -> int:
+        """How often main has asked the guard to release the latch."""
+        return int(self._release[0])
+
+    def ask_release(self) -> None:
+        """Main's half of a release; the guard does it and clears the flag."""
+        self._release[0] = self.releases + 1
 
     @property
     def estop(self) -> EStop:

@@ -113,7 +113,9 @@ class SafetyFilter:
         """The verdict on `action` [D]; with report-only the action comes back unchanged, with the notes."""
         refusal = self._refusal(action, state, path)
         if refusal:
-            return Verdict(action if self._settings.report_only and _usable(action, state) else None, (refusal,))
+            return Verdict(
+                action if self._settings.report_only and _usable(action, state) else None, (refusal,)
+            )
         reachable, notes = self._reachable(action, state, path)
         violation = self._violation(reachable, state)
         if self._settings.report_only:
@@ -128,7 +130,10 @@ class SafetyFilter:
         if path == "motion":
             return ""
         return (
-            self._stale(state) or self._leaves_box(action) or self._runs_away(action, state) or self._jumps(action, state)
+            self._stale(state)
+            or self._leaves_box(action)
+            or self._runs_away(action, state)
+            or self._jumps(action, state)
         )
 
     def _stale(self, state: RobotState) -> str:

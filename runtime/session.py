@@ -33,6 +33,7 @@ class Happening(StrEnum):
     SETUP_FAILED = "setup_failed"
     HELD = "held"  # control holds, for a reason of its own
     RUN_ENDED = "run_ended"  # the run is over by itself: its time, its source
+    RUN_FAILED = "run_failed"  # it could not begin
     LEASE_ENDED = "lease_ended"
     ESTOPPED = "estopped"
     RELEASED = "released"
@@ -115,14 +116,12 @@ HAPPENINGS: dict[tuple[Happening, State], State] = {
     (Happening.HELD, S.SETTING_UP): S.IDLE,
     (Happening.RUN_ENDED, S.RUNNING): S.READY,
     (Happening.RUN_ENDED, S.HOLDING): S.READY,
+    (Happening.RUN_FAILED, S.RUNNING): S.READY,
     (Happening.LEASE_ENDED, S.RUNNING): S.HOLDING,
     (Happening.LEASE_ENDED, S.SETTING_UP): S.IDLE,
     (Happening.RELEASED, S.FAULTED): S.IDLE,
     **{(Happening.ESTOPPED, state): S.FAULTED for state in State if state is not S.FAULTED},
-    **{
-        (Happening.FAMILY_DIED, state): S.IDLE
-        for state in (S.READY, S.RUNNING, S.HOLDING, S.SETTING_UP)
-    },
+    **{(Happening.FAMILY_DIED, state): S.IDLE for state in (S.READY, S.RUNNING, S.HOLDING, S.SETTING_UP)},
 }
 
 
@@ -174,6 +173,8 @@ class Session:
             self._interrupt(before, reason)
         elif happening is Happening.RUN_ENDED:
             self._effects.end_run("finished", reason)
+        elif happening is Happening.RUN_FAILED:
+            self._effects.end_run("failed", reason)
         self._enter(after, reason)
         return True
 
@@ -191,7 +192,9 @@ class Session:
         if command.kind in LEASE_COMMANDS:
             return ""
         if command.kind not in COMMANDS and command.kind != "estop":
-            return f"unknown command {command.kind!r}; known: {', '.join([*COMMANDS, 'estop', *LEASE_COMMANDS])}"
+            return (
+                f"unknown command {command.kind!r}; known: {', '.join([*COMMANDS, 'estop', *LEASE_COMMANDS])}"
+            )
         if command.kind not in STOPPING:
             stale = self._staleness(command)
             if stale:
@@ -214,7 +217,9 @@ class Session:
     def _not_now(self, kind: str) -> str:
         if kind in self.allowed():
             return ""
-        return f"{kind} is not allowed while {self.state} ({self.reason}); allowed: {', '.join(self.allowed())}"
+        return (
+            f"{kind} is not allowed while {self.state} ({self.reason}); allowed: {', '.join(self.allowed())}"
+        )
 
     def _carry_out(self, command: Command) -> str:
         if command.kind in LEASE_COMMANDS:

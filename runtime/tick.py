@@ -62,7 +62,9 @@ class Tick:
         self._run = 0
         self._refused = 0
         self._starved_since: float | None = None
-        self._waiting = True  # for the first chunk of a run: no starvation yet, the policy's deadline bounds it
+        self._waiting = (
+            True  # for the first chunk of a run: no starvation yet, the policy's deadline bounds it
+        )
         self._outbox: list[ChunkMerged | Event] = []
         self._records_lost = 0
         self.orphaned = False
@@ -130,7 +132,9 @@ class Tick:
         arrival = Arrival(chunk.chunk_id, chunk.observation_step, chunk.rows)
         if self._starved_since is not None and not self._merge.waits:
             # The plan ran out: blend the new chunk over from the target that is being held.
-            self.timeline.replace(step, np.repeat(self._commanded[None], len(chunk.rows), 0), [()] * len(chunk.rows))
+            self.timeline.replace(
+                step, np.repeat(self._commanded[None], len(chunk.rows), 0), [()] * len(chunk.rows)
+            )
         merged = self._merge(self.timeline, arrival, step)
         self._waiting = self._waiting and bool(merged.dropped)
         self._outbox.append(
@@ -260,7 +264,9 @@ class Tick:
             self._say("refused", notes[-1], planned)
         if self._refused >= self._settings.safety.refusals_to_hold:
             count = self._refused
-            self._hold_because("refusals", f"{count} actions refused in a row, the last one: {notes[-1]}", planned)
+            self._hold_because(
+                "refusals", f"{count} actions refused in a row, the last one: {notes[-1]}", planned
+            )
         return self._stand(step, planned, target, notes, refused=True)
 
     def _stand(

@@ -1,0 +1,74 @@
+"""`python -m runtime DEPLOYMENT`: check, run in lockstep, or start a station's family of processes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from runtime import deployment, lockstep
+from runtime.errors import RuntimeFault
+from runtime.family import Plan, plan, start_log
+from runtime.supervisor import Supervisor
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit code 0 where all went well, 1 where the run failed, 2 where the deployment is wrong."""
+    parser = argparse.ArgumentParser(prog="python -m runtime", description=__doc__)
+    parser.add_argument("deployment", type=Path, help="a TOML file; deployments/ has examples")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument(
+        "--check", action="store_true", help="print the resolved deployment and its hash, start nothing"
+    )
+    how.add_argument("--lockstep", action="store_true", help="one process on a virtual clock")
+    how.add_argument(
+        "--headless", action="store_true", help="set up, run once, publish, end; holds the lease itself"
+    )
+    given = parser.parse_args(arguments)
+    start_log("supervisor")
+    try:
+        made = plan(deployment.load(given.deployment, given.assignments))
+    except RuntimeFault as fault:
+        print(fault, file=sys.stderr)
+        return 2
+    try:
+        if given.check:
+            return _check(made)
+        if given.lockstep:
+            return _lockstep(made)
+        return Supervisor(made).run(given.headless)
+    except RuntimeFault as fault:
+        print(f"error: {fault}", file=sys.stderr)
+        return 1
+
+
+def _check(made: Plan) -> int:
+    print(json.dumps(dict(made.resolved.tree), indent=1))
+    print(f"hash {made.resolved.digest}")
+    robot = made.robot
+    print(
+        f"ok: {robot.name}, {robot.dim} joints, {len(robot.cameras)} cameras, {made.rate:g} Hz, {made.fps:g} fps"
+    )
+    return 0
+
+
+def _lockstep(made: Plan) -> int:
+    done = lockstep.run(made)
+    episode = done.episode
+    print(f"{done.state}: {done.reason}")
+    print(
+        f"episode  {episode.get('path', 'none')}  {episode.get('rows', 0)} rows, {episode.get('status', '')}"
+    )
+    if made.deployment.publish.dataset and episode.get("status") == "finished":
+        from runtime.datasets.published import publish
+
+        published = publish(Path(episode["path"]), made.deployment.data / made.deployment.publish.dataset)
+        print(f"dataset  {published.dataset}  episode {published.episode_index}, {published.frames} frames")
+    return 0 if episode.get("status", "finished") == "finished" else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

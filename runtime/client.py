@@ -1,0 +1,136 @@
+"""A client of one station: what the terminal, the headless driver and scripts command it with."""
+
+from __future__ import annotations
+
+import getpass
+import socket
+import time
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from runtime.bus import CommandClient, Endpoints, Subscriber
+from runtime.errors import RuntimeFault, TransportError
+from runtime.messages import Ack, Command
+
+RENEW_S = 1.0
+
+
+class Refused(RuntimeFault):
+    """The station refused a command; the message is its reason."""
+
+
+class StationClient:
+    """Finds the station in its folder, holds a lease where asked to, gives commands.
+
+    Every command is decided by the newest status this client has seen; the station refuses it as stale where
+    something has changed since.
+    """
+
+    def __init__(self, station_dir: Path, holder: str = "") -> None:
+        self.holder = holder or f"terminal:{getpass.getuser()}@{socket.gethostname()}"
+        self._endpoints = Endpoints(station_dir)
+        self._context = zmq.Context.instance()
+        self._commands: CommandClient | None = None
+        self._endpoint = ""
+        self._epoch = 0
+        self._boot = ""
+        self._sequence = 0
+        self._clock_offset = 0.0
+        self._renewed = 0.0
+
+    def status(self, timeout: float = 2.0) -> dict[str, Any]:
+        """The station's snapshot; raises TransportError where it does not answer."""
+        asked = time.monotonic()
+        data = dict(self._send(Command(str(uuid.uuid4()), "status"), timeout).data)
+        self._boot, self._sequence = data["boot"], data["sequence"]
+        self._clock_offset = data["clock"] - asked
+        return data
+
+    def events_since(self, number: int) -> list[dict[str, Any]]:
+        """The station's events after `number`."""
+        ack = self._send(Command(str(uuid.uuid4()), "events_since", {"number": number}), 2.0)
+        return list(ack.data["events"])
+
+    def claim(self, epoch: int = 0) -> None:
+        """Take the lease where it is free (or ours); raises Refused with who holds it."""
+        ack = self._command("lease_claim", 2.0, epoch=epoch)
+        self._epoch = int(ack.data["epoch"])
+        self._renewed = time.monotonic()
+
+    def renew(self) -> None:
+        """Keep the lease; cheap to call often, it sends once a second."""
+        if time.monotonic() - self._renewed >= RENEW_S:
+            self._command("lease_renew", 2.0, epoch=self._epoch)
+            self._renewed = time.monotonic()
+
+    def give_up(self) -> None:
+        """End the lease before its time."""
+        self._command("lease_give_up", 2.0, epoch=self._epoch)
+
+    def command(self, kind: str, timeout: float = 2.0, identity: str = "") -> Ack:
+        """Give one command under the lease; raises Refused, or TransportError where the outcome is unknown."""
+        self.claim()
+        self.status()
+        return self._command(kind, timeout, epoch=self._epoch, identity=identity)
+
+    def estop(self, why: str) -> Ack:
+        """Press the software e-stop at the guard, which needs neither lease nor main."""
+        endpoint = self._endpoints.read("guard")["estop"]
+        client = CommandClient(self._context, endpoint)
+        try:
+            command = Command(str(uuid.uuid4()), "estop", {"why": why}, user=self.holder)
+            return client.request(command, 2.0)
+        finally:
+            client.close()
+
+    def subscribe(self, *streams: str) -> Subscriber:
+        """The station's live streams: state, joints, event."""
+        return Subscriber(self._context, self._endpoints.read("main")["state"], *streams)
+
+    def wait(self, reached: Callable[[dict[str, Any]], bool], timeout: float) -> dict[str, Any]:
+        """The first status that satisfies `reached`, keeping a lease that is held; raises TransportError."""
+        deadline = time.monotonic() + timeout
+        while True:
+            status = self.status()
+            if reached(status):
+                return status
+            if time.monotonic() > deadline:
+                state, reason = status["state"], status["reason"]
+                raise TransportError(f"not reached within {timeout:g} s; the station is {state}: {reason}")
+            if self._epoch:
+                self.renew()
+            time.sleep(0.02)
+
+    def _command(self, kind: str, timeout: float, epoch: int = 0, identity: str = "") -> Ack:
+        command = Command(
+            identity or str(uuid.uuid4()),
+            kind,
+            user=self.holder,
+            holder=self.holder,
+            epoch=epoch,
+            boot=self._boot,
+            sequence=self._sequence,
+            valid_until=time.monotonic() + self._clock_offset + timeout,
+        )
+        ack = self._send(command, timeout)
+        self._sequence = max(self._sequence, ack.sequence)
+        if ack.status in ("refused", "failed"):
+            raise Refused(ack.reason)
+        return ack
+
+    def _send(self, command: Command, timeout: float) -> Ack:
+        endpoint = self._endpoints.read("main")["commands"]
+        if self._commands is None or endpoint != self._endpoint:
+            self.close()
+            self._commands, self._endpoint = CommandClient(self._context, endpoint), endpoint
+        return self._commands.request(command, timeout)
+
+    def close(self) -> None:
+        """Close the connection; the next request opens another."""
+        if self._commands is not None:
+            self._commands.close()
+            self._commands = None

@@ -1,0 +1,125 @@
+"""`python -m runtime.ctl STATION COMMAND`: command and watch a station from a terminal."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from runtime.client import Refused, StationClient
+from runtime.errors import RuntimeFault
+
+# Commands that go on after they were accepted: the terminal stays, keeps the lease, and Ctrl-C stops.
+_LASTING = {"setup": ("setting_up",), "home": ("setting_up",), "run": ("running",), "resume": ("running",)}
+_AT_ONCE = ("stop", "halt", "release")
+_GOOD_END = ("ready", "idle")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit code 0 where the command was done, 1 where it was refused or failed."""
+    parser = argparse.ArgumentParser(prog="python -m runtime.ctl", description=__doc__)
+    parser.add_argument("station")
+    parser.add_argument("command", choices=[*_LASTING, *_AT_ONCE, "estop", "status", "watch", "record"])
+    parser.add_argument("what", nargs="?", help="record: start or stop; estop: why")
+    parser.add_argument("--data-dir", default=os.environ.get("EVA_DATA_DIR", "data"))
+    parser.add_argument("--json", action="store_true", help="status and watch as JSON")
+    given = parser.parse_args(arguments)
+    if given.command == "record" and given.what not in ("start", "stop"):
+        parser.error("record needs start or stop")
+    client = StationClient(Path(given.data_dir).absolute() / "stations" / given.station)
+    try:
+        return _do(client, given)
+    except Refused as refusal:
+        print(f"refused: {refusal}", file=sys.stderr)
+    except RuntimeFault as fault:
+        print(f"error: {fault}", file=sys.stderr)
+    except KeyboardInterrupt:
+        return 130
+    finally:
+        client.close()
+    return 1
+
+
+def _do(client: StationClient, given: argparse.Namespace) -> int:
+    if given.command == "estop":
+        ack = client.estop(given.what or "pressed in a terminal")
+        print(f"{ack.status}: {ack.reason}")
+        return 0 if ack.status == "done" else 1
+    if given.command == "status":
+        status = client.status()
+        print(json.dumps(status, indent=1, default=str) if given.json else line(status))
+        return 0
+    if given.command == "watch":
+        return _watch(client, given.json)
+    if given.command == "record":
+        client.command(f"record_{given.what}")
+    elif given.command in _AT_ONCE:
+        client.command(given.command)
+    else:
+        return _attend(client, given.command)
+    print(line(client.status()))
+    return 0
+
+
+def _attend(client: StationClient, kind: str) -> int:
+    """Give a lasting command and stay with it: the lease lives as long as this terminal."""
+    client.command(kind)
+    try:
+        status = client.status()
+        shown = 0.0
+        while status["state"] in _LASTING[kind]:
+            client.renew()
+            if time.monotonic() - shown > 0.5:
+                shown = time.monotonic()
+                print(line(status), flush=True)
+            time.sleep(0.05)
+            status = client.status()
+    except KeyboardInterrupt:
+        client.command("stop")
+        status = client.status()
+    print(line(status))
+    return 0 if status["state"] in _GOOD_END else 1
+
+
+def _watch(client: StationClient, as_json: bool) -> int:
+    client.status()
+    subscriber = client.subscribe("state", "event")
+    shown = 0.0
+    while True:
+        content = subscriber.receive(2.0)
+        if not content:
+            client.status()  # raises a sentence where the station is gone
+        if event := content.get("event"):
+            print(
+                json.dumps(event, default=str) if as_json else f"  {event['kind']}: {event['text']}",
+                flush=True,
+            )
+        if (status := content.get("state")) and time.monotonic() - shown > 0.5:
+            shown = time.monotonic()
+            print(json.dumps(status, default=str) if as_json else line(status), flush=True)
+
+
+def line(status: dict[str, Any]) -> str:
+    """One line of figures for a terminal."""
+    control, policy, link = status["control"], status["policy"], status["link"]
+    run = f"  run {status['run']['elapsed']:6.1f} s" if status["run"]["number"] else ""
+    rows = f"  {status['recording']['rows']} rows" if status["recording"]["uuid"] else ""
+    rates = " ".join(f"{name} {rate:.1f}" for name, rate in sorted(link["rates"].items()))
+    latency = policy["latency_p50_ms"]
+    asked = "" if math.isnan(latency) else f"  policy {latency:.0f} ms (delay {policy['delay_p50']:.0f})"
+    stage = f" {status['stage']}" if status["state"] == "setting_up" else ""
+    holder = status["lease"]["holder"] or "nobody"
+    return (
+        f"{status['station']}  {status['state'].upper()}{stage}: {status['reason']}{run}{rows}{asked}  "
+        f"tick p99 {control['lateness_p99_ms']:.2f} ms, {control['missed']} missed  Hz {rates or '-'}  lease {holder}"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

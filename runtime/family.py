@@ -1,0 +1,160 @@
+"""What every process of a family starts from: the deployment, its robot, the page, a lifeline, a log."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import select
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+import robots
+from robots import Robot
+from runtime import deployment
+from runtime.config import Deployment
+from runtime.deployment import Resolved
+from runtime.errors import ConfigurationError, SetupError
+from runtime.kinematics import numeric
+from runtime.page import Page, PageLayout
+from runtime.plugins import variants
+from runtime.safety import Limits
+from runtime.spaces import Spaces
+from runtime.transports.base import Capabilities
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A deployment with everything that can be known of it before anything is connected."""
+
+    resolved: Resolved
+    robot: Robot
+
+    @property
+    def deployment(self) -> Deployment:
+        return self.resolved.deployment
+
+    @property
+    def rate(self) -> float:
+        """Control ticks per second."""
+        return self.deployment.control.rate or self.robot.control_rate
+
+    @property
+    def fps(self) -> float:
+        """Rows of the dataset grid per second."""
+        return self.deployment.recording.fps or self.rate
+
+    @property
+    def transport(self) -> ModuleType:
+        return variants("runtime.transports")[self.deployment.transport.kind]
+
+    @property
+    def strategy(self) -> ModuleType:
+        return variants("runtime.strategies")[self.deployment.strategy.kind]
+
+    @property
+    def policy(self) -> ModuleType:
+        return variants("runtime.policies")[self.deployment.policy.kind]
+
+    @property
+    def capabilities(self) -> Capabilities:
+        found: Capabilities = self.transport.capabilities(self.deployment.transport)
+        return found
+
+    @property
+    def layout(self) -> PageLayout:
+        return PageLayout(
+            self.robot.dim, self.robot.eef_dim, tuple(camera.key for camera in self.robot.cameras)
+        )
+
+    @property
+    def limits(self) -> Limits:
+        robot = self.robot
+        grippers, binary = [False] * robot.dim, [False] * robot.dim
+        for dim in robot.gripper_dims:
+            grippers[dim] = True
+        for dim in robot.binary_dims:
+            binary[dim] = True
+        return Limits(
+            robot.joint_names, robot.lower, robot.upper, robot.velocity, np.array(grippers), np.array(binary)
+        )
+
+    def spaces(self) -> Spaces:
+        """The robot's action spaces, with its kinematics."""
+        return Spaces(self.robot, numeric.build(numeric.Config(), self.robot), self.rate)
+
+
+def plan(resolved: Resolved) -> Plan:
+    """Check that the parts of a deployment fit each other; raises ConfigurationError or SetupError."""
+    settings = resolved.deployment
+    try:
+        robot = robots.load(settings.robot)
+    except robots.RobotError as error:
+        raise ConfigurationError(str(error)) from None
+    made = Plan(resolved, robot)
+    if settings.setup.pose not in robot.poses:
+        raise ConfigurationError(
+            f"setup.pose = {settings.setup.pose!r}: {robot.name} has {', '.join(sorted(robot.poses))}"
+        )
+    unknown = set(settings.safety.workspace) - {arm.name for arm in robot.arms}
+    if unknown:
+        arms = ", ".join(arm.name for arm in robot.arms)
+        raise ConfigurationError(f"safety.workspace.{min(unknown)}: {robot.name} has the arms {arms}")
+    if settings.safety.report_only and made.capabilities.moves_robot:
+        raise SetupError(
+            f"safety.report_only = true with transport {settings.transport.kind!r}: it can move a robot; "
+            "report-only is for transports that cannot (dataset)"
+        )
+    return made
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One process of a family: what it works with."""
+
+    plan: Plan
+    page: Page
+    boot: str  # of the supervisor: names this start of the station
+    lifeline: Lifeline
+
+
+class Lifeline:
+    """Standard input, held open by the supervisor; its end is the supervisor's end, however it came."""
+
+    def __init__(self, descriptor: int = 0) -> None:
+        self._descriptor = descriptor
+
+    @property
+    def cut(self) -> bool:
+        """Whether the supervisor is gone."""
+        readable, _, _ = select.select([self._descriptor], [], [], 0)
+        return bool(readable) and os.read(self._descriptor, 4096) == b""
+
+
+def join(process: str, pictures: bool = True) -> Member:
+    """Read what the supervisor handed over on the command line."""
+    parser = argparse.ArgumentParser(prog=f"runtime.{process}", description="started by the supervisor")
+    parser.add_argument("--resolved", required=True)
+    parser.add_argument("--page", required=True, type=int)
+    parser.add_argument("--boot", required=True)
+    given = parser.parse_args()
+    start_log(process)
+    tree = json.loads(Path(given.resolved).read_text("utf-8"))
+    made = plan(deployment.resolve(tree, {}, given.resolved))
+    return Member(made, Page.attach(made.layout, given.page, pictures), given.boot, Lifeline())
+
+
+def start_log(process: str) -> None:
+    """Log lines on standard error: time, process, level, sentence."""
+    logging.basicConfig(
+        stream=sys.stderr,
+        level=os.environ.get("EVA_LOG_LEVEL", "INFO"),
+        format=f"%(asctime)s {process:<10} %(levelname)-7s %(message)s",
+        datefmt="%H:%M:%S",
+        force=True,
+    )

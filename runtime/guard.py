@@ -1,0 +1,106 @@
+"""The process that holds the e-stop: its socket, the latch on disk, the flag that every send checks."""
+
+from __future__ import annotations
+
+import logging
+
+import zmq
+
+from runtime.bus import CommandServer, Endpoints
+from runtime.clock import Clock, MonotonicClock
+from runtime.family import Member, join
+from runtime.latch import Latch
+from runtime.messages import Ack, Command
+from runtime.page import EStop, Page
+
+log = logging.getLogger(__name__)
+_POLL_S = 0.005
+_OUTLIVES_S = 1.0  # how long it stays after control's own end, so that a press is possible to the last
+
+
+class Guard:
+    """Presses and releases; the flag first, the disk second, so that no disk delays a stop."""
+
+    def __init__(self, page: Page, latch: Latch, clock: Clock, period: float) -> None:
+        self._page = page
+        self._latch = latch
+        self._clock = clock
+        self._patience = max(0.05, 2.0 * period)
+        self._releases = page.releases
+        latched = latch.read()
+        # A restarted guard also trusts the flag of its predecessor, which may not have reached the disk.
+        page.set_estop(EStop.LATCHED if latched or page.estop is EStop.LATCHED else EStop.CLEAR)
+        if latched:
+            log.warning("e-stop is latched since before this start, by %s: %s", latched.by, latched.why)
+
+    def press(self, by: str, why: str) -> str:
+        """Raise the flag, then latch on disk; returns "" or why the latch will not outlive a restart."""
+        self._page.set_estop(EStop.LATCHED)
+        log.warning("E-STOP by %s: %s", by, why)
+        try:
+            self._latch.set(by, why)
+        except OSError as error:
+            log.error("the e-stop is not on disk: %s", error)
+            return f"; not on disk ({error.strerror}): a restart of the station will forget it"
+        return ""
+
+    def watch(self) -> None:
+        """Release where main has asked for it; main has checked the lease."""
+        if self._page.releases != self._releases:
+            self._releases = self._page.releases
+            self._latch.clear()
+            self._page.set_estop(EStop.CLEAR)
+            log.warning("e-stop released")
+
+    def obeyed(self) -> bool:
+        """Whether control obeys, waiting at most max(50 ms, 2 ticks)."""
+        until = self._clock.now() + self._patience
+        while self._clock.now() < until:
+            if self._page.control.read()["estop_obeyed"]:
+                return True
+            self._clock.sleep_until(self._clock.now() + 0.002)
+        return bool(self._page.control.read()["estop_obeyed"])
+
+    def answer(self, command: Command) -> Ack:
+        """Any user may press; "failed" means that control did not answer in time: use the hardware stop."""
+        if command.kind == "estop":
+            why = str(command.args.get("why", "pressed"))
+            doubt = self.press(command.user or command.holder or "unknown", why)
+            if self.obeyed():
+                return Ack(command.uuid, "done", "every tick now sends the measured position" + doubt)
+            return Ack(
+                command.uuid,
+                "failed",
+                f"latched, but control has not obeyed within {self._patience * 1000:.0f} ms: USE THE HARDWARE STOP",
+            )
+        if command.kind == "status":
+            latched = self._latch.read()
+            data = {"latched": latched is not None, "by": latched.by if latched else ""}
+            return Ack(command.uuid, "done", data=data)
+        return Ack(command.uuid, "refused", f"the guard knows estop and status, not {command.kind!r}")
+
+
+def main() -> None:
+    """Guard until the supervisor is gone and control has stopped ticking."""
+    member = join("guard")
+    settings, clock = member.plan.deployment, MonotonicClock()
+    server = CommandServer(zmq.Context.instance(), settings.bus.host, settings.bus.estop_port)
+    guard = Guard(member.page, Latch(settings.station_dir), clock, 1.0 / member.plan.rate)
+    Endpoints(settings.station_dir).write("guard", {"estop": server.endpoint})
+    while _needed(member, clock.now()):
+        member.page.beat("guard", clock.now())
+        guard.watch()
+        if server.socket.poll(int(_POLL_S * 1000)):
+            received = server.receive()
+            if isinstance(received, tuple):
+                address, command = received
+                server.answer(address, guard.answer(command))
+    server.close()
+
+
+def _needed(member: Member, now: float) -> bool:
+    return not member.lifeline.cut or now - member.page.last_beat("control") < _OUTLIVES_S
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,233 @@
+"""From observations to chunks: when the query half says so, ask the policy and post the answer to control."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from runtime.clock import Clock
+from runtime.errors import PolicyError, RuntimeFault
+from runtime.messages import ChunkMerged, Event, PolicyAnswer, PostedChunk
+from runtime.orders import Orders
+from runtime.page import Page
+from runtime.policies.base import Policy
+from runtime.spaces import Spaces
+from runtime.strategies.base import Progress, Query
+from runtime.timeline import resample
+from runtime.types import ActionChunk, Float64, Observation
+
+Result = TypeVar("Result")
+
+
+class Runner(ABC):
+    """Where blocking calls to the policy are made, one after the other."""
+
+    @abstractmethod
+    def submit(self, call: Callable[[], Result]) -> Future[Result]:
+        """Start `call`; its result is in the future when `ready` says so."""
+
+    @abstractmethod
+    def ready(self, future: Future[Result]) -> bool: ...
+
+    def tick(self) -> None:
+        """One control period has passed (for runners that count)."""
+
+    def close(self) -> None:
+        """Take no further calls."""
+
+
+class ThreadRunner(Runner):
+    """One thread of its own, so that a slow policy never stops main."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
+
+    def submit(self, call: Callable[[], Result]) -> Future[Result]:
+        return self._pool.submit(call)
+
+    def ready(self, future: Future[Result]) -> bool:
+        return future.done()
+
+    def close(self) -> None:
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+class LockstepRunner(Runner):
+    """Calls at once and hands the result over `delay` ticks later, the same on every run."""
+
+    def __init__(self, delay: int) -> None:
+        self._delay = delay
+        self._now = 0
+        self._due: dict[int, int] = {}
+
+    def submit(self, call: Callable[[], Result]) -> Future[Result]:
+        future: Future[Result] = Future()
+        try:
+            future.set_result(call())
+        except RuntimeFault as error:
+            future.set_exception(error)
+        self._due[id(future)] = self._now + self._delay
+        return future
+
+    def ready(self, future: Future[Result]) -> bool:
+        return self._now >= self._due.get(id(future), 0)
+
+    def tick(self) -> None:
+        self._now += 1
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """An inference that came back: the chunk, how long it took [s], what it was asked about."""
+
+    chunk: ActionChunk
+    seconds: float
+    observation: Observation
+
+
+@dataclass(frozen=True, slots=True)
+class InferenceSettings:
+    """What inference goes by."""
+
+    control_rate: float
+    task: str
+    joint_age: float
+    picture_age: float
+    switched: tuple[int, ...]  # binary dimensions
+
+
+class Inference:
+    """Asks the policy during a run and posts what it answers; one request in flight."""
+
+    def __init__(
+        self,
+        policy: Policy,
+        query: Query,
+        spaces: Spaces,
+        page: Page,
+        orders: Orders,
+        runner: Runner,
+        clock: Clock,
+        settings: InferenceSettings,
+    ) -> None:
+        self.policy = policy
+        self.runner = runner
+        self._query = query
+        self._spaces = spaces
+        self._page = page
+        self._orders = orders
+        self._clock = clock
+        self._settings = settings
+        self._run = 0
+        self._fresh = True
+        self._flight: Future[Answered] | None = None
+        self._unmerged: set[int] = set()
+        self._asked_at = float("-inf")
+        self.latencies: deque[float] = deque(maxlen=200)  # [s]
+        self.delays: deque[int] = deque(maxlen=200)  # control steps
+        self.notes: list[Event] = []  # for main to collect
+
+    # --- asking --------------------------------------------------------------------------------------------
+
+    def observe(self) -> Observation:
+        """The newest observation as the policy is shown it; raises PolicyError where there is none, or it is old."""
+        seen = self._page.read_observation(self._page.layout.cameras)
+        if seen is None:
+            raise PolicyError("no observation has arrived yet")
+        now, bounds = self._clock.now(), self._settings
+        for stream, captured in seen.captured.items():
+            allowed = bounds.joint_age if stream in ("joints", "eef") else bounds.picture_age
+            if not now - captured <= allowed:
+                raise PolicyError(f"{stream} is {now - captured:.2f} s old, allowed {allowed:g}")
+        missing = [camera for camera in self._page.layout.cameras if camera not in seen.pictures]
+        if missing:
+            raise PolicyError(f"no picture has arrived from {', '.join(missing)}")
+        status = self._page.control.read()
+        step = int(status["step"]) + (seen.sequence != int(status["sequence"]))
+        return replace(seen, step=step, prompt=self._settings.task)
+
+    def ask(self) -> Future[Answered]:
+        """Send one request about the newest observation; raises PolicyError where that is too old."""
+        observation = self.observe()
+        fresh, self._fresh = self._fresh, False
+        return self.runner.submit(lambda: self._infer(observation, fresh))
+
+    def _infer(self, observation: Observation, fresh: bool) -> Answered:
+        if fresh:
+            self.policy.reset()
+        begun = self._clock.now()
+        if observation.eef is None:
+            observation = replace(observation, eef=self._spaces.eef_of(observation.qpos))
+        chunk = self.policy.infer(observation)
+        return Answered(chunk, self._clock.now() - begun, observation)
+
+    def command_rows(self, answered: Answered) -> tuple[Float64, np.ndarray]:
+        """The answer as rows in command space at control rate, and the policy row each was made from."""
+        rows, solved = self._spaces.to_command(answered.chunk, answered.observation.qpos)
+        if solved is not None and not solved.reached.all():
+            missed = int((~solved.reached).any(axis=1).sum())
+            worst = float(solved.position_error.max()) * 1000
+            text = f"{missed} of {len(rows)} poses cannot be reached, the worst by {worst:.1f} mm: nearest joints taken"
+            self.notes.append(Event("ik_unreached", text, self._clock.now(), answered.observation.step))
+        rate = answered.chunk.rate or self._settings.control_rate
+        return resample(rows, rate, self._settings.control_rate, self._settings.switched)
+
+    # --- a run ---------------------------------------------------------------------------------------------
+
+    def begin(self, run: int, fresh: bool) -> None:
+        """Ask from now on, for this run; `fresh` lets the policy forget the episode before."""
+        self._run = run
+        self._fresh = fresh
+        self._unmerged.clear()
+        self._asked_at = float("-inf")
+
+    def pause(self) -> None:
+        """Stop asking; an answer still in flight is ignored."""
+        self._run = 0
+        self._flight = None
+        self._unmerged.clear()
+
+    def merged(self, merged: ChunkMerged) -> None:
+        """Control has put a chunk on the timeline, or dropped it."""
+        self._unmerged.discard(merged.chunk_id)
+        if merged.run == self._run:
+            self.delays.append(merged.delay)
+
+    def pump(self) -> PolicyAnswer | None:
+        """Collect an answer, or ask; returns the answer for the record. Raises PolicyError where the policy fails."""
+        if not self._run:
+            return None
+        if self._flight is not None:
+            if not self.runner.ready(self._flight):
+                return None
+            answer = self._post(self._flight.result())
+            self._flight = None
+            return answer
+        if self._query.wants(self._progress()):
+            self._asked_at = self._clock.now()
+            self._flight = self.ask()
+            if self.runner.ready(self._flight):
+                return self.pump()
+        return None
+
+    def _progress(self) -> Progress:
+        remaining = int(self._page.control.read()["remaining"])
+        return Progress(remaining, bool(self._unmerged), self._clock.now() - self._asked_at)
+
+    def _post(self, answered: Answered) -> PolicyAnswer:
+        rows, source = self.command_rows(answered)
+        number = self._orders.next_chunk()
+        step = answered.observation.step
+        self._orders.post(PostedChunk(number, self._run, step, rows))
+        self._unmerged.add(number)
+        self.latencies.append(answered.seconds)
+        chunk = answered.chunk
+        return PolicyAnswer(
+            number, self._run, step, chunk.actions, chunk.space, source, answered.seconds * 1000.0
+        )

@@ -1,0 +1,57 @@
+"""The e-stop latch on disk: it outlives every process and is read before the first command after a restart."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class Latched:
+    """Who pressed, why, when (Unix time)."""
+
+    by: str
+    why: str
+    wall: float
+
+
+class Latch:
+    """One file; there = latched."""
+
+    def __init__(self, station_dir: Path) -> None:
+        self._path = station_dir / "estop.json"
+
+    def read(self) -> Latched | None:
+        """The latch as it stands; an unreadable file counts as latched."""
+        try:
+            return Latched(**json.loads(self._path.read_text("utf-8")))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, TypeError) as error:
+            return Latched("unknown", f"the latch file cannot be read ({error})", 0.0)
+
+    def set(self, by: str, why: str) -> Latched:
+        """Latch on disk, synced."""
+        latched = Latched(by, why, time.time())
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with self._path.open("w", encoding="utf-8") as file:
+            json.dump(asdict(latched), file)
+            file.flush()
+            os.fsync(file.fileno())
+        self._sync_folder()
+        return latched
+
+    def clear(self) -> None:
+        """Release."""
+        self._path.unlink(missing_ok=True)
+        self._sync_folder()
+
+    def _sync_folder(self) -> None:
+        folder = os.open(self._path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)

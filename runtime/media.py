@@ -1,0 +1,292 @@
+"""The process that receives every observation, records, and makes previews; the one writer of an episode."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from runtime.clock import Clock, MonotonicClock
+from runtime.errors import RecordingError, RuntimeFault
+from runtime.family import Member, Plan, join
+from runtime.messages import (
+    BeginEpisode,
+    ChunkMerged,
+    EndEpisode,
+    EpisodeClosed,
+    EpisodeOpened,
+    Event,
+    MediaReport,
+    Message,
+    PolicyAnswer,
+    TickDone,
+    decode,
+    encode,
+    event_row,
+)
+from runtime.page import Page
+from runtime.recorder import Grid, Recorder
+from runtime.recording.episode import EpisodeJournal
+from runtime.recording.repair import repair
+from runtime.transports.base import Source
+from runtime.types import Observation
+
+log = logging.getLogger(__name__)
+_REPORT_PERIOD = 0.2
+_RATE_WINDOW = 40  # arrivals per stream
+
+
+class Media:
+    """One `pump` receives what there is, passes it on, and writes it down; lockstep calls it tick by tick."""
+
+    def __init__(
+        self,
+        page: Page,
+        source: Source,
+        recorder: Recorder,
+        clock: Clock,
+        preview: Callable[[Observation], None] = lambda observation: None,
+    ) -> None:
+        self._page = page
+        self._source = source
+        self._recorder = recorder
+        self._clock = clock
+        self._preview = preview
+        self._numbers: Counter[str] = Counter({c: self._newest(c) for c in page.layout.cameras})
+        self._captured: dict[str, float] = {}
+        self._arrivals: dict[str, deque[float]] = {}
+        self._next_report = 0.0
+        self._faults: dict[str, int] = {}
+        for ring in ("minutes", "ticks"):
+            for _ in page.rings[ring].drain():
+                pass  # addressed to a predecessor that died
+
+    def _newest(self, camera: str) -> int:
+        record = self._page.observation.read()
+        return int(record["picture_number"][self._page.layout.cameras.index(camera)])
+
+    @property
+    def recording(self) -> bool:
+        return bool(self._recorder.recording)
+
+    def pump(self, timeout: float) -> None:
+        """Take one observation if there is one within `timeout` seconds, then all that the family has to say."""
+        observation = self._source.receive(timeout)
+        if observation is not None:
+            self._take(observation)
+        self.digest()
+
+    def digest(self) -> None:
+        """Write down what control and main have posted."""
+        for ring in ("minutes", "ticks"):
+            for payload in self._page.rings[ring].drain():
+                self._hear(decode(payload))
+        now = self._clock.now()
+        if now >= self._next_report:
+            self._next_report = now + _REPORT_PERIOD
+            self._report(now)
+
+    # --- observations --------------------------------------------------------------------------------------
+
+    def _take(self, observation: Observation) -> None:
+        for camera, picture in observation.pictures.items():
+            captured = observation.captured.get(camera, observation.arrived)
+            if camera in self._numbers and captured != self._captured.get(camera):
+                self._captured[camera] = captured
+                self._numbers[camera] += 1
+                self._page.pictures[camera].write(self._numbers[camera], picture)
+                self._count(camera, observation.arrived)
+        self._count("joints", observation.arrived)
+        self._recorder.see(observation)
+        self._page.publish_observation(observation, self._numbers)
+        self._preview(observation)
+
+    def _count(self, stream: str, arrived: float) -> None:
+        self._arrivals.setdefault(stream, deque(maxlen=_RATE_WINDOW)).append(arrived)
+
+    def _rate(self, stream: str, now: float) -> float:
+        times = self._arrivals[stream]
+        if len(times) < 2 or now - times[-1] > 2.0:
+            return 0.0
+        return (len(times) - 1) / max(times[-1] - times[0], 1e-9)
+
+    # --- what the family says ------------------------------------------------------------------------------
+
+    def _hear(self, message: Message) -> None:
+        try:
+            self._write(message)
+        except RecordingError as error:
+            self._fail(error)
+
+    def _write(self, message: Message) -> None:
+        recorder = self._recorder
+        if isinstance(message, TickDone):
+            recorder.tick(message)
+        elif isinstance(message, ChunkMerged):
+            recorder.merged(message)
+        elif isinstance(message, PolicyAnswer):
+            recorder.answered(message)
+        elif isinstance(message, Event):
+            recorder.mark(event_row(message))
+        elif isinstance(message, BeginEpisode):
+            self._begin(message)
+        elif isinstance(message, EndEpisode):
+            self.end(message.status, message.reason, message.details)
+
+    def _begin(self, message: BeginEpisode) -> None:
+        identity, path, error = "", Path(), ""
+        if message.manifest is not None:
+            try:
+                identity, path = self._recorder.begin(message.manifest, message.run)
+            except RecordingError as fault:
+                error = str(fault)
+        if not error and message.run:
+            self._source.begin_run()
+            first = self._source.receive(0.0)  # so that the run's first tick sees its first frame
+            if first is not None:
+                self._take(first)
+        self._tell(EpisodeOpened(message.run, identity, str(path), error))
+
+    def end(self, status: str, reason: str, details: Mapping[str, Any] | None = None) -> None:
+        """Close the open episode, if there is one."""
+        if self._recorder.recording:
+            closed = self._recorder.end(status, reason, details or {})  # type: ignore[arg-type]
+            self._tell(
+                EpisodeClosed(
+                    closed.uuid, str(closed.path), closed.status, closed.reason, closed.rows, closed.error
+                )
+            )
+
+    def _fail(self, error: RecordingError) -> None:
+        log.error("recording failed: %s", error)
+        self._tell(Event("recording_failed", str(error), self._clock.now()))
+        self.end("failed", str(error))
+
+    def _report(self, now: float) -> None:
+        faults = self._source.faults()
+        for name, count in faults.items():
+            if count > self._faults.get(name, 0):
+                text = f"source: {name.replace('_', ' ')} ({count} so far)"
+                self._tell(Event(f"source_{name}", text, now, data={"count": count}))
+        self._faults = dict(faults)
+        rates = {stream: self._rate(stream, now) for stream in self._arrivals}
+        recorder = self._recorder
+        self._tell(MediaReport(now, rates, faults, recorder.rows, recorder.recording, 0))
+
+    def _tell(self, message: Message) -> None:
+        if not self._page.rings["media_events"].push(encode(message)):
+            log.warning("main does not read: %s lost", type(message).__name__)
+
+
+def make_recorder(plan: Plan, now: Callable[[], float], patient: bool = False) -> Recorder:
+    """The recorder of a deployment; `patient` waits for encoders, as lockstep may."""
+    robot, spaces = plan.robot, plan.spaces()
+    described = {
+        "name": robot.name,
+        "joint_names": list(robot.joint_names),
+        "eef_names": list(robot.eef_names),
+        "dim": robot.dim,
+        "eef_dim": robot.eef_dim,
+    }
+    root = plan.deployment.episodes_dir
+    journal = EpisodeJournal(root, plan.deployment.recording, patient=patient)
+    grid = Grid(described, plan.layout.cameras, plan.rate, plan.fps, spaces.eef_of)
+    return Recorder(journal, root, grid, now)
+
+
+class _Previews:
+    """JPEG previews of every camera on the bus, at most at a rate."""
+
+    def __init__(self, member: Member) -> None:
+        import zmq
+
+        from runtime.bus import CAMERA_HIGH_WATER, Endpoints, Publisher
+
+        settings = member.plan.deployment.bus
+        self._publisher = Publisher(
+            zmq.Context.instance(), settings.host, settings.camera_port, CAMERA_HIGH_WATER
+        )
+        self._period = 1.0 / settings.preview_rate if settings.preview_rate else float("inf")
+        self._height = settings.preview_height
+        self._due: dict[str, float] = {}
+        Endpoints(member.plan.deployment.station_dir).write("media", {"cameras": self._publisher.endpoint})
+
+    def __call__(self, observation: Observation) -> None:
+        import numpy as np
+        import simplejpeg
+
+        for camera, picture in observation.pictures.items():
+            if observation.arrived < self._due.get(camera, 0.0):
+                continue
+            # A little early counts, so that 15 of 30 pictures a second are shown and not 10.
+            self._due[camera] = observation.arrived + 0.9 * self._period
+            stride = max(1, picture.shape[0] // self._height)
+            small = np.ascontiguousarray(picture[::stride, ::stride])
+            self._publisher.publish(f"camera/{camera}", simplejpeg.encode_jpeg(small, quality=80))
+
+
+def _repair_leftovers(plan: Plan) -> None:
+    """Close what this station's last start left open: nobody else writes its episodes."""
+    for manifest in plan.deployment.episodes_dir.glob("*/manifest.json"):
+        if (manifest.parent / "outcome.json").exists() or _station_of(manifest) != plan.deployment.station:
+            continue
+        log.warning("an episode was left open: %s", repair(manifest.parent))
+
+
+def _station_of(manifest: Path) -> str:
+    try:
+        return str(json.loads(manifest.read_text("utf-8"))["station"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        log.error("%s cannot be read (%r): left as it is", manifest, error)
+        return ""
+
+
+def main() -> None:
+    """Run media until the supervisor is gone."""
+    member = join("media")
+    plan, page = member.plan, member.page
+    clock = MonotonicClock()
+    _repair_leftovers(plan)
+    source: Source = plan.transport.source(plan.deployment.transport, plan.robot, clock)
+    media = Media(page, source, make_recorder(plan, clock.now), clock, _Previews(member))
+    connected = False
+    try:
+        while not member.lifeline.cut:
+            now = clock.now()
+            page.beat("media", now)
+            connected = connected or _connect(source, now)
+            if connected:
+                media.pump(0.005)
+            else:
+                media.digest()
+                clock.sleep_until(now + 0.1)
+            silent = now - page.last_beat("main")
+            if media.recording and silent > plan.deployment.control.heartbeat_timeout_s:
+                media.end("interrupted", f"main has given no sign of life for {silent:.1f} s")
+    finally:
+        media.end("interrupted", "the station's supervisor ended")
+        source.close()
+
+
+_retry_at = 0.0
+
+
+def _connect(source: Source, now: float) -> bool:
+    """Connect, at most once a second; says why it could not."""
+    global _retry_at
+    if now < _retry_at:
+        return False
+    try:
+        source.connect()
+    except RuntimeFault as error:
+        log.warning("%s", error)
+        _retry_at = now + 1.0
+        return False
+    return True
+
+
+if __name__ == "__main__":
+    main()

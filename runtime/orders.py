@@ -1,0 +1,40 @@
+"""Main's side of the ring to control: numbered orders and chunks."""
+
+from __future__ import annotations
+
+from runtime.errors import RuntimeFault
+from runtime.messages import Message, Order, OrderKind, PostedChunk, encode
+from runtime.page import Page
+from runtime.types import Float64
+
+
+class Orders:
+    """Writes orders and chunks; only the thread that owns main's loop may call it."""
+
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._number = int(page.control.read()["order"])
+        self._chunk = 0
+
+    def give(self, kind: OrderKind, *, run: int = 0, goal: Float64 | None = None, reason: str = "") -> int:
+        """Tell control what to do; returns the order's number, which control's status shows once obeyed."""
+        self._number += 1
+        self._push(Order(self._number, kind, run, goal, reason))
+        return self._number
+
+    def obeyed(self, number: int) -> bool:
+        """Whether control has come to order `number`."""
+        return int(self._page.control.read()["order"]) >= number
+
+    def next_chunk(self) -> int:
+        """A new chunk number."""
+        self._chunk += 1
+        return self._chunk
+
+    def post(self, chunk: PostedChunk) -> None:
+        """Hand a chunk over, unmerged."""
+        self._push(chunk)
+
+    def _push(self, message: Message) -> None:
+        if not self._page.rings["orders"].push(encode(message)):
+            raise RuntimeFault("control does not read its orders: the ring is full; restart the station")

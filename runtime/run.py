@@ -1,0 +1,76 @@
+"""A run: from the moment it is asked for until its episode is on disk."""
+
+from __future__ import annotations
+
+import platform
+import time
+import uuid
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from typing import Any
+
+from runtime.family import Plan
+from runtime.policies.base import PolicyInfo
+
+_PACKAGES = ("eva-web", "numpy", "pyarrow", "av", "pyzmq", "msgpack")
+
+
+@dataclass(slots=True)
+class Run:
+    """One open run; times on our monotonic clock [s]."""
+
+    number: int
+    uuid: str
+    asked: float
+    begun: float | None = None  # control follows
+    held_since: float | None = None
+    held: float = 0.0  # in total
+
+    def hold(self, now: float) -> None:
+        """Its clock is paused."""
+        if self.held_since is None:
+            self.held_since = now
+
+    def resume(self, now: float) -> None:
+        """Its clock goes on."""
+        if self.held_since is not None:
+            self.held += now - self.held_since
+            self.held_since = None
+
+    def elapsed(self, now: float) -> float:
+        """Time it has run, without the time it was held."""
+        if self.begun is None:
+            return 0.0
+        return (self.held_since or now) - self.begun - self.held
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """What every manifest of this start of the runtime says."""
+
+    plan: Plan
+    boot: str
+    versions: dict[str, str] = field(
+        default_factory=lambda: {"python": platform.python_version()} | {p: version(p) for p in _PACKAGES}
+    )
+
+    def manifest(self, mode: str, info: PolicyInfo | None) -> dict[str, Any]:
+        """The manifest of a new episode, without what only media knows."""
+        settings = self.plan.deployment
+        return {
+            "uuid": str(uuid.uuid4()),
+            "station": settings.station,
+            "boot": self.boot,
+            "task": settings.task,
+            "operator": settings.operator,
+            "kind": settings.recording.kind,
+            "mode": mode,
+            "strategy": settings.strategy.kind,
+            "policy": {"kind": settings.policy.kind, "name": info.name, "metadata": dict(info.metadata)}
+            if info
+            else {"kind": settings.policy.kind},
+            "configuration": dict(self.plan.resolved.tree),
+            "configuration_hash": self.plan.resolved.digest,
+            "versions": self.versions,
+            "asked_wall": time.time(),
+        }

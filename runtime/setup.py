@@ -1,0 +1,161 @@
+"""What `setup` does, stage by stage, without ever blocking main: connect, observe, home, warm up, validate."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from enum import StrEnum
+
+import numpy as np
+
+from runtime.clock import Clock
+from runtime.errors import PolicyError, SetupError
+from runtime.family import Plan
+from runtime.inference import Answered, Inference
+from runtime.messages import Event
+from runtime.orders import Orders
+from runtime.page import Page
+from runtime.policies.base import PolicyInfo
+
+_SETTLE_S = 2.0  # for the arm to follow the last target of a motion
+_ARRIVED_RAD = 0.1
+
+
+class Stage(StrEnum):
+    """Where set-up is."""
+
+    IDLE = "idle"
+    CONNECT = "connecting to the policy"
+    OBSERVE = "waiting for a complete observation"
+    HOME = "going to the pose"
+    SETTLE = "waiting for the arm to arrive"
+    WARM_UP = "warming up the policy"
+
+
+class SetUp:
+    """A set-up in progress; `pump` advances it and is cheap."""
+
+    def __init__(self, plan: Plan, inference: Inference, orders: Orders, page: Page, clock: Clock) -> None:
+        self._plan = plan
+        self._inference = inference
+        self._orders = orders
+        self._page = page
+        self._clock = clock
+        self.stage = Stage.IDLE
+        self.info: PolicyInfo | None = None
+        self.validated = ""
+
+    @property
+    def active(self) -> bool:
+        return self.stage is not Stage.IDLE
+
+    def begin(self) -> None:
+        """Start from the first stage."""
+        self.info, self.validated = None, ""
+        self._homing_only = False
+        self._connection = self._inference.runner.submit(self._inference.policy.connect)
+        self._enter(Stage.CONNECT)
+
+    def begin_homing(self) -> None:
+        """Only go to the pose."""
+        self._homing_only = True
+        self._go()
+
+    def cancel(self) -> None:
+        """Stop where it is; a call to the policy that is under way is cut off."""
+        if self.stage in (Stage.CONNECT, Stage.WARM_UP):
+            self._inference.policy.close()
+        self.stage = Stage.IDLE
+
+    def heard(self, event: Event) -> None:
+        """Control's events: the one that says that the motion is done."""
+        if self.stage is Stage.HOME and event.kind == "motion_done":
+            self._enter(Stage.SETTLE)
+
+    def pump(self) -> bool:
+        """Advance; True when done. Raises RuntimeFault where it cannot go on."""
+        if self.stage is Stage.CONNECT:
+            if self._inference.runner.ready(self._connection):
+                self.info = self._connection.result()
+                self._enter(Stage.OBSERVE)
+        elif self.stage is Stage.OBSERVE:
+            return self._observe()
+        elif self.stage is Stage.SETTLE:
+            return self._settle()
+        elif self.stage is Stage.WARM_UP:
+            return self._warm_up()
+        return False
+
+    def _enter(self, stage: Stage) -> None:
+        self.stage = stage
+        self._since = self._clock.now()
+
+    def _waited(self) -> float:
+        return self._clock.now() - self._since
+
+    def _observe(self) -> bool:
+        settings = self._plan.deployment.setup
+        try:
+            self._inference.observe()
+        except PolicyError as error:
+            if self._waited() > settings.observation_timeout_s:
+                raise SetupError(
+                    f"no complete observation within {settings.observation_timeout_s:g} s: {error}"
+                ) from None
+            return False
+        if settings.home and self._plan.capabilities.moves_robot:
+            self._go()
+        else:
+            self._start_warm_up()
+        return False
+
+    def _go(self) -> None:
+        self._goal = self._plan.robot.poses[self._plan.deployment.setup.pose]
+        self._orders.give("motion", goal=np.array(self._goal, np.float64))
+        self._enter(Stage.HOME)
+
+    def _settle(self) -> bool:
+        measured = np.array(self._page.observation.read()["qpos"], np.float64)
+        limits = self._plan.limits
+        error = np.where(limits.grippers, 0.0, np.abs(measured - self._goal))
+        worst = int(error.argmax())
+        if error[worst] > _ARRIVED_RAD:
+            if self._waited() > _SETTLE_S:
+                raise SetupError(
+                    f"the arm did not arrive: {limits.names[worst]} is {error[worst]:.2f} rad from the pose "
+                    f"{self._plan.deployment.setup.pose!r}; is it blocked, or is another program commanding it?"
+                )
+            return False
+        if self._homing_only:
+            self.stage = Stage.IDLE
+            return True
+        self._start_warm_up()
+        return False
+
+    def _start_warm_up(self) -> None:
+        self._left = self._plan.deployment.setup.warmup_chunks
+        self._asked: Future[Answered] | None = None
+        self._enter(Stage.WARM_UP)
+
+    def _warm_up(self) -> bool:
+        if self._asked is None:
+            self._asked = self._inference.ask()
+            return False
+        if not self._inference.runner.ready(self._asked):
+            return False
+        answered, self._asked = self._asked.result(), None
+        self._validate(answered)
+        self._left -= 1
+        if self._left:
+            return False
+        self.stage = Stage.IDLE
+        return True
+
+    def _validate(self, answered: Answered) -> None:
+        rows, _ = self._inference.command_rows(answered)
+        limits = self._plan.limits
+        away = np.where(limits.grippers, 0.0, np.abs(rows[0] - answered.observation.qpos))
+        worst = int(away.argmax())
+        self.validated = (
+            f"{len(answered.chunk.actions)} rows in {answered.seconds * 1000:.0f} ms, the first at most "
+            f"{away[worst]:.3f} rad away ({limits.names[worst]})"
+        )

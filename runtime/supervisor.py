@@ -1,0 +1,144 @@
+"""The family's parent: starts control, main, media and guard, restarts what dies, ends what must end."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections import deque
+from pathlib import Path
+from types import FrameType
+from typing import IO
+
+from runtime.bus import Endpoints
+from runtime.errors import SetupError
+from runtime.family import Plan
+from runtime.page import PROCESSES, Page
+
+log = logging.getLogger(__name__)
+_START_ORDER = ("guard", "media", "control", "main")
+_MOST_RESTARTS, _RESTART_WINDOW_S = 5, 60.0
+_PATIENCE_S = 9.0  # after the lifeline is cut; then what is left is killed
+_POLL_S = 0.05
+
+
+class Supervisor:
+    """One family; everything it starts ends with it, however it ends."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._station_dir = plan.deployment.station_dir
+        self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._restarts: deque[float] = deque()
+        self._ending = False
+        self.boot = str(uuid.uuid4())
+
+    def run(self, headless: bool) -> int:
+        """Start, watch until a signal or the end of a headless run, end; returns the exit code."""
+        lock = self._lock()
+        Endpoints(self._station_dir).clear()
+        self._page, self._page_fd = Page.create(self._plan.layout)
+        self._resolved = self._write_resolved()
+        # Children hold the reading end as their standard input: it ends when this process does, however it does.
+        self._lifeline_out, self._lifeline_in = os.pipe()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+        try:
+            for process in _START_ORDER:
+                self._start(process)
+            driver = self._spawn("headless") if headless else None
+            return self._watch(driver)
+        finally:
+            self._end()
+            lock.close()
+
+    def _lock(self) -> IO[str]:
+        self._station_dir.mkdir(parents=True, exist_ok=True)
+        lock = (self._station_dir / "lock").open("a+", encoding="utf-8")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.seek(0)
+            raise SetupError(
+                f"station {self._plan.deployment.station!r} is already running (process {lock.read().strip() or '?'}); "
+                "end it first, or give this one another name with --set station=NAME"
+            ) from None
+        lock.truncate(0)
+        lock.write(str(os.getpid()))
+        lock.flush()
+        return lock
+
+    def _write_resolved(self) -> Path:
+        path = self._station_dir / "resolved.json"
+        path.write_text(json.dumps(dict(self._plan.resolved.tree), indent=1), "utf-8")
+        return path
+
+    def _start(self, process: str) -> None:
+        self._page.set_generation(process, self._page.generation(process) + 1)
+        self._children[process] = self._spawn(process)
+
+    def _spawn(self, process: str) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            [
+                *(sys.executable, "-m", f"runtime.{process}"),
+                *("--resolved", str(self._resolved), "--page", str(self._page_fd), "--boot", self.boot),
+            ],
+            stdin=self._lifeline_out,
+            pass_fds=(self._page_fd,),
+            start_new_session=True,  # Ctrl-C reaches the supervisor alone, which ends them in order
+        )
+
+    def _watch(self, driver: subprocess.Popen[bytes] | None) -> int:
+        while not self._ending:
+            if driver is not None and driver.poll() is not None:
+                return driver.returncode
+            for process in PROCESSES:
+                code = self._children[process].poll()
+                if code is not None and not self._restart(process, code):
+                    return 1
+            time.sleep(_POLL_S)
+        if driver is not None:
+            driver.terminate()
+            driver.wait()
+        return 130
+
+    def _restart(self, process: str, code: int) -> bool:
+        now = time.monotonic()
+        self._restarts.append(now)
+        while self._restarts[0] < now - _RESTART_WINDOW_S:
+            self._restarts.popleft()
+        if len(self._restarts) > _MOST_RESTARTS:
+            log.error(
+                "%s ended with %d; %d restarts within a minute: giving up",
+                process,
+                code,
+                len(self._restarts) - 1,
+            )
+            return False
+        log.error("%s ended with %d: restarting it", process, code)
+        self._start(process)
+        return True
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self._ending = True
+
+    def _end(self) -> None:
+        """Cut the lifeline; each child closes its files, control holds for its time; kill what does not end."""
+        os.close(self._lifeline_in)
+        deadline = time.monotonic() + _PATIENCE_S
+        for process, child in self._children.items():
+            try:
+                child.wait(max(0.1, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                log.error("%s does not end: killed", process)
+                child.kill()
+                child.wait()
+        os.close(self._lifeline_out)
+        os.close(self._page_fd)
+        Endpoints(self._station_dir).clear()
