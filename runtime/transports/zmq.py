@@ -53,9 +53,14 @@ class Config(Section):
     @model_validator(mode="after")
     def _stay_on_this_machine(self) -> Config:
         for key in ("sub_endpoint", "pub_endpoint"):
-            if not self.insecure_link and not is_loopback(getattr(self, key)):
+            endpoint = getattr(self, key)
+            if endpoint.startswith("tcp://") and not _has_port(endpoint):
                 raise ConfigurationError(
-                    f"transport.{key} = {getattr(self, key)!r} leaves this machine over a plain link; "
+                    f"transport.{key} = {endpoint!r}; allowed: tcp://HOST:PORT with a port from 1 to 65535"
+                )
+            if not self.insecure_link and not is_loopback(endpoint):
+                raise ConfigurationError(
+                    f"transport.{key} = {endpoint!r} leaves this machine over a plain link; "
                     "allowed: a loopback address, or insecure_link = true on a network you trust"
                 )
         return self
@@ -72,6 +77,12 @@ def is_loopback(endpoint: str) -> bool:
     with contextlib.suppress(ValueError):
         return ipaddress.ip_address(host).is_loopback
     return False
+
+
+def _has_port(endpoint: str) -> bool:
+    """Whether it ends in a port one can connect to; libzmq takes any number and then waits for ever."""
+    port = endpoint.rpartition(":")[2]
+    return port.isascii() and port.isdigit() and 0 < int(port) < 65536
 
 
 def capabilities(config: Config) -> Capabilities:

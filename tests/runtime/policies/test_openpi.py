@@ -1,0 +1,597 @@
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+from websockets.http11 import Request
+from websockets.server import ServerProtocol
+from websockets.sync.server import ServerConnection, serve
+
+import robots
+from runtime import codecs
+from runtime.clock import MonotonicClock
+from runtime.errors import ConfigurationError, PolicyError
+from runtime.policies import openpi
+from runtime.policies.link import PolicyGone, PolicyTimeout
+from runtime.policies.openpi import Config, OpenpiPolicy
+from runtime.sim.faults import NONE, Fault
+from runtime.sim.openpi_server import Behaviour, OpenpiServer
+from runtime.types import Conditioning, Observation
+
+ROBOT = robots.load("agilex_piper")
+CAMERAS = tuple(camera.key for camera in ROBOT.cameras)
+Handler = Callable[[ServerConnection], None]
+
+
+def observation(value: float = 0.1, **changes: Any) -> Observation:
+    pictures = {key: np.full((48, 64, 3), index, np.uint8) for index, key in enumerate(CAMERAS)}
+    made = Observation(
+        sequence=1,
+        arrived=0.0,
+        captured={},
+        qpos=np.full(ROBOT.dim, value, np.float32),
+        pictures=pictures,
+        prompt="pick the block",
+    )
+    return dataclasses.replace(made, **changes)
+
+
+@contextlib.contextmanager
+def policy_at(url: str, **settings: Any) -> Iterator[OpenpiPolicy]:
+    config = Config(url=url, **{"connect_deadline": 10.0, "image_size": [24, 32], **settings})
+    policy = openpi.build(config, ROBOT, MonotonicClock(), ROBOT.control_rate)
+    with contextlib.closing(policy):
+        yield policy
+
+
+@contextlib.contextmanager
+def served(fault: Fault = NONE, **behaviour: Any) -> Iterator[str]:
+    with contextlib.closing(OpenpiServer(ROBOT, Behaviour(fault=fault, **behaviour))) as server:
+        yield str(server.start()["url"])
+
+
+@contextlib.contextmanager
+def stub(handler: Handler) -> Iterator[str]:
+    """A websocket server that does what a test says."""
+    with serve(handler, "127.0.0.1", 0, compression=None, close_timeout=0.5) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def replying(reply: object, metadata: object = None, seen: list[Any] | None = None) -> Handler:
+    def converse(connection: ServerConnection) -> None:
+        connection.send(codecs.pack(metadata or {}))
+        for request in connection:
+            if seen is not None:
+                seen.append(request)
+            connection.send(reply if isinstance(reply, bytes) else codecs.pack(reply))
+
+    return converse
+
+
+@contextlib.contextmanager
+def raw_server(answer: bytes) -> Iterator[int]:
+    """A TCP server that says `answer` to whoever connects, and nothing more."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        held: list[socket.socket] = []
+
+        def accept() -> None:
+            with contextlib.suppress(OSError):
+                peer = listener.accept()[0]
+                held.append(peer)
+                if answer:
+                    peer.recv(65536)
+                    peer.sendall(answer)
+                    peer.shutdown(socket.SHUT_WR)
+
+        thread = threading.Thread(target=accept)
+        thread.start()
+        yield listener.getsockname()[1]
+        thread.join()
+        for peer in held:
+            peer.close()
+
+
+@contextlib.contextmanager
+def not_reading_server() -> Iterator[str]:
+    """A websocket server that sends its metadata and then never reads again."""
+    ended = threading.Event()
+
+    def converse() -> None:
+        peer = listener.accept()[0]
+        protocol = ServerProtocol()
+        protocol.receive_data(peer.recv(65536))
+        (request,) = protocol.events_received()
+        assert isinstance(request, Request)
+        protocol.send_response(protocol.accept(request))
+        protocol.send_binary(codecs.pack({}))
+        for data in protocol.data_to_send():
+            peer.sendall(data)
+        ended.wait()
+        peer.close()
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=converse)
+        thread.start()
+        try:
+            yield f"ws://127.0.0.1:{listener.getsockname()[1]}"
+        finally:
+            ended.set()
+            thread.join()
+
+
+def row_zero_starts_at(chunk: Any, value: float) -> bool:
+    return bool(np.abs(chunk.actions[0] - np.clip(value, ROBOT.lower, ROBOT.upper)).max() < 0.05)
+
+
+# A conversation that goes well
+
+
+def test_it_reads_the_metadata_on_connect() -> None:
+    with served(horizon=20) as url, policy_at(url) as policy:
+        info = policy.connect()
+    assert info.name == "stand-in"
+    assert info.horizon == 20
+    assert info.action_space is None
+    assert not info.supports_rtc
+    assert info.metadata["action_horizon"] == 20
+
+
+def test_it_returns_the_rows_that_belong_to_its_observation() -> None:
+    with served(horizon=20) as url, policy_at(url) as policy:
+        policy.connect()
+        for value in (0.05, 0.4, 0.2):
+            chunk = policy.infer(observation(value))
+            assert chunk.actions.shape == (20, ROBOT.dim)
+            assert chunk.actions.dtype == np.float32
+            assert chunk.space == "joint"
+            assert row_zero_starts_at(chunk, value)
+
+
+def test_it_keeps_the_servers_figures_and_the_round_trip() -> None:
+    with served(latency=0.02) as url, policy_at(url) as policy:
+        policy.connect()
+        policy.infer(observation())
+        timing = policy.infer(observation()).timing
+    assert timing["server.infer_ms"] >= 20.0
+    assert timing["policy.infer_ms"] >= 20.0
+    assert timing["server.prev_total_ms"] >= 20.0
+    assert timing["round_trip_ms"] >= timing["server.infer_ms"]
+
+
+def test_it_connects_by_itself_where_nobody_did() -> None:
+    with served() as url, policy_at(url) as policy:
+        assert row_zero_starts_at(policy.infer(observation(0.3)), 0.3)
+
+
+def test_it_sends_the_key_that_the_environment_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LAB_POLICY_KEY", "secret")
+    keys = []
+
+    def converse(connection: ServerConnection) -> None:
+        assert connection.request is not None
+        keys.append(connection.request.headers.get("Authorization"))
+        connection.send(codecs.pack({}))
+
+    with stub(converse) as url, policy_at(url, api_key_env="LAB_POLICY_KEY") as policy:
+        policy.connect()
+    assert keys == ["Api-Key secret"]
+
+
+def test_it_keeps_the_models_own_rows_for_later_conditioning() -> None:
+    reply = {"actions": np.zeros((4, ROBOT.dim)), "origin_actions": np.ones((4, 32), np.float32)}
+    with stub(replying(reply)) as url, policy_at(url) as policy:
+        chunk = policy.infer(observation())
+    assert chunk.model_actions is not None
+    np.testing.assert_array_equal(chunk.model_actions, np.ones((4, 32), np.float32))
+
+
+# Requests
+
+
+def request_of(shown: Observation | None = None, **settings: Any) -> dict[str, Any]:
+    policy = openpi.build(Config(**settings), ROBOT, MonotonicClock(), 30.0)
+    return dict(codecs.unpack(codecs.pack(policy.request(shown or observation()))))
+
+
+def test_the_request_has_state_pictures_and_prompt_in_the_trained_size() -> None:
+    request = request_of()
+    assert list(request) == ["state", "images", "prompt"]
+    assert request["state"].dtype == np.float32
+    assert list(request["images"]) == list(CAMERAS)
+    assert all(picture.shape == (3, 224, 224) for picture in request["images"].values())
+    assert request["prompt"] == "pick the block"
+
+
+def test_pictures_go_out_as_they_are_if_no_resizing_is_wanted() -> None:
+    for settings in ({"image_size": None}, {"resize": "none"}):
+        request = request_of(image_layout="hwc", **settings)
+        np.testing.assert_array_equal(request["images"]["cam_left_wrist"], np.full((48, 64, 3), 1, np.uint8))
+
+
+def test_a_flat_layout_with_a_divided_state_can_be_declared() -> None:
+    request = request_of(
+        images_key="",
+        cameras={
+            "cam_high": "observation/exterior_image_1_left",
+            "cam_left_wrist": "observation/wrist_image_left",
+        },
+        state_key="",
+        state_parts={"observation/joint_position": [0, 1, 2, 3, 4, 5], "observation/gripper_position": [6]},
+        image_layout="hwc",
+    )
+    assert request["observation/exterior_image_1_left"].shape == (224, 224, 3)
+    assert request["observation/wrist_image_left"].max() == 1
+    assert request["observation/joint_position"].shape == (6,)
+    assert request["observation/gripper_position"].shape == (1,)
+    assert set(request) == {
+        "observation/exterior_image_1_left",
+        "observation/wrist_image_left",
+        "observation/joint_position",
+        "observation/gripper_position",
+        "prompt",
+    }
+
+
+def test_poses_are_the_state_if_the_policy_was_trained_so() -> None:
+    poses = np.arange(ROBOT.eef_dim, dtype=np.float32)
+    np.testing.assert_array_equal(request_of(observation(eef=poses), observation_space="eef")["state"], poses)
+    with pytest.raises(PolicyError, match="no poses"):
+        request_of(observation_space="eef")
+
+
+def test_a_missing_picture_is_named() -> None:
+    with pytest.raises(PolicyError, match="no picture 'cam_right_wrist'; it has cam_high, cam_left_wrist"):
+        request_of(observation(pictures={key: np.zeros((8, 8, 3), np.uint8) for key in CAMERAS[:2]}))
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"cameras": {"cam_low": "cam_low"}}, "policy.cameras names cam_low"),
+        ({"state_parts": {"gripper": [14]}}, "allowed: 0 to 13"),
+        ({"api_key_env": "SURELY_NOT_SET"}, "SURELY_NOT_SET, which is not set"),
+    ],
+)
+def test_a_layout_that_does_not_fit_the_robot_is_refused_at_once(settings: dict[str, Any], says: str) -> None:
+    with pytest.raises(ConfigurationError, match=says):
+        openpi.build(Config(**settings), ROBOT, MonotonicClock(), 30.0)
+
+
+def test_conditioning_is_refused_because_the_server_would_drop_it_silently() -> None:
+    conditioning = Conditioning(np.zeros((2, ROBOT.dim), np.float32), 1)
+    with policy_at("ws://127.0.0.1:9") as policy, pytest.raises(PolicyError, match="RTC"):
+        policy.infer(observation(), conditioning)
+
+
+# What does not answer, or not as it should, when we connect
+
+
+def test_a_port_where_nobody_listens_is_said_to_be_empty() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+    with (
+        policy_at(f"ws://127.0.0.1:{port}") as policy,
+        pytest.raises(PolicyError, match="no policy server listens"),
+    ):
+        policy.connect()
+
+
+def test_http_404_is_said_to_be_another_web_server() -> None:
+    with (
+        served(Fault("http_404")) as url,
+        policy_at(url) as policy,
+        pytest.raises(PolicyError, match="HTTP 404"),
+    ):
+        policy.connect()
+
+
+def test_a_web_server_that_does_not_upgrade_is_named() -> None:
+    answer = b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nhi"
+    with (
+        raw_server(answer) as port,
+        policy_at(f"ws://127.0.0.1:{port}") as policy,
+        pytest.raises(PolicyError, match="HTTP 200"),
+    ):
+        policy.connect()
+
+
+def test_a_server_of_another_kind_is_said_not_to_speak_websocket() -> None:
+    with (
+        raw_server(b"SSH-2.0-OpenSSH_9.6\r\n") as port,
+        policy_at(f"ws://127.0.0.1:{port}") as policy,
+        pytest.raises(PolicyError, match="does not speak websocket"),
+    ):
+        policy.connect()
+
+
+def test_a_port_that_accepts_and_says_nothing_times_out() -> None:
+    with (
+        raw_server(b"") as port,
+        policy_at(f"ws://127.0.0.1:{port}", connect_deadline=0.2) as policy,
+        pytest.raises(PolicyTimeout, match=r"no websocket handshake within 0\.2 s"),
+    ):
+        policy.connect()
+
+
+def test_a_server_that_sends_no_metadata_times_out() -> None:
+    with (
+        served(Fault("mute_on_connect")) as url,
+        policy_at(url, connect_deadline=0.3) as policy,
+        pytest.raises(PolicyTimeout, match=r"did not send its metadata within 0\.3 s"),
+    ):
+        policy.connect()
+
+
+def test_a_text_frame_first_is_the_servers_error() -> None:
+    with (
+        served(Fault("text_first")) as url,
+        policy_at(url) as policy,
+        pytest.raises(PolicyError, match="checkpoint could not be loaded"),
+    ):
+        policy.connect()
+
+
+@pytest.mark.parametrize(
+    ("first", "says"),
+    [(b"\xc1\xc1", "not the openpi protocol"), (codecs.pack([1]), "is a list; expected a map")],
+)
+def test_a_first_frame_that_is_no_map_is_the_wrong_protocol(first: bytes, says: str) -> None:
+    with (
+        stub(lambda connection: connection.send(first)) as url,
+        policy_at(url) as policy,
+        pytest.raises(PolicyError, match=says),
+    ):
+        policy.connect()
+
+
+@pytest.mark.parametrize(
+    ("mode", "says"),
+    [
+        ("eef", "actions are 'eef', policy.action_space is 'joint'"),
+        ("torque", "'torque'; allowed: joint, qpos, eef"),
+    ],
+)
+def test_metadata_may_not_contradict_the_configured_space(mode: str, says: str) -> None:
+    with (
+        served(Fault("action_mode", mode)) as url,
+        policy_at(url) as policy,
+        pytest.raises(PolicyError, match=says),
+    ):
+        policy.connect()
+
+
+def test_metadata_that_agree_are_reported() -> None:
+    with served(Fault("action_mode", "qpos")) as url, policy_at(url) as policy:
+        assert policy.connect().action_space == "joint"
+
+
+# What goes wrong with an answer
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ("wrong_dim", "rows of 13 numbers; this robot needs 14"),
+        ("nan", "nan at row 3, column 2"),
+        ("empty", "actions is empty"),
+        ("two_batches", r"shape \[2, 50, 14\]"),
+        ("bad_array_dialect", "MNP"),
+        ("object_array", "refused"),
+        ("exception", r"RuntimeError: CUDA out of memory"),
+    ],
+)
+def test_an_unusable_answer_is_named(fault: str, says: str) -> None:
+    with served(Fault(fault)) as url, policy_at(url) as policy:
+        policy.connect()
+        with pytest.raises(PolicyError, match=says):
+            policy.infer(observation())
+
+
+@pytest.mark.parametrize(("fault", "rows"), [("batched", 50), ("single_row", 1)])
+def test_one_batch_and_one_row_are_understood(fault: str, rows: int) -> None:
+    with served(Fault(fault)) as url, policy_at(url) as policy:
+        assert policy.infer(observation()).actions.shape == (rows, ROBOT.dim)
+
+
+@pytest.mark.parametrize(
+    ("reply", "says"),
+    [
+        ({"result": 1}, "no 'actions'; it has result"),
+        ({"actions": [[0.0] * 14]}, "actions is a list"),
+        ({"actions": np.zeros((2, 14), bool)}, "dtype"),
+        ({"actions": np.full((1, 14), 1e300)}, "row 0, column 0"),
+        ({"actions": np.zeros((1, 14)), "action_mode": "eef"}, "answer says that actions are 'eef'"),
+        ({"actions": np.zeros((1, 14)), "action_mode": ["eef"]}, "allowed: joint, qpos, eef"),
+        (
+            {"actions": np.zeros((1, 14)), "origin_actions": np.full((1, 32), np.inf)},
+            "origin_actions has inf",
+        ),
+        ([1, 2], "an answer that is a list"),
+        (b"\xc1", "not the openpi protocol"),
+    ],
+)
+def test_a_strange_answer_is_named(reply: object, says: str) -> None:
+    with stub(replying(reply)) as url, policy_at(url) as policy:
+        policy.connect()
+        with pytest.raises(PolicyError, match=says):
+            policy.infer(observation())
+
+
+def test_whole_numbers_become_float32() -> None:
+    with stub(replying({"actions": np.ones((2, 14), np.int64)})) as url, policy_at(url) as policy:
+        actions = policy.infer(observation()).actions
+    assert actions.dtype == np.float32
+    assert actions.tolist() == [[1.0] * 14] * 2
+
+
+def test_poses_have_eight_numbers_per_arm() -> None:
+    reply = {"actions": np.zeros((3, 16)), "action_mode": "eef"}
+    with stub(replying(reply)) as url, policy_at(url, action_space="eef") as policy:
+        chunk = policy.infer(observation())
+    assert chunk.space == "eef"
+    assert chunk.actions.shape == (3, 16)
+
+
+def test_a_text_frame_at_any_time_is_the_servers_error() -> None:
+    def converse(connection: ServerConnection) -> None:
+        connection.send(codecs.pack({}))
+        connection.recv()
+        connection.send("Traceback (most recent call last):\n  somewhere\nKeyError: 'state'\n")
+
+    with stub(converse) as url, policy_at(url) as policy:
+        policy.connect()
+        with pytest.raises(PolicyError, match="reports an error: KeyError: 'state'\nTraceback"):
+            policy.infer(observation())
+
+
+# What happens to the connection
+
+
+def test_a_mute_server_times_out_by_the_first_and_then_by_the_later_deadline() -> None:
+    settings = {"first_inference_deadline": 0.3, "inference_deadline": 0.1}
+    with served(Fault("mute_on_infer")) as url, policy_at(url, **settings) as policy:
+        policy.connect()
+        with pytest.raises(PolicyTimeout, match=r"did not send an answer within 0\.3 s"):
+            policy.infer(observation())
+        with pytest.raises(PolicyTimeout, match=r"within 0\.1 s"):
+            policy.infer(observation())
+
+
+def test_the_later_deadline_holds_after_the_first_answer() -> None:
+    settings = {"first_inference_deadline": 30.0, "inference_deadline": 0.1}
+    with served(Fault("mute_on_infer", "1")) as url, policy_at(url, **settings) as policy:
+        policy.connect()
+        policy.infer(observation())
+        with pytest.raises(PolicyTimeout, match=r"within 0\.1 s"):
+            policy.infer(observation())
+
+
+def test_a_late_answer_is_never_paired_with_the_next_request() -> None:
+    settings = {"first_inference_deadline": 10.0, "inference_deadline": 1.0}
+    with served(Fault("late_reply", "1.5")) as url, policy_at(url, **settings) as policy:
+        policy.connect()
+        assert row_zero_starts_at(policy.infer(observation(0.05)), 0.05)
+        with pytest.raises(PolicyTimeout):
+            policy.infer(observation(0.5))
+        for value in (0.1, 0.2, 0.3, 0.4, 0.5):
+            assert row_zero_starts_at(policy.infer(observation(value)), value)
+
+
+def test_a_connection_that_ends_within_an_answer_is_opened_anew() -> None:
+    with served(Fault("close_mid_reply", "1")) as url, policy_at(url) as policy:
+        policy.connect()
+        policy.infer(observation())
+        with pytest.raises(PolicyGone, match="closed the connection"):
+            policy.infer(observation())
+    with served() as url, policy_at(url) as policy:
+        policy.connect()
+        assert row_zero_starts_at(policy.infer(observation(0.2)), 0.2)
+
+
+def test_a_server_that_came_back_is_found_again_and_given_time_to_compile() -> None:
+    server = OpenpiServer(ROBOT, Behaviour())
+    url = str(server.start()["url"])
+    with policy_at(url, first_inference_deadline=10.0, inference_deadline=0.3) as policy:
+        policy.connect()
+        policy.infer(observation())
+        server.close()
+        with pytest.raises(PolicyGone):
+            policy.infer(observation())
+        with pytest.raises(PolicyError, match="no policy server listens"):
+            policy.infer(observation())
+        port = int(url.rpartition(":")[2])
+        with contextlib.closing(OpenpiServer(ROBOT, Behaviour(latency=0.6), port)) as again:
+            again.start()
+            assert row_zero_starts_at(policy.infer(observation(0.3)), 0.3)
+
+
+def test_a_server_that_stops_reading_does_not_block_the_request() -> None:
+    shown = observation(pictures={key: np.zeros((3000, 2000, 3), np.uint8) for key in CAMERAS})
+    settings = {"image_size": None, "first_inference_deadline": 0.5}
+    with not_reading_server() as url, policy_at(url, **settings) as policy:
+        policy.connect()
+        with pytest.raises(PolicyTimeout, match=r"did not take the request within 0\.5 s"):
+            policy.infer(shown)
+
+
+def test_close_unblocks_an_inference_that_waits_in_another_thread() -> None:
+    asked = threading.Event()
+
+    def converse(connection: ServerConnection) -> None:
+        connection.send(codecs.pack({}))
+        connection.recv()
+        asked.set()
+        connection.recv()
+
+    errors: list[BaseException] = []
+    with stub(converse) as url, policy_at(url, first_inference_deadline=60.0) as policy:
+        policy.connect()
+
+        def ask() -> None:
+            try:
+                policy.infer(observation())
+            except PolicyError as error:
+                errors.append(error)
+
+        thread = threading.Thread(target=ask)
+        thread.start()
+        assert asked.wait(10)
+        policy.close()
+        thread.join(10)
+        assert not thread.is_alive()
+        policy.close()
+    assert "closed from our side" in str(errors[0])
+
+
+def test_a_closed_policy_does_not_connect_by_itself_but_when_asked() -> None:
+    with served() as url, policy_at(url) as policy:
+        policy.connect()
+        policy.close()
+        with pytest.raises(PolicyError, match="is closed; connect first"):
+            policy.infer(observation())
+        policy.connect()
+        assert row_zero_starts_at(policy.infer(observation(0.3)), 0.3)
+
+
+def test_two_threads_never_share_the_wire() -> None:
+    """Each gets the answer to its own request; a mix-up would show in the first row."""
+
+    def ask(value: float) -> None:
+        for _ in range(10):
+            assert row_zero_starts_at(policy.infer(observation(value)), value)
+
+    with served(horizon=5) as url, policy_at(url) as policy:
+        policy.connect()
+        with ThreadPoolExecutor(3) as pool:
+            assert list(pool.map(ask, (0.1, 0.3, 0.5))) == [None, None, None]
+
+
+def test_reset_leaves_the_conversation_as_it_is() -> None:
+    with served() as url, policy_at(url) as policy:
+        policy.connect()
+        first = policy.infer(observation(0.2))
+        policy.reset()
+        np.testing.assert_array_equal(policy.infer(observation(0.2)).actions, first.actions)
+
+
+def test_an_inference_while_reset_is_called_comes_back_with_its_own_answer() -> None:
+    with served(latency=0.1) as url, policy_at(url) as policy:
+        policy.connect()
+        timer = threading.Timer(0.03, policy.reset)
+        timer.start()
+        assert row_zero_starts_at(policy.infer(observation(0.4)), 0.4)
+        timer.join()
+        assert row_zero_starts_at(policy.infer(observation(0.1)), 0.1)

@@ -1,0 +1,517 @@
+from __future__ import annotations
+
+import contextlib
+import re
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+
+import robots
+from runtime import codecs
+from runtime.clock import MonotonicClock, VirtualClock
+from runtime.errors import ConfigurationError, TransportError
+from runtime.transports import zmq as link
+from runtime.transports.zmq import Config, NodeSink, NodeSource
+from runtime.types import Observation, RobotCommand
+
+ROBOT = robots.load("agilex_piper")
+CAMERAS = tuple(camera.key for camera in ROBOT.cameras)
+PATIENCE = 10.0  # s until a test gives up
+
+
+class Node:
+    """An execution node's two sockets in the hands of a test, with libzmq's defaults as real nodes have."""
+
+    def __init__(self, obs: str = "tcp://127.0.0.1:0", act: str = "tcp://127.0.0.1:0") -> None:
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
+        self.publisher = context.socket(zmq.PUB)
+        self.subscriber = context.socket(zmq.SUB)
+        self.subscriber.setsockopt(zmq.SUBSCRIBE, b"")
+        self.obs = _bind(self.publisher, obs)
+        self.act = _bind(self.subscriber, act)
+
+    def say(self, payload: bytes) -> None:
+        self.publisher.send(payload)
+
+    def hear(self, patience: float = PATIENCE) -> dict[str, Any] | None:
+        if not self.subscriber.poll(int(patience * 1e3)):
+            return None
+        return dict(codecs.unpack(self.subscriber.recv()))
+
+    def close(self) -> None:
+        self.publisher.close(linger=0)
+        self.subscriber.close(linger=0)
+
+
+def _bind(socket: zmq.Socket[bytes], endpoint: str) -> str:
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        try:
+            socket.bind(endpoint)
+        except zmq.ZMQError:  # the address of a node that was closed a moment ago
+            assert time.monotonic() < deadline
+        else:
+            raw = socket.getsockopt(zmq.LAST_ENDPOINT)
+            assert isinstance(raw, bytes)
+            return raw.rstrip(b"\0").decode()
+
+
+@pytest.fixture
+def node() -> Iterator[Node]:
+    with contextlib.closing(Node()) as made:
+        yield made
+
+
+@contextlib.contextmanager
+def listening(node: Node, **settings: Any) -> Iterator[NodeSource]:
+    source = link.source(Config(sub_endpoint=node.obs, **settings), ROBOT, MonotonicClock())
+    source.connect()
+    with contextlib.closing(source):
+        yield source
+
+
+@contextlib.contextmanager
+def commanding(node: Node) -> Iterator[NodeSink]:
+    sink = link.sink(Config(pub_endpoint=node.act), ROBOT, MonotonicClock())
+    sink.connect()
+    with contextlib.closing(sink):
+        yield sink
+
+
+def frame(t: float, mark: int = 0, /, **changes: Any) -> bytes:
+    """A whole message whose pictures' first channel on the wire and whose first joint carry `mark`."""
+    picture = np.zeros((6, 8, 3), np.uint8)
+    picture[..., 0] = mark % 256
+    picture[..., 2] = 99
+    message: dict[str, Any] = {
+        "t": t,
+        "images": dict.fromkeys(CAMERAS, picture),
+        "state": {"left_arm": np.full(7, mark, np.float32), "right_arm": np.zeros(7, np.float32)},
+        "hil_supported": False,
+        "hil_active": False,
+    }
+    return codecs.pack({key: value for key, value in (message | changes).items() if value is not ...})
+
+
+def until_heard(node: Node, source: NodeSource, payload: Callable[[], bytes]) -> Observation:
+    """Publish until the subscription has reached the node and a frame comes through."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        node.say(payload())
+        observation = source.receive(0.05)
+        if observation is not None:
+            return observation
+    raise AssertionError("no frame came through")
+
+
+def joined(node: Node, source: NodeSource) -> None:
+    """The link is up and nothing is on its way any more."""
+    until_heard(node, source, lambda: frame(time.monotonic()))
+    while source.receive(0.2) is not None:
+        pass
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.005)
+
+
+# Configuration
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    ["tcp://192.168.1.5:5555", "tcp://robot:5555", "tcp://0.0.0.0:5555", "tcp://[2001:db8::1]:5555"],
+)
+@pytest.mark.parametrize("key", ["sub_endpoint", "pub_endpoint"])
+def test_a_plain_link_beyond_this_machine_must_be_asked_for(key: str, endpoint: str) -> None:
+    with pytest.raises(ConfigurationError, match=rf"transport\.{key} .* insecure_link = true"):
+        Config(**{key: endpoint})  # type: ignore[arg-type]
+    assert getattr(Config(**{key: endpoint}, insecure_link=True), key) == endpoint  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    ["tcp://127.0.0.1:1", "tcp://127.8.0.1:1", "tcp://localhost:1", "tcp://[::1]:1", "ipc:///tmp/x"],
+)
+def test_addresses_of_this_machine_are_loopback(endpoint: str) -> None:
+    assert link.is_loopback(endpoint)
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["tcp://127.0.0.1:99999", "tcp://127.0.0.1:0", "tcp://127.0.0.1", "tcp://127.0.0.1:x"]
+)
+def test_an_impossible_port_is_refused_because_libzmq_would_wait_for_it_for_ever(endpoint: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"transport.sub_endpoint .* port from 1 to 65535"):
+        Config(sub_endpoint=endpoint)
+
+
+def test_a_source_address_does_not_pass_for_the_destination() -> None:
+    assert not link.is_loopback("tcp://127.0.0.1:0;192.168.1.5:5555")
+
+
+def test_a_disabled_camera_must_exist() -> None:
+    with pytest.raises(
+        ConfigurationError, match=r"\['cam_low'\] are no cameras of agilex_piper; allowed: cam_high"
+    ):
+        link.source(Config(disabled_cameras=["cam_low"]), ROBOT, MonotonicClock())
+
+
+def test_it_moves_a_robot() -> None:
+    assert link.capabilities(Config()).moves_robot
+    assert not link.capabilities(Config()).ends
+
+
+# Observations
+
+
+def test_a_frame_arrives_as_rgb_with_all_its_streams(node: Node) -> None:
+    with listening(node) as source:
+        observation = until_heard(node, source, lambda: frame(time.monotonic(), 7))
+    assert list(observation.pictures) == list(CAMERAS)
+    assert observation.pictures["cam_high"][0, 0].tolist() == [99, 0, 7]  # BGR on the wire
+    assert observation.pictures["cam_high"].flags.c_contiguous
+    assert not observation.pictures["cam_high"].flags.writeable
+    assert observation.qpos.tolist() == [7.0] * 7 + [0.0] * 7
+    assert set(observation.captured) == {"joints", *CAMERAS}
+    assert observation.captured["joints"] <= observation.arrived
+    assert observation.eef is None
+    assert observation.reported_action is None
+
+
+def test_the_encoding_on_the_wire_wins_over_the_configured_one(node: Node) -> None:
+    with listening(node, encoding="rgb") as source:
+        observation = until_heard(node, source, lambda: frame(time.monotonic(), 7))
+        assert observation.pictures["cam_high"][0, 0].tolist() == [7, 0, 99]
+        joined(node, source)
+        observation = until_heard(node, source, lambda: frame(time.monotonic(), 8, encoding="bgr"))
+        assert observation.pictures["cam_high"][0, 0].tolist() == [99, 0, 8]
+
+
+def test_poses_and_the_reported_action_are_carried(node: Node) -> None:
+    pose = np.array([0.1, 0.2, 0.3, 1, 0, 0, 0, 0.05], np.float32)
+    action = np.arange(14, dtype=np.float32)
+    extras: dict[str, Any] = {
+        "eef": {"left_arm": pose, "right_arm": pose},
+        "action": action,
+        "action_eef": np.concatenate([pose, pose]),
+    }
+    with listening(node) as source:
+        observation = until_heard(node, source, lambda: frame(time.monotonic(), **extras))
+    assert observation.eef is not None
+    assert observation.reported_action_eef is not None
+    np.testing.assert_array_equal(observation.eef, np.concatenate([pose, pose]))
+    np.testing.assert_array_equal(observation.reported_action, action)
+    np.testing.assert_array_equal(observation.reported_action_eef, np.concatenate([pose, pose]))
+    assert "eef" in observation.captured
+
+
+def test_a_frame_is_delivered_once_and_numbers_grow(node: Node) -> None:
+    with listening(node) as source:
+        joined(node, source)
+        assert source.receive(0.0) is None
+        numbers = [until_heard(node, source, lambda: frame(time.monotonic())).sequence for _ in range(3)]
+    assert numbers == sorted(set(numbers))
+
+
+def test_a_disabled_camera_is_neither_needed_nor_delivered(node: Node) -> None:
+    images = {key: np.zeros((6, 8, 3), np.uint8) for key in CAMERAS[:2]}
+    with listening(node, disabled_cameras=["cam_right_wrist"]) as source:
+        observation = until_heard(node, source, lambda: frame(time.monotonic(), images=images))
+    assert list(observation.pictures) == ["cam_high", "cam_left_wrist"]
+
+
+def test_a_thousand_frames_that_queued_while_nobody_read_give_the_newest_one(node: Node) -> None:
+    picture = np.zeros((120, 160, 3), np.uint8)
+    with listening(node) as source:
+        joined(node, source)
+        for number in range(1000):
+            node.say(frame(time.monotonic(), number, images=dict.fromkeys(CAMERAS, picture)))
+
+        def ended() -> bool:  # said again, because a full queue of the publisher drops the newest
+            node.say(frame(time.monotonic(), 1000, master="end"))
+            return source.status.master == "end"
+
+        wait_for(ended)
+        first = source.receive(PATIENCE)
+        assert first is not None
+        assert first.qpos[0] == 1000
+        assert first.arrived - first.captured["joints"] < 5
+
+
+def test_the_newest_counts_by_arrival_when_a_node_restarts_with_a_smaller_clock() -> None:
+    first = Node()
+    with listening(first) as source:
+        until_heard(first, source, lambda: frame(5000.0 + time.monotonic(), 1))
+        endpoints = first.obs, first.act
+        first.close()
+        with contextlib.closing(Node(*endpoints)) as second:
+            while True:
+                observation = until_heard(second, source, lambda: frame(time.monotonic() % 100, 2))
+                if observation.qpos[0] == 2:
+                    break
+            assert source.faults()["clock_backwards"] == 1
+            assert abs(observation.captured["joints"] - observation.arrived) < 5
+            observation = until_heard(second, source, lambda: frame(time.monotonic() % 100, 3))
+    assert observation.qpos[0] in (2, 3)
+    assert observation.captured["joints"] <= observation.arrived
+
+
+FAULTS: list[tuple[str, dict[str, Any], str]] = [
+    ("malformed", {"t": ...}, "t is None"),
+    ("malformed", {"t": float("nan")}, "t is nan"),
+    ("malformed", {"t": "now"}, "t is 'now'"),
+    ("malformed", {"state": ...}, "state is a NoneType"),
+    ("malformed", {"images": [1]}, "images is a list"),
+    ("missing_group", {"state": {"left_arm": np.zeros(7, np.float32)}}, "state lacks right_arm"),
+    (
+        "wrong_dimension",
+        {"state": {"left_arm": np.zeros(6, np.float32), "right_arm": np.zeros(7, np.float32)}},
+        r"state.left_arm has shape \[6\]; expected \[7\]",
+    ),
+    (
+        "wrong_dtype",
+        {"state": {"left_arm": np.zeros(7, np.int32), "right_arm": np.zeros(7, np.float32)}},
+        "state.left_arm is <i4",
+    ),
+    (
+        "not_finite",
+        {"state": {"left_arm": np.full(7, np.nan, np.float32), "right_arm": np.zeros(7, np.float32)}},
+        "state.left_arm has",
+    ),
+    ("missing_camera", {"images": {"cam_high": np.zeros((6, 8, 3), np.uint8)}}, "images lack cam_left_wrist"),
+    (
+        "wrong_dtype",
+        {"images": dict.fromkeys(CAMERAS, np.zeros((6, 8, 3), np.float32))},
+        "images.cam_high is <f4",
+    ),
+    ("wrong_dimension", {"images": dict.fromkeys(CAMERAS, np.zeros((3, 6, 8), np.uint8))}, r"\[3, 6, 8\]"),
+    ("wrong_dimension", {"images": dict.fromkeys(CAMERAS, np.zeros((0, 8, 3), np.uint8))}, r"\[0, 8, 3\]"),
+    ("unknown_encoding", {"encoding": "yuv"}, "'yuv'; allowed: 'bgr', 'rgb'"),
+]
+
+
+@pytest.mark.parametrize(("fault", "changes", "says"), FAULTS)
+def test_an_unusable_message_is_counted_by_name_and_the_next_one_arrives(
+    node: Node, fault: str, changes: dict[str, Any], says: str
+) -> None:
+    with listening(node) as source:
+        joined(node, source)
+        node.say(frame(time.monotonic(), 1, **changes))
+        wait_for(lambda: bool(source.faults()))
+        assert source.faults() == {fault: 1}
+        assert re.search(says, source.last_fault)
+        assert source.receive(0.0) is None
+        assert until_heard(node, source, lambda: frame(time.monotonic(), 2)).qpos[0] == 2
+
+
+@pytest.mark.parametrize(
+    "payload", [b"", b"\x85\xa1t", b"\xc1", codecs.pack([1, 2]), b"\x80", b"GET / HTTP/1.1\r\n\r\n"]
+)
+def test_garbage_is_counted_as_malformed(node: Node, payload: bytes) -> None:
+    with listening(node) as source:
+        joined(node, source)
+        node.say(payload)
+        wait_for(lambda: source.faults() == {"malformed": 1})
+        assert until_heard(node, source, lambda: frame(time.monotonic(), 2)).qpos[0] == 2
+
+
+def test_a_foreign_array_dialect_is_named(node: Node) -> None:
+    foreign = {b"nd": True, b"type": "<f4", b"kind": b"", b"shape": [7], b"data": b"\0" * 28}
+    with listening(node) as source:
+        joined(node, source)
+        node.say(frame(time.monotonic(), state={"left_arm": foreign, "right_arm": foreign}))
+        wait_for(lambda: source.faults() == {"malformed": 1})
+        assert "MNP" in source.last_fault
+
+
+def test_a_partial_message_right_after_a_complete_one_does_not_displace_it(node: Node) -> None:
+    with listening(node) as source:
+        joined(node, source)
+        node.say(frame(time.monotonic(), 5))
+        node.say(frame(time.monotonic(), 6, images={"cam_high": np.zeros((6, 8, 3), np.uint8)}))
+        observation = source.receive(PATIENCE)
+        assert observation is not None
+        assert observation.qpos[0] == 5
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        (
+            {"eef": {"left_arm": np.zeros(8, np.float32), "right_arm": np.zeros(8, np.float32)}},
+            "eef_unusable",
+        ),
+        ({"eef": {"left_arm": np.ones(8, np.float32)}}, "eef_unusable"),
+        ({"eef": [1]}, "eef_unusable"),
+        ({"action": np.zeros(3, np.float32)}, "action_unusable"),
+        ({"action_eef": np.zeros(16, np.float32)}, "action_eef_unusable"),
+    ],
+)
+def test_an_unusable_optional_part_is_left_out_and_counted(
+    node: Node, changes: dict[str, Any], fault: str
+) -> None:
+    with listening(node) as source:
+        joined(node, source)
+        node.say(frame(time.monotonic(), 3, **changes))
+        observation = source.receive(PATIENCE)
+        assert observation is not None
+        assert observation.qpos[0] == 3
+        assert observation.eef is None
+        assert observation.reported_action is None
+        assert observation.reported_action_eef is None
+        assert "eef" not in observation.captured
+        assert source.faults() == {fault: 1}
+
+
+def test_gaps_in_the_nodes_own_numbers_are_counted_as_lost(node: Node) -> None:
+    with listening(node) as source:
+        joined(node, source)
+        for number in (10, 11, 15):
+            node.say(frame(time.monotonic(), number, seq=number))
+            wait_for(lambda: source.receive(0.05) is not None)
+        assert source.faults() == {"frames_lost": 3}
+        node.say(frame(time.monotonic(), 0, seq=0))
+        wait_for(lambda: source.receive(0.05) is not None)
+        assert source.faults() == {"frames_lost": 3}
+
+
+def test_what_the_node_says_of_itself_is_passed_on(node: Node) -> None:
+    said: dict[str, Any] = {
+        "holding": True,
+        "refused": {"limits": 4},
+        "master": "abc",
+        "hil_error": "no leader",
+    }
+    with listening(node) as source:
+        until_heard(node, source, lambda: frame(time.monotonic(), **said))
+        assert source.status.holding is True
+        assert source.status.master == "abc"
+        assert source.status.hil_error == "no leader"
+        assert source.faults() == {"node_refused.limits": 4}
+
+
+def test_two_readers_do_not_steal_each_others_frames(node: Node) -> None:
+    with listening(node) as one, listening(node) as two:
+        joined(node, one)
+        joined(node, two)
+        one.receive(0.2)
+        node.say(frame(time.monotonic(), 42))
+        seen = [source.receive(PATIENCE) for source in (one, two)]
+    assert [None if each is None else each.qpos[0] for each in seen] == [42, 42]
+
+
+def test_it_can_be_closed_twice_and_connected_again(node: Node) -> None:
+    source = link.source(Config(sub_endpoint=node.obs), ROBOT, MonotonicClock())
+    source.close()
+    source.connect()
+    source.close()
+    source.close()
+    source.connect()
+    assert until_heard(node, source, lambda: frame(time.monotonic(), 4)).qpos[0] == 4
+    source.close()
+
+
+def test_an_address_that_libzmq_refuses_is_a_transport_error() -> None:
+    config = Config(sub_endpoint="ipc://" + "x" * 500, pub_endpoint="ipc://" + "x" * 500)
+    with pytest.raises(TransportError, match="cannot listen to the node at ipc"):
+        link.source(config, ROBOT, MonotonicClock()).connect()
+    with pytest.raises(TransportError, match="cannot reach the node at ipc"):
+        link.sink(config, ROBOT, MonotonicClock()).connect()
+
+
+def test_a_reader_that_broke_says_so_in_the_caller(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    with listening(node) as source:
+        joined(node, source)
+
+        def broken(payload: bytes) -> None:
+            raise MemoryError("no room")
+
+        monkeypatch.setattr(source._messages, "read", broken)
+        node.say(frame(time.monotonic()))
+        with pytest.raises(TransportError, match="no room"):
+            source.receive(PATIENCE)
+
+
+# Commands
+
+
+def send_until_heard(node: Node, sink: NodeSink, command: RobotCommand) -> dict[str, Any]:
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        sink.send(command)
+        heard = node.hear(0.05)
+        if heard is not None:
+            return heard
+    raise AssertionError("no command came through")
+
+
+def test_a_command_has_the_fields_of_the_protocol(node: Node) -> None:
+    action = np.linspace(0, 0.1, 14).astype(np.float32)
+    with commanding(node) as sink:
+        heard = send_until_heard(node, sink, RobotCommand(action, 3, 12.5))
+    assert list(heard) == ["t", "action", "target", "master", "seq"]
+    assert heard["t"] == 12.5
+    assert heard["target"] == "real"
+    assert heard["action"].dtype == np.float32
+    np.testing.assert_array_equal(heard["action"], action)
+    assert heard["master"] == sink.master
+    assert heard["seq"] >= 1
+
+
+def test_every_sink_has_a_name_of_its_own() -> None:
+    names = {link.sink(Config(), ROBOT, VirtualClock()).master for _ in range(5)}
+    assert len(names) == 5
+
+
+def test_sending_never_waits_for_a_node_that_is_not_there() -> None:
+    with socket_address() as endpoint:
+        sink = link.sink(Config(pub_endpoint=endpoint), ROBOT, MonotonicClock())
+    sink.connect()
+    with contextlib.closing(sink):
+        for step in range(5000):
+            sink.send(RobotCommand(np.zeros(14, np.float32), step, 0.0))
+    assert sink._sequence == 5000
+
+
+@contextlib.contextmanager
+def socket_address() -> Iterator[str]:
+    with contextlib.closing(Node()) as gone:
+        yield gone.act
+
+
+def test_a_node_that_comes_back_is_not_given_the_commands_of_the_moment_it_went_away() -> None:
+    first = Node()
+    with commanding(first) as sink:
+        send_until_heard(first, sink, RobotCommand(np.zeros(14, np.float32), 0, 0.0))
+        endpoints = first.obs, first.act
+        first.close()
+        for step in range(100):
+            sink.send(RobotCommand(np.full(14, 0.5, np.float32), step, 1.0))
+            time.sleep(0.002)
+        with contextlib.closing(Node(*endpoints)) as second:
+            heard = second.hear(1.0)
+            assert heard is None
+            fresh = send_until_heard(second, sink, RobotCommand(np.zeros(14, np.float32), 0, 2.0))
+            assert fresh["t"] == 2.0
+
+
+@pytest.mark.parametrize(
+    "action", [np.zeros(13), np.zeros((1, 14)), np.full(14, np.nan), np.full(14, np.inf)]
+)
+def test_a_vector_that_no_node_may_be_given_is_refused(node: Node, action: Any) -> None:
+    with commanding(node) as sink, pytest.raises(TransportError, match="allowed: 14 finite numbers"):
+        sink.send(RobotCommand(action, 0, 0.0))
+
+
+def test_sending_needs_a_connection() -> None:
+    sink = link.sink(Config(), ROBOT, MonotonicClock())
+    sink.close()
+    with pytest.raises(TransportError, match="not connected"):
+        sink.send(RobotCommand(np.zeros(14, np.float32), 0, 0.0))
