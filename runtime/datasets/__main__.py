@@ -1,4 +1,4 @@
-"""python -m runtime.datasets publish EPISODE --to DIR | check DIR."""
+"""python -m runtime.datasets publish EPISODE --to DIR | check DIR | recover DIR."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from pathlib import Path
 
 from runtime.datasets.consistency import check
 from runtime.datasets.published import publish
-from runtime.errors import RuntimeFault
+from runtime.datasets.staging import locked, recover
+from runtime.errors import RecordingError, RuntimeFault
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -38,6 +39,9 @@ def _parser() -> argparse.ArgumentParser:
     checking = commands.add_parser("check", help="check a dataset against its own metadata")
     checking.add_argument("dataset", type=Path, help="folder of the dataset")
     checking.set_defaults(run=_check)
+    recovering = commands.add_parser("recover", help="take back what an interrupted publication left")
+    recovering.add_argument("dataset", type=Path, help="folder of the dataset")
+    recovering.set_defaults(run=_recover)
     return parser
 
 
@@ -62,6 +66,14 @@ def _check(options: argparse.Namespace) -> int:
     if not problems:
         print(f"{options.dataset} is whole")
     return 1 if problems else 0
+
+
+def _recover(options: argparse.Namespace) -> int:
+    if not options.dataset.is_dir():
+        raise RecordingError(f"there is no dataset folder {options.dataset}")
+    with locked(options.dataset):
+        recover(options.dataset)
+    return _check(options)
 
 
 if __name__ == "__main__":

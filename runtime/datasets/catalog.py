@@ -41,11 +41,12 @@ class Catalog:
                 f"{root} is of version {info['codebase_version']}, published is {layout.CODEBASE_VERSION}"
             )
         total = int(info["total_episodes"])
+        episodes = _committed(root / layout.EPISODES, total)
         catalog = cls(
             root,
             info,
-            _committed(root / layout.EPISODES, total),
-            tuple(layout.read_lines(root / layout.TASKS)),
+            episodes,
+            _committed_tasks(root, info, episodes),
             _committed(root / layout.EPISODES_STATS, total),
             _committed(root / layout.EVA_EPISODES, total),
         )
@@ -152,9 +153,9 @@ class Catalog:
         )
 
     def documents_before_data(self) -> dict[str, bytes]:
-        """Files that may name more than the dataset holds: written before the data."""
+        """Files that may name more than there is; an existing modality.json stays, it may be edited."""
         documents = {layout.TASKS: _lines(self.tasks)}
-        if not (self.root / layout.MODALITY).exists():
+        if not ((self.root / layout.INFO).exists() and (self.root / layout.MODALITY).exists()):
             documents[layout.MODALITY] = _object(modality(self.features))
         return documents
 
@@ -192,6 +193,13 @@ def _groups(names: list[str]) -> dict[str, dict[str, int]]:
 def _committed(path: Path, total: int) -> tuple[Line, ...]:
     lines = [line for line in layout.read_lines(path) if line["episode_index"] < total]
     return tuple(sorted(lines, key=lambda line: int(line["episode_index"])))
+
+
+def _committed_tasks(root: Path, info: Mapping[str, Any], episodes: tuple[Line, ...]) -> tuple[Line, ...]:
+    used = {task for line in episodes for task in line["tasks"]}
+    lines = layout.read_lines(root / layout.TASKS)
+    total = int(info.get("total_tasks", len(lines)))
+    return tuple(line for line in lines if line["task_index"] < total or line["task"] in used)
 
 
 def _with(lines: tuple[Line, ...], new: Line) -> tuple[Line, ...]:

@@ -236,4 +236,4 @@ def _strays(root: Path, info: layout.Info) -> Iterator[str]:
     counted = {layout.data_file(root, info, index, listed.get(index)) for index in range(total)}
     for path in sorted((root / "data").rglob("*.parquet")):
         if path not in counted:
-            yield f"{path} belongs to no episode: an interrupted publication; publishing again removes it"
+            yield f"{path} belongs to no episode: publishing was interrupted; `recover` removes it"

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 
 from runtime.datasets import layout
+from runtime.datasets.catalog import Catalog
 from runtime.errors import RecordingError
 from runtime.recording.files import disk_fault, read_document, sync_folder, write_whole
 
@@ -39,7 +40,8 @@ def recover(root: Path) -> None:
     """Take back what an interrupted publication left; the caller holds the lock.
 
     The plan of that publication names its files. Those of an episode that info.json does not count are
-    removed; those of an episode that it counts stay, in either version: publishing again completes it.
+    removed, and so is every line about it; the files of an episode that it counts stay, in either version:
+    publishing that episode again completes it.
     """
     staging = root / FOLDER
     if not staging.exists():
@@ -50,14 +52,21 @@ def recover(root: Path) -> None:
         index, files = content.get("episode_index"), content.get("files")
         if not isinstance(index, int) or not isinstance(files, list):
             raise RecordingError(f"{plan} is not ours: {content}. Remove {staging} by hand")
-        if index >= _committed(root):
-            for name in files:
-                (root / str(name)).unlink(missing_ok=True)
+        _take_back(root, index, [root / str(name) for name in files])
     shutil.rmtree(staging)
 
 
-def _committed(root: Path) -> int:
-    return int(layout.read_info(root)["total_episodes"]) if (root / layout.INFO).exists() else 0
+def _take_back(root: Path, index: int, files: list[Path]) -> None:
+    catalog = Catalog.read(root)
+    if index < len(catalog.episodes):
+        return
+    for path in files:
+        path.unlink(missing_ok=True)
+    if not catalog.info:
+        return
+    documents = catalog.documents_before_data() | catalog.documents_after_data()
+    for name in (layout.TASKS, layout.EPISODES_STATS, layout.STATS, layout.EVA_EPISODES, layout.EPISODES):
+        write_whole(root / name, documents[name])
 
 
 def require_empty(root: Path) -> None:

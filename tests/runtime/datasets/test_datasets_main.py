@@ -42,3 +42,12 @@ def test_a_check_lists_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_a_folder_without_an_episode_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["publish", str(tmp_path / "absent"), "--to", str(tmp_path / "set")]) == 1
     assert "manifest.json" in capsys.readouterr().err
+
+
+def test_recover_removes_what_was_left_and_checks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["publish", str(record(tmp_path / "episodes", frames=4)), "--to", str(tmp_path / "set")])
+    (tmp_path / "set/.publishing").mkdir()
+    assert main(["recover", str(tmp_path / "set")]) == 0
+    assert not (tmp_path / "set/.publishing").exists()
+    assert main(["recover", str(tmp_path / "absent")]) == 1
+    assert "no dataset folder" in capsys.readouterr().err

@@ -382,6 +382,39 @@ def test_a_crash_at_any_rename_leaves_the_old_contents_and_a_second_run_complete
     assert stranger(dataset)["broken"] == []
 
 
+@pytest.mark.parametrize("steps", range(RENAMES))
+def test_recovery_takes_back_every_trace(tmp_path: Path, steps: int) -> None:
+    dataset = tmp_path / "set"
+    publish(record(tmp_path / "episodes", frames=6), dataset)
+
+    def contents() -> dict[str, bytes]:
+        return {str(p.relative_to(dataset)): p.read_bytes() for p in dataset.rglob("*") if p.is_file()}
+
+    old = contents()
+    assert _die(record(tmp_path / "episodes", frames=8, seed=8, task="another"), dataset, steps) == 9
+    with staging.locked(dataset):
+        staging.recover(dataset)
+    assert contents() == old
+    assert check(dataset) == []
+
+
+def test_a_refused_episode_after_a_crash_leaves_a_whole_dataset(tmp_path: Path) -> None:
+    dataset = tmp_path / "set"
+    publish(record(tmp_path / "episodes", frames=6), dataset)
+    assert _die(record(tmp_path / "episodes", frames=8), dataset, RENAMES - 1) == 9
+    with pytest.raises(RecordingError, match="fps"):
+        publish(record(tmp_path / "episodes", frames=5, fps=20.0), dataset)
+    assert check(dataset) == []
+
+
+def test_a_first_episode_that_was_lost_leaves_no_modalities_to_another_robot(tmp_path: Path) -> None:
+    dataset = tmp_path / "set"
+    assert _die(record(tmp_path / "episodes", frames=4), dataset, 5) == 9
+    cameras = {"top": {"width": 64, "height": 48}}
+    publish(record(tmp_path / "episodes", frames=4, cameras=cameras, capture_streams=[]), dataset)
+    assert list(json.loads((dataset / "meta/modality.json").read_text())["video"]) == ["top"]
+
+
 def test_one_more_rename_than_that_is_not_needed(tmp_path: Path) -> None:
     dataset = tmp_path / "set"
     publish(record(tmp_path / "episodes", frames=6), dataset)
