@@ -34,7 +34,7 @@ from runtime.messages import (
 from runtime.orders import Orders
 from runtime.page import EStop, Page
 from runtime.run import Provenance, Run
-from runtime.session import Effects, Happening, Session, State
+from runtime.session import LEASE_COMMANDS, Effects, Happening, Session, State
 from runtime.setup import SetUp
 from runtime.snapshot import snapshot
 
@@ -329,9 +329,11 @@ class Main(Effects):
         if command.kind == "events_since":
             rows = self.events.since(int(command.args.get("number", 0)))
             return Ack(command.uuid, "done", boot=self.boot, data={"events": rows})
-        before = self.session.state
+        before, sequence = self.session.state, self.session.sequence
         ack = self.session.handle(command)
-        if command.kind != "lease_renew":
+        # A lease that is kept is a stream; only its changes and refusals are worth a line.
+        kept = command.kind in LEASE_COMMANDS and ack.status == "accepted" and ack.sequence == sequence
+        if not kept:
             who = command.user or command.holder
             what = f"{command.kind} by {who}: {ack.status}" + (f", {ack.reason}" if ack.reason else "")
             data = {"uuid": command.uuid, "from": str(before), "to": str(self.session.state)}

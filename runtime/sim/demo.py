@@ -1,0 +1,138 @@
+"""`make demo`: a station on this machine, with the bundled execution node and policy server beside it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from runtime import deployment
+from runtime.errors import RuntimeFault, SetupError
+from runtime.headless import RESULT_NAME
+
+_DEPLOYMENT = Path(__file__).parents[2] / "deployments" / "demo.toml"
+_READY_S = 30.0
+
+
+class Helpers:
+    """The node and the policy server; they end when their standard input does, so they never outlive us."""
+
+    def __init__(self) -> None:
+        self._children: list[subprocess.Popen[str]] = []
+
+    def start(self, module: str, *arguments: str) -> dict[str, Any]:
+        """Start `python -m module`, and return what its first line of output says of its endpoints."""
+        child = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments, "--lifeline"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        self._children.append(child)
+        assert child.stdout is not None
+        first = child.stdout.readline()
+        if not first:
+            raise SetupError(f"{module} ended with {child.wait()} before it was ready")
+        ready: dict[str, Any] = json.loads(first)
+        return ready
+
+    def end(self) -> None:
+        """Close their lifelines and wait; what does not end is killed."""
+        for child in self._children:
+            assert child.stdin is not None
+            child.stdin.close()
+        for child in self._children:
+            try:
+                child.wait(5)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit code 0 where the run went well."""
+    parser = argparse.ArgumentParser(prog="make demo", description=__doc__)
+    parser.add_argument("--once", action="store_true", help="one episode, then end; else until Ctrl-C")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures of the run there")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
+    given = parser.parse_args(arguments)
+    signal.signal(signal.SIGTERM, _interrupt)
+    helpers = Helpers()
+    try:
+        return _demo(helpers, given)
+    except RuntimeFault as fault:
+        print(f"error: {fault}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    finally:
+        helpers.end()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _demo(helpers: Helpers, given: argparse.Namespace) -> int:
+    robot = deployment.load(_DEPLOYMENT, given.assignments).deployment.robot
+    free = "tcp://127.0.0.1:0"
+    node = helpers.start(
+        "runtime.sim.node", "--robot", robot, "--obs-endpoint", free, "--action-endpoint", free
+    )
+    server = helpers.start(
+        "runtime.sim.serve", "openpi", "--robot", robot, "--port", "0", "--latency-ms", "80"
+    )
+    print(f"execution node   {node['obs_endpoint']}  {node['action_endpoint']}")
+    print(f"policy server    {server['url']}", flush=True)
+    assignments = [
+        f'transport.sub_endpoint="{node["obs_endpoint"]}"',
+        f'transport.pub_endpoint="{node["action_endpoint"]}"',
+        f'policy.url="{server["url"]}"',
+        *given.assignments,
+    ]
+    station = deployment.load(_DEPLOYMENT, assignments).deployment.station_dir
+    result = station / RESULT_NAME
+    result.unlink(missing_ok=True)
+    code = _station("--headless", assignments)
+    if given.json:
+        given.json.write_text(
+            result.read_text("utf-8") if result.exists() else '{"error": "no result"}', "utf-8"
+        )
+    if code == 0 and not given.once:
+        print(
+            f"\nThe station stays up. In a second terminal: .venv/bin/python -m runtime.ctl {station.name} watch"
+        )
+        print(
+            f"or setup, run, stop, halt, resume, home, estop, release. Ctrl-C here ends everything.\n",
+            flush=True,
+        )
+        _station("", assignments)
+    return code
+
+
+def _station(option: str, assignments: Sequence[str]) -> int:
+    """Run the station's supervisor to its end; Ctrl-C is passed on and waited for."""
+    sets = [part for assignment in assignments for part in ("--set", assignment)]
+    options = [option] if option else []
+    child = subprocess.Popen(
+        [sys.executable, "-m", "runtime", str(_DEPLOYMENT), *options, *sets], start_new_session=True
+    )
+    try:
+        return child.wait()
+    except KeyboardInterrupt:
+        child.send_signal(signal.SIGINT)
+        child.wait()
+        raise
+
+
+if __name__ == "__main__":
+    sys.exit(main())
