@@ -147,6 +147,8 @@ class Node:
         if every and self._sequence % every == every - 1:
             payload = _GARBAGE
         self._sequence += 1
+        # libzmq by itself notes only once a millisecond what was taken, and drops while a queue looks full.
+        self._publisher.poll(0, zmq.POLLOUT)
         with contextlib.suppress(zmq.Again):  # nobody takes them fast enough: the next frame is newer
             self._publisher.send(payload, zmq.NOBLOCK, copy=False)
 

@@ -20,13 +20,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def announce(ready: Mapping[str, object], path: Path | None) -> None:
-    """Print the addresses as one JSON line, and write them to `path` whole or not at all."""
+    """Write the addresses to `path`, whole or not at all, then print them as one JSON line."""
     line = json.dumps(dict(ready))
-    print(line, flush=True)
     if path is not None:
         draft = path.with_name(f"{path.name}.{os.getpid()}")
         draft.write_text(line + "\n")
         draft.replace(path)
+    print(line, flush=True)
 
 
 def ending(lifeline: bool) -> threading.Event:

@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import robots
+from runtime import codecs
+from runtime.sim.gate import Gate
+
+ROBOT = robots.load("agilex_piper")
+HOME = ROBOT.poses["home"].astype(np.float32)
+
+
+def command(action: Any = HOME, **fields: Any) -> bytes:
+    return codecs.pack({"t": 0.0, "action": action, "target": "real"} | fields)
+
+
+@pytest.fixture
+def gate() -> Gate:
+    return Gate(ROBOT, deadline=0.3)
+
+
+def test_a_whole_target_within_limits_passes(gate: Gate) -> None:
+    target = HOME + np.where(np.asarray(ROBOT.upper) > 0.01, 0.01, -0.01).astype(np.float32)
+    accepted = gate.judge(command(target), 0.0)
+    assert accepted is not None
+    assert accepted.target is not None
+    np.testing.assert_allclose(accepted.target, target, atol=1e-6)
+    assert gate.refused == {}
+
+
+@pytest.mark.parametrize(
+    ("action", "reason"),
+    [
+        (HOME[:13], "dimension"),
+        (HOME[None], "dimension"),
+        (np.where(np.arange(14) == 3, np.nan, HOME), "not_finite"),
+        (np.where(np.arange(14) == 3, np.inf, HOME), "not_finite"),
+        (np.where(np.arange(14) == 0, 3.0, HOME), "limits"),
+        (np.where(np.arange(14) == 6, -0.01, HOME), "limits"),
+        (np.zeros(14, np.int64), "malformed"),
+        ([0.0] * 14, "malformed"),
+        (None, "malformed"),
+    ],
+)
+def test_a_target_that_no_arm_may_be_given_is_refused_and_counted(
+    gate: Gate, action: Any, reason: str
+) -> None:
+    assert gate.judge(command(action), 0.0) is None
+    assert gate.refused == {reason: 1}
+    assert gate.silent(0.0)
+
+
+def test_limits_that_were_rounded_to_float32_are_not_violations(gate: Gate) -> None:
+    for bound in (ROBOT.lower, ROBOT.upper):
+        accepted = gate.judge(command(bound.astype(np.float32)), 0.0)
+        assert accepted is not None
+        assert accepted.target is not None
+        assert (accepted.target >= ROBOT.lower).all()
+        assert (accepted.target <= ROBOT.upper).all()
+
+
+@pytest.mark.parametrize("payload", [b"", b"\xc1", codecs.pack([1]), codecs.pack({"target": 3})])
+def test_garbage_is_refused_as_malformed(gate: Gate, payload: bytes) -> None:
+    assert gate.judge(payload, 0.0) is None
+    assert gate.refused == {"malformed": 1}
+
+
+def test_without_a_target_field_it_is_meant_for_the_robot(gate: Gate) -> None:
+    accepted = gate.judge(codecs.pack({"t": 0.0, "action": HOME}), 0.0)
+    assert accepted is not None
+    assert accepted.target is not None
+
+
+def test_a_target_for_the_simulation_is_ignored_without_a_word(gate: Gate) -> None:
+    assert gate.judge(command(target="sim"), 0.0) is None
+    assert gate.refused == {}
+
+
+def test_an_unknown_target_is_refused(gate: Gate) -> None:
+    assert gate.judge(command(target="fire"), 0.0) is None
+    assert gate.refused == {"unknown_target": 1}
+
+
+@pytest.mark.parametrize("word", ["collect_start", "collect_stop", "hil_start", "hil_stop"])
+def test_control_words_pass_without_counting_as_a_command(gate: Gate, word: str) -> None:
+    accepted = gate.judge(command(np.zeros(14, np.float32), target=word), 0.0)
+    assert accepted is not None
+    assert accepted.control == word
+    assert accepted.target is None
+    assert gate.silent(0.0)
+
+
+def test_it_is_silent_after_the_deadline_by_our_own_clock(gate: Gate) -> None:
+    assert gate.silent(100.0)
+    gate.judge(command(t=9e9), 100.0)
+    assert not gate.silent(100.3)
+    assert gate.silent(100.31)
+
+
+def test_the_first_master_rules_until_it_is_silent_for_a_second(gate: Gate) -> None:
+    assert gate.judge(command(master="a"), 0.0) is not None
+    assert gate.judge(command(master="b"), 0.5) is None
+    assert gate.refused == {"other_master": 1}
+    assert gate.judge(command(master="a"), 0.9) is not None
+    assert gate.judge(command(master="b"), 1.8) is None
+    assert gate.judge(command(master="b"), 1.91) is not None
+    assert gate.master == "b"
+    assert gate.judge(command(master="a"), 2.0) is None
+    assert gate.refused == {"other_master": 3}
+
+
+def test_refused_attempts_of_another_do_not_prolong_nor_end_the_reign(gate: Gate) -> None:
+    gate.judge(command(master="a"), 0.0)
+    for tenth in range(1, 11):
+        assert gate.judge(command(master="b"), tenth / 10) is None
+    assert gate.judge(command(master="b"), 1.01) is not None
+
+
+def test_a_client_without_a_name_is_a_master_like_any_other(gate: Gate) -> None:
+    assert gate.judge(command(), 0.0) is not None
+    assert gate.master == "anonymous"
+    assert gate.judge(command(master="b"), 0.1) is None
+    assert gate.judge(command(), 0.2) is not None
+
+
+def test_control_words_of_another_client_are_refused(gate: Gate) -> None:
+    gate.judge(command(master="a"), 0.0)
+    assert gate.judge(command(target="collect_start", master="b"), 0.1) is None
+    assert gate.refused == {"other_master": 1}

@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosedError
+from websockets.sync.client import ClientConnection, connect
+
+import robots
+from runtime import codecs
+from runtime.clock import MonotonicClock
+from runtime.errors import PolicyError
+from runtime.policies import openpi
+from runtime.policies.link import PolicyGone
+from runtime.sim.gestures import Gesture
+from runtime.types import Observation
+
+ROBOT = robots.load("agilex_piper")
+HOME = ROBOT.poses["home"]
+PATIENCE = 15.0
+
+
+@pytest.fixture
+def serve(start: Any) -> Any:
+    return lambda *arguments: start(
+        "runtime.sim.serve", "openpi", "--robot", "agilex_piper", "--port", "0", *arguments
+    )
+
+
+@contextlib.contextmanager
+def conversation(url: str) -> Iterator[ClientConnection]:
+    with connect(url, compression=None, max_size=None, proxy=None) as connection:
+        yield connection
+
+
+def receive(connection: ClientConnection) -> dict[str, Any]:
+    answer = connection.recv(timeout=PATIENCE)
+    assert isinstance(answer, bytes)
+    return dict(codecs.unpack(answer))
+
+
+def request(**changes: Any) -> bytes:
+    picture = np.zeros((3, 8, 8), np.uint8)
+    whole = {"state": HOME.astype(np.float32), "images": {"cam_high": picture}, "prompt": "wave"}
+    return codecs.pack(whole | changes)
+
+
+def test_it_speaks_as_an_openpi_server_does(serve: Any) -> None:
+    url = serve("--horizon", "12", "--latency-ms", "20").ready["url"]
+    with conversation(url) as connection:
+        assert receive(connection)["action_horizon"] == 12
+        connection.send(request())
+        first = receive(connection)
+        connection.send(request())
+        second = receive(connection)
+    assert first["actions"].dtype == np.float32
+    assert first["actions"].shape == (12, 14)
+    assert first["server_timing"]["infer_ms"] >= 20
+    assert "prev_total_ms" not in first["server_timing"]
+    assert second["server_timing"]["prev_total_ms"] >= 20
+    assert second["policy_timing"]["infer_ms"] >= 20
+    np.testing.assert_array_equal(first["actions"], second["actions"])
+    expected = Gesture(ROBOT).chunk(HOME.astype(np.float32).astype(np.float64), 12, ROBOT.control_rate)
+    np.testing.assert_array_equal(first["actions"], expected)
+
+
+def test_a_wrong_request_is_answered_by_a_traceback_and_code_1011(serve: Any) -> None:
+    url = serve().ready["url"]
+    for changes in ({"state": np.zeros(7, np.float32)}, {"images": {"a": np.zeros((3, 8, 8), np.float32)}}):
+        with conversation(url) as connection:
+            receive(connection)
+            connection.send(request(**changes))
+            text = connection.recv(timeout=PATIENCE)
+            assert isinstance(text, str)
+            assert "Traceback" in text
+            assert "expected" in text
+            with pytest.raises(ConnectionClosedError) as closed:
+                connection.recv(timeout=PATIENCE)
+            assert closed.value.rcvd is not None
+            assert closed.value.rcvd.code == 1011
+
+
+def test_healthz_answers_beside_the_websocket(serve: Any) -> None:
+    port = serve().ready["port"]
+    direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    with direct.open(f"http://127.0.0.1:{port}/healthz", timeout=PATIENCE) as answer:
+        assert (answer.status, answer.read()) == (200, b"OK\n")
+
+
+def test_a_server_that_dies_during_an_inference_is_gone_for_the_client(serve: Any) -> None:
+    standin = serve("--fault", "die:1")
+    config = openpi.Config(url=standin.ready["url"], image_size=[24, 32])
+    pictures = {camera.key: np.zeros((24, 32, 3), np.uint8) for camera in ROBOT.cameras}
+    shown = Observation(1, 0.0, {}, HOME.astype(np.float32), pictures)
+    with contextlib.closing(openpi.build(config, ROBOT, MonotonicClock(), 30.0)) as policy:
+        policy.connect()
+        assert policy.infer(shown).actions.shape == (50, 14)
+        with pytest.raises(PolicyGone, match="closed the connection"):
+            policy.infer(shown)
+        assert standin.process.wait(PATIENCE) == 1
+        with pytest.raises(PolicyError, match="no policy server listens"):
+            policy.infer(shown)
+
+
+def test_it_writes_its_address_and_ends_on_sigterm(serve: Any, tmp_path: Path) -> None:
+    file = tmp_path / "ready.json"
+    standin = serve("--ready-file", str(file))
+    assert json.loads(file.read_text()) == standin.ready
+    with conversation(standin.ready["url"]) as connection:
+        receive(connection)
+        standin.process.terminate()
+        assert standin.process.wait(PATIENCE) == 0
+
+
+def test_it_ends_when_its_lifeline_ends(serve: Any) -> None:
+    process = serve().process
+    process.stdin.close()
+    assert process.wait(PATIENCE) == 0
+
+
+def test_a_port_that_is_taken_is_said_so(serve: Any) -> None:
+    port = str(serve().ready["port"])
+    arguments = ["-m", "runtime.sim.serve", "openpi", "--robot", "agilex_piper", "--port", port]
+    ended = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 2
+    assert f"cannot listen at 127.0.0.1:{port}" in ended.stderr
+
+
+def test_an_unknown_fault_names_the_known_ones() -> None:
+    arguments = ["-m", "runtime.sim.serve", "openpi", "--robot", "agilex_piper", "--fault", "boom"]
+    ended = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 2
+    assert "'boom' is no fault; allowed: mute_on_connect" in ended.stderr
