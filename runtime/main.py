@@ -102,6 +102,7 @@ class Main(Effects):
     def begin_run(self) -> None:
         if self._recording_alone:
             raise RuntimeFault("a recording without a run is open: record stop first")
+        self._require_family()
         self._runs += 1
         manifest = None
         if self.plan.deployment.recording.enabled:
@@ -144,6 +145,7 @@ class Main(Effects):
     def start_recording(self) -> None:
         if self._recording_alone:
             raise RuntimeFault("a recording is open already")
+        self._require_family()
         self._recording_alone = True
         self._tell_media(BeginEpisode(0, self._provenance.manifest("observe", self.setup.info)))
 
@@ -151,6 +153,13 @@ class Main(Effects):
         if not self._recording_alone:
             raise RuntimeFault("no recording is open; a run's own recording ends with the run")
         self._end_recording("finished", "stopped by the operator")
+
+    def _require_family(self) -> None:
+        """What is sent to a process that is still starting would be lost."""
+        now, within = self.clock.now(), self.plan.deployment.control.heartbeat_timeout_s
+        for name in _SIBLINGS:
+            if not self.page.alive(name, now, within):
+                raise RuntimeFault(f"the process {name} gives no sign of life yet: try again in a moment")
 
     def _end_recording(self, status: str, reason: str) -> None:
         self._recording_alone = False

@@ -155,6 +155,10 @@ class Page:
         """When `process` last said that it is alive; 0 = never."""
         return float(self._beats[process][0])
 
+    def alive(self, process: str, now: float, within: float) -> bool:
+        """Whether `process` has said so in the last `within` seconds."""
+        return now - self.last_beat(process) <= within
+
     def generation(self, process: str) -> int:
         """How often the supervisor has started `process`; a change means that it died and was restarted."""
         return int(self._generations[process][0])

@@ -79,6 +79,8 @@ class SetUp:
                 self._enter(Stage.OBSERVE)
         elif self.stage is Stage.OBSERVE:
             return self._observe()
+        elif self.stage is Stage.HOME:
+            self._require_family()
         elif self.stage is Stage.SETTLE:
             return self._settle()
         elif self.stage is Stage.WARM_UP:
@@ -95,8 +97,9 @@ class SetUp:
     def _observe(self) -> bool:
         settings = self._plan.deployment.setup
         try:
+            self._require_family()
             self._inference.observe()
-        except PolicyError as error:
+        except (PolicyError, SetupError) as error:
             if self._waited() > settings.observation_timeout_s:
                 raise SetupError(
                     f"no complete observation within {settings.observation_timeout_s:g} s: {error}"
@@ -107,6 +110,13 @@ class SetUp:
         else:
             self._start_warm_up()
         return False
+
+    def _require_family(self) -> None:
+        """An order to a control that is still starting would be lost, and without a guard it only holds."""
+        within = self._plan.deployment.control.heartbeat_timeout_s
+        for process in ("control", "guard"):
+            if not self._page.alive(process, self._clock.now(), within):
+                raise SetupError(f"the process {process} gives no sign of life")
 
     def _go(self) -> None:
         self._goal = self._plan.robot.poses[self._plan.deployment.setup.pose]

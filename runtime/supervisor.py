@@ -80,8 +80,11 @@ class Supervisor:
         return path
 
     def _start(self, process: str) -> None:
+        self._page.beat(process, 0.0)  # not alive until it says so itself
         self._page.set_generation(process, self._page.generation(process) + 1)
         self._children[process] = self._spawn(process)
+        pids = {name: str(child.pid) for name, child in self._children.items()}
+        Endpoints(self._station_dir).write("supervisor", {"boot": self.boot, **pids})
 
     def _spawn(self, process: str) -> subprocess.Popen[bytes]:
         return subprocess.Popen(

@@ -198,9 +198,10 @@ class Tick:
             self._hold_because("orphaned", "the supervisor is gone", now)
             return
         for process in ("main", "guard"):
-            silent = now - self._page.last_beat(process)
-            if silent > self._settings.heartbeat_timeout:
-                self._hold_because("family", f"no sign of life from {process} for {silent:.1f} s", now)
+            beat = self._page.last_beat(process)
+            if now - beat > self._settings.heartbeat_timeout:
+                since = f"for {now - beat:.1f} s" if beat else "since it was restarted"
+                self._hold_because("family", f"no sign of life from {process} {since}", now)
 
     def _finish_motion(self, now: float) -> None:
         if isinstance(self._behaviour, Move) and self._behaviour.finished(now):

@@ -1,0 +1,159 @@
+"""Whole stations of real processes, and the means to kill each of them."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from runtime.bus import Endpoints
+from runtime.client import StationClient
+from runtime.errors import RuntimeFault
+
+ROOT = Path(__file__).parents[2]
+ROBOT = "agilex_piper"
+FREE = "tcp://127.0.0.1:0"
+
+
+def alive(pid: int) -> bool:
+    """Whether the process runs; one that only waits to be reaped does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def eventually(check, seconds, what):
+    """Wait for something that real processes do in their own time."""
+    deadline = time.monotonic() + seconds
+    while not (found := check()):
+        assert time.monotonic() < deadline, f"{what}: not within {seconds} s"
+        time.sleep(0.02)
+    return found
+
+
+class Lab:
+    """A node, a policy server and a station in a folder of its own."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.data = folder / "data"
+        self.children = {}
+        self.addresses = {}
+        self.supervisor = None
+        self.node_arguments = ()
+
+    def start(self, name, module, *arguments, stdout=subprocess.PIPE):
+        child = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments, "--lifeline"],
+            stdin=subprocess.PIPE,
+            stdout=stdout,
+            stderr=(self.folder / f"{name}.log").open("a"),
+            text=True,
+            cwd=ROOT,
+        )
+        self.children[name] = child
+        return json.loads(child.stdout.readline())
+
+    def node(self, *arguments):
+        ends = self.addresses.get("node", {"obs_endpoint": FREE, "action_endpoint": FREE})
+        self.addresses["node"] = self.start(
+            *("node", "runtime.sim.node", "--robot", ROBOT, "--width", "64", "--height", "48"),
+            *("--obs-endpoint", ends["obs_endpoint"], "--action-endpoint", ends["action_endpoint"]),
+            *arguments,
+        )
+        return self
+
+    def server(self, *arguments):
+        self.addresses["server"] = self.start(
+            *("server", "runtime.sim.serve", "openpi", "--robot", ROBOT, "--port", "0"),
+            *("--latency-ms", "20", *arguments),
+        )
+        return self
+
+    def station(self, *assignments):
+        node = self.addresses.get("node", {"obs_endpoint": "tcp://127.0.0.1:1", "action_endpoint": "tcp://127.0.0.1:1"})
+        server = self.addresses.get("server", {"url": "ws://127.0.0.1:1"})
+        settings = [
+            f'transport.sub_endpoint="{node["obs_endpoint"]}"',
+            f'transport.pub_endpoint="{node["action_endpoint"]}"',
+            f'policy.url="{server["url"]}"',
+            f'data_dir="{self.data}"',
+            "run.duration_s=600",
+            "recording.min_free_bytes=0",
+            "bus.preview_rate=0",
+            *assignments,
+        ]
+        sets = [part for setting in settings for part in ("--set", setting)]
+        self.supervisor = subprocess.Popen(
+            [sys.executable, "-m", "runtime", "deployments/demo.toml", *sets],
+            stderr=(self.folder / "station.log").open("a"),
+            cwd=ROOT,
+        )
+        self.client = StationClient(self.data / "stations" / "demo", holder="test")
+        eventually(self.answers, 20, "the station answers")
+        return self
+
+    def answers(self):
+        try:
+            return self.client.status(0.5)
+        except RuntimeFault:
+            return None
+
+    def up(self, *assignments):
+        """Node, server and station, connected and idle."""
+        if "node" not in self.children:
+            self.node()
+        if "server" not in self.children:
+            self.server()
+        self.station(*assignments)
+        self.reach("idle")
+        return self
+
+    def reach(self, *states, seconds=20):
+        return self.client.wait(lambda status: status["state"] in states, seconds)
+
+    def ready(self):
+        self.client.command("setup")
+        status = self.reach("ready", "idle", "faulted")
+        assert status["state"] == "ready", status["reason"]
+        return self
+
+    def running(self, seconds=1.0):
+        """A run that has moved the arm for a while."""
+        self.ready()
+        self.client.command("run")
+        self.client.wait(lambda s: s["run"]["elapsed"] >= seconds and s["policy"]["answers"] > 3, 20)
+        return self
+
+    def pids(self):
+        found = Endpoints(self.data / "stations" / "demo").read("supervisor")
+        return {name: int(found[name]) for name in ("control", "main", "media", "guard")}
+
+    def kill(self, process):
+        """kill -9 of one of the family, or of the supervisor."""
+        pid = self.supervisor.pid if process == "supervisor" else self.pids()[process]
+        os.kill(pid, signal.SIGKILL)
+        if process == "supervisor":
+            self.supervisor.wait()
+
+    def events(self, kind):
+        return [event for event in self.client.events_since(0) if event["kind"] == kind]
+
+    def episodes(self):
+        return sorted((self.data / "episodes").glob("*"))
+
+    def outcome(self, seconds=12):
+        """The outcome of the only episode."""
+        path = eventually(lambda: list((self.data / "episodes").glob("*/outcome.json")), seconds, "an outcome")
+        return json.loads(path[0].read_text())
+
+    def close(self):
+        if self.supervisor and self.supervisor.poll() is None:
+            self.supervisor.send_signal(signal.SIGTERM)
+            self.supervisor.wait(15)
+        for child in self.children.values():
+            child.stdin.close()
+            child.wait(10)

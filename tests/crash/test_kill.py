@@ -1,0 +1,91 @@
+"""kill -9 of each process of the family and of the supervisor, in idle, running and recording."""
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from runtime.recording.reader import open_episode
+from tests.crash.lab import ROOT, alive, eventually
+
+pytestmark = pytest.mark.slow
+FAMILY = ("control", "main", "media", "guard")
+
+
+def to_state(lab, state):
+    lab.up(f"recording.enabled={'true' if state == 'recording' else 'false'}", "control.orphan_hold_s=2.0")
+    if state != "idle":
+        lab.running(2.0)
+    return lab
+
+
+def readable_to_the_last_second(lab, killed_at):
+    """The only episode opens, is marked interrupted, and reaches to within a second of the kill."""
+    outcome = lab.outcome()
+    assert outcome["status"] == "interrupted", outcome
+    assert outcome["reason"]
+    episode = open_episode(lab.episodes()[0])
+    manifest = episode.manifest
+    recorded = manifest["started_wall"] + episode.frames / manifest["fps"]
+    assert recorded > killed_at - 1.2, (recorded, killed_at)  # a second, and the time to open the episode
+    assert episode.frames == len(episode.rows)
+    return episode
+
+
+@pytest.mark.parametrize("state", ["idle", "running", "recording"])
+@pytest.mark.parametrize("process", FAMILY)
+def test_a_killed_process_is_restarted_and_nothing_moves_until_set_up_again(lab, process, state):
+    to_state(lab, state)
+    before = lab.pids()
+    killed_at = time.time()
+    lab.kill(process)
+    eventually(lambda: lab.pids()[process] != before[process], 10, "a restart")
+    eventually(lab.answers, 10, "the station answers again")
+    lab.reach("idle", seconds=15)
+    assert {name: pid for name, pid in lab.pids().items() if name != process} == {
+        name: pid for name, pid in before.items() if name != process
+    }
+    if state == "recording":
+        readable_to_the_last_second(lab, killed_at)
+    if state != "idle":
+        held = lab.client.wait(lambda s: s["control"]["behaviour"] == "hold", 10)
+        assert held["control"]["engaged"]
+    lab.ready()
+
+
+@pytest.mark.parametrize("state", ["idle", "running", "recording"])
+def test_nothing_is_left_ten_seconds_after_the_supervisor_was_killed(lab, state):
+    to_state(lab, state)
+    pids = lab.pids().values()
+    killed_at = time.time()
+    lab.kill("supervisor")
+    eventually(lambda: not any(map(alive, pids)), 10, "the end of the family")
+    if state == "recording":
+        readable_to_the_last_second(lab, killed_at)
+
+
+def test_a_killed_supervisor_makes_the_arm_decelerate_and_hold_before_control_ends(lab):
+    to_state(lab, "running")
+    subscriber = lab.client.subscribe("joints")
+    lab.client.status()
+    control = lab.pids()["control"]
+    lab.kill("supervisor")
+    time.sleep(1.0)
+    assert alive(control)  # it is holding
+    subscriber.close()
+    eventually(lambda: not alive(control), 10, "the end of control")
+
+
+def test_a_second_supervisor_for_the_same_station_is_refused(lab):
+    lab.up()
+    second = subprocess.run(
+        [sys.executable, "-m", "runtime", "deployments/demo.toml", "--set", f'data_dir="{lab.data}"'],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=30,
+    )
+    assert second.returncode == 1
+    assert "station 'demo' is already running" in second.stderr
+    assert lab.answers()["state"] == "idle"
