@@ -25,6 +25,10 @@ from runtime.types import ActionChunk, Float64, Observation
 Result = TypeVar("Result")
 
 
+class StaleObservationError(PolicyError):
+    """The newest observation is too old to ask a policy about."""
+
+
 class Runner(ABC):
     """Where blocking calls to the policy are made, one after the other."""
 
@@ -100,6 +104,7 @@ class InferenceSettings:
     joint_age: float
     picture_age: float
     switched: tuple[int, ...]  # binary dimensions
+    stale_patience: float  # [s] without a fresh observation until waiting for one is an error
 
 
 class Inference:
@@ -128,6 +133,7 @@ class Inference:
         self._fresh = True
         self._flight: Future[Answered] | None = None
         self._unmerged: set[int] = set()
+        self._stale_since: float | None = None
         self._asked_at = float("-inf")
         self.latencies: deque[float] = deque(maxlen=200)  # [s]
         self.delays: deque[int] = deque(maxlen=200)  # control steps
@@ -144,7 +150,7 @@ class Inference:
         for stream, captured in seen.captured.items():
             allowed = bounds.joint_age if stream in ("joints", "eef") else bounds.picture_age
             if not now - captured <= allowed:
-                raise PolicyError(f"{stream} is {now - captured:.2f} s old, allowed {allowed:g}")
+                raise StaleObservationError(f"{stream}: {now - captured:.2f} s old, allowed {allowed:g}")
         missing = [camera for camera in self._page.layout.cameras if camera not in seen.pictures]
         if missing:
             raise PolicyError(f"no picture has arrived from {', '.join(missing)}")
@@ -184,6 +190,7 @@ class Inference:
         """Ask from now on, for this run; `fresh` lets the policy forget the episode before."""
         self._run = run
         self._fresh = fresh
+        self._stale_since = None
         self._unmerged.clear()
         self._asked_at = float("-inf")
 
@@ -209,12 +216,27 @@ class Inference:
             answer = self._post(self._flight.result())
             self._flight = None
             return answer
-        if self._query.wants(self._progress()):
-            self._asked_at = self._clock.now()
-            self._flight = self.ask()
-            if self.runner.ready(self._flight):
-                return self.pump()
+        if self._query.wants(self._progress()) and self._try_to_ask():
+            return self.pump()
         return None
+
+    def _try_to_ask(self) -> bool:
+        """Ask; True where the answer is there at once.
+
+        A gap in the observations is control's to judge, action by action. But while a strategy waits for this
+        answer there is nothing to judge, so a gap that lasts is an error here too.
+        """
+        now = self._clock.now()
+        try:
+            flight = self.ask()
+        except StaleObservationError:
+            if self._stale_since is None:
+                self._stale_since = now
+            if now - self._stale_since > self._settings.stale_patience:
+                raise
+            return False
+        self._stale_since, self._asked_at, self._flight = None, now, flight
+        return self.runner.ready(flight)
 
     def _progress(self) -> Progress:
         remaining = int(self._page.control.read()["remaining"])

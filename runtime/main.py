@@ -363,6 +363,7 @@ def _inference_settings(plan: Plan) -> InferenceSettings:
         settings.safety.joint_age_s,
         settings.safety.picture_age_s,
         plan.robot.binary_dims,
+        settings.control.starvation_hold_s,
     )
 
 

@@ -42,8 +42,7 @@ class Lab:
         self.data = folder / "data"
         self.children = {}
         self.addresses = {}
-        self.supervisor = None
-        self.node_arguments = ()
+        self.supervisor = self.client = None
 
     def start(self, name, module, *arguments, stdout=subprocess.PIPE):
         child = subprocess.Popen(
@@ -151,9 +150,12 @@ class Lab:
         return json.loads(path[0].read_text())
 
     def close(self):
+        if self.client:
+            self.client.close()
         if self.supervisor and self.supervisor.poll() is None:
             self.supervisor.send_signal(signal.SIGTERM)
             self.supervisor.wait(15)
         for child in self.children.values():
             child.stdin.close()
             child.wait(10)
+        self.children.clear()
