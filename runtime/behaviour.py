@@ -5,8 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import numpy as np
-
 from runtime.motion import Motion
 from runtime.recording.base import ControlSource
 from runtime.safety import Path
@@ -48,7 +46,7 @@ class Silent(Behaviour):
 
 
 class Hold(Behaviour):
-    """Comes to a stand and publishes the held target on every tick, because some nodes move when we fall silent."""
+    """Comes to a stand and sends the held target on every tick: some nodes move when we fall silent."""
 
     name = "hold"
 
@@ -95,17 +93,15 @@ class Follow(Behaviour):
 
 
 class EStopped(Behaviour):
-    """Sends the measured position on every tick, or the last command where the measurement is old."""
+    """Sends the measured position on every tick, or the last command where the measurement is old.
+
+    `position` float64 [D] is renewed by the tick; None, nothing is sent, while it is not known.
+    """
 
     name = "estop"
 
-    def __init__(self, position: Float64) -> None:
+    def __init__(self, position: Float64 | None) -> None:
         self.position = position
 
-    def see(self, measured: Float64 | None) -> None:
-        """The newest measurement, None where it is old."""
-        if measured is not None and np.isfinite(measured).all():
-            self.position = measured
-
     def target(self, step: int, now: float) -> Target | None:
-        return Target(self.position, "estop", None)
+        return None if self.position is None else Target(self.position, "estop", None)

@@ -41,19 +41,22 @@ class Bench:
         self.measured = np.zeros(DIM)
         self.merge = merge or overlap.merge(overlap.Config(), ())
         self.safety = SafetySettings(**safety)
+        self.before_send = lambda: None
         self.tick = self.new_tick()
         self.feed = self.alive = True
 
     def new_tick(self):
-        limits = Limits(
-            ("a", "b"), np.full(2, -2.0), np.full(2, 2.0), np.full(2, 3.0), np.zeros(2, bool), np.zeros(2, bool)
-        )
+        no = np.zeros(2, bool)
+        limits = Limits(("a", "b"), np.full(2, -2.0), np.full(2, 2.0), np.full(2, 3.0), no, no)
         settings = TickSettings(
             PERIOD, np.full(2, 1.0), limits.lower, limits.upper, limits.binary, self.safety, 1.0, 1.0
         )
-        return Tick(
-            self.page, self.sink, SafetyFilter(self.safety, limits), self.merge, settings, self.clock.now
-        )
+        safety = SafetyFilter(self.safety, limits)
+        return Tick(self.page, self.sink, safety, self.merge, settings, self.time_of_sending)
+
+    def time_of_sending(self):
+        self.before_send()
+        return self.clock.now()
 
     def observe(self, **changes):
         self.sequence += 1
@@ -72,8 +75,9 @@ class Bench:
         self.page.rings["orders"].push(encode(Order(self.order, kind, **fields)))
 
     def chunk(self, number, rows, step=None, run=1):
-        rows = np.asarray(rows, float)
-        self.page.rings["orders"].push(encode(PostedChunk(number, run, self.step if step is None else step, rows)))
+        step = self.step if step is None else step
+        chunk = PostedChunk(number, run, step, np.asarray(rows, float))
+        self.page.rings["orders"].push(encode(chunk))
 
     def run(self, ticks=1, stretch=1.0):
         for _ in range(ticks):
@@ -323,3 +327,84 @@ def test_each_tick_is_written_down_with_its_source_and_its_makers(bench):
     assert records[3].run == 1
     assert records[3].smoothed is None
     assert (records[2].executed == bench.sink.sent[2]).all()
+
+
+def test_an_e_stop_from_before_this_start_sends_nothing_until_the_robot_has_been_measured():
+    bench = Bench()
+    bench.page.set_estop(EStop.LATCHED)
+    bench.feed = False
+    bench.run(5)
+    assert bench.sink.sent == []  # nobody knows where the robot is: zero would be a command to go there
+    assert bench.page.control.read()["estop_obeyed"]
+    bench.measured, bench.feed = np.array([0.4, -0.3]), True
+    bench.run(3)
+    assert np.allclose(bench.sink.sent, [[0.4, -0.3]] * 3)
+    bench.page.set_estop(EStop.CLEAR)
+    bench.run(3)
+    assert np.allclose(bench.sink.sent[-1], [0.4, -0.3])
+
+
+def test_releasing_an_e_stop_over_a_robot_that_was_never_measured_keeps_silent(bench):
+    bench.page.set_estop(EStop.LATCHED)
+    bench.feed = False
+    bench.run(3)
+    bench.page.set_estop(EStop.CLEAR)
+    bench.run(3)
+    assert bench.behaviour == "silent"
+    assert bench.sink.sent == []
+
+
+@pytest.mark.parametrize("order", [{"kind": "follow", "run": 1}, {"kind": "motion", "goal": np.ones(2)}])
+@pytest.mark.parametrize("qpos", [None, np.array([np.nan, 0.0], np.float32)])
+def test_a_robot_that_is_not_measured_is_not_taken_over(bench, order, qpos):
+    bench.feed = False
+    if qpos is not None:
+        bench.observe(qpos=qpos)
+    bench.say(**order)
+    bench.run(3)
+    assert bench.sink.sent == []
+    assert bench.behaviour == "silent"
+    assert "no fresh joints" in bench.said("unmeasured")[0].text
+
+
+def test_a_policy_that_is_always_too_late_starves_and_is_held(bench):
+    bench.say("follow", run=1)
+    bench.run(10)
+    for number in range(20):
+        bench.chunk(number, wave(5), step=bench.step - 9)
+        bench.run(5)
+    events = bench.said()
+    assert [e.kind for e in events] == ["starved", "starvation"]
+    assert bench.behaviour == "hold"
+    assert (np.array(bench.sink.sent) == 0.0).all()
+
+
+def test_a_chunk_that_comes_too_late_does_not_end_a_starvation(bench):
+    following(bench, wave(5))
+    bench.run(10)
+    bench.chunk(2, wave(5), step=bench.step - 9)
+    bench.run(4)
+    assert [e.kind for e in bench.said()] == ["starved"]
+
+
+def test_the_record_of_a_tick_is_on_its_way_before_main_can_see_the_tick(bench):
+    seen = []
+    push = bench.page.rings["ticks"].push
+    bench.page.rings["ticks"].push = lambda payload: (
+        seen.append((type(decode(payload)).__name__, int(bench.page.control.read()["step"]))) or push(payload)
+    )
+    following(bench)
+    bench.run()
+    assert seen == [("TickDone", 0), ("ChunkMerged", 0), ("TickDone", 0)]
+
+
+def test_an_e_stop_pressed_within_a_tick_repeats_the_last_command(bench):
+    following(bench, wave(60, speed=1.5))
+    bench.run(5)
+    last = bench.sink.sent[-1]
+    bench.before_send = lambda: bench.page.set_estop(EStop.LATCHED)
+    bench.run()
+    assert np.allclose(bench.sink.sent[-1], last)
+    assert bench.records()[-1].notes == ["e-stop pressed within the tick"]
+    bench.run()
+    assert bench.behaviour == "estop"
