@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
@@ -22,7 +20,7 @@ _DEPLOYMENT = Path(__file__).parents[2] / "deployments" / "demo.toml"
 _READY_S = 30.0
 
 
-class Helpers:
+class StandIns:
     """The node and the policy server; they end when their standard input does, so they never outlive us."""
 
     def __init__(self) -> None:
@@ -66,72 +64,74 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
     given = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, _interrupt)
-    helpers = Helpers()
+    standins = StandIns()
     try:
-        return _demo(helpers, given)
+        return _demo(standins, given)
     except RuntimeFault as fault:
         print(f"error: {fault}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130
     finally:
-        helpers.end()
+        standins.end()
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def _demo(helpers: Helpers, given: argparse.Namespace) -> int:
-    robot = deployment.load(_DEPLOYMENT, given.assignments).deployment.robot
+def start_standins(standins: StandIns, robot: str) -> list[str]:
+    """Start node and policy server on free ports; returns the settings that lead a deployment to them."""
     free = "tcp://127.0.0.1:0"
-    node = helpers.start(
+    node = standins.start(
         "runtime.sim.node", "--robot", robot, "--obs-endpoint", free, "--action-endpoint", free
     )
-    server = helpers.start(
+    server = standins.start(
         "runtime.sim.serve", "openpi", "--robot", robot, "--port", "0", "--latency-ms", "80"
     )
     print(f"execution node   {node['obs_endpoint']}  {node['action_endpoint']}")
     print(f"policy server    {server['url']}", flush=True)
-    assignments = [
+    return [
         f'transport.sub_endpoint="{node["obs_endpoint"]}"',
         f'transport.pub_endpoint="{node["action_endpoint"]}"',
         f'policy.url="{server["url"]}"',
-        *given.assignments,
     ]
-    station = deployment.load(_DEPLOYMENT, assignments).deployment.station_dir
-    result = station / RESULT_NAME
+
+
+def run_station(option: str, assignments: Sequence[str]) -> tuple[int, dict[str, Any]]:
+    """Run the demo's supervisor to its end, also after Ctrl-C; returns its exit code and the run's result."""
+    result = deployment.load(_DEPLOYMENT, assignments).deployment.station_dir / RESULT_NAME
     result.unlink(missing_ok=True)
-    code = _station("--headless", assignments)
-    if given.json:
-        given.json.write_text(
-            result.read_text("utf-8") if result.exists() else '{"error": "no result"}', "utf-8"
-        )
-    if code == 0 and not given.once:
-        print(
-            f"\nThe station stays up. In a second terminal: .venv/bin/python -m runtime.ctl {station.name} watch"
-        )
-        print(
-            f"or setup, run, stop, halt, resume, home, estop, release. Ctrl-C here ends everything.\n",
-            flush=True,
-        )
-        _station("", assignments)
-    return code
-
-
-def _station(option: str, assignments: Sequence[str]) -> int:
-    """Run the station's supervisor to its end; Ctrl-C is passed on and waited for."""
     sets = [part for assignment in assignments for part in ("--set", assignment)]
-    options = [option] if option else []
     child = subprocess.Popen(
-        [sys.executable, "-m", "runtime", str(_DEPLOYMENT), *options, *sets], start_new_session=True
+        [sys.executable, "-m", "runtime", str(_DEPLOYMENT), *([option] if option else []), *sets],
+        start_new_session=True,
     )
     try:
-        return child.wait()
+        code = child.wait()
     except KeyboardInterrupt:
         child.send_signal(signal.SIGINT)
         child.wait()
         raise
+    found: dict[str, Any] = json.loads(result.read_text("utf-8")) if result.exists() else {}
+    return code, found
+
+
+def _demo(standins: StandIns, given: argparse.Namespace) -> int:
+    settings = deployment.load(_DEPLOYMENT, given.assignments).deployment
+    assignments = [*start_standins(standins, settings.robot), *given.assignments]
+    code, result = run_station("--headless", assignments)
+    if given.json:
+        given.json.write_text(json.dumps(result or {"error": "no result"}, indent=1), "utf-8")
+    if code == 0 and not given.once:
+        ctl = f".venv/bin/python -m runtime.ctl --data-dir {settings.data} {settings.station}"
+        print("\nThe station stays up; Ctrl-C here ends everything. Command it from a second terminal:")
+        print(
+            f"  {ctl} watch\n  {ctl} setup   (run, stop, halt, resume, home, estop, release, status)\n",
+            flush=True,
+        )
+        run_station("", assignments)
+    return code
 
 
 if __name__ == "__main__":

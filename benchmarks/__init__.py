@@ -1,0 +1,1 @@
+"""Measurements of hot paths: `python -m benchmarks NAME [--json FILE]`."""

@@ -1,0 +1,66 @@
+"""What a benchmark returns, as a table for people and as JSON for programs."""
+
+from __future__ import annotations
+
+import json
+import operator
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+_COMPARE = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One number and what it should be, as "<= 0.5"; "" where it is only reported."""
+
+    name: str
+    value: float
+    unit: str
+    wanted: str = ""
+
+    @property
+    def holds(self) -> bool | None:
+        """Whether the value is as wanted; None where nothing is wanted."""
+        if not self.wanted:
+            return None
+        sign, bound = self.wanted.split()
+        return bool(_COMPARE[sign](self.value, float(bound)))
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """The figures of one run, and the rows they were made from."""
+
+    name: str
+    figures: Sequence[Figure]
+    rows: Sequence[Mapping[str, object]] = field(default_factory=list)
+
+    def table(self) -> str:
+        """The figures in columns."""
+        width = max(len(figure.name) for figure in self.figures)
+        marks = {True: "ok", False: "MISSED", None: ""}
+        return "\n".join(
+            f"{f.name:<{width}}  {f.value:>12.3f} {f.unit:<5} {f.wanted:<10} {marks[f.holds]}"
+            for f in self.figures
+        )
+
+    def write(self, path: Path) -> None:
+        """The report as JSON."""
+        figures = [asdict(figure) | {"holds": figure.holds} for figure in self.figures]
+        content = {"name": self.name, "machine": machine(), "figures": figures, "rows": list(self.rows)}
+        path.write_text(json.dumps(content, indent=1, default=str), "utf-8")
+
+
+def machine() -> dict[str, object]:
+    """What the figures were measured on."""
+    return {
+        "cpus": os.cpu_count(),
+        "load": os.getloadavg(),
+        "kernel": platform.release(),
+        "machine": platform.machine(),
+        "python": platform.python_version(),
+    }
