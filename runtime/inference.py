@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -22,6 +25,7 @@ from runtime.strategies.base import Progress, Query
 from runtime.timeline import resample
 from runtime.types import ActionChunk, Float64, Observation
 
+log = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
 
@@ -34,16 +38,31 @@ class Runner(ABC):
 
     @abstractmethod
     def submit(self, call: Callable[[], Result]) -> Future[Result]:
-        """Start `call`; its result is in the future when `ready` says so."""
+        """Start `call`; its result or RuntimeFault is in the future when `ready` says so."""
 
     @abstractmethod
     def ready(self, future: Future[Result]) -> bool: ...
 
-    def tick(self) -> None:
-        """One control period has passed (for runners that count)."""
+    def tick(self) -> None:  # noqa: B027  # only runners that count have something to do
+        """One control period has passed."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027  # only runners with a thread have something to do
         """Take no further calls."""
+
+
+def _told(call: Callable[[], Result]) -> Callable[[], Result]:
+    """`call`, with every error of a policy's own code told as a PolicyError: it must not end main."""
+
+    def telling() -> Result:
+        try:
+            return call()
+        except RuntimeFault:
+            raise
+        except Exception as error:
+            log.exception("the policy's own code failed")
+            raise PolicyError(f"the policy's own code failed: {type(error).__name__}: {error}") from error
+
+    return telling
 
 
 class ThreadRunner(Runner):
@@ -53,7 +72,7 @@ class ThreadRunner(Runner):
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
 
     def submit(self, call: Callable[[], Result]) -> Future[Result]:
-        return self._pool.submit(call)
+        return self._pool.submit(_told(call))
 
     def ready(self, future: Future[Result]) -> bool:
         return future.done()
@@ -68,19 +87,19 @@ class LockstepRunner(Runner):
     def __init__(self, delay: int) -> None:
         self._delay = delay
         self._now = 0
-        self._due: dict[int, int] = {}
+        self._due: WeakKeyDictionary[Future[Any], int] = WeakKeyDictionary()
 
     def submit(self, call: Callable[[], Result]) -> Future[Result]:
         future: Future[Result] = Future()
         try:
-            future.set_result(call())
+            future.set_result(_told(call)())
         except RuntimeFault as error:
             future.set_exception(error)
-        self._due[id(future)] = self._now + self._delay
+        self._due[future] = self._now + self._delay
         return future
 
     def ready(self, future: Future[Result]) -> bool:
-        return self._now >= self._due.get(id(future), 0)
+        return self._now >= self._due[future]
 
     def tick(self) -> None:
         self._now += 1
@@ -142,7 +161,7 @@ class Inference:
     # --- asking --------------------------------------------------------------------------------------------
 
     def observe(self) -> Observation:
-        """The newest observation as the policy is shown it; raises PolicyError where there is none, or it is old."""
+        """The newest observation as the policy is shown it; PolicyError where there is none, or it is old."""
         seen = self._page.read_observation(self._page.layout.cameras)
         if seen is None:
             raise PolicyError("no observation has arrived yet")
@@ -154,9 +173,19 @@ class Inference:
         missing = [camera for camera in self._page.layout.cameras if camera not in seen.pictures]
         if missing:
             raise PolicyError(f"no picture has arrived from {', '.join(missing)}")
+        return replace(seen, step=self._step_of(seen), prompt=self._settings.task)
+
+    def _step_of(self, seen: Observation) -> int:
+        """The control step that an observation is assembled for: the tick that saw it, or the next one.
+
+        While control stalls that is more than one step on: steps follow the clock, missed ticks are skipped.
+        """
         status = self._page.control.read()
-        step = int(status["step"]) + (seen.sequence != int(status["sequence"]))
-        return replace(seen, step=step, prompt=self._settings.task)
+        step, planned = int(status["step"]), float(status["planned"])
+        if seen.sequence == int(status["sequence"]):
+            return step
+        periods = (seen.arrived - planned) * self._settings.control_rate if planned else 1.0
+        return step + max(1, math.ceil(periods - 1e-6))
 
     def ask(self) -> Future[Answered]:
         """Send one request about the newest observation; raises PolicyError where that is too old."""
@@ -179,7 +208,9 @@ class Inference:
         if solved is not None and not solved.reached.all():
             missed = int((~solved.reached).any(axis=1).sum())
             worst = float(solved.position_error.max()) * 1000
-            text = f"{missed} of {len(rows)} poses cannot be reached, the worst by {worst:.1f} mm: nearest joints taken"
+            text = (
+                f"{missed} of {len(rows)} poses are out of reach, the worst by {worst:.1f} mm: nearest taken"
+            )
             self.notes.append(Event("ik_unreached", text, self._clock.now(), answered.observation.step))
         rate = answered.chunk.rate or self._settings.control_rate
         return resample(rows, rate, self._settings.control_rate, self._settings.switched)
@@ -189,7 +220,7 @@ class Inference:
     def begin(self, run: int, fresh: bool) -> None:
         """Ask from now on, for this run; `fresh` lets the policy forget the episode before."""
         self._run = run
-        self._fresh = fresh
+        self._fresh = self._fresh or fresh
         self._stale_since = None
         self._unmerged.clear()
         self._asked_at = float("-inf")
@@ -207,15 +238,14 @@ class Inference:
             self.delays.append(merged.delay)
 
     def pump(self) -> PolicyAnswer | None:
-        """Collect an answer, or ask; returns the answer for the record. Raises PolicyError where the policy fails."""
+        """Collect an answer, or ask; returns the answer, for the record. Raises PolicyError."""
         if not self._run:
             return None
         if self._flight is not None:
             if not self.runner.ready(self._flight):
                 return None
-            answer = self._post(self._flight.result())
-            self._flight = None
-            return answer
+            flight, self._flight = self._flight, None
+            return self._post(flight.result())
         if self._query.wants(self._progress()) and self._try_to_ask():
             return self.pump()
         return None

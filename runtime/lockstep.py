@@ -96,8 +96,8 @@ class Lockstep:
             )
         )
 
-    def until(self, reached: Callable[[], bool], seconds: float, what: str) -> None:
-        """Tick until `reached`; raises SetupError after `seconds` of virtual time."""
+    def until(self, reached: Callable[[], bool], seconds: float, what: str) -> State:
+        """Tick until `reached`, return the state then; raises SetupError after `seconds` of virtual time."""
         end = self.clock.now() + seconds
         while not reached():
             if self.clock.now() > end:
@@ -105,6 +105,7 @@ class Lockstep:
                 raise SetupError(f"{what}: not within {seconds:g} s; {session.state}: {session.reason}")
             self._handle("lease_renew" if self.main.lease.current(self.clock.now()) else "lease_claim")
             self.tick()
+        return self.main.session.state
 
     def close(self) -> None:
         """Close the episode, the policy, source and sink."""
@@ -126,13 +127,13 @@ def run(plan: Plan, longest: float = 3600.0) -> LockstepRun:
         station.connect()
         station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
         station.command("setup")
-        station.until(lambda: session.state is not State.SETTING_UP, 120.0, "set-up")
-        if session.state is not State.READY:
+        prepared = station.until(lambda: session.state is not State.SETTING_UP, 120.0, "set-up")
+        if prepared is not State.READY:
             raise SetupError(f"set-up failed: {session.reason}")
         station.command("run")
-        station.until(lambda: session.state is not State.RUNNING, longest, "run")
-        how, why = session.state, session.reason
-        if session.state is State.HOLDING:
+        how = station.until(lambda: session.state is not State.RUNNING, longest, "run")
+        why = session.reason
+        if how is State.HOLDING:
             station.command("stop")
         for _ in range(3):  # the end goes from main to media and back
             station.tick()

@@ -43,7 +43,7 @@ _LINK_LOST_S = 2.0
 _CONNECTED_S = 1.0
 _SIBLINGS = ("control", "media", "guard")
 # Control's own reasons to hold, as events of these kinds.
-_HOLDS = ("refusals", "starvation", "family", "orphaned")
+_HOLDS = ("refusals", "starvation", "unmeasured", "family", "orphaned")
 
 
 class Main(Effects):
@@ -120,8 +120,13 @@ class Main(Effects):
     def resume_run(self) -> None:
         if self.run is None:
             raise RuntimeFault("no run is open: stop, then run")
-        self.run.resume(self.clock.now())
-        self._follow(self.run, fresh=False)
+        if self.run.unrecorded and self.plan.deployment.recording.on_failure == "hold":
+            raise RuntimeFault(f"the recording of this run has ended ({self.run.unrecorded}): stop, then run")
+        if self.run.begun is not None:
+            self.run.resume(self.clock.now())
+            self._follow(self.run, fresh=False)
+        elif self.run.opened:  # it was halted before it began
+            self._begin(self.run)
 
     def end_run(self, status: str, reason: str) -> None:
         self.inference.pause()
@@ -165,6 +170,10 @@ class Main(Effects):
         self._recording_alone = False
         self._tell_media(EndEpisode(status, reason, {"control": self._control_figures()}))
 
+    def _begin(self, run: Run) -> None:
+        run.begin(self.clock.now())
+        self._follow(run, fresh=True)
+
     def _follow(self, run: Run, fresh: bool) -> None:
         self._orders.give("follow", run=run.number)
         self.inference.begin(run.number, fresh)
@@ -189,9 +198,8 @@ class Main(Effects):
     def _hear_event(self, event: Event) -> None:
         self._log(event)  # control writes its own events into the episode
         self.setup.heard(event)
-        if event.kind in _HOLDS:
-            self._observe(Happening.HELD, event.text)
-        elif event.kind == "recording_failed" and self.plan.deployment.recording.on_failure == "hold":
+        evidence = self.plan.deployment.recording.on_failure == "hold"
+        if event.kind in _HOLDS or (event.kind == "recording_failed" and evidence):
             self._observe(Happening.HELD, event.text)
 
     def _episode_opened(self, opened: EpisodeOpened) -> None:
@@ -206,11 +214,16 @@ class Main(Effects):
             return
         if opened.error and self.plan.deployment.recording.on_failure == "hold":
             self._observe(Happening.RUN_FAILED, opened.error)
-        elif self.session.state is State.RUNNING:
-            run.begun = self.clock.now()
-            self._follow(run, fresh=True)
+        elif opened.error:
+            self._tell_media(BeginEpisode(run.number, None))  # unrecorded; the source plays all the same
+        else:
+            run.opened = True
+            if self.session.state is State.RUNNING:
+                self._begin(run)
 
     def _episode_closed(self, closed: EpisodeClosed) -> None:
+        if self.run is not None and self.run.uuid == closed.uuid:
+            self.run.unrecorded = closed.error or closed.reason
         self.last_episode = {
             "uuid": closed.uuid,
             "path": closed.path,
@@ -308,7 +321,7 @@ class Main(Effects):
         if self.setup.stage is not stage:
             self.say(Event("setup", str(self.setup.stage), self.clock.now()))
         if done:
-            self._observe(Happening.SETUP_DONE, self.setup.validated or "at the pose")
+            self._observe(Happening.SETUP_DONE, self.setup.outcome)
 
     def _advance_inference(self) -> None:
         try:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from runtime.clock import Clock, MonotonicClock
-from runtime.errors import RecordingError, RuntimeFault
+from runtime.errors import RecordingError, RuntimeFault, TransportError
 from runtime.family import Member, Plan, join
 from runtime.messages import (
     BeginEpisode,
@@ -60,6 +60,8 @@ class Media:
         self._arrivals: dict[str, deque[float]] = {}
         self._next_report = 0.0
         self._faults: dict[str, int] = {}
+        self._too_large: Counter[str] = Counter()
+        self._source_failure = ""
         for ring in ("minutes", "ticks"):
             for _ in page.rings[ring].drain():
                 pass  # addressed to a predecessor that died
@@ -73,32 +75,53 @@ class Media:
         return bool(self._recorder.recording)
 
     def pump(self, timeout: float) -> None:
-        """Take one observation if there is one within `timeout` seconds, then all that the family has to say."""
-        observation = self._source.receive(timeout)
+        """Take one observation if there is one within `timeout` seconds, then all that the family says."""
+        observation = self._receive(timeout)
         if observation is not None:
             self._take(observation)
         self.digest()
 
     def digest(self) -> None:
         """Write down what control and main have posted."""
-        for ring in ("minutes", "ticks"):
-            for payload in self._page.rings[ring].drain():
-                self._hear(decode(payload))
+        self._drain("minutes")
+        self._drain("ticks")
         now = self._clock.now()
         if now >= self._next_report:
             self._next_report = now + _REPORT_PERIOD
             self._report(now)
 
+    def _drain(self, ring: str) -> None:
+        for payload in self._page.rings[ring].drain():
+            self._hear(decode(payload))
+
     # --- observations --------------------------------------------------------------------------------------
+
+    def _receive(self, timeout: float) -> Observation | None:
+        """What the source has; a failure is said once, and control holds when what it sees is old."""
+        try:
+            observation = self._source.receive(timeout)
+        except TransportError as error:
+            if str(error) != self._source_failure:
+                self._source_failure = str(error)
+                log.error("%s", error)
+                self._say(Event("source_failed", str(error), self._clock.now()))
+            self._clock.sleep_until(self._clock.now() + timeout)
+            return None
+        if observation is not None:
+            self._source_failure = ""
+        return observation
 
     def _take(self, observation: Observation) -> None:
         for camera, picture in observation.pictures.items():
             captured = observation.captured.get(camera, observation.arrived)
             if camera in self._numbers and captured != self._captured.get(camera):
                 self._captured[camera] = captured
+                self._count(camera, observation.arrived)
+                if picture.nbytes > self._page.layout.picture_bytes:
+                    self._too_large[f"picture_too_large_{camera}"] += 1
+                    continue
                 self._numbers[camera] += 1
                 self._page.pictures[camera].write(self._numbers[camera], picture)
-                self._count(camera, observation.arrived)
         self._count("joints", observation.arrived)
         self._recorder.see(observation)
         self._page.publish_observation(observation, self._numbers)
@@ -134,6 +157,7 @@ class Media:
         elif isinstance(message, BeginEpisode):
             self._begin(message)
         elif isinstance(message, EndEpisode):
+            self._drain("ticks")  # those that control did before main decided to end
             self.end(message.status, message.reason, message.details)
 
     def _begin(self, message: BeginEpisode) -> None:
@@ -145,7 +169,7 @@ class Media:
                 error = str(fault)
         if not error and message.run:
             self._source.begin_run()
-            first = self._source.receive(0.0)  # so that the run's first tick sees its first frame
+            first = self._receive(0.0)  # so that the run's first tick sees its first frame
             if first is not None:
                 self._take(first)
         self._tell(EpisodeOpened(message.run, identity, str(path), error))
@@ -166,15 +190,20 @@ class Media:
         self.end("failed", str(error))
 
     def _report(self, now: float) -> None:
-        faults = self._source.faults()
+        faults = self._source.faults() | dict(self._too_large)
         for name, count in faults.items():
             if count > self._faults.get(name, 0):
                 text = f"source: {name.replace('_', ' ')} ({count} so far)"
-                self._tell(Event(f"source_{name}", text, now, data={"count": count}))
+                self._say(Event(f"source_{name}", text, now, data={"count": count}))
         self._faults = dict(faults)
         rates = {stream: self._rate(stream, now) for stream in self._arrivals}
         recorder = self._recorder
-        self._tell(MediaReport(now, rates, faults, recorder.rows, recorder.recording, 0))
+        self._tell(MediaReport(now, rates, faults, recorder.rows, recorder.recording, recorder.repeated))
+
+    def _say(self, event: Event) -> None:
+        """An event of media's own: to main, and into the episode."""
+        self._tell(event)
+        self._hear(event)
 
     def _tell(self, message: Message) -> None:
         if not self._page.rings["media_events"].push(encode(message)):

@@ -46,7 +46,10 @@ class Closed:
 
 
 class Recorder:
-    """Samples on the dataset's grid: row k is the last tick not after k / fps since the first one recorded."""
+    """Samples on the dataset's grid: row k is the last tick not after k / fps since the first one recorded.
+
+    A row that falls into a gap of missed ticks repeats the tick before it; its pictures are flagged repeats.
+    """
 
     def __init__(self, journal: Journal, root: Path, grid: Grid, now: Callable[[], float]) -> None:
         self._journal = journal
@@ -56,6 +59,7 @@ class Recorder:
         self._seen: deque[Observation] = deque(maxlen=_OBSERVATIONS_KEPT)
         self._uuid = ""
         self.rows = 0
+        self.repeated = 0  # pictures that rows of this episode had to repeat
 
     @property
     def recording(self) -> str:
@@ -76,9 +80,9 @@ class Recorder:
             raise RecordingError(f"no picture has arrived from {', '.join(missing)}")
         identity = str(manifest.get("uuid") or uuid.uuid4())
         self._journal.begin(self._manifest(dict(manifest), identity, newest))
-        self._uuid, self._run, self.rows = identity, run, 0
+        self._uuid, self._run, self.rows, self.repeated = identity, run, 0, 0
         self._first_step: int | None = None
-        self._before: TickDone | None = None
+        self._before: tuple[TickDone, Observation | None] | None = None
         self._complete = False
         self._shown: dict[str, float] = {}
         self._answers: dict[int, PolicyAnswer] = {}
@@ -183,12 +187,12 @@ class Recorder:
         if self._first_step is None:
             self._first_step = tick.step
         self._journal.append(_executed(tick))
+        here = (tick, self._observation(tick.sequence))
         while (target := self._target(self.rows)) <= tick.step:
-            chosen = tick if target == tick.step or self._before is None else self._before
-            self._write_row(chosen)
-        self._before = tick
-        observation = self._observation(tick.sequence)
-        self._complete = observation is not None and observation.last
+            chosen = here if target == tick.step or self._before is None else self._before
+            self._write_row(*chosen)
+        self._before = here
+        self._complete = here[1] is not None and here[1].last
 
     def _target(self, row: int) -> int:
         """The step at or before which row `row` was sampled."""
@@ -201,50 +205,56 @@ class Recorder:
                 return observation
         return None
 
-    def _write_row(self, tick: TickDone) -> None:
-        found = self._observation(tick.sequence)
-        seen = found or self._seen[0]
+    def _write_row(self, tick: TickDone, seen: Observation | None) -> None:
+        """`seen` is what the tick saw, None where that is not known any more; its joints came with it."""
         action = tick.qpos if tick.executed is None else tick.executed
-        qpos = tick.qpos
-        reported = (
-            seen.reported_action is not None
-            and seen.reported_action_eef is not None
-            and np.array_equal(seen.reported_action, action)
-        )
+        measured = None if seen is None else seen.eef
+        reported = None if seen is None else _reported_eef(seen, action)
         with_eef = bool(self._grid.robot["eef_dim"])
-        measured = seen.eef is not None and found is not None
         row = Row(
             index=self.rows,
             step=tick.step,
             tick_time=tick.planned,
             sequence=tick.sequence,
-            qpos=qpos,
+            qpos=tick.qpos,
             action=action,
-            captured=seen.captured,
-            pictures=self._new_pictures(seen, known=found is not None),
+            captured={} if seen is None else seen.captured,
+            pictures=self._new_pictures(seen),
             control_source=tick.source,  # type: ignore[arg-type]  # control writes nothing else
-            qvel=seen.qvel,
-            effort=seen.effort,
-            eef=(seen.eef if measured else self._grid.eef_of(qpos)) if with_eef else None,
-            eef_action=(seen.reported_action_eef if reported else self._grid.eef_of(action))
-            if with_eef
-            else None,
-            eef_measured=measured,
-            eef_action_reported=reported,
+            qvel=None if seen is None else seen.qvel,
+            effort=None if seen is None else seen.effort,
+            eef=self._eef(measured, tick.qpos) if with_eef else None,
+            eef_action=self._eef(reported, action) if with_eef else None,
+            eef_measured=measured is not None,
+            eef_action_reported=reported is not None,
         )
         self._journal.append(row)
         self.rows += 1
 
-    def _new_pictures(self, seen: Observation, known: bool) -> dict[str, UInt8 | None]:
-        """The observation's pictures; None for a camera whose picture the row before had already."""
+    def _eef(self, told: Float32 | None, joints: Float32) -> Float32:
+        """Poses as the robot told them, else by forward kinematics."""
+        return self._grid.eef_of(joints) if told is None else told
+
+    def _new_pictures(self, seen: Observation | None) -> dict[str, UInt8 | None]:
+        """The observation's pictures; None for a camera whose picture an earlier row has already."""
         pictures: dict[str, UInt8 | None] = {}
         for camera in self._grid.cameras:
-            captured = seen.captured.get(camera, math.nan)
-            fresh = known and camera in seen.pictures and captured != self._shown.get(camera)
-            pictures[camera] = seen.pictures[camera] if fresh else None
-            if fresh:
+            picture = None if seen is None else seen.pictures.get(camera)
+            captured = math.nan if seen is None else seen.captured.get(camera, math.nan)
+            if captured == self._shown.get(camera):
+                picture = None
+            if picture is not None:
                 self._shown[camera] = captured
+            self.repeated += picture is None
+            pictures[camera] = picture
         return pictures
+
+
+def _reported_eef(seen: Observation, action: Float32) -> Float32 | None:
+    """The poses that the robot reports for this very action; None where it reports another one, or none."""
+    if seen.reported_action is None or not np.array_equal(seen.reported_action, action):
+        return None
+    return seen.reported_action_eef
 
 
 def _executed(tick: TickDone) -> ExecutedTick:

@@ -25,6 +25,12 @@ class Run:
     begun: float | None = None  # control follows
     held_since: float | None = None
     held: float = 0.0  # in total
+    opened: bool = False  # media is ready for it
+    unrecorded: str = ""  # why its recording ended before it did
+
+    def begin(self, now: float) -> None:
+        """Control follows: its clock starts."""
+        self.begun, self.held_since, self.held = now, None, 0.0
 
     def hold(self, now: float) -> None:
         """Its clock is paused."""
@@ -41,7 +47,7 @@ class Run:
         """Time it has run, without the time it was held."""
         if self.begun is None:
             return 0.0
-        return (self.held_since or now) - self.begun - self.held
+        return (now if self.held_since is None else self.held_since) - self.begun - self.held
 
 
 @dataclass(frozen=True, slots=True)

@@ -65,7 +65,7 @@ class RobotState:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What may be sent: `action` float64 [D], or None where refused; `notes` say what was changed or why refused."""
+    """What may be sent: `action` float64 [D], None where refused; `notes` say what was changed or why."""
 
     action: Float64 | None
     notes: tuple[str, ...] = ()
@@ -91,11 +91,11 @@ Path = Literal["policy", "motion"]
 
 
 class SafetyFilter:
-    """Judges actions in a fixed order: finite, ages, workspace, following error, jump, reachability, joint limits.
+    """Judges actions in a fixed order: finite, ages, workspace, following error, jump, reachability, limits.
 
-    Reachability makes the command satisfy velocity, acceleration and joint limits in one step: the velocity is
-    bounded so that the joint can still stop before its limit with the same acceleration, also at changing tick
-    lengths (v dt + v^2 / 2a <= distance), so that no limit undoes another.
+    Reachability makes the command satisfy velocity, acceleration and joint limits in one step: the velocity
+    is bounded so that the joint can still stop before its limit with the same acceleration, also at changing
+    tick lengths (v dt + v^2 / 2a <= distance), so that no limit undoes another.
     """
 
     def __init__(
@@ -111,38 +111,41 @@ class SafetyFilter:
 
     def judge(self, action: Float64, state: RobotState, path: Path = "policy") -> Verdict:
         """The verdict on `action` [D]; with report-only the action comes back unchanged, with the notes."""
+        if not _usable(action, state):
+            return Verdict(None, (_unusable(action, self._limits),))
         refusal = self._refusal(action, state, path)
-        if refusal:
-            return Verdict(
-                action if self._settings.report_only and _usable(action, state) else None, (refusal,)
-            )
-        reachable, notes = self._reachable(action, state, path)
-        violation = self._violation(reachable, state)
+        if refusal and not self._settings.report_only:
+            return Verdict(None, (refusal,))
+        reachable, notes = self._reachable(action, state)
         if self._settings.report_only:
-            return Verdict(action, notes + self._excess(action))
+            return Verdict(action, (*filter(None, [refusal]), *notes, *self._excess(action)))
+        violation = self._violation(reachable, state)
         if violation:
             return Verdict(None, (*notes, violation))
         return Verdict(reachable, notes)
 
     def _refusal(self, action: Float64, state: RobotState, path: Path) -> str:
-        if not _usable(action, state):
-            return _unusable(action, self._limits)
-        if path == "motion":
-            return ""
+        if path == "motion":  # of ours: needs no pictures, and may come from outside the box
+            return self._blind(state) or self._runs_away(action, state)
         return (
-            self._stale(state)
+            self._blind(state)
+            or self._stale(state)
             or self._leaves_box(action)
             or self._runs_away(action, state)
             or self._jumps(action, state)
         )
 
+    def _blind(self, state: RobotState) -> str:
+        allowed = self._settings.joint_age_s
+        if state.joint_age <= allowed:
+            return ""
+        return f"joints are {state.joint_age:.2f} s old, allowed {allowed:g}"
+
     def _stale(self, state: RobotState) -> str:
-        settings = self._settings
-        if state.joint_age > settings.joint_age_s:
-            return f"joints are {state.joint_age:.2f} s old, allowed {settings.joint_age_s:g}"
+        allowed = self._settings.picture_age_s
         for camera, age in state.picture_ages.items():
-            if not age <= settings.picture_age_s:  # also refuses NaN: a picture that never came
-                return f"picture {camera} is {age:.2f} s old, allowed {settings.picture_age_s:g}"
+            if not age <= allowed:  # also refuses NaN: a picture that never came
+                return f"picture {camera} is {age:.2f} s old, allowed {allowed:g}"
         return ""
 
     def _leaves_box(self, action: Float64) -> str:
@@ -151,14 +154,14 @@ class SafetyFilter:
 
     def _runs_away(self, action: Float64, state: RobotState) -> str:
         error = np.where(self._angles, np.abs(action - state.measured), 0.0)
-        worst = int(error.argmax())
-        if error[worst] <= self._settings.following_error:
-            return ""
         # A blocked arm must still be allowed to come back towards where it is measured.
-        if abs(action[worst] - state.measured[worst]) < abs(state.previous[worst] - state.measured[worst]):
+        returning = error < np.abs(state.previous - state.measured)
+        excess = np.where(returning | (error <= self._settings.following_error), 0.0, error)
+        if not excess.any():  # NaN, a joint that is measured nowhere, counts
             return ""
+        worst = int(excess.argmax())
         name, allowed = self._limits.names[worst], self._settings.following_error
-        return f"{name} would be {error[worst]:.2f} rad from where it is measured, allowed {allowed:g}"
+        return f"{name} would be {excess[worst]:.2f} rad from where it is measured, allowed {allowed:g}"
 
     def _jumps(self, action: Float64, state: RobotState) -> str:
         jump = np.where(self._angles, np.abs(action - state.previous), 0.0)
@@ -167,7 +170,7 @@ class SafetyFilter:
             return ""
         return f"{self._limits.names[worst]} jumps {jump[worst]:.2f} rad, allowed {self._settings.jump:g}"
 
-    def _reachable(self, action: Float64, state: RobotState, path: Path) -> tuple[Float64, tuple[str, ...]]:
+    def _reachable(self, action: Float64, state: RobotState) -> tuple[Float64, tuple[str, ...]]:
         limits, dt = self._limits, state.elapsed
         a = self._settings.acceleration
         scale = self._settings.velocity_scale

@@ -1,4 +1,4 @@
-"""What `setup` does, stage by stage, without ever blocking main: connect, observe, home, warm up, validate."""
+"""What `setup` does, stage by stage, never blocking main: connect, observe, home, warm up, validate."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from runtime.errors import PolicyError, SetupError
 from runtime.family import Plan
 from runtime.inference import Answered, Inference
 from runtime.messages import Event
+from runtime.motion import Trajectory
 from runtime.orders import Orders
 from runtime.page import Page
 from runtime.policies.base import PolicyInfo
@@ -43,10 +44,16 @@ class SetUp:
         self.stage = Stage.IDLE
         self.info: PolicyInfo | None = None
         self.validated = ""
+        self._homing_only = False
 
     @property
     def active(self) -> bool:
         return self.stage is not Stage.IDLE
+
+    @property
+    def outcome(self) -> str:
+        """What came of it, in one sentence."""
+        return f"at the pose {self._plan.deployment.setup.pose!r}" if self._homing_only else self.validated
 
     def begin(self) -> None:
         """Start from the first stage."""
@@ -80,7 +87,7 @@ class SetUp:
         elif self.stage is Stage.OBSERVE:
             return self._observe()
         elif self.stage is Stage.HOME:
-            self._require_family()
+            self._wait_for_motion()
         elif self.stage is Stage.SETTLE:
             return self._settle()
         elif self.stage is Stage.WARM_UP:
@@ -120,8 +127,24 @@ class SetUp:
 
     def _go(self) -> None:
         self._goal = self._plan.robot.poses[self._plan.deployment.setup.pose]
+        self._allowed = self._motion_time() + _SETTLE_S
         self._orders.give("motion", goal=np.array(self._goal, np.float64))
         self._enter(Stage.HOME)
+
+    def _motion_time(self) -> float:
+        """How long the motion to the goal takes from where control will start it [s]."""
+        status = self._page.control.read()
+        start = status["commanded"] if status["engaged"] else self._page.observation.read()["qpos"]
+        safety, limits = self._plan.deployment.safety, self._plan.limits
+        velocity = limits.velocity * safety.motion_velocity_scale
+        acceleration = np.full(len(velocity), safety.motion_acceleration)
+        return Trajectory(np.array(start, np.float64), self._goal, velocity, acceleration).duration
+
+    def _wait_for_motion(self) -> None:
+        self._require_family()
+        if self._waited() > self._allowed:
+            pose = self._plan.deployment.setup.pose
+            raise SetupError(f"control has not come to the pose {pose!r} within {self._allowed:.1f} s")
 
     def _settle(self) -> bool:
         measured = np.array(self._page.observation.read()["qpos"], np.float64)
@@ -130,9 +153,10 @@ class SetUp:
         worst = int(error.argmax())
         if error[worst] > _ARRIVED_RAD:
             if self._waited() > _SETTLE_S:
+                pose = self._plan.deployment.setup.pose
                 raise SetupError(
                     f"the arm did not arrive: {limits.names[worst]} is {error[worst]:.2f} rad from the pose "
-                    f"{self._plan.deployment.setup.pose!r}; is it blocked, or is another program commanding it?"
+                    f"{pose!r}; is it blocked, or is another program commanding it?"
                 )
             return False
         if self._homing_only:

@@ -34,7 +34,7 @@ def snapshot(main: Main) -> dict[str, Any]:
         "lease": _lease(main, now),
         "estop": main.estop_sentence,
         "run": _run(main, now),
-        "recording": {"uuid": main.media_report.recording, "rows": main.media_report.rows},
+        "recording": _recording(main),
         "episode": main.last_episode,
         "control": _control(main),
         "link": _link(main, now),
@@ -47,6 +47,11 @@ def _lease(main: Main, now: float) -> dict[str, Any]:
     if held is None:
         return {"holder": "", "epoch": main.lease.epoch, "expires_in": 0.0}
     return {"holder": held.holder, "epoch": held.epoch, "expires_in": held.until - now}
+
+
+def _recording(main: Main) -> dict[str, Any]:
+    report = main.media_report
+    return {"uuid": report.recording, "rows": report.rows, "repeated": report.repeated}
 
 
 def _run(main: Main, now: float) -> dict[str, Any]:

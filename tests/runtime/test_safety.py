@@ -55,7 +55,27 @@ def test_it_refuses_on_old_joints_and_on_old_pictures_each_by_its_own_bound():
 
 
 def test_a_motion_of_ours_needs_no_pictures():
-    assert not judge([0, 1, 0.05], state(picture_ages={"cam": 9.0}, joint_age=9.0), path="motion").refused
+    assert not judge([0, 1, 0.05], state(picture_ages={"cam": 9.0}), path="motion").refused
+
+
+def test_a_motion_of_ours_is_not_made_blind_nor_against_a_blocked_arm():
+    old = judge([0, 1, 0.05], state(joint_age=0.25), path="motion")
+    assert "joints are 0.25 s old, allowed 0.2" in old.notes[0]
+    blocked = state(previous=(0.5, 1, 0.05), measured=(0.0, 1, 0.05))
+    assert "from where it is measured" in judge([0.51, 1, 0.05], blocked, path="motion").notes[0]
+    assert not judge([0.45, 1, 0.05], blocked, path="motion").refused
+
+
+def test_a_joint_that_comes_back_does_not_hide_another_one_that_runs_away():
+    both = state(previous=(0.8, 1.55, 0.05), measured=(0.0, 1.0, 0.05))
+    verdict = judge([0.7, 1.6, 0.05], both)
+    assert verdict.refused
+    assert "arm.joint1 would be 0.60 rad" in verdict.notes[0]
+
+
+def test_a_joint_that_is_measured_as_nan_refuses_every_action():
+    assert judge([0, 1, 0.05], state(measured=(np.nan, 1, 0.05))).refused
+    assert judge([0, 1, 0.05], state(measured=(np.nan, 1, 0.05)), path="motion").refused
 
 
 def test_a_target_never_runs_away_from_a_blocked_arm_but_may_come_back():
@@ -86,7 +106,9 @@ def test_a_gripper_beyond_its_range_is_brought_back_into_it():
 
 
 def test_a_binary_gripper_switches_at_once():
-    limits = Limits(LIMITS.names, LIMITS.lower, LIMITS.upper, LIMITS.velocity, LIMITS.grippers, LIMITS.grippers)
+    limits = Limits(
+        LIMITS.names, LIMITS.lower, LIMITS.upper, LIMITS.velocity, LIMITS.grippers, LIMITS.grippers
+    )
     verdict = judge([0, 1, 0.1], state(previous=(0, 1, 0.0)), limits=limits)
     assert verdict.action[2] == 0.1
     assert verdict.notes == ()
@@ -95,6 +117,12 @@ def test_a_binary_gripper_switches_at_once():
 def test_report_only_sends_the_action_as_it_is_and_lists_what_it_would_have_done():
     verdict = judge([0, 1, 0.103], report_only=True, where=state(previous=(0, 1, 0.1)))
     assert verdict.action[2] == 0.103
+    assert "arm.gripper 0.1030 is outside 0..0.1" in verdict.notes
+
+
+def test_report_only_lists_what_is_beyond_a_limit_also_where_it_would_have_refused():
+    verdict = judge([0, 1, 0.103], state(joint_age=9.0), report_only=True)
+    assert "joints are 9.00 s old, allowed 0.2" in verdict.notes
     assert "arm.gripper 0.1030 is outside 0..0.1" in verdict.notes
 
 
@@ -118,7 +146,9 @@ def test_an_arm_that_starts_outside_its_limits_may_stay_or_come_back_but_not_go_
 )
 def test_whatever_is_asked_the_limits_hold_together(asked, stretches, acceleration):
     """Velocity, acceleration and joint limits at once, at changing tick lengths: none undoes another."""
-    limits = Limits(("j",), np.array([-1.0]), np.array([1.0]), np.array([3.0]), np.zeros(1, bool), np.zeros(1, bool))
+    limits = Limits(
+        ("j",), np.array([-1.0]), np.array([1.0]), np.array([3.0]), np.zeros(1, bool), np.zeros(1, bool)
+    )
     options = SafetySettings(acceleration=acceleration, jump=100.0, following_error=100.0)
     safety = SafetyFilter(options, limits)
     previous, velocity = np.zeros(1), np.zeros(1)
