@@ -108,12 +108,21 @@ class CommandServer:
 
 
 class CommandClient:
-    """The asking end: one command at a time, each with a deadline; a late answer is never taken for another's."""
+    """The asking end: one command at a time, each with a deadline.
+
+    After a timeout the connection is dropped with all that is under way on it, in both directions: a late
+    answer is never taken for another's, and a command that was not sent is not delivered hours later.
+    """
 
     def __init__(self, context: zmq.Context[Any], endpoint: str) -> None:
-        self._socket = context.socket(zmq.DEALER)
+        self._context = context
+        self._endpoint = endpoint
+        self._connect()
+
+    def _connect(self) -> None:
+        self._socket = self._context.socket(zmq.DEALER)
         self._socket.linger = 200
-        self._socket.connect(endpoint)
+        self._socket.connect(self._endpoint)
 
     def request(self, command: Command, timeout: float) -> Ack:
         """The answer; raises TransportError "outcome unknown" where none came in time."""
@@ -125,6 +134,8 @@ class CommandClient:
             answer = decode(self._socket.recv())
             if isinstance(answer, Ack) and answer.uuid in (command.uuid, ""):
                 return answer
+        self._socket.close(linger=0)
+        self._connect()
         raise TransportError(f"no answer to {command.kind} within {timeout:g} s: outcome unknown")
 
     def close(self) -> None:

@@ -33,7 +33,7 @@ class StationClient:
     def __init__(self, station_dir: Path, holder: str = "") -> None:
         self.holder = holder or f"terminal:{getpass.getuser()}@{socket.gethostname()}"
         self._endpoints = Endpoints(station_dir)
-        self._context = zmq.Context.instance()
+        self._context: zmq.Context[Any] = zmq.Context.instance()
         self._commands: CommandClient | None = None
         self._endpoint = ""
         self._epoch = 0
@@ -72,20 +72,22 @@ class StationClient:
         self._command("lease_give_up", 2.0, epoch=self._epoch)
 
     def command(self, kind: str, timeout: float = 2.0, identity: str = "") -> Ack:
-        """Give one command under the lease; raises Refused, or TransportError where the outcome is unknown."""
+        """Give one command under the lease; raises Refused, or TransportError: outcome unknown."""
         self.claim()
         self.status()
         return self._command(kind, timeout, epoch=self._epoch, identity=identity)
 
     def estop(self, why: str) -> Ack:
         """Press the software e-stop at the guard, which needs neither lease nor main."""
-        endpoint = self._endpoints.read("guard")["estop"]
-        client = CommandClient(self._context, endpoint)
         try:
-            command = Command(str(uuid.uuid4()), "estop", {"why": why}, user=self.holder)
-            return client.request(command, 2.0)
-        finally:
-            client.close()
+            client = CommandClient(self._context, self._endpoints.read("guard")["estop"])
+            try:
+                command = Command(str(uuid.uuid4()), "estop", {"why": why}, user=self.holder)
+                return client.request(command, 2.0)
+            finally:
+                client.close()
+        except TransportError as error:
+            raise TransportError(f"USE THE HARDWARE STOP: {error}") from None
 
     def subscribe(self, *streams: str) -> Subscriber:
         """The station's live streams: state, joints, event."""

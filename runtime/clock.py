@@ -26,7 +26,7 @@ class MonotonicClock(Clock):
         return time.monotonic()
 
     def sleep_until(self, deadline: float) -> None:
-        # time.sleep in 3.11 uses clock_nanosleep with an absolute deadline on CLOCK_MONOTONIC.
+        # time.sleep itself waits on CLOCK_MONOTONIC, to an absolute deadline, through signals.
         remaining = deadline - time.monotonic()
         if remaining > 0:
             time.sleep(remaining)
@@ -45,6 +45,8 @@ class VirtualClock(Clock):
         self._now = max(self._now, deadline)
 
     def advance(self, seconds: float) -> None:
+        if not seconds >= 0:
+            raise ValueError(f"advance by {seconds!r} s: time does not go backwards; allowed: 0 or more")
         self._now += seconds
 
 
@@ -52,8 +54,8 @@ class ClockMap:
     """Maps a peer's clock onto ours by the smallest (arrival - stamp) of the last `window` seconds.
 
     Clocks drift by tens of ppm, so the minimum is taken over a window and not for ever. A stamp that goes
-    backwards by more than `tolerance` seconds means that the peer restarted: the map starts anew and `restarts`
-    counts it. Source: the minimum filter of NTP (RFC 5905, section 10).
+    backwards by more than `tolerance` seconds means that the peer restarted: the map starts anew and
+    `restarts` counts it. Source: the minimum filter of NTP (RFC 5905, section 10).
     """
 
     def __init__(self, window: float = 45.0, tolerance: float = 0.5) -> None:
@@ -76,4 +78,4 @@ class ClockMap:
         self._minima.append((arrival, offset))
         while self._minima[0][0] < arrival - self._window:
             self._minima.popleft()
-        return stamp + self._minima[0][1]
+        return min(arrival, stamp + self._minima[0][1])  # rounding may put it a hair later

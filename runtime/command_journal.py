@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import time
 from dataclasses import asdict
@@ -10,7 +11,9 @@ from pathlib import Path
 
 from runtime.messages import Ack, Command
 
-_REMEMBERED = 5000
+log = logging.getLogger(__name__)
+REMEMBERED = 5000
+_TAIL_BYTES = 16 << 20  # of a file that grows for years, enough for what is remembered
 
 
 class CommandJournal:
@@ -18,29 +21,30 @@ class CommandJournal:
 
     def __init__(self, station_dir: Path) -> None:
         station_dir.mkdir(parents=True, exist_ok=True)
-        self._path = station_dir / "commands.jsonl"
+        self._file = (station_dir / "commands.jsonl").open("a+b", buffering=0)
         self.answers = self._read()
-        self._file = self._path.open("a", encoding="utf-8")
 
     def _read(self) -> dict[str, Ack]:
-        try:
-            lines = self._path.read_text("utf-8", errors="replace").splitlines()
-        except FileNotFoundError:
-            return {}
+        size = self._file.seek(0, os.SEEK_END)
+        self._file.seek(max(0, size - _TAIL_BYTES))
+        content = self._file.read() or b""
+        whole, _, torn = content.rpartition(b"\n")
+        if torn:  # by a kill: its command was never answered
+            self._file.truncate(size - len(torn))
         answers = {}
-        for line in lines[-_REMEMBERED:]:
+        for line in whole.split(b"\n")[-REMEMBERED:]:
             try:
                 row = json.loads(line)
                 answers[row["uuid"]] = Ack(**row["ack"])
             except (ValueError, KeyError, TypeError):
-                continue  # a line torn by a kill: its command was never answered
-        if lines and not self._path.read_bytes().endswith(b"\n"):
-            with self._path.open("a", encoding="utf-8") as file:
-                file.write("\n")
+                continue  # damaged, or the rest of a line that begins before the tail
         return answers
 
-    def append(self, command: Command, ack: Ack) -> None:
-        """Write one answer before it is given."""
+    def append(self, command: Command, ack: Ack) -> str:
+        """Write one answer before it is given; "" or why it is not on disk.
+
+        A full disk must not end who carries out stops: the line is taken back and the reason logged.
+        """
         row = {
             "uuid": command.uuid,
             "kind": command.kind,
@@ -51,6 +55,23 @@ class CommandJournal:
             "wall": time.time(),
             "ack": asdict(ack),
         }
-        self._file.write(json.dumps(row, default=str) + "\n")
-        self._file.flush()
-        os.fdatasync(self._file.fileno())
+        try:
+            self._write(json.dumps(row, default=str).encode() + b"\n")
+        except OSError as error:
+            log.error("the answer to %s is not on disk: %s", command.kind, error)
+            return f"not on disk ({error}): after a restart {command.kind} could be given twice"
+        return ""
+
+    def _write(self, line: bytes) -> None:
+        end = self._file.seek(0, os.SEEK_END)
+        try:
+            if self._file.write(line) != len(line):
+                raise OSError("the disk took only a part of the line")
+            os.fdatasync(self._file.fileno())
+        except OSError:
+            self._file.truncate(end)
+            raise
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()

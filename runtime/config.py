@@ -6,7 +6,7 @@ import os
 from functools import reduce
 from operator import or_
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
@@ -17,20 +17,31 @@ from runtime.section import Section
 
 
 def _variants_of(package: str) -> Any:
-    """The union of every variant's Config, told apart by `kind`; a new file in the package joins by itself."""
+    """The union of the variants' Configs, told apart by `kind`; a new file in the package joins by itself."""
     configs = [module.Config for module in variants(package).values()]
     union = reduce(or_, configs)
     return Annotated[union, Field(discriminator="kind")] if len(configs) > 1 else union
 
 
-TransportConfig = _variants_of("runtime.transports")
-PolicyConfig = _variants_of("runtime.policies")
-StrategyConfig = _variants_of("runtime.strategies")
+if TYPE_CHECKING:
+
+    class Variant(Section):
+        """What all variants have in common."""
+
+        kind: str
+
+    TransportConfig = Variant
+    PolicyConfig = Variant
+    StrategyConfig = Variant
+else:
+    TransportConfig = _variants_of("runtime.transports")
+    PolicyConfig = _variants_of("runtime.policies")
+    StrategyConfig = _variants_of("runtime.strategies")
 
 
 def _loopback(host: str) -> str:
-    if host not in ("127.0.0.1", "localhost", "::1"):
-        raise ValueError("must be a loopback address (127.0.0.1): the bus has no keys of its own yet")
+    if host not in ("127.0.0.1", "localhost"):
+        raise ValueError("must be 127.0.0.1 or localhost: the bus has no keys of its own yet")
     return host
 
 

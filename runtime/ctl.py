@@ -18,7 +18,7 @@ from runtime.errors import RuntimeFault
 # Commands that go on after they were accepted: the terminal stays, keeps the lease, and Ctrl-C stops.
 _LASTING = {"setup": ("setting_up",), "home": ("setting_up",), "run": ("running",), "resume": ("running",)}
 _AT_ONCE = ("stop", "halt", "release")
-_GOOD_END = ("ready", "idle")
+_GOOD_END = "ready"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -27,12 +27,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("station")
     parser.add_argument("command", choices=[*_LASTING, *_AT_ONCE, "estop", "status", "watch", "record"])
     parser.add_argument("what", nargs="?", help="record: start or stop; estop: why")
-    parser.add_argument("--data-dir", default=os.environ.get("EVA_DATA_DIR", "data"))
+    parser.add_argument("--data-dir", default=os.environ.get("EVA_DATA_DIR") or "data")
     parser.add_argument("--json", action="store_true", help="status and watch as JSON")
     given = parser.parse_args(arguments)
     if given.command == "record" and given.what not in ("start", "stop"):
         parser.error("record needs start or stop")
-    client = StationClient(Path(given.data_dir).absolute() / "stations" / given.station)
+    client = StationClient(Path(given.data_dir).expanduser().absolute() / "stations" / given.station)
     try:
         return _do(client, given)
     except Refused as refusal:
@@ -69,8 +69,8 @@ def _do(client: StationClient, given: argparse.Namespace) -> int:
 
 def _attend(client: StationClient, kind: str) -> int:
     """Give a lasting command and stay with it: the lease lives as long as this terminal."""
-    client.command(kind)
     try:
+        client.command(kind)
         status = client.status()
         shown = 0.0
         while status["state"] in _LASTING[kind]:
@@ -84,25 +84,36 @@ def _attend(client: StationClient, kind: str) -> int:
         client.command("stop")
         status = client.status()
     print(line(status))
-    return 0 if status["state"] in _GOOD_END else 1
+    return 0 if status["state"] == _GOOD_END else 1
 
 
 def _watch(client: StationClient, as_json: bool) -> int:
-    client.status()
-    subscriber = client.subscribe("state", "event")
-    shown = 0.0
+    """Print until interrupted; the stream only wakes, events are fetched by number so that none is missed."""
+    status = client.status()
+    boot, seen, shown = status["boot"], status["newest_event"], 0.0
+    subscriber = client.subscribe("state")
     while True:
-        content = subscriber.receive(2.0)
-        if not content:
-            client.status()  # raises a sentence where the station is gone
-        if event := content.get("event"):
-            print(
-                json.dumps(event, default=str) if as_json else f"  {event['kind']}: {event['text']}",
-                flush=True,
-            )
-        if (status := content.get("state")) and time.monotonic() - shown > 0.5:
+        status = subscriber.receive(2.0).get("state", {})
+        if not status:
+            status = client.status()  # raises a sentence where the station is gone
+            subscriber.close()
+            subscriber = client.subscribe("state")  # a restarted one has other sockets
+        if status["boot"] != boot:
+            boot, seen = status["boot"], 0
+        if status["newest_event"] > seen:
+            seen = _print_events(client, seen, as_json)
+        if time.monotonic() - shown > 0.5:
             shown = time.monotonic()
             print(json.dumps(status, default=str) if as_json else line(status), flush=True)
+
+
+def _print_events(client: StationClient, after: int, as_json: bool) -> int:
+    for event in client.events_since(after):
+        print(
+            json.dumps(event, default=str) if as_json else f"  {event['kind']}: {event['text']}", flush=True
+        )
+        after = event["number"]
+    return after
 
 
 def line(status: dict[str, Any]) -> str:
@@ -117,7 +128,8 @@ def line(status: dict[str, Any]) -> str:
     holder = status["lease"]["holder"] or "nobody"
     return (
         f"{status['station']}  {status['state'].upper()}{stage}: {status['reason']}{run}{rows}{asked}  "
-        f"tick p99 {control['lateness_p99_ms']:.2f} ms, {control['missed']} missed  Hz {rates or '-'}  lease {holder}"
+        f"tick p99 {control['lateness_p99_ms']:.2f} ms, {control['missed']} missed  "
+        f"Hz {rates or '-'}  lease {holder}"
     )
 
 

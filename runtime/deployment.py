@@ -1,4 +1,4 @@
-"""Reads deployment files: TOML with `extends`, `--set key=value`, and errors that name file, key and value."""
+"""Reads deployment files: TOML with `extends` and `--set key=value`; errors name file, key and value."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -30,12 +30,18 @@ class Resolved:
 
 
 def load(path: Path, assignments: Sequence[str] = ()) -> Resolved:
-    """The deployment of `path` with `key=value` assignments on top; raises ConfigurationError."""
+    """The deployment of `path` with `key=value` assignments on top; raises ConfigurationError.
+
+    A `kind` is assigned before anything else, because a new kind replaces the table it stands in.
+    """
     tree, origin = _read(path, ())
-    for assignment in assignments:
-        key, value = _assignment(assignment)
-        _put(tree, key, value, f"--set {assignment}")
-        origin[key] = f"--set {assignment}"
+    parsed = [(*_assignment(text), f"--set {text}") for text in assignments]
+    for key, value, source in sorted(parsed, key=lambda one: one[0][-1] != "kind"):
+        _put(tree, key, value, source)
+        origin = {known: where for known, where in origin.items() if known[: len(key)] != key}
+        for depth in range(1, len(key)):
+            origin.setdefault(key[:depth], source)
+        origin[key] = source
     return resolve(tree, origin, str(path))
 
 
@@ -47,21 +53,24 @@ def resolve(tree: Mapping[str, Any], origin: Mapping[Key, str], source: str) -> 
         raise ConfigurationError(
             "\n".join(_sentence(e, tree, origin, source) for e in invalid.errors())
         ) from None
+    except ConfigurationError as error:  # of a variant's own check, which knows no file
+        raise ConfigurationError(f"{source}: {error}") from None
     canonical = deployment.model_dump(mode="json")
     text = json.dumps(canonical, sort_keys=True, separators=(",", ":"))
     return Resolved(deployment, canonical, hashlib.sha256(text.encode()).hexdigest())
 
 
 def _read(path: Path, chain: tuple[Path, ...]) -> tuple[dict[str, Any], dict[Key, str]]:
-    path = path.absolute()
+    path = path.resolve()
     if path in chain:
         raise ConfigurationError(f"{path}: extends itself by way of {' -> '.join(map(str, chain))}")
     try:
         own = tomllib.loads(path.read_text("utf-8"))
     except OSError as error:
         near = ", ".join(sorted(p.name for p in path.parent.glob("*.toml"))) or "none"
+        by = f"which {chain[-1]} extends " if chain else ""
         raise ConfigurationError(
-            f"{path}: cannot be read ({error.strerror}); deployment files there: {near}"
+            f"{path}: {by}cannot be read ({error.strerror}); deployment files there: {near}"
         ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{path}: is not valid TOML: {error}") from None
@@ -129,15 +138,17 @@ def _sentence(error: ErrorDetails, tree: Mapping[str, Any], origin: Mapping[Key,
     if kind == "extra_forbidden":
         allowed = _allowed(key[:-1], tree)
         near = difflib.get_close_matches(key[-1], allowed, 1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        return f"{where}: {name} = {error['input']!r}: unknown key{hint} Allowed here: {', '.join(allowed)}"
+        hint = f" (did you mean {near[0]}?)" if near else ""
+        return f"{where}: {name} = {error['input']!r}: unknown key{hint}; allowed here: {', '.join(allowed)}"
     if kind == "missing":
         return f"{where}: {name} is missing and has no default"
     if kind in ("union_tag_invalid", "union_tag_not_found"):
-        given = error["input"].get("kind") if isinstance(error["input"], dict) else error["input"]
-        tags = error.get("ctx", {}).get("expected_tags", "")
-        return f"{where}: {name}.kind = {given!r}: must be one of {tags}"
-    return f"{where}: {name} = {error['input']!r}: {error['msg']}"
+        where = origin.get((*key, "kind"), where)
+        given = f"= {error['input']['kind']!r}" if "kind" in error["input"] else "is missing"
+        return f"{where}: {name}.kind {given}: must be one of {', '.join(_kinds(key, tree))}"
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        return f"{where}: {name} = {error['input']!r}: must be a table"
+    return f"{where}: {name} = {error['input']!r}: {error['msg'].removeprefix('Value error, ')}"
 
 
 def _plain(loc: tuple[int | str, ...], tree: Mapping[str, Any]) -> Key:
@@ -159,19 +170,46 @@ def _plain(loc: tuple[int | str, ...], tree: Mapping[str, Any]) -> Key:
 
 def _allowed(key: Key, tree: Mapping[str, Any]) -> list[str]:
     """The keys that the table at `key` may have."""
-    models: list[type[BaseModel]] = [Deployment]
+    return sorted({name for model in _tables(key, tree) for name in model.model_fields})
+
+
+def _kinds(key: Key, tree: Mapping[str, Any]) -> list[str]:
+    """The kinds that the table at `key` may be of."""
+    return [repr(model.model_fields["kind"].default) for model in _tables(key, tree)]
+
+
+def _tables(key: Key, tree: Mapping[str, Any]) -> list[type[BaseModel]]:
+    """What the table at `key` may be: one model where its kind says so, else each it could be."""
+    annotations: list[Any] = [Deployment]
     at: Any = tree
     for name in key:
-        at = at.get(name, {})
-        fields = [m.model_fields[name].annotation for m in models if name in m.model_fields]
-        models = [leaf for field in fields for leaf in _models(field)]
-    chosen = [
-        m for m in models if "kind" in m.model_fields and m.model_fields["kind"].default == at.get("kind")
-    ]
-    return sorted({name for model in (chosen or models) for name in model.model_fields})
+        annotations = [found for annotation in annotations for found in _under(name, annotation)]
+        at = at.get(name) if isinstance(at, Mapping) else None
+        chosen = [model for model in _models(annotations) if _is_of_kind(model, at)]
+        annotations = list(chosen or annotations)
+    return _models(annotations)
 
 
-def _models(annotation: Any) -> list[type[BaseModel]]:
+def _under(name: str, annotation: Any) -> list[Any]:
+    """The annotations of what stands under `name` in something of type `annotation`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [model for part in get_args(annotation) for model in _models(part)]
+        field = annotation.model_fields.get(name)
+        return [field.annotation] if field else []
+    if get_origin(annotation) in (dict, list):
+        return [get_args(annotation)[-1]]
+    return [found for part in get_args(annotation) for found in _under(name, part)]
+
+
+def _is_of_kind(model: type[BaseModel], table: Any) -> bool:
+    declared = model.model_fields.get("kind")
+    return declared is not None and isinstance(table, Mapping) and table.get("kind") == declared.default
+
+
+def _models(annotations: Sequence[Any]) -> list[type[BaseModel]]:
+    found: list[type[BaseModel]] = []
+    for annotation in annotations:
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            found.append(annotation)
+        else:
+            found.extend(_models(get_args(annotation)))
+    return found

@@ -105,6 +105,11 @@ def plan(resolved: Resolved) -> Plan:
     if unknown:
         arms = ", ".join(arm.name for arm in robot.arms)
         raise ConfigurationError(f"safety.workspace.{min(unknown)}: {robot.name} has the arms {arms}")
+    if made.fps > made.rate:
+        raise ConfigurationError(
+            f"recording.fps = {made.fps:g}: there would be more rows than ticks; "
+            f"allowed: at most {made.rate:g}, the control rate"
+        )
     if settings.safety.report_only and made.capabilities.moves_robot:
         raise SetupError(
             f"safety.report_only = true with transport {settings.transport.kind!r}: it can move a robot; "

@@ -26,7 +26,7 @@ class Guard:
         self._latch = latch
         self._clock = clock
         self._patience = max(0.05, 2.0 * period)
-        self._releases = page.releases
+        self._releases = page.releases  # what was asked for before is void
         latched = latch.read()
         # A restarted guard also trusts the flag of its predecessor, which may not have reached the disk.
         page.set_estop(EStop.LATCHED if latched or page.estop is EStop.LATCHED else EStop.CLEAR)
@@ -36,42 +36,57 @@ class Guard:
     def press(self, by: str, why: str) -> str:
         """Raise the flag, then latch on disk; returns "" or why the latch will not outlive a restart."""
         self._page.set_estop(EStop.LATCHED)
+        self._releases = self._page.releases  # a release asked for before this press is not for this press
         log.warning("E-STOP by %s: %s", by, why)
         try:
             self._latch.set(by, why)
         except OSError as error:
             log.error("the e-stop is not on disk: %s", error)
-            return f"; not on disk ({error.strerror}): a restart of the station will forget it"
+            return f"; not on disk ({error.strerror or error}): a restart of the station may forget it"
         return ""
 
     def watch(self) -> None:
-        """Release where main has asked for it; main has checked the lease."""
-        if self._page.releases != self._releases:
-            self._releases = self._page.releases
+        """Release where main has asked for it, which has checked the lease; not where the disk refuses."""
+        if self._page.releases == self._releases:
+            return
+        self._releases = self._page.releases
+        try:
             self._latch.clear()
-            self._page.set_estop(EStop.CLEAR)
-            log.warning("e-stop released")
+        except OSError as error:
+            log.error("the e-stop stays: its latch cannot be removed: %s", error)
+            return
+        self._page.set_estop(EStop.CLEAR)
+        log.warning("e-stop released")
 
-    def obeyed(self) -> bool:
-        """Whether control obeys, waiting at most max(50 ms, 2 ticks)."""
+    def obeyed(self, version: int) -> bool:
+        """Whether control has said since `version` of its status that it obeys.
+
+        Waits at most max(50 ms, 2 ticks). An older word is worth nothing: control may have died after it.
+        """
         until = self._clock.now() + self._patience
-        while self._clock.now() < until:
-            if self._page.control.read()["estop_obeyed"]:
-                return True
+        while not self._says_so(version):
+            if self._clock.now() >= until:
+                return False
             self._clock.sleep_until(self._clock.now() + 0.002)
-        return bool(self._page.control.read()["estop_obeyed"])
+        return True
+
+    def _says_so(self, version: int) -> bool:
+        status = self._page.control
+        return status.version > version and bool(status.read()["estop_obeyed"])
 
     def answer(self, command: Command) -> Ack:
         """Any user may press; "failed" means that control did not answer in time: use the hardware stop."""
         if command.kind == "estop":
             why = str(command.args.get("why", "pressed"))
+            version = self._page.control.version
             doubt = self.press(command.user or command.holder or "unknown", why)
-            if self.obeyed():
+            if self.obeyed(version):
                 return Ack(command.uuid, "done", "every tick now sends the measured position" + doubt)
             return Ack(
                 command.uuid,
                 "failed",
-                f"latched, but control has not obeyed within {self._patience * 1000:.0f} ms: USE THE HARDWARE STOP",
+                f"latched, but control has not obeyed within {self._patience * 1000:.0f} ms: "
+                f"USE THE HARDWARE STOP{doubt}",
             )
         if command.kind == "status":
             latched = self._latch.read()
@@ -92,7 +107,7 @@ def main() -> None:
         guard.watch()
         if server.socket.poll(int(_POLL_S * 1000)):
             received = server.receive()
-            if isinstance(received, tuple):
+            if received is not None:
                 address, command = received
                 server.answer(address, guard.answer(command))
     server.close()

@@ -1,4 +1,4 @@
-"""The e-stop latch on disk: it outlives every process and is read before the first command after a restart."""
+"""The e-stop latch on disk: outlives every process, is read before the first command after a restart."""
 
 from __future__ import annotations
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+HIGHEST_EPOCH = 2**52  # of a claim; beyond 2**53 a browser counts no more
+
 
 @dataclass(frozen=True, slots=True)
 class Held:
@@ -30,13 +32,24 @@ class Lease:
     def epoch(self) -> int:
         return self._epoch
 
+    def never_below(self, epoch: int) -> None:
+        """Epochs up to `epoch` were in use before a restart: they are over."""
+        self._epoch = max(self._epoch, epoch)
+
     def claim(self, holder: str, epoch: int, now: float) -> str:
-        """Take or keep the lease; "" where granted, else the reason for the refusal."""
+        """Take or keep the lease; "" where granted, else the reason for the refusal.
+
+        Epoch 0 is a terminal's: it takes a free lease under the next epoch, or keeps its own.
+        """
+        if not holder:
+            return "a lease needs the name of its holder"
+        if not 0 <= epoch <= HIGHEST_EPOCH:
+            return f"epoch {epoch} is impossible; allowed: 0 to {HIGHEST_EPOCH}"
         held = self.current(now)
         if held and held.holder == holder and epoch in (0, held.epoch):
             self._held = Held(holder, held.epoch, now + self._ttl)
             return ""
-        if epoch == 0:  # a terminal: takes a free lease, never somebody's
+        if epoch == 0:
             if held:
                 return f"{held.holder} holds the lease for another {held.until - now:.1f} s"
             epoch = self._epoch + 1

@@ -1,13 +1,15 @@
 """Every message between our processes: inside the family, and between the runtime and its clients.
 
-A message is a frozen dataclass; on the wire it is a map of its fields with its class name under "type".
+A message is a frozen dataclass; on the wire it is a map of its fields with its class name under "type". What
+comes in is checked against the fields' annotations, so that nothing behind `decode` meets what it cannot use.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +36,10 @@ class Order:
 
 @dataclass(frozen=True, slots=True)
 class PostedChunk:
-    """A chunk in command space at control rate, not yet merged: float64 [H, D], row 0 for `observation_step`."""
+    """A chunk in command space at control rate, not yet merged: float64 [H, D].
+
+    Row 0 is for `observation_step`.
+    """
 
     chunk_id: int
     run: int
@@ -214,6 +219,49 @@ Message = (
 _TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Message.__args__}
 _FIELDS = {kind: tuple(f.name for f in fields(kind)) for kind in _TYPES.values()}
 
+# What stands on the wire for an annotation: numpy's scalars are numbers, a whole number will do for a float.
+_INTEGERS: tuple[type, ...] = (int, np.integer)
+_ON_THE_WIRE: dict[Any, tuple[type, ...]] = {
+    str: (str,),
+    bool: (bool, np.bool_),
+    int: _INTEGERS,
+    float: (float, np.floating, *_INTEGERS),
+    list: (list,),
+    Mapping: (dict,),
+    np.ndarray: (np.ndarray,),
+    NoneType: (NoneType,),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Expected:
+    """What a field may be: one of `classes`, and where `words` are given, one of these."""
+
+    classes: tuple[type, ...]
+    words: tuple[str, ...] = ()
+
+    def admits(self, value: object) -> bool:
+        return isinstance(value, self.classes) and (not self.words or value in self.words)
+
+    def __str__(self) -> str:
+        return " or ".join(self.words or (kind.__name__ for kind in self.classes))
+
+
+def _expected(annotation: Any) -> _Expected:
+    origin = get_origin(annotation)
+    if origin is Literal:
+        return _Expected((str,), get_args(annotation))
+    if origin in (Union, UnionType):
+        parts = [_expected(part).classes for part in get_args(annotation)]
+        return _Expected(tuple(kind for part in parts for kind in part))
+    return _Expected(_ON_THE_WIRE[origin or annotation])
+
+
+_EXPECTED = {
+    kind: {name: _expected(annotation) for name, annotation in get_type_hints(kind).items()}
+    for kind in _TYPES.values()
+}
+
 
 def encode(message: Message) -> bytes:
     """The message as bytes."""
@@ -224,15 +272,19 @@ def encode(message: Message) -> bytes:
 def decode(payload: bytes) -> Message:
     """The message in `payload`; raises CodecError naming what does not fit. Unknown fields are ignored."""
     content = unpack(payload)
-    if not isinstance(content, dict) or content.get("type") not in _TYPES:
-        given = content.get("type") if isinstance(content, dict) else type(content).__name__
-        raise CodecError(f"message type {given!r} is unknown; known: {', '.join(_TYPES)}")
-    kind = _TYPES[content["type"]]
-    known = {name: content[name] for name in _FIELDS[kind] if name in content}
+    name = content.get("type") if isinstance(content, dict) else type(content).__name__
+    if not isinstance(content, dict) or not isinstance(name, str) or name not in _TYPES:
+        raise CodecError(f"message type {name!r} is unknown; known: {', '.join(_TYPES)}")
+    kind = _TYPES[name]
+    known = {field_: content[field_] for field_ in _FIELDS[kind] if field_ in content}
+    for field_, value in known.items():
+        if not _EXPECTED[kind][field_].admits(value):
+            expected = _EXPECTED[kind][field_]
+            raise CodecError(f"message {name}: {field_} = {value!r:.80}; expected {expected}")
     try:
         message: Message = kind(**known)
     except TypeError as error:
-        raise CodecError(f"message {content['type']}: {error}") from None
+        raise CodecError(f"message {name}: {error}") from None
     return message
 
 

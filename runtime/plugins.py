@@ -7,14 +7,28 @@ import importlib
 import pkgutil
 from types import ModuleType
 
+from runtime.errors import ConfigurationError
+
 
 @functools.cache
 def variants(package: str) -> dict[str, ModuleType]:
-    """The modules of `package` by their `kind`; adding a file there is all it takes to add a variant."""
+    """The modules of `package` by their `kind`; adding a file there is all it takes to add a variant.
+
+    Raises ConfigurationError where two modules claim the same kind.
+    """
     root = importlib.import_module(package)
-    found = {}
+    found: dict[str, ModuleType] = {}
     for info in pkgutil.iter_modules(root.__path__):
+        if info.name.startswith("_"):
+            continue
         module = importlib.import_module(f"{package}.{info.name}")
-        if hasattr(module, "Config"):
-            found[module.Config.model_fields["kind"].default] = module
+        if not hasattr(module, "Config"):
+            continue
+        kind = module.Config.model_fields["kind"].default
+        if kind in found:
+            raise ConfigurationError(
+                f"{module.__name__} declares the kind {kind!r}, which is {found[kind].__name__}'s; "
+                f"allowed: any but {', '.join(found)}"
+            )
+        found[kind] = module
     return found

@@ -6,6 +6,12 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Section(BaseModel):
-    """A frozen table of a deployment file: unknown keys and wrong types are errors, nothing is coerced."""
+    """A frozen table of a deployment file, in which nothing is coerced.
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True)
+    Unknown keys, wrong types, NaN and infinity are errors.
+    """
+
+    # A limit of infinity or NaN would be no limit at all, and neither is valid in a manifest's JSON.
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )

@@ -41,7 +41,10 @@ class Happening(StrEnum):
 
 
 class Effects(ABC):
-    """What the session makes happen; implemented by main, recorded by tests. Each raises RuntimeFault to refuse."""
+    """What the session makes happen; implemented by main, recorded by tests.
+
+    Each raises RuntimeFault to refuse.
+    """
 
     @abstractmethod
     def begin_setup(self) -> None: ...
@@ -103,6 +106,7 @@ COMMANDS: dict[str, Rule] = {
 CANCELLING = ("stop", "halt")
 STOPPING = ("stop", "halt", "estop")  # never stale
 LEASE_COMMANDS = ("lease_claim", "lease_renew", "lease_give_up")
+ANSWERS_KEPT = 5000
 
 # What happens by itself: (happening, state) -> the state after it. Pairs that are not here change nothing.
 HAPPENINGS: dict[tuple[Happening, State], State] = {
@@ -117,6 +121,7 @@ HAPPENINGS: dict[tuple[Happening, State], State] = {
     (Happening.RUN_ENDED, S.RUNNING): S.READY,
     (Happening.RUN_ENDED, S.HOLDING): S.READY,
     (Happening.RUN_FAILED, S.RUNNING): S.READY,
+    (Happening.RUN_FAILED, S.HOLDING): S.READY,
     (Happening.LEASE_ENDED, S.RUNNING): S.HOLDING,
     (Happening.LEASE_ENDED, S.SETTING_UP): S.IDLE,
     (Happening.RELEASED, S.FAULTED): S.IDLE,
@@ -139,8 +144,10 @@ class Session:
         self._answers: dict[str, Ack] = {}
 
     def remember(self, answers: dict[str, Ack]) -> None:
-        """Answers given before a restart: the same uuid gets the same answer again."""
+        """Answers given before a restart: the same uuid gets the same answer, and no epoch comes again."""
         self._answers = answers | self._answers
+        epochs = [ack.data.get("epoch") for ack in answers.values()]
+        self._lease.never_below(max((e for e in epochs if isinstance(e, int)), default=0))
 
     def allowed(self) -> list[str]:
         """The commands that would be accepted now."""
@@ -151,6 +158,8 @@ class Session:
 
     def handle(self, command: Command) -> Ack:
         """The answer to `command`; repeated uuids get the first answer again."""
+        if not command.uuid:  # all such commands would be repetitions of each other
+            return self._ack(command, "refused", "a command needs a uuid of its own")
         if command.uuid in self._answers:
             return self._answers[command.uuid]
         refusal = self._refusal(command)
@@ -159,10 +168,15 @@ class Session:
         ack = self._ack(command, "refused" if refusal else "accepted", refusal)
         if command.kind != "lease_renew":  # a stream, not a discrete command: nothing to repeat
             self._answers[command.uuid] = ack
+            if len(self._answers) > ANSWERS_KEPT:
+                del self._answers[next(iter(self._answers))]
         return ack
 
     def observe(self, happening: Happening, reason: str = "") -> bool:
-        """Tell the session what happened; True where the state changed."""
+        """Tell the session what happened; True where the state changed.
+
+        A RuntimeFault of an effect passes through, with the state as it was: nobody is there to be refused.
+        """
         after = HAPPENINGS.get((happening, self.state))
         if after is None:
             return False
@@ -210,7 +224,7 @@ class Session:
             return "stale: it was decided before the runtime was restarted"
         if command.sequence < self.sequence:
             return f"stale: the state has changed since it was decided (now {self.state}: {self.reason})"
-        if self._now() > command.valid_until:
+        if not self._now() <= command.valid_until:  # NaN included
             return "stale: it arrived after its deadline"
         return ""
 
@@ -226,17 +240,16 @@ class Session:
             return self._lease_command(command)
         if command.kind == "estop":
             return "the e-stop has a socket of its own: send it to the guard"
-        if self.state is State.SETTING_UP and command.kind in CANCELLING:
-            self._effects.cancel_setup("cancelled by the operator")
-            self._enter(State.IDLE, "set-up cancelled by the operator")
-            return ""
         rule = COMMANDS[command.kind]
+        if self.state is State.SETTING_UP and command.kind in CANCELLING:
+            rule = _CANCEL
         try:
             rule.effect(self._effects)
         except RuntimeFault as error:
             return str(error)
         if rule.after:
-            self._enter(rule.after, _REASONS.get(command.kind, ""))
+            reason = _CANCELLED if rule is _CANCEL else _REASONS.get(command.kind, "")
+            self._enter(rule.after, reason)
         return ""
 
     def _lease_command(self, command: Command) -> str:
@@ -263,6 +276,8 @@ class Session:
         return Ack(command.uuid, status, reason, self.allowed(), self._boot, self.sequence, data)
 
 
+_CANCELLED = "set-up cancelled by the operator"
+_CANCEL = Rule((S.SETTING_UP,), S.IDLE, lambda e: e.cancel_setup(_CANCELLED))
 _REASONS = {
     "stop": "stopped by the operator",
     "halt": "halted by the operator: resume or stop",
