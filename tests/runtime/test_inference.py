@@ -1,0 +1,397 @@
+from __future__ import annotations
+
+import mmap
+import threading
+import weakref
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.clock import VirtualClock
+from runtime.errors import PolicyError
+from runtime.inference import Inference, InferenceSettings, LockstepRunner, Runner, ThreadRunner
+from runtime.messages import ChunkMerged, PolicyAnswer, PostedChunk, decode
+from runtime.orders import Orders
+from runtime.page import Page, PageLayout
+from runtime.policies.base import Policy, PolicyInfo
+from runtime.spaces import Spaces
+from runtime.strategies import overlap, sync
+from runtime.types import ActionChunk, Conditioning, Float32, Observation
+
+RATE = 30.0
+PICTURE = np.zeros((5, 5, 3), np.uint8)
+
+
+class FakePolicy(Policy):
+    """Writes down what is asked of it, and answers with the step it was asked about."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+        self.seen: list[Observation] = []
+        self.answer: Any = None
+        self.open = threading.Event()
+        self.open.set()
+
+    def connect(self) -> PolicyInfo:
+        return PolicyInfo("fake")
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        self.calls.append("infer")
+        self.seen.append(observation)
+        self.open.wait(10)
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer or ActionChunk(np.full((4, 2), observation.step, np.float32))
+
+    def reset(self) -> None:
+        self.calls.append("reset")
+
+    def close(self) -> None:
+        self.calls.append("close")
+
+
+class FakeSpaces(Spaces):
+    """Joint rows pass; a row of NaN is refused as the real ones refuse it."""
+
+    def __init__(self) -> None:
+        pass
+
+    def to_command(self, chunk: ActionChunk, qpos: Float32) -> Any:
+        if not np.isfinite(chunk.actions).all():
+            raise PolicyError("the policy answered with nan")
+        return chunk.actions.astype(np.float64), None
+
+    def eef_of(self, q: Any, previous: Any = None) -> Float32:
+        return np.full(8, q[0], np.float32)
+
+
+class Desk:
+    """Inference with everything around it under the test's hand; media and control are played by it."""
+
+    def __init__(self, runner: Runner | None = None, query: Any = None) -> None:
+        layout = PageLayout(2, 8, ("cam",), 300)
+        self.page = Page(layout, mmap.mmap(-1, Page.size(layout)))
+        self.clock = VirtualClock(100.0)
+        self.policy = FakePolicy()
+        self.runner = runner or LockstepRunner(0)
+        self.inference = Inference(
+            self.policy,
+            query or overlap.query(overlap.Config()),
+            FakeSpaces(),
+            self.page,
+            Orders(self.page),
+            self.runner,
+            self.clock,
+            InferenceSettings(RATE, "pick", 0.2, 0.5, (), 1.0),
+        )
+        self.sequence = 0
+
+    def observe(self, **changes: Any) -> None:
+        self.sequence += 1
+        now = self.clock.now()
+        self.page.pictures["cam"].write(self.sequence, PICTURE)
+        fields: dict[str, Any] = {
+            "sequence": self.sequence,
+            "arrived": now,
+            "captured": {"joints": now, "cam": now},
+            "qpos": np.zeros(2, np.float32),
+            "pictures": {},
+        }
+        self.page.publish_observation(Observation(**(fields | changes)), {"cam": self.sequence})
+
+    def ticked(self, step: int, remaining: int = 0) -> None:
+        """Control has done `step` with the newest observation."""
+        status = self.page.control.read().copy()
+        status["step"], status["planned"], status["sequence"] = step, self.clock.now(), self.sequence
+        status["remaining"] = remaining
+        self.page.control.write(status)
+
+    def posted(self) -> list[PostedChunk]:
+        found = [decode(payload) for payload in self.page.rings["orders"].drain()]
+        return [message for message in found if isinstance(message, PostedChunk)]
+
+    def merged(self, chunk: int, run: int = 1, delay: int = 3, dropped: str = "") -> None:
+        self.inference.merged(ChunkMerged(chunk, run, 10, delay, np.zeros(4, np.int64), 0, dropped))
+
+    def going(self) -> Desk:
+        self.observe()
+        self.ticked(7)
+        self.inference.begin(1, fresh=True)
+        return self
+
+
+@pytest.fixture
+def desk() -> Desk:
+    return Desk().going()
+
+
+def test_an_observation_that_control_has_seen_is_of_the_step_that_saw_it(desk: Desk) -> None:
+    assert desk.inference.observe().step == 7
+
+
+def test_a_newer_observation_is_of_the_next_step(desk: Desk) -> None:
+    desk.clock.advance(0.02)
+    desk.observe()
+    assert desk.inference.observe().step == 8
+
+
+def test_while_control_stalls_an_observation_is_of_the_step_that_will_see_it(desk: Desk) -> None:
+    desk.clock.advance(14.5 / RATE)
+    desk.observe()
+    assert desk.inference.observe().step == 22
+
+
+def test_an_observation_that_arrived_just_before_a_tick_that_missed_it_is_of_the_next_step(
+    desk: Desk,
+) -> None:
+    desk.observe(arrived=desk.clock.now() - 0.001)
+    assert desk.inference.observe().step == 8
+
+
+def test_the_policy_is_shown_the_task_the_pictures_and_poses(desk: Desk) -> None:
+    desk.inference.pump()
+    (seen,) = desk.policy.seen
+    assert seen.prompt == "pick"
+    assert list(seen.pictures) == ["cam"]
+    assert seen.eef is not None
+    assert seen.eef.shape == (8,)
+
+
+@pytest.mark.parametrize(
+    ("captured", "sentence"),
+    [
+        ({"joints": -0.3, "cam": 0.0}, "joints: 0.30 s old, allowed 0.2"),
+        ({"joints": 0.0, "cam": -0.6}, "cam: 0.60 s old, allowed 0.5"),
+        ({"joints": 0.0, "cam": float("nan")}, "cam: nan s old"),
+    ],
+)
+def test_what_is_too_old_is_named_and_not_shown_to_the_policy(
+    captured: dict[str, float], sentence: str
+) -> None:
+    desk = Desk()
+    desk.observe(captured={name: 100.0 + offset for name, offset in captured.items()})
+    with pytest.raises(PolicyError, match=sentence):
+        desk.inference.ask()
+    assert desk.policy.calls == []
+
+
+def test_pictures_may_be_older_than_joints(desk: Desk) -> None:
+    desk.observe(captured={"joints": 100.0, "cam": 99.6})
+    assert desk.inference.observe().captured["cam"] == 99.6
+
+
+def test_without_an_observation_or_a_picture_it_says_what_is_missing() -> None:
+    desk = Desk()
+    with pytest.raises(PolicyError, match="no observation has arrived yet"):
+        desk.inference.observe()
+    now = desk.clock.now()
+    bare = Observation(1, now, {"joints": now}, np.zeros(2, np.float32), {})
+    desk.page.publish_observation(bare, {})
+    with pytest.raises(PolicyError, match="no picture has arrived from cam"):
+        desk.inference.observe()
+
+
+def test_an_answer_is_posted_unmerged_with_the_step_of_its_observation(desk: Desk) -> None:
+    answer = desk.inference.pump()
+    (chunk,) = desk.posted()
+    assert (chunk.chunk_id, chunk.run, chunk.observation_step) == (1, 1, 7)
+    assert (chunk.rows == 7.0).all()
+    assert isinstance(answer, PolicyAnswer)
+    assert (answer.chunk_id, answer.run, answer.observation_step, answer.space) == (1, 1, 7, "joint")
+    assert answer.source_rows.tolist() == [0, 1, 2, 3]
+
+
+def test_a_chunk_of_another_rate_is_resampled_and_says_which_row_made_which(desk: Desk) -> None:
+    desk.policy.answer = ActionChunk(np.arange(6, dtype=np.float32).reshape(3, 2), rate=15.0)
+    answer = desk.inference.pump()
+    (chunk,) = desk.posted()
+    assert chunk.rows[:, 0].tolist() == [0, 1, 2, 3, 4, 4]
+    assert answer is not None
+    assert answer.source_rows.tolist() == [0, 0, 1, 1, 2, 2]
+    assert len(answer.actions) == 3  # the record has them as the policy gave them
+
+
+def test_nothing_is_asked_while_an_answer_is_not_merged_yet(desk: Desk) -> None:
+    desk.inference.pump()
+    for _ in range(3):
+        assert desk.inference.pump() is None
+    assert desk.policy.calls.count("infer") == 1
+    desk.merged(1)
+    desk.inference.pump()
+    assert desk.policy.calls.count("infer") == 2
+    assert list(desk.inference.delays) == [3]
+
+
+def test_a_dropped_chunk_is_followed_by_a_new_query(desk: Desk) -> None:
+    desk.inference.pump()
+    desk.merged(1, dropped="too late")
+    assert desk.inference.pump() is not None
+
+
+def test_nothing_is_asked_while_a_request_is_in_flight() -> None:
+    desk = Desk(LockstepRunner(3)).going()
+    answers = []
+    for _ in range(4):
+        answers.append(desk.inference.pump())
+        desk.runner.tick()
+    assert [answer is not None for answer in answers] == [False, False, False, True]
+    assert desk.policy.calls == ["reset", "infer"]
+
+
+def test_sync_asks_only_when_nothing_is_left_to_execute() -> None:
+    desk = Desk(query=sync.query(sync.Config())).going()
+    desk.ticked(7, remaining=2)
+    assert desk.inference.pump() is None
+    desk.ticked(9, remaining=0)
+    assert desk.inference.pump() is not None
+
+
+def test_async_keeps_its_rate() -> None:
+    desk = Desk(query=overlap.query(overlap.Config(inference_rate=5.0))).going()
+    asked = []
+    for step in range(30):
+        desk.observe()
+        desk.ticked(step)
+        if desk.inference.pump() is not None:
+            asked.append(step)
+            desk.merged(len(asked))
+        desk.clock.advance(1 / RATE)
+    assert asked == [0, 6, 12, 18, 24]
+
+
+def test_a_pause_drops_the_answer_that_is_still_in_flight() -> None:
+    desk = Desk(LockstepRunner(2)).going()
+    desk.inference.pump()
+    desk.inference.pause()
+    for _ in range(5):
+        desk.runner.tick()
+        assert desk.inference.pump() is None
+    desk.inference.begin(2, fresh=False)
+    assert desk.inference.pump() is None  # it asks anew, the old answer is gone
+    assert desk.posted() == []
+    assert desk.policy.calls == ["reset", "infer", "infer"]
+
+
+def test_what_control_says_of_another_run_is_not_counted(desk: Desk) -> None:
+    desk.merged(1, run=9)
+    assert list(desk.inference.delays) == []
+
+
+def test_the_policy_is_reset_once_per_run_and_before_its_first_inference(desk: Desk) -> None:
+    for chunk in (1, 2, 3):
+        desk.inference.pump()
+        desk.merged(chunk)
+    assert desk.policy.calls == ["reset", "infer", "infer", "infer"]
+    desk.inference.pause()
+    desk.inference.begin(1, fresh=False)  # resumed
+    desk.inference.pump()
+    desk.inference.pause()
+    desk.inference.begin(2, fresh=True)
+    desk.inference.pump()
+    assert desk.policy.calls[4:] == ["infer", "reset", "infer"]
+
+
+def test_a_run_that_is_halted_before_it_asked_is_still_reset_when_it_resumes(desk: Desk) -> None:
+    desk.inference.pause()
+    desk.inference.begin(1, fresh=False)
+    desk.inference.pump()
+    assert desk.policy.calls == ["reset", "infer"]
+
+
+@pytest.mark.parametrize(
+    ("answer", "sentence"),
+    [
+        (PolicyError("the server is gone"), "the server is gone"),
+        (ZeroDivisionError("oh"), "the policy's own code failed: ZeroDivisionError: oh"),
+        (ActionChunk(np.full((4, 2), np.nan, np.float32)), "nan"),
+    ],
+)
+def test_a_policy_that_fails_raises_once_and_posts_nothing(answer: Any, sentence: str) -> None:
+    desk = Desk(LockstepRunner(1)).going()
+    desk.policy.answer = answer
+    desk.inference.pump()
+    desk.runner.tick()
+    with pytest.raises(PolicyError, match=sentence):
+        desk.inference.pump()
+    assert desk.posted() == []
+    desk.policy.answer = None
+    desk.inference.pump()  # not the old failure again: it asks anew
+    desk.runner.tick()
+    assert desk.inference.pump() is not None
+
+
+def test_a_gap_in_the_observations_is_waited_out_and_an_error_where_it_lasts(desk: Desk) -> None:
+    desk.clock.advance(0.5)
+    assert desk.inference.pump() is None
+    desk.observe()
+    assert desk.inference.pump() is not None
+    desk.merged(1)
+    desk.clock.advance(0.5)
+    assert desk.inference.pump() is None
+    desk.clock.advance(1.1)
+    with pytest.raises(PolicyError, match=r"1\.60 s old"):
+        desk.inference.pump()
+
+
+def test_lockstep_hands_every_result_over_the_same_number_of_ticks_later() -> None:
+    runner = LockstepRunner(2)
+    first = runner.submit(lambda: 1)
+    runner.tick()
+    second = runner.submit(lambda: 2)
+    ready = []
+    for _ in range(3):
+        ready.append((runner.ready(first), runner.ready(second)))
+        runner.tick()
+    assert ready == [(False, False), (True, False), (True, True)]
+    assert first.result() + second.result() == 3
+
+
+def test_lockstep_keeps_no_result_that_nobody_waits_for() -> None:
+    runner = LockstepRunner(5)
+    kept = weakref.ref(runner.submit(lambda: 1))
+    assert kept() is None
+
+
+def test_a_thread_of_its_own_makes_one_call_after_the_other() -> None:
+    runner = ThreadRunner()
+    gate, order = threading.Event(), []
+
+    def slow() -> str:
+        gate.wait(10)
+        order.append("slow")
+        return threading.current_thread().name
+
+    first = runner.submit(slow)
+    second = runner.submit(lambda: order.append("quick"))
+    assert not runner.ready(first)
+    assert not runner.ready(second)
+    gate.set()
+    second.result(10)
+    assert first.result(10) != threading.current_thread().name
+    assert order == ["slow", "quick"]
+    assert runner.ready(first)
+    runner.close()
+
+
+def test_a_slow_policy_in_its_thread_never_stops_the_caller() -> None:
+    desk = Desk(ThreadRunner()).going()
+    desk.policy.open.clear()
+    assert desk.inference.pump() is None
+    flight = desk.inference._flight
+    assert flight is not None
+    for _ in range(5):
+        assert desk.inference.pump() is None
+    desk.policy.open.set()
+    flight.result(10)
+    assert desk.inference.pump() is not None
+    assert desk.policy.calls == ["reset", "infer"]
+    desk.runner.close()
+
+
+def test_an_error_in_the_thread_is_told_as_a_policy_error() -> None:
+    runner = ThreadRunner()
+    future = runner.submit(lambda: 1 // 0)
+    with pytest.raises(PolicyError, match="ZeroDivisionError"):
+        future.result(10)
+    runner.close()

@@ -1,0 +1,316 @@
+from __future__ import annotations
+
+import mmap
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.clock import VirtualClock
+from runtime.errors import TransportError
+from runtime.media import Media
+from runtime.messages import (
+    BeginEpisode,
+    EndEpisode,
+    EpisodeClosed,
+    EpisodeOpened,
+    Event,
+    MediaReport,
+    Message,
+    TickDone,
+    decode,
+    encode,
+)
+from runtime.page import Page, PageLayout
+from runtime.recorder import Grid, Recorder
+from runtime.transports.base import Source
+from runtime.types import Observation
+from tests.runtime.test_recorder import FakeJournal
+
+RATE = 30.0
+CAMERAS = ("left", "right")
+
+
+class FakeSource(Source):
+    """Delivers what the test lays out; a new run begins with a frame of its own."""
+
+    def __init__(self) -> None:
+        self.waiting: deque[Observation | Exception] = deque()
+        self.first: Observation | None = None
+        self.counts: dict[str, int] = {}
+        self.begun = 0
+
+    def connect(self) -> None:
+        pass
+
+    def receive(self, timeout: float) -> Observation | None:
+        if not self.waiting:
+            return None
+        found = self.waiting.popleft()
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def close(self) -> None:
+        pass
+
+    def begin_run(self) -> None:
+        self.begun += 1
+        if self.first is not None:
+            self.waiting.append(self.first)
+
+    def faults(self) -> dict[str, int]:
+        return dict(self.counts)
+
+
+class Desk:
+    def __init__(self) -> None:
+        layout = PageLayout(2, 8, CAMERAS, 300)
+        self.page = Page(layout, mmap.mmap(-1, Page.size(layout)))
+        self.clock, self.source, self.journal = VirtualClock(100.0), FakeSource(), FakeJournal()
+        robot = {"name": "toy", "joint_names": ["a", "b"], "eef_names": [], "dim": 2, "eef_dim": 0}
+        grid = Grid(robot, CAMERAS, RATE, RATE, lambda q: q)
+        recorder = Recorder(self.journal, Path("/episodes"), grid, self.clock.now)
+        self.previewed: list[int] = []
+        self.media = Media(
+            self.page, self.source, recorder, self.clock, lambda o: self.previewed.append(o.sequence)
+        )
+
+    def observation(self, sequence: int, **changes: Any) -> Observation:
+        now = self.clock.now()
+        picture = np.full((5, 5, 3), sequence, np.uint8)
+        fields: dict[str, Any] = {
+            "sequence": sequence,
+            "arrived": now,
+            "captured": {"joints": now, "left": now, "right": now},
+            "qpos": np.full(2, sequence, np.float32),
+            "pictures": dict.fromkeys(CAMERAS, picture),
+        }
+        return Observation(**(fields | changes))
+
+    def receive(self, *sequences: int) -> None:
+        for sequence in sequences:
+            self.source.waiting.append(self.observation(sequence))
+            self.media.pump(0.0)
+            self.clock.advance(1 / RATE)
+
+    def post(self, message: Message, ring: str = "minutes") -> None:
+        self.page.rings[ring].push(encode(message))
+
+    def begin(self, run: int = 1, **manifest: Any) -> None:
+        self.post(BeginEpisode(run, {"uuid": "one"} | manifest))
+        self.media.pump(0.0)
+
+    def tick(self, step: int, sequence: int, run: int = 1) -> None:
+        now, q = self.clock.now(), np.zeros(2, np.float32)
+        self.post(TickDone(step, run, now, now, sequence, "policy", q, None, q, [], [], [], False), "ticks")
+
+    def told(self, kind: type[Any]) -> list[Any]:
+        found = [decode(payload) for payload in self.page.rings["media_events"].drain()]
+        return [message for message in found if isinstance(message, kind)]
+
+
+@pytest.fixture
+def desk() -> Desk:
+    return Desk()
+
+
+def test_an_observation_reaches_the_page_with_its_pictures_and_the_preview(desk: Desk) -> None:
+    desk.receive(1)
+    seen = desk.page.read_observation(CAMERAS)
+    assert seen is not None
+    assert (seen.sequence, seen.captured["left"]) == (1, 100.0)
+    assert all((seen.pictures[camera] == 1).all() for camera in CAMERAS)
+    assert desk.previewed == [1]
+
+
+def test_a_picture_that_is_not_new_is_not_written_again(desk: Desk) -> None:
+    desk.receive(1)
+    desk.source.waiting.append(desk.observation(2, captured={"joints": 100.2, "left": 100.0, "right": 100.2}))
+    desk.media.pump(0.0)
+    record = desk.page.observation.read()
+    assert record["picture_number"].tolist() == [1, 2]
+    assert record["picture_captured"].tolist() == [100.0, 100.2]
+
+
+def test_a_restarted_media_goes_on_counting_pictures(desk: Desk) -> None:
+    desk.receive(1, 2)
+    again = Media(desk.page, desk.source, desk.media._recorder, desk.clock)
+    desk.source.waiting.append(desk.observation(3))
+    again.pump(0.0)
+    assert desk.page.observation.read()["picture_number"].tolist() == [3, 3]
+    seen = desk.page.read_observation(CAMERAS)
+    assert seen is not None
+    assert (seen.pictures["left"] == 3).all()
+
+
+def test_rates_are_measured_per_stream(desk: Desk) -> None:
+    desk.receive(*range(1, 31))
+    report = desk.told(MediaReport)[-1]
+    assert report.rates["joints"] == pytest.approx(RATE)
+    assert report.rates["left"] == pytest.approx(RATE)
+    desk.clock.advance(3.0)
+    desk.media.digest()
+    assert desk.told(MediaReport)[-1].rates["joints"] == 0.0
+
+
+def test_malformed_messages_are_counted_told_once_per_change_and_written_into_the_episode(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.told(Event)
+    desk.source.counts = {"malformed": 3}
+    desk.clock.advance(1.0)
+    desk.media.pump(0.0)
+    desk.clock.advance(1.0)
+    desk.media.pump(0.0)
+    messages = [decode(payload) for payload in desk.page.rings["media_events"].drain()]
+    events = [m for m in messages if isinstance(m, Event)]
+    assert [(e.kind, e.text) for e in events] == [("source_malformed", "source: malformed (3 so far)")]
+    assert [m.faults for m in messages if isinstance(m, MediaReport)] == [{"malformed": 3}] * 2
+    assert [event["kind"] for event in desk.journal.events] == ["source_malformed"]
+
+
+def test_a_source_that_fails_is_told_once_and_received_from_again(desk: Desk) -> None:
+    desk.source.waiting.extend([TransportError("frame 7 cannot be decoded")] * 3)
+    for _ in range(3):
+        desk.media.pump(0.01)
+    assert [e.text for e in desk.told(Event)] == ["frame 7 cannot be decoded"]
+    assert desk.clock.now() == pytest.approx(100.03)  # it waits and does not spin
+    desk.receive(1)
+    assert desk.page.observation.read()["sequence"] == 1
+    desk.source.waiting.append(TransportError("frame 7 cannot be decoded"))
+    desk.media.pump(0.0)
+    assert len(desk.told(Event)) == 1
+
+
+def test_a_picture_too_large_for_the_page_is_named_and_the_rest_goes_on(desk: Desk) -> None:
+    large = np.zeros((11, 11, 3), np.uint8)
+    pictures = {"left": large, "right": np.zeros((5, 5, 3), np.uint8)}
+    desk.source.waiting.append(desk.observation(1, pictures=pictures))
+    desk.media.pump(0.0)
+    assert [e.kind for e in desk.told(Event)] == ["source_picture_too_large_left"]
+    assert desk.page.observation.read()["picture_number"].tolist() == [0, 1]
+    assert desk.page.observation.read()["sequence"] == 1
+
+
+def test_a_run_begins_with_the_first_frame_of_the_source(desk: Desk) -> None:
+    desk.receive(1)
+    desk.source.first = desk.observation(2)
+    desk.begin()
+    assert desk.source.begun == 1
+    assert desk.page.observation.read()["sequence"] == 2  # before main hears that it may begin
+    (opened,) = desk.told(EpisodeOpened)
+    assert (opened.run, opened.uuid, opened.path, opened.error) == (1, "one", "/episodes/one", "")
+    assert desk.media.recording
+
+
+def test_a_run_that_is_not_recorded_begins_all_the_same(desk: Desk) -> None:
+    desk.receive(1)
+    desk.post(BeginEpisode(4, None))
+    desk.media.pump(0.0)
+    assert desk.source.begun == 1
+    (opened,) = desk.told(EpisodeOpened)
+    assert (opened.run, opened.uuid, opened.error) == (4, "", "")
+    assert not desk.media.recording
+
+
+def test_a_recording_without_a_run_leaves_the_source_alone(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin(run=0)
+    assert desk.source.begun == 0
+    assert desk.media.recording
+
+
+def test_an_episode_that_cannot_begin_is_told_with_the_reason(desk: Desk) -> None:
+    desk.begin()  # nothing has been seen yet
+    (opened,) = desk.told(EpisodeOpened)
+    assert "no observation has arrived" in opened.error
+    assert desk.source.begun == 0
+    desk.receive(1)
+    desk.journal.failing = {"begin"}
+    desk.begin(run=2)
+    assert desk.told(EpisodeOpened)[-1].error == "disk full while begin"
+    assert not desk.media.recording
+
+
+def test_ticks_become_rows_and_the_end_is_told(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.tick(0, 1)
+    desk.tick(1, 1)
+    desk.media.pump(0.0)
+    desk.post(EndEpisode("finished", "over", {"a": 1}))
+    desk.media.pump(0.0)
+    (closed,) = desk.told(EpisodeClosed)
+    assert (closed.uuid, closed.status, closed.reason, closed.rows, closed.error) == (
+        "one",
+        "finished",
+        "over",
+        2,
+        "",
+    )
+    assert len(desk.journal.rows) == 2
+    assert not desk.media.recording
+
+
+def test_a_tick_done_before_the_end_was_decided_is_still_recorded(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.tick(0, 1)
+    desk.post(EndEpisode("finished", "over"))  # both wait in their rings when media comes to them
+    desk.media.pump(0.0)
+    assert desk.told(EpisodeClosed)[0].rows == 1
+
+
+def test_a_recording_that_fails_is_an_event_and_closes_the_episode(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.told(Event)
+    desk.journal.failing = {"append"}
+    desk.tick(0, 1)
+    desk.tick(1, 1)
+    desk.media.pump(0.0)
+    messages = [decode(payload) for payload in desk.page.rings["media_events"].drain()]
+    assert [m.text for m in messages if isinstance(m, Event)] == ["disk full while append"]
+    (closed,) = [m for m in messages if isinstance(m, EpisodeClosed)]
+    assert (closed.status, closed.reason) == ("failed", "disk full while append")
+    assert not desk.media.recording
+    desk.receive(2)  # and life goes on
+    assert desk.page.observation.read()["sequence"] == 2
+
+
+def test_an_event_that_cannot_be_written_fails_the_recording_too(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.journal.failing = {"mark"}
+    desk.post(Event("x", "y", 1.0))
+    desk.media.pump(0.0)
+    assert [m.kind for m in desk.told(Event)] == ["recording_failed"]
+    assert not desk.media.recording
+
+
+def test_what_was_addressed_to_a_predecessor_is_not_obeyed(desk: Desk) -> None:
+    desk.receive(1)
+    desk.post(BeginEpisode(1, {"uuid": "old"}))
+    desk.tick(0, 1)
+    Media(desk.page, desk.source, desk.media._recorder, desk.clock).digest()
+    assert not desk.media.recording
+    assert desk.source.begun == 0
+
+
+def test_the_report_counts_rows_and_repeated_pictures(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.tick(0, 1)
+    desk.tick(1, 1)
+    desk.clock.advance(1.0)
+    desk.media.pump(0.0)
+    report = desk.told(MediaReport)[-1]
+    assert (report.rows, report.recording, report.repeated) == (2, "one", 2)
+
+
+def test_ending_without_an_episode_says_nothing(desk: Desk) -> None:
+    desk.media.end("interrupted", "nobody home")
+    assert desk.told(EpisodeClosed) == []

@@ -1,0 +1,367 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from runtime.errors import RecordingError
+from runtime.messages import ChunkMerged, PolicyAnswer, TickDone
+from runtime.recorder import Grid, Recorder
+from runtime.recording.base import ExecutedTick, Journal, Outcome, RawChunk, Record, Row
+from runtime.types import Observation
+
+CAMERA = "cam"
+PICTURE = np.zeros((4, 6, 3), np.uint8)
+
+
+class FakeJournal(Journal):
+    """Keeps what it is given; fails from the moment it is told to."""
+
+    def __init__(self) -> None:
+        self.manifest: Mapping[str, object] = {}
+        self.taken: list[Record] = []
+        self.events: list[Mapping[str, object]] = []
+        self.outcome: Outcome | None = None
+        self.failing: set[str] = set()
+
+    def _check(self, name: str) -> None:
+        if name in self.failing:
+            raise RecordingError(f"disk full while {name}")
+
+    def begin(self, manifest: Mapping[str, object]) -> None:
+        self._check("begin")
+        self.manifest = manifest
+
+    def append(self, record: Record) -> None:
+        self._check("append")
+        self.taken.append(record)
+
+    def mark(self, event: Mapping[str, object]) -> None:
+        self._check("mark")
+        self.events.append(event)
+
+    def end(self, outcome: Outcome) -> None:
+        self.outcome = outcome
+        self._check("end")
+
+    def of(self, kind: type[Any]) -> list[Any]:
+        return [record for record in self.taken if isinstance(record, kind)]
+
+    @property
+    def rows(self) -> list[Row]:
+        return self.of(Row)
+
+
+class Desk:
+    """A recorder with a fake journal, ticks and observations."""
+
+    def __init__(self, rate: float = 30.0, fps: float = 30.0) -> None:
+        self.journal = FakeJournal()
+        robot = {"name": "toy", "joint_names": ["a", "b"], "eef_names": [], "dim": 2, "eef_dim": 8}
+        grid = Grid(robot, (CAMERA,), rate, fps, lambda q: np.full(8, q[0] + 0.5, np.float32))
+        self.recorder = Recorder(self.journal, Path("/episodes"), grid, lambda: 5.0)
+        self.rate = rate
+
+    def see(self, sequence: int, captured: float | None = None, **changes: Any) -> None:
+        time = float(sequence) if captured is None else captured
+        fields: dict[str, Any] = {
+            "sequence": sequence,
+            "arrived": float(sequence),
+            "captured": {"joints": float(sequence), CAMERA: time},
+            "qpos": np.full(2, sequence, np.float32),
+            "pictures": {CAMERA: PICTURE + sequence},
+        }
+        self.recorder.see(Observation(**(fields | changes)))
+
+    def begin(self, run: int = 1) -> None:
+        self.see(1)
+        self.recorder.begin({"uuid": "one", "task": "t"}, run)
+
+    def tick(self, step: int, sequence: int = 1, run: int = 1, **changes: Any) -> None:
+        fields: dict[str, Any] = {
+            "step": step,
+            "run": run,
+            "planned": 100.0 + step / self.rate,
+            "sent": 100.0 + step / self.rate,
+            "sequence": sequence,
+            "source": "policy",
+            "qpos": np.full(2, sequence, np.float32),
+            "smoothed": None,
+            "executed": np.full(2, step + 0.25, np.float32),
+            "chunk_ids": [],
+            "weights": [],
+            "notes": [],
+            "refused": False,
+        }
+        self.recorder.tick(TickDone(**(fields | changes)))
+
+    def answer(self, chunk: int, rows: int = 3, source: list[int] | None = None, run: int = 1) -> None:
+        actions = np.full((rows, 2), chunk, np.float32)
+        mapping = np.array(range(rows) if source is None else source)
+        self.recorder.answered(PolicyAnswer(chunk, run, 10, actions, "joint", mapping, 12.0))
+
+    def merge(self, chunk: int, targets: list[int], run: int = 1, dropped: str = "") -> None:
+        self.recorder.merged(ChunkMerged(chunk, run, 12, 2, np.array(targets, np.int64), 0, dropped))
+
+
+@pytest.fixture
+def desk() -> Desk:
+    desk = Desk()
+    desk.begin()
+    return desk
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    rates=st.sampled_from([(30, 30), (100, 30), (200, 30), (30, 10), (30, 60), (50, 15)]),
+    first=st.integers(0, 10_000),
+    steps=st.sets(st.integers(1, 240)),
+)
+def test_row_k_is_the_last_tick_not_after_its_time_also_with_missed_ticks(
+    rates: tuple[int, int], first: int, steps: set[int]
+) -> None:
+    rate, fps = rates
+    desk = Desk(rate, fps)
+    desk.begin()
+    ticks = [0, *sorted(steps)]
+    for step in ticks:
+        desk.tick(first + step)
+    expected, k = [], 0
+    while k * rate // fps <= ticks[-1]:
+        expected.append(first + max(t for t in ticks if t * fps <= k * rate))
+        k += 1
+    assert [row.step for row in desk.journal.rows] == expected
+    assert [row.index for row in desk.journal.rows] == list(range(k))
+    assert [tick.step for tick in desk.journal.of(ExecutedTick)] == [first + t for t in ticks]
+
+
+def test_a_row_has_the_observation_and_the_action_of_its_tick(desk: Desk) -> None:
+    desk.see(2, qvel=np.ones(2, np.float32))
+    desk.tick(7, sequence=2)
+    (row,) = desk.journal.rows
+    assert (row.sequence, row.step, row.tick_time) == (2, 7, 100.0 + 7 / 30)
+    assert (row.qpos == 2).all()
+    assert (row.action == 7.25).all()
+    assert row.qvel is not None
+    assert row.captured == {"joints": 2.0, CAMERA: 2.0}
+    assert (row.pictures[CAMERA] == 2).all()
+
+
+def test_where_nothing_was_sent_the_measured_joints_are_the_action(desk: Desk) -> None:
+    desk.tick(0, executed=None, source="none")
+    (row,) = desk.journal.rows
+    assert (row.action == row.qpos).all()
+    assert row.control_source == "none"
+
+
+def test_a_picture_that_a_row_has_already_is_repeated_and_counted(desk: Desk) -> None:
+    desk.tick(0)
+    desk.see(2, captured=1.0)  # newer joints, the same picture
+    desk.tick(1, sequence=2)
+    desk.see(3)
+    desk.tick(2, sequence=3)
+    assert [row.pictures[CAMERA] is None for row in desk.journal.rows] == [False, True, False]
+    assert desk.recorder.repeated == 1
+
+
+def test_an_observation_that_is_not_known_any_more_leaves_no_foreign_times_or_pictures(desk: Desk) -> None:
+    desk.tick(0)
+    desk.tick(1, sequence=99)
+    row = desk.journal.rows[1]
+    assert row.captured == {}
+    assert row.pictures == {CAMERA: None}
+    assert (row.qvel, row.effort) == (None, None)
+    assert (row.qpos == 99).all()
+    assert row.eef is not None
+    assert (row.eef == 99.5).all()
+    assert not row.eef_measured
+
+
+def test_a_row_in_a_long_gap_keeps_the_observation_of_the_tick_before_it(desk: Desk) -> None:
+    desk.tick(0)
+    for sequence in range(2, 60):  # media went on receiving while control stood still
+        desk.see(sequence)
+    desk.tick(58, sequence=59)
+    rows = desk.journal.rows
+    assert len(rows) == 59
+    assert all(row.captured == {"joints": 1.0, CAMERA: 1.0} for row in rows[:58])
+    assert [row.pictures[CAMERA] is None for row in rows] == [False, *[True] * 57, False]
+    assert rows[58].sequence == 59
+
+
+def test_the_last_frame_of_the_source_ends_the_rows(desk: Desk) -> None:
+    desk.tick(0)
+    desk.see(2, last=True)
+    desk.tick(1, sequence=2)
+    desk.tick(2, sequence=2)
+    assert [row.step for row in desk.journal.rows] == [0, 1]
+    assert len(desk.journal.of(ExecutedTick)) == 2
+
+
+def test_measured_poses_are_kept_and_others_come_from_kinematics(desk: Desk) -> None:
+    told = np.arange(8, dtype=np.float32)
+    desk.see(2, eef=told)
+    desk.tick(0, sequence=2)
+    desk.tick(1, sequence=1)
+    first, second = desk.journal.rows
+    assert first.eef is not None
+    assert second.eef is not None
+    assert (first.eef == told).all()
+    assert first.eef_measured
+    assert (second.eef == 1.5).all()
+    assert not second.eef_measured
+
+
+def test_reported_poses_count_only_for_the_very_action_that_was_sent(desk: Desk) -> None:
+    told = np.arange(8, dtype=np.float32)
+    desk.see(2, reported_action=np.full(2, 0.25, np.float32), reported_action_eef=told)
+    desk.tick(0, sequence=2)  # sends 0.25
+    desk.tick(1, sequence=2)  # sends 1.25
+    first, second = desk.journal.rows
+    assert first.eef_action is not None
+    assert second.eef_action is not None
+    assert first.eef_action_reported
+    assert (first.eef_action == told).all()
+    assert not second.eef_action_reported
+    assert (second.eef_action == 1.75).all()
+
+
+@pytest.mark.parametrize("order", ["answer first", "merge first"])
+def test_an_answer_and_its_merge_make_one_raw_chunk_in_either_order(desk: Desk, order: str) -> None:
+    steps = [lambda: desk.answer(4), lambda: desk.merge(4, [-1, -1, 12])]
+    for step in steps if order == "answer first" else reversed(steps):
+        assert desk.journal.of(RawChunk) == []
+        step()
+    (chunk,) = desk.journal.of(RawChunk)
+    assert (chunk.chunk_id, chunk.observation_step, chunk.arrival_step, chunk.delay) == (4, 10, 12, 2)
+    assert chunk.target_steps.tolist() == [-1, -1, 12]
+    assert (chunk.actions == 4).all()
+
+
+def test_a_resampled_row_counts_for_the_first_step_that_was_made_from_it(desk: Desk) -> None:
+    desk.answer(4, rows=3, source=[0, 0, 1, 1, 2, 2])
+    desk.merge(4, [-1, 11, 12, 13, 14, 15])
+    (chunk,) = desk.journal.of(RawChunk)
+    assert chunk.target_steps.tolist() == [-1, 12, 14]
+
+
+def test_answers_that_were_never_merged_are_written_at_the_end(desk: Desk) -> None:
+    desk.answer(4)
+    desk.recorder.end("finished", "over", {})
+    (chunk,) = desk.journal.of(RawChunk)
+    assert (chunk.arrival_step, chunk.delay) == (-1, -1)
+    assert chunk.target_steps.tolist() == [-1, -1, -1]
+    assert math.isclose(chunk.inference_ms, 12.0)
+
+
+def test_only_the_run_of_the_episode_is_recorded(desk: Desk) -> None:
+    desk.tick(0, run=2)
+    desk.answer(1, run=2)
+    desk.merge(1, [1, 2, 3], run=2)
+    assert desk.journal.taken == []
+    desk.tick(1)
+    assert [row.step for row in desk.journal.rows] == [1]
+
+
+def test_a_recording_without_a_run_takes_every_tick() -> None:
+    desk = Desk()
+    desk.begin(run=0)
+    desk.tick(0, run=0)
+    desk.tick(1, run=3)
+    assert [row.step for row in desk.journal.rows] == [0, 1]
+
+
+def test_without_an_episode_nothing_is_written() -> None:
+    desk = Desk()
+    desk.see(1)
+    desk.tick(0)
+    desk.answer(1)
+    desk.merge(1, [1, 2, 3])
+    desk.recorder.mark({"kind": "x"})
+    assert desk.journal.taken == []
+    assert desk.journal.events == []
+
+
+def test_the_manifest_says_what_the_robot_sends() -> None:
+    desk = Desk()
+    desk.see(1, qvel=np.zeros(2, np.float32), eef=np.zeros(8, np.float32))
+    desk.recorder.begin({"uuid": "one", "task": "t"}, 1)
+    told = desk.journal.manifest
+    assert told["streams"] == {"qvel": True, "effort": False, "eef": True, "eef_action": True}
+    assert told["capture_streams"] == ["joints", "eef", CAMERA]
+    assert told["cameras"] == {CAMERA: {"width": 6, "height": 4}}
+    assert (told["fps"], told["control_rate"], told["started_monotonic"]) == (30.0, 30.0, 5.0)
+    assert (told["uuid"], told["task"]) == ("one", "t")
+
+
+def test_it_refuses_to_begin_before_every_camera_was_seen() -> None:
+    desk = Desk()
+    with pytest.raises(RecordingError, match="no observation"):
+        desk.recorder.begin({}, 1)
+    desk.see(1, pictures={})
+    with pytest.raises(RecordingError, match="no picture has arrived from cam"):
+        desk.recorder.begin({}, 1)
+    assert desk.recorder.recording == ""
+
+
+def test_it_refuses_a_second_episode_while_one_is_open(desk: Desk) -> None:
+    with pytest.raises(RecordingError, match="episode one is still open"):
+        desk.recorder.begin({}, 2)
+    assert desk.recorder.recording == "one"
+
+
+def test_a_journal_that_cannot_begin_leaves_nothing_open() -> None:
+    desk = Desk()
+    desk.journal.failing = {"begin"}
+    desk.see(1)
+    with pytest.raises(RecordingError, match="disk full"):
+        desk.recorder.begin({"uuid": "one"}, 1)
+    assert desk.recorder.recording == ""
+
+
+def test_the_end_says_how_it_went_and_a_next_episode_counts_from_zero(desk: Desk) -> None:
+    desk.tick(0)
+    closed = desk.recorder.end("interrupted", "because", {"a": 1})
+    assert (closed.uuid, closed.status, closed.reason, closed.rows, closed.error) == (
+        "one",
+        "interrupted",
+        "because",
+        1,
+        "",
+    )
+    assert closed.path == Path("/episodes/one")
+    assert desk.journal.outcome is not None
+    assert desk.journal.outcome.details == {"a": 1}
+    assert desk.recorder.recording == ""
+    desk.recorder.begin({"uuid": "two"}, 1)
+    desk.tick(50)
+    assert [row.index for row in desk.journal.rows] == [0, 0]
+
+
+@pytest.mark.parametrize("failing", ["append", "end"])
+def test_a_journal_that_fails_at_the_end_closes_the_episode_as_failed_with_the_error(
+    desk: Desk, failing: str
+) -> None:
+    desk.tick(0)
+    desk.answer(4)
+    desk.journal.failing = {failing}
+    closed = desk.recorder.end("finished", "over", {})
+    assert closed.status == "failed"
+    assert closed.error == f"disk full while {failing}"
+    assert closed.reason == closed.error
+    assert desk.journal.outcome is not None  # it was told to end all the same
+    assert desk.recorder.recording == ""
+
+
+def test_a_journal_that_fails_in_the_middle_raises(desk: Desk) -> None:
+    desk.journal.failing = {"append", "mark"}
+    with pytest.raises(RecordingError, match="append"):
+        desk.tick(0)
+    with pytest.raises(RecordingError, match="mark"):
+        desk.recorder.mark({"kind": "x"})
