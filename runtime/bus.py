@@ -20,8 +20,13 @@ from runtime.codecs import pack, unpack
 from runtime.errors import CodecError, TransportError
 from runtime.messages import Ack, Command, Event, decode, encode
 
-STREAM_HIGH_WATER = 4  # snapshots replace each other: a slow reader gets the newest few
-CAMERA_HIGH_WATER = 2
+# What a publisher queues per reader that does not keep up, beyond which ZMQ drops the newest. It counts a
+# queue as emptied only when half of it is, so it has to take two bursts: all events, all cameras at once.
+STREAM_HIGH_WATER = 64
+CAMERA_HIGH_WATER = 16
+# A reader that comes rarely must find everything in its own queue, else the newest is hidden behind the old.
+_READER_HIGH_WATER = 256
+_AWAY_S = 1.0
 EVENTS_KEPT = 2000
 
 
@@ -45,7 +50,7 @@ class Endpoints:
             found: dict[str, Any] = json.loads(path.read_text("utf-8"))
         except (OSError, ValueError) as error:
             station = self._folder.parent
-            known = ", ".join(sorted(p.name for p in station.parent.glob("*/endpoints"))) or "none"
+            known = ", ".join(sorted(p.parent.name for p in station.parent.glob("*/endpoints"))) or "none"
             raise TransportError(
                 f"station {station.name!r} is not running here ({path}: {error.__class__.__name__}); "
                 f"start it with python -m runtime DEPLOYMENT, or name another data folder (looked in "
@@ -161,20 +166,35 @@ class Subscriber:
     """Receives streams by name prefix, newest of each."""
 
     def __init__(self, context: zmq.Context[Any], endpoint: str, *streams: str) -> None:
-        self._socket = context.socket(zmq.SUB)
-        self._socket.set_hwm(STREAM_HIGH_WATER)
-        for stream in streams:
+        self._context = context
+        self._endpoint = endpoint
+        self._streams = streams
+        self._connect()
+
+    def _connect(self) -> None:
+        self._read_at = time.monotonic()
+        self._socket = self._context.socket(zmq.SUB)
+        self._socket.set_hwm(_READER_HIGH_WATER)
+        for stream in self._streams:
             self._socket.subscribe(stream.encode())
-        self._socket.connect(endpoint)
+        self._socket.connect(self._endpoint)
 
     def receive(self, timeout: float) -> dict[str, Any]:
-        """The newest content of every stream that had something within `timeout` seconds."""
+        """The newest content of every stream that had something within `timeout` seconds.
+
+        Who was away for more than a second is connected anew, which takes some milliseconds: what has piled
+        up meanwhile, here and in the kernel, is old.
+        """
+        if time.monotonic() - self._read_at > _AWAY_S:
+            self._socket.close(linger=0)
+            self._connect()
         newest: dict[str, bytes] = {}
         wait = int(timeout * 1000)
         while self._socket.poll(wait):
             name, payload = self._socket.recv_multipart()
             newest[name.decode()] = payload
             wait = 0
+        self._read_at = time.monotonic()
         return {
             name: unpack(payload) if name[:7] != "camera/" else payload for name, payload in newest.items()
         }

@@ -1,0 +1,367 @@
+import math
+from dataclasses import replace
+from itertools import count, product
+
+import pytest
+
+from runtime import session as session_module
+from runtime.clock import VirtualClock
+from runtime.errors import RuntimeFault
+from runtime.lease import Lease
+from runtime.messages import Ack, Command
+from runtime.session import COMMANDS, HAPPENINGS, STOPPING, Effects, Happening, Session, State
+
+S, H = State, Happening
+EFFECTS = {
+    "setup": "begin_setup",
+    "run": "begin_run",
+    "stop": "end_run",
+    "halt": "hold",
+    "resume": "resume_run",
+    "home": "go_home",
+    "release": "release_estop",
+    "record_start": "start_recording",
+    "record_stop": "stop_recording",
+}
+# Written out a second time, so that a change of the table is a decision and not a slip.
+ALLOWED = {
+    S.DISCONNECTED: {"estop"},
+    S.IDLE: {"setup", "record_start", "record_stop", "estop"},
+    S.SETTING_UP: {"stop", "halt", "estop"},
+    S.READY: {"setup", "run", "stop", "home", "record_start", "record_stop", "estop"},
+    S.RUNNING: {"stop", "halt", "estop"},
+    S.HOLDING: {"stop", "halt", "resume", "record_stop", "estop"},
+    S.FAULTED: {"release", "estop"},
+}
+
+
+class Recorded(Effects):
+    """Remembers what was asked for; refuses what it is told to."""
+
+    def __init__(self):
+        self.done, self.refuse = [], set()
+
+    def _do(self, name, *details):
+        if name in self.refuse:
+            raise RuntimeFault(f"cannot {name}")
+        self.done.append((name, *details))
+
+    def begin_setup(self):
+        self._do("begin_setup")
+
+    def cancel_setup(self, reason):
+        self._do("cancel_setup", reason)
+
+    def begin_run(self):
+        self._do("begin_run")
+
+    def hold(self, reason):
+        self._do("hold", reason)
+
+    def resume_run(self):
+        self._do("resume_run")
+
+    def end_run(self, status, reason):
+        self._do("end_run", status, reason)
+
+    def go_home(self):
+        self._do("go_home")
+
+    def release_estop(self):
+        self._do("release_estop")
+
+    def start_recording(self):
+        self._do("start_recording")
+
+    def stop_recording(self):
+        self._do("stop_recording")
+
+
+class Bench:
+    """A session with a lease held by anna, in any state."""
+
+    def __init__(self, state=S.DISCONNECTED):
+        self.clock, self.effects, self.lease = VirtualClock(100.0), Recorded(), Lease(5.0)
+        self.session = Session(self.effects, self.lease, "boot-1", self.clock.now)
+        self.session.state = state
+        self._uuids = (f"uuid-{n}" for n in count())
+        self.give("lease_claim")
+
+    def command(self, kind, **changes):
+        decided = Command(
+            next(self._uuids),
+            kind,
+            holder="anna",
+            epoch=self.lease.epoch,
+            boot="boot-1",
+            sequence=self.session.sequence,
+            valid_until=self.clock.now() + 1.0,
+        )
+        return replace(decided, **changes)
+
+    def give(self, kind, **changes):
+        changes = ({"epoch": 0} if kind == "lease_claim" else {}) | changes
+        return self.session.handle(self.command(kind, **changes))
+
+    @property
+    def names(self):
+        return [done[0] for done in self.effects.done]
+
+
+@pytest.mark.parametrize("state", State)
+def test_the_allowed_commands_of_a_state_are_those_of_the_table(state):
+    assert set(Bench(state).session.allowed()) == ALLOWED[state]
+    cancelling = {"stop", "halt"} if state is S.SETTING_UP else set()
+    table = {kind for kind, rule in COMMANDS.items() if state in rule.allowed}
+    assert ALLOWED[state] == table | cancelling | {"estop"}
+
+
+@pytest.mark.parametrize(("kind", "state"), list(product(COMMANDS, State)))
+def test_a_command_is_carried_out_exactly_where_the_table_allows_it(kind, state):
+    bench = Bench(state)
+    sequence = bench.session.sequence
+    ack = bench.give(kind)
+    if kind not in ALLOWED[state]:
+        assert ack.status == "refused"
+        assert ack.reason.startswith(f"{kind} is not allowed while {state} (")
+        assert set(ack.allowed) == ALLOWED[state]
+        assert bench.session.state is state
+        assert bench.session.sequence == sequence
+        assert bench.effects.done == []
+        return
+    cancels = state is S.SETTING_UP
+    after = S.IDLE if cancels else COMMANDS[kind].after or state
+    assert (ack.status, ack.reason) == ("accepted", "")
+    assert bench.names == ["cancel_setup" if cancels else EFFECTS[kind]]
+    assert bench.session.state is after
+    assert set(ack.allowed) == ALLOWED[after]
+    assert ack.sequence == bench.session.sequence
+    assert (bench.session.sequence > sequence) == (cancels or COMMANDS[kind].after is not None)
+
+
+@pytest.mark.parametrize(("kind", "state"), [(k, s) for s in State for k in sorted(ALLOWED[s] - {"estop"})])
+def test_an_effect_that_refuses_is_the_reason_and_nothing_changes(kind, state):
+    bench = Bench(state)
+    name = "cancel_setup" if state is S.SETTING_UP else EFFECTS[kind]
+    bench.effects.refuse = {name}
+    sequence, reason = bench.session.sequence, bench.session.reason
+    ack = bench.give(kind)
+    assert (ack.status, ack.reason) == ("refused", f"cannot {name}")
+    assert (bench.session.state, bench.session.sequence, bench.session.reason) == (state, sequence, reason)
+
+
+@pytest.mark.parametrize("state", State)
+def test_an_unknown_command_is_refused_with_the_known_ones(state):
+    ack = Bench(state).give("dance")
+    assert ack.status == "refused"
+    assert ack.reason.startswith("unknown command 'dance'; known: setup, run, stop")
+
+
+@pytest.mark.parametrize("state", State)
+def test_the_estop_is_sent_on_to_its_own_socket_by_anybody(state):
+    bench = Bench(state)
+    ack = bench.give("estop", holder="", epoch=0, boot="", sequence=-1, valid_until=0.0)
+    assert (ack.status, ack.reason) == ("refused", "the e-stop has a socket of its own: send it to the guard")
+    assert bench.session.state is state
+
+
+STALE = {
+    "another boot": ({"boot": "boot-0"}, "stale: it was decided before the runtime was restarted"),
+    "an older state": ({"sequence": 0}, "stale: the state has changed since it was decided"),
+    "a deadline that has passed": ({"valid_until": 99.9}, "stale: it arrived after its deadline"),
+    "no deadline at all": ({"valid_until": math.nan}, "stale: it arrived after its deadline"),
+}
+
+
+@pytest.mark.parametrize(("changes", "reason"), STALE.values(), ids=STALE.keys())
+@pytest.mark.parametrize("kind", [kind for kind in COMMANDS if kind not in STOPPING])
+def test_what_was_decided_by_something_old_is_refused_as_stale(kind, changes, reason):
+    state = COMMANDS[kind].allowed[0]
+    bench = Bench(state)
+    ack = bench.give(kind, **changes)
+    assert ack.status == "refused"
+    assert ack.reason.startswith(reason)
+    assert (bench.session.state, bench.effects.done) == (state, [])
+
+
+@pytest.mark.parametrize("kind", ["stop", "halt"])
+@pytest.mark.parametrize("changes", [changes for changes, _ in STALE.values()], ids=STALE.keys())
+def test_a_stopping_command_is_never_stale(kind, changes):
+    bench = Bench(S.RUNNING)
+    assert bench.give(kind, **changes).status == "accepted"
+    assert bench.session.state is COMMANDS[kind].after
+
+
+@pytest.mark.parametrize("kind", COMMANDS)
+def test_every_command_needs_the_lease(kind):
+    bench = Bench(COMMANDS[kind].allowed[0])
+    assert bench.give(kind, holder="ben").reason == "anna holds the lease"
+    assert bench.give(kind, epoch=7).reason == "epoch 7 is not the lease's epoch 1"
+    bench.clock.advance(5.0)
+    assert bench.give(kind).reason == "nobody holds the lease: claim it first"
+    assert bench.effects.done == []
+
+
+def test_of_two_commanders_only_the_newer_epoch_commands():
+    bench = Bench(S.READY)
+    assert bench.give("lease_claim", holder="ben", epoch=0).status == "refused"
+    taken = bench.give("lease_claim", holder="ben", epoch=2)
+    assert (taken.status, taken.data) == ("accepted", {"epoch": 2, "holder": "ben"})
+    assert bench.give("run", epoch=1).reason == "ben holds the lease"
+    assert bench.give("run", holder="ben", epoch=2).status == "accepted"
+    assert bench.give("stop", epoch=1).reason == "ben holds the lease"
+
+
+def test_a_command_decided_before_the_lease_changed_hands_is_stale():
+    bench = Bench(S.READY)
+    decided = bench.command("run")
+    bench.give("lease_claim", holder="ben", epoch=2)
+    bench.give("lease_claim", epoch=3)
+    ack = bench.session.handle(replace(decided, epoch=3))
+    assert ack.reason.startswith("stale: the state has changed")
+
+
+def test_keeping_a_lease_makes_nothing_stale():
+    bench = Bench(S.READY)
+    decided = bench.command("run")
+    bench.give("lease_renew")
+    bench.give("lease_claim")
+    assert bench.session.handle(decided).status == "accepted"
+
+
+def test_a_lease_can_be_claimed_by_who_knows_nothing_yet():
+    bench = Bench()
+    bench.clock.advance(5.0)
+    ack = bench.give("lease_claim", holder="ben", boot="", sequence=0, valid_until=0.0)
+    assert (ack.status, ack.data["holder"], ack.data["epoch"]) == ("accepted", "ben", 2)
+
+
+def test_a_repeated_uuid_gets_the_first_answer_and_is_not_carried_out_again():
+    bench = Bench(S.READY)
+    command = bench.command("run")
+    first = bench.session.handle(command)
+    bench.give("stop")
+    assert bench.session.handle(command) is first
+    assert bench.names == ["begin_run", "end_run"]
+    assert bench.session.state is S.READY
+
+
+def test_a_repeated_refusal_is_the_same_refusal():
+    bench = Bench(S.IDLE)
+    command = bench.command("run")
+    first = bench.session.handle(command)
+    bench.session.state = S.READY
+    assert bench.session.handle(command) is first
+    assert first.status == "refused"
+
+
+def test_answers_of_before_a_restart_are_given_again_and_their_epochs_are_over():
+    bench = Bench(S.READY)
+    before = Ack("old", "accepted", boot="boot-0", data={"epoch": 12, "holder": "anna"})
+    bench.session.remember({"old": before, "odd": Ack("odd", "refused", data={"epoch": "x"})})
+    assert bench.session.handle(bench.command("run", uuid="old")) is before
+    assert bench.effects.done == []
+    assert bench.lease.epoch == 12
+
+
+def test_commands_without_a_uuid_are_not_taken_for_repetitions_of_each_other():
+    bench = Bench(S.RUNNING)
+    assert bench.give("resume", uuid="").reason == "a command needs a uuid of its own"
+    assert bench.give("stop", uuid="").reason == "a command needs a uuid of its own"
+    assert bench.give("stop").status == "accepted"
+
+
+def test_renewals_are_a_stream_and_not_remembered():
+    bench = Bench(S.READY)
+    assert bench.give("lease_renew", uuid="same").status == "accepted"
+    bench.clock.advance(5.0)
+    assert bench.give("lease_renew", uuid="same").status == "refused"
+
+
+def test_memory_is_bounded_and_forgets_the_oldest_answer(monkeypatch):
+    monkeypatch.setattr(session_module, "ANSWERS_KEPT", 3)
+    bench = Bench(S.IDLE)
+    first = bench.session.handle(bench.command("run", uuid="first"))
+    newest = [bench.session.handle(bench.command("run", uuid=f"later-{n}")) for n in range(3)]
+    assert bench.session.handle(bench.command("run", uuid="later-0")) is newest[0]
+    assert bench.session.handle(bench.command("run", uuid="first")) is not first
+
+
+EXPECTED_EFFECTS = {
+    H.HELD: ["hold"],
+    H.LEASE_ENDED: ["hold"],
+    H.LINK_LOST: ["hold"],
+    H.ESTOPPED: ["end_run"],
+    H.FAMILY_DIED: ["end_run"],
+    H.RUN_ENDED: ["end_run"],
+    H.RUN_FAILED: ["end_run"],
+}
+
+
+@pytest.mark.parametrize(("happening", "state"), list(product(Happening, State)))
+def test_what_happens_changes_the_state_as_the_table_says_and_in_no_other_case(happening, state):
+    bench = Bench(state)
+    sequence = bench.session.sequence
+    changed = bench.session.observe(happening, "because")
+    after = HAPPENINGS.get((happening, state))
+    assert changed == (after is not None)
+    if after is None:
+        assert (bench.session.state, bench.session.sequence) == (state, sequence)
+        assert bench.effects.done == []
+        return
+    assert (bench.session.state, bench.session.reason) == (after, "because")
+    assert bench.session.sequence == sequence + 1
+    cancels = state is S.SETTING_UP and happening not in (H.SETUP_DONE, H.SETUP_FAILED)
+    assert bench.names == ["cancel_setup"] * cancels + EXPECTED_EFFECTS.get(happening, [])
+
+
+@pytest.mark.parametrize(
+    ("happening", "status"),
+    [
+        (H.RUN_ENDED, "finished"),
+        (H.RUN_FAILED, "failed"),
+        (H.ESTOPPED, "interrupted"),
+        (H.FAMILY_DIED, "interrupted"),
+    ],
+)
+def test_a_run_is_closed_with_the_status_of_what_ended_it(happening, status):
+    bench = Bench(S.RUNNING)
+    bench.session.observe(happening, "because")
+    assert bench.effects.done == [("end_run", status, "because")]
+
+
+@pytest.mark.parametrize("state", [s for s in State if s is not S.FAULTED])
+def test_the_estop_faults_every_state_and_only_its_release_leads_out(state):
+    bench = Bench(state)
+    bench.session.observe(H.ESTOPPED, "e-stop by anna")
+    for happening in set(Happening) - {H.RELEASED}:
+        bench.session.observe(happening, "because")
+        assert bench.session.state is S.FAULTED
+    bench.give("release")
+    assert bench.session.state is S.FAULTED  # until the guard has released
+    bench.session.observe(H.RELEASED, "released")
+    assert bench.session.state is S.IDLE
+
+
+def test_nothing_that_happens_starts_a_motion():
+    for happening, state in product(Happening, State):
+        bench = Bench(state)
+        bench.session.observe(happening, "because")
+        assert not {"begin_setup", "begin_run", "resume_run", "go_home"} & set(bench.names)
+        assert bench.session.state is state or bench.session.state not in (S.RUNNING, S.SETTING_UP)
+
+
+def test_the_end_of_the_lease_holds_a_run_and_leaves_it_open():
+    bench = Bench(S.RUNNING)
+    bench.session.observe(H.LEASE_ENDED, "not renewed")
+    assert bench.session.state is S.HOLDING
+    assert bench.effects.done == [("hold", "not renewed")]
+    assert "resume" in bench.session.allowed()
+
+
+def test_a_fault_of_an_effect_passes_through_where_nobody_can_be_refused():
+    bench = Bench(S.RUNNING)
+    bench.effects.refuse = {"hold"}
+    with pytest.raises(RuntimeFault, match="cannot hold"):
+        bench.session.observe(H.HELD, "because")
+    assert bench.session.state is S.RUNNING
