@@ -60,7 +60,7 @@ class Tick:
         self._check_estop(planned)
         self._check_family(planned)
         sent = self._send(step, planned)
-        self._finish_motion(planned)
+        self._finish_motion(planned, sent)
         self._report.record(step, planned, self._observation, sent)
         remaining = self.timeline.remaining(step + 1)
         self._report.status(
@@ -184,8 +184,12 @@ class Tick:
                 since = f"for {now - beat:.1f} s" if beat else "since it was restarted"
                 self._hold_because("family", f"no sign of life from {process} {since}", now)
 
-    def _finish_motion(self, now: float) -> None:
-        if isinstance(self._behaviour, Move) and self._behaviour.finished(now):
+    def _finish_motion(self, now: float, sent: Sent) -> None:
+        """A motion is done when its end has been sent: not refused, and not limited on the way there."""
+        if not isinstance(self._behaviour, Move) or sent.target is None or sent.executed is None:
+            return
+        there = not sent.refused and np.allclose(sent.executed, sent.target.action, atol=1e-6)
+        if there and self._behaviour.finished(now):
             self._behaviour = self._holding(now)
             self._report.say("motion_done", "arrived", now)
 

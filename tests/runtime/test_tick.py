@@ -408,3 +408,23 @@ def test_an_e_stop_pressed_within_a_tick_repeats_the_last_command(bench):
     assert bench.records()[-1].notes == ["e-stop pressed within the tick"]
     bench.run()
     assert bench.behaviour == "estop"
+
+
+def test_a_motion_is_not_done_while_it_is_refused(bench):
+    bench.say("motion", goal=np.array([0.8, 0.0]))
+    bench.run(12)
+    bench.feed = False
+    bench.run(20)
+    assert bench.said("motion_done") == []
+    assert bench.behaviour == "hold"
+
+
+def test_a_motion_that_was_refused_for_a_while_still_comes_to_its_end(bench):
+    bench.say("motion", goal=np.array([0.8, 0.0]))
+    bench.run(12)
+    bench.feed = False
+    bench.run(10)
+    bench.feed = True
+    bench.run(25)
+    assert [e.kind for e in bench.said()] == ["refused", "motion_done"]
+    assert np.allclose(bench.sink.sent[-1], [0.8, 0.0], atol=1e-6)

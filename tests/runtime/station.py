@@ -1,0 +1,238 @@
+"""Whole stations in lockstep around a robot and a policy under the test's hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from runtime import deployment, family
+from runtime.errors import PolicyError
+from runtime.family import Plan
+from runtime.lockstep import Lockstep
+from runtime.policies.base import Policy, PolicyInfo
+from runtime.recording.reader import Episode, open_episode
+from runtime.session import State
+from runtime.transports.base import Capabilities, Sink, Source
+from runtime.types import ActionChunk, Conditioning, Float64, Observation, RobotCommand, Space
+from tests.runtime.recording.samples import numbered
+
+DIM = 14
+MOVED = (0, 7)  # first joint of each arm: far from every limit
+STANDS = np.tile([0.0, 0.8, -0.8, 0.0, 0.5, 0.0, 0.05], 2)  # a pose with room on all sides
+Rows = Callable[[Observation, int], Any]
+
+
+def ramp(first: int, count: int, speed: float = 0.002) -> Float64:
+    """The positions for the steps from `first` on: [count, D], `speed` rad per step on two joints."""
+    rows = np.tile(STANDS, (count, 1))
+    rows[:, MOVED] += speed * (first + np.arange(count))[:, None]
+    return rows
+
+
+class StubRobot(Source, Sink):
+    """Goes wherever it is told, at once; each observation shows its own number on every camera."""
+
+    def __init__(self, plan: StubPlan, clock: Any) -> None:
+        self._plan, self._clock = plan, clock
+        self.position = plan.start.copy()
+        self.commands: list[RobotCommand] = []
+        self.blocked = False
+        self.silent = False
+        self.cameras = [camera.key for camera in plan.robot.cameras]
+        self.picture = numbered
+        self.bias: Float64 = np.zeros(DIM)  # it stands beside where it is told to go
+        self._sequence = 0
+
+    def connect(self) -> None:
+        pass
+
+    def receive(self, timeout: float) -> Observation | None:
+        if self.silent:
+            return None
+        self._sequence += 1
+        now = self._clock.now()
+        return Observation(
+            sequence=self._sequence,
+            arrived=now,
+            captured=dict.fromkeys(("joints", *self.cameras), now),
+            qpos=self.position.astype(np.float32),
+            pictures=dict.fromkeys(self.cameras, self.picture(self._sequence)),
+        )
+
+    def send(self, command: RobotCommand) -> None:
+        self.commands.append(command)
+        if not self.blocked:
+            self.position = command.action.astype(np.float64) + self.bias
+
+    def close(self) -> None:
+        pass
+
+    @property
+    def sent(self) -> Float64:
+        """All commands [N, D]."""
+        return np.array([command.action for command in self.commands], np.float64).reshape(-1, DIM)
+
+
+class StubPolicy(Policy):
+    """Answers with what `rows(observation, number)` says; `number` counts the answers since the reset."""
+
+    def __init__(self, plan: StubPlan) -> None:
+        self._plan = plan
+        self.calls: list[str] = []
+        self.number = 0
+        self.first: int | None = None  # step of the first observation since the reset
+
+    def connect(self) -> PolicyInfo:
+        self.calls.append("connect")
+        if self._plan.absent:
+            raise PolicyError(self._plan.absent)
+        return PolicyInfo("stub")
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        self.calls.append("infer")
+        if self.first is None:
+            self.first = observation.step
+        rows = self._plan.rows(replace(observation, step=observation.step - self.first), self.number)
+        self.number += 1
+        return ActionChunk(np.asarray(rows, np.float32), space=self._plan.space)
+
+    def reset(self) -> None:
+        self.calls.append("reset")
+        self.number, self.first = 0, None
+
+    def close(self) -> None:
+        self.calls.append("close")
+
+
+def on_time(observation: Observation, number: int) -> Float64:
+    """For every step the position that the ramp has then."""
+    return ramp(observation.step, 20)
+
+
+@dataclass(frozen=True, slots=True)
+class StubPlan(Plan):
+    """A plan whose transport and policy are the test's; it keeps what it has built."""
+
+    built: dict[str, Any]
+    start: Float64
+    rows: Rows
+    space: Space
+    absent: str
+    moves_robot: bool
+
+    @property
+    def transport(self) -> Any:
+        return SimpleNamespace(source=self._robot, sink=self._robot)
+
+    @property
+    def policy(self) -> Any:
+        return SimpleNamespace(build=self._policy)
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return Capabilities(moves_robot=self.moves_robot)
+
+    def _robot(self, config: object, robot: object, clock: object) -> StubRobot:
+        if "robot" not in self.built:
+            self.built["robot"] = StubRobot(self, clock)
+        return self.built["robot"]
+
+    def _policy(self, config: object, robot: object, clock: object, rate: float) -> StubPolicy:
+        self.built["policy"] = StubPolicy(self)
+        return self.built["policy"]
+
+
+def plan(
+    data: Path,
+    rows: Rows = on_time,
+    strategy: str = "async",
+    delay: int = 0,
+    start: Float64 = STANDS,
+    space: Space = "joint",
+    absent: str = "",
+    moves_robot: bool = True,
+    **settings: Any,
+) -> StubPlan:
+    """A station on the bundled robot's description; `settings` are tables of the deployment."""
+    tree: dict[str, Any] = {
+        "station": "bench",
+        "robot": "agilex_piper",
+        "data_dir": str(data),
+        "task": "stack the cups",
+        "transport": {"kind": "dataset", "path": "-"},
+        "policy": {"kind": "mock"},
+        "strategy": {"kind": strategy},
+        "setup": {"home": False},
+        "recording": {"min_free_bytes": 0},
+        "lockstep": {"delay_ticks": delay},
+    }
+    for table, values in settings.items():
+        tree[table] = {**tree.get(table, {}), **values} if isinstance(values, dict) else values
+    made = family.plan(deployment.resolve(tree, {}, "test"))
+    return StubPlan(made.resolved, made.robot, {}, start, rows, space, absent, moves_robot)
+
+
+class Station(Lockstep):
+    """A lockstep station with its robot, its policy, and a few words for what tests do again and again."""
+
+    def __init__(self, made: StubPlan) -> None:
+        made.built.clear()
+        super().__init__(made)
+        self.robot: StubRobot = made.built["robot"]
+        self.policy: StubPolicy = made.built["policy"]
+        self.connect()
+
+    @property
+    def state(self) -> State:
+        return self.main.session.state
+
+    @property
+    def reason(self) -> str:
+        return self.main.session.reason
+
+    def go(self, ticks: int) -> None:
+        """Tick under a lease that is kept."""
+        left = self.step + ticks
+        self.until(lambda: self.step >= left, ticks + 1.0, "ticks")
+
+    def reach(self, state: State, seconds: float = 30.0) -> None:
+        self.until(lambda: self.state is state, seconds, f"{state}")
+
+    def ready(self) -> Station:
+        self.prepare()
+        assert self.state is State.READY, self.reason
+        return self
+
+    def running(self, ticks: int = 30) -> Station:
+        self.ready()
+        self.command("run")
+        self.go(ticks)
+        return self
+
+    def stop(self) -> Episode:
+        """Stop, let the end go from main to media and back, and read what was recorded."""
+        self.command("stop")
+        self.go(3)
+        return self.episode()
+
+    def episode(self) -> Episode:
+        return open_episode(Path(self.main.last_episode["path"]))
+
+    def prepare(self) -> None:
+        """Set up, to whatever end."""
+        self.reach(State.IDLE)
+        self.command("setup")
+        self.until(lambda: self.state is not State.SETTING_UP, 60.0, "set-up")
+
+    def events(self, kind: str) -> list[str]:
+        return [event["text"] for event in self.main.events.since(0) if event["kind"] == kind]
+
+
+def column(table: Any, name: str) -> np.ndarray:
+    """A column of a table as an array."""
+    return np.array(table[name].to_pylist())

@@ -1,0 +1,224 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from runtime.errors import PolicyError, SetupError
+from runtime.session import State
+from runtime.setup import Stage
+from runtime.types import Observation
+from tests.runtime.station import STANDS, Station, on_time, plan, ramp
+
+
+def failed(station: Station) -> str:
+    """Set up, in vain; the reason."""
+    station.prepare()
+    assert station.state is State.IDLE
+    assert station.main.setup.stage is Stage.IDLE
+    return station.reason
+
+
+def without_control(station: Station, seconds: float, beating: bool = True) -> None:
+    """Time passes, and control, alive or not, does not tick."""
+    until = station.clock.now() + seconds
+    while station.clock.now() < until:
+        now = station.clock.now()
+        for process in ("control", "guard", "media") if beating else ("guard", "media"):
+            station.page.beat(process, now)
+        station._handle("lease_renew")
+        station.media.pump(0.0)
+        station.main.pump()
+        station.clock.advance(1 / 30)
+
+
+def test_it_goes_from_stage_to_stage_and_says_so(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, setup={"home": True})).ready()
+    assert station.events("setup") == [
+        "waiting for a complete observation",
+        "going to the pose",
+        "warming up the policy",
+        "idle",
+    ]
+    assert station.reason.startswith("20 rows in 0 ms, the first at most ")
+    assert station.main.setup.validated == station.reason
+    assert station.main.setup.info is not None
+    assert station.main.setup.info.name == "stub"
+    station.close()
+
+
+def test_the_policy_is_reset_once_and_warmed_up_as_often_as_asked(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, setup={"warmup_chunks": 4})).ready()
+    assert station.policy.calls == ["connect", "reset", "infer", "infer", "infer", "infer"]
+    assert station.robot.commands == []  # nothing moved: no homing was asked for
+    station.close()
+
+
+def test_the_first_row_is_compared_with_where_the_arm_is(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, lambda o, n: ramp(100, 5))).ready()
+    assert (
+        station.main.setup.validated == "5 rows in 0 ms, the first at most 0.200 rad away (left_arm.joint0)"
+    )
+    station.close()
+
+
+def test_a_policy_that_cannot_be_reached_ends_it_with_its_sentence(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, absent="no server at ws://there: start it"))
+    assert failed(station) == "no server at ws://there: start it"
+    assert station.policy.calls == ["connect", "close"]
+    station.close()
+
+
+@pytest.mark.parametrize("error", [PolicyError("out of memory"), ValueError("bad shape")])
+def test_a_policy_that_fails_while_it_is_warmed_up_ends_it(tmp_path: Path, error: Exception) -> None:
+    def rows(observation: Observation, number: int) -> np.ndarray:
+        if number == 1:
+            raise error
+        return on_time(observation, number)
+
+    station = Station(plan(tmp_path, rows, delay=2))
+    assert str(error) in failed(station)
+    assert station.policy.calls == ["connect", "reset", "infer", "infer", "close"]
+    station.close()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_policy_that_answers_what_is_no_number_ends_it(tmp_path: Path, value: float) -> None:
+    def rows(observation: Observation, number: int) -> np.ndarray:
+        answer = ramp(0, 5)
+        answer[3, 9] = value
+        return answer
+
+    station = Station(plan(tmp_path, rows))
+    assert f"{value} for right_arm.joint2 in row 3" in failed(station)
+    assert station.robot.commands == []
+    station.close()
+
+
+def test_a_camera_that_falls_away_ends_it_with_its_name(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, setup={"observation_timeout_s": 1.0}))
+    station.reach(State.IDLE)
+    station.robot.cameras.remove("cam_left_wrist")
+    station.go(30)  # the last picture of it grows old
+    reason = failed(station)
+    assert reason.startswith("no complete observation within 1 s: cam_left_wrist: ")
+    assert "old, allowed 0.5" in reason
+    station.close()
+
+
+def test_an_arm_that_does_not_arrive_ends_it_with_its_name_and_how_far_it_is(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, setup={"home": True}))
+    station.robot.bias[8] = 0.2
+    reason = failed(station)
+    assert "the arm did not arrive: right_arm.joint1 is 0.20 rad from the pose 'home'" in reason
+    assert "another program" in reason
+    station.go(10)
+    assert (station.robot.sent[-5:] == station.robot.sent[-1]).all()  # it holds
+    station.close()
+
+
+def test_a_blocked_arm_is_not_pulled_at_further_than_the_following_error(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, setup={"home": True}))
+    station.robot.blocked = True
+    reason = failed(station)
+    assert "10 actions refused in a row" in reason
+    assert "from where it is measured, allowed 0.5" in reason
+    assert np.abs(station.robot.sent - STANDS).max() < 0.6
+    station.close()
+
+
+def test_a_node_that_falls_silent_while_it_homes_stops_the_motion(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, setup={"home": True}))
+    station.reach(State.IDLE)
+    station.command("setup")
+    station.go(15)
+    station.robot.silent = True
+    station.reach(State.IDLE, 2.0)
+    assert "10 actions refused in a row, the last one: joints are " in station.reason
+    station.go(15)  # it has come to a stand
+    assert (station.robot.sent[-5:] == station.robot.sent[-1]).all()
+    station.close()
+
+
+def test_a_motion_that_control_never_finishes_ends_it(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, setup={"home": True}))
+    station.reach(State.IDLE)
+    station.command("setup")
+    without_control(station, 10.0)
+    assert station.state is State.IDLE
+    assert "control has not come to the pose 'home' within" in station.reason
+    station.close()
+
+
+def test_without_control_no_motion_is_ordered(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, setup={"home": True, "observation_timeout_s": 3.0}))
+    station.reach(State.IDLE)
+    station.command("setup")
+    without_control(station, 4.5, beating=False)
+    assert station.state is State.IDLE
+    assert "the process control gives no sign of life" in station.reason
+    station.close()
+
+
+@pytest.mark.parametrize("ticks", [1, 3, 8])  # while connecting, before and within warming up
+@pytest.mark.parametrize("command", ["stop", "halt"])
+def test_it_can_be_cancelled_at_any_time_and_begun_again(tmp_path: Path, ticks: int, command: str) -> None:
+    station = Station(plan(tmp_path, delay=4))
+    station.reach(State.IDLE)
+    station.command("setup")
+    station.go(ticks)
+    assert station.state is State.SETTING_UP
+    station.command(command)
+    assert station.state is State.IDLE
+    assert station.policy.calls[-1] == "close"  # what is under way is cut off
+    station.go(10)
+    assert station.state is State.IDLE
+    station.ready()
+    station.close()
+
+
+def test_homing_alone_asks_no_policy(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path)).ready()
+    asked = len(station.policy.calls)
+    station.command("home")
+    assert station.state is State.SETTING_UP
+    station.reach(State.READY)
+    assert station.reason == "at the pose 'home'"
+    assert len(station.policy.calls) == asked
+    assert np.allclose(station.robot.position, station.plan.robot.poses["home"], atol=1e-6)
+    station.close()
+
+
+def test_a_transport_that_moves_nothing_is_not_homed(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, moves_robot=False, setup={"home": True})).ready()
+    assert station.robot.commands == []
+    with pytest.raises(SetupError, match="transport 'dataset' moves no robot"):
+        station.command("home")
+    assert station.state is State.READY
+    station.close()
+
+
+def test_a_second_set_up_connects_and_validates_anew(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path)).ready()
+    station.command("setup")
+    assert station.main.setup.validated == ""
+    station.reach(State.READY)
+    assert station.policy.calls.count("connect") == 2
+    assert station.main.setup.validated != ""
+    station.close()
+
+
+def test_the_e_stop_ends_it(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, setup={"home": True}))
+    station.reach(State.IDLE)
+    station.command("setup")
+    station.go(15)
+    station.guard.press("ada", "smoke")
+    station.go(3)
+    assert station.state is State.FAULTED
+    assert station.main.setup.stage is Stage.IDLE
+    here = station.robot.position.copy()
+    station.go(20)
+    assert np.array_equal(station.robot.position, here)
+    station.close()
