@@ -11,6 +11,7 @@ from pathlib import Path
 from runtime import deployment, lockstep
 from runtime.errors import RuntimeFault
 from runtime.family import Plan, plan, start_log
+from runtime.session import State
 from runtime.supervisor import Supervisor
 
 
@@ -38,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if given.check:
             return _check(made)
         if given.lockstep:
-            return _lockstep(made)
+            return run_in_lockstep(made)
         return Supervisor(made).run(given.headless)
     except RuntimeFault as fault:
         print(f"error: {fault}", file=sys.stderr)
@@ -49,25 +50,27 @@ def _check(made: Plan) -> int:
     print(json.dumps(dict(made.resolved.tree), indent=1))
     print(f"hash {made.resolved.digest}")
     robot = made.robot
-    print(
-        f"ok: {robot.name}, {robot.dim} joints, {len(robot.cameras)} cameras, {made.rate:g} Hz, {made.fps:g} fps"
-    )
+    counts = f"{robot.dim} joints, {len(robot.cameras)} cameras"
+    print(f"ok: {robot.name}, {counts}, {made.rate:g} Hz, {made.fps:g} fps")
     return 0
 
 
-def _lockstep(made: Plan) -> int:
+def run_in_lockstep(made: Plan) -> int:
+    """Run, print how it went, publish what ended well; returns the exit code."""
     done = lockstep.run(made)
     episode = done.episode
     print(f"{done.state}: {done.reason}")
     print(
         f"episode  {episode.get('path', 'none')}  {episode.get('rows', 0)} rows, {episode.get('status', '')}"
     )
-    if made.deployment.publish.dataset and episode.get("status") == "finished":
+    # A run that held was ended by nobody's judgement: it is kept, but neither published nor a success.
+    well = done.state is State.READY and episode.get("status", "finished") == "finished"
+    if well and made.deployment.publish.dataset and episode:
         from runtime.datasets.published import publish
 
         published = publish(Path(episode["path"]), made.deployment.data / made.deployment.publish.dataset)
         print(f"dataset  {published.dataset}  episode {published.episode_index}, {published.frames} frames")
-    return 0 if episode.get("status", "finished") == "finished" else 1
+    return 0 if well else 1
 
 
 if __name__ == "__main__":

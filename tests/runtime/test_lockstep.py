@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from runtime import __main__ as command_line
 from runtime import deployment, family, lockstep
 from runtime.datasets.published import publish
 from runtime.errors import SetupError
@@ -230,6 +231,19 @@ def test_a_policy_that_is_always_too_late_is_held_and_not_running_for_ever(tmp_p
     assert len(station.events("chunk_dropped")) >= 2
     assert (station.robot.sent == STANDS.astype(np.float32)).all()
     station.close()
+
+
+def test_a_run_that_held_is_no_success_and_is_not_published(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = plan(tmp_path, lambda o, n: ramp(o.step, 5), delay=7, publish={"dataset": "set"})
+    assert command_line.run_in_lockstep(made) == 1
+    assert "holding: no usable chunk" in capsys.readouterr().out
+    assert not (tmp_path / "set").exists()
+    assert (
+        command_line.run_in_lockstep(plan(tmp_path, run={"duration_s": 0.5}, publish={"dataset": "set"})) == 0
+    )
+    assert (tmp_path / "set/meta/info.json").exists()
 
 
 def test_a_policy_that_is_absent_fails_the_set_up_with_its_sentence(tmp_path: Path) -> None:
