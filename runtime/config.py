@@ -53,6 +53,7 @@ class ControlSettings(Section):
     realtime: Literal["auto", "off"] = "auto"
     """"auto" asks for SCHED_FIFO and locked memory and says what it got; "off" does not ask."""
     realtime_priority: int = Field(default=20, ge=1, le=99)
+    """Priority within SCHED_FIFO."""
     heartbeat_timeout_s: float = Field(default=1.0, gt=0)
     """Silence of main or guard after which control holds [s]."""
     orphan_hold_s: float = Field(default=5.0, ge=0, le=8)
@@ -80,15 +81,18 @@ class RunSettings(Section):
     duration_s: float | None = Field(default=None, gt=0)
     """Time after which a run ends by itself [s]; until it is stopped where it is not given."""
     mode: Literal["continuous"] = "continuous"
+    """The policy drives the robot until the run ends."""
 
 
 class RecordingChoice(RecordingSettings):
     """Recording of every run."""
 
     enabled: bool = True
+    """Whether runs are recorded; one that is not leaves nothing behind."""
     fps: float | None = Field(default=None, gt=0)
     """Rows per second of the dataset grid; the control rate where it is not given."""
     kind: Literal["rollout", "demonstration"] = "rollout"
+    """What the episodes are, for the manifest and the dataset."""
     on_failure: Literal["hold", "continue"] = "hold"
     """What a run does when its recording fails: an unrecorded run is no evidence."""
 
@@ -111,13 +115,19 @@ class BusSettings(Section):
     """Sockets that the web, the terminal and scripts talk to."""
 
     host: Annotated[str, AfterValidator(_loopback)] = "127.0.0.1"
+    """Address to listen on: 127.0.0.1 or localhost."""
     command_port: int = Field(default=0, ge=0, le=65535)
+    """Where commands are taken; 0 for a free port, which clients find in the station's folder."""
     state_port: int = Field(default=0, ge=0, le=65535)
+    """Where snapshots, joints and events are published; 0 for a free port."""
     camera_port: int = Field(default=0, ge=0, le=65535)
+    """Where previews are published; 0 for a free port."""
     estop_port: int = Field(default=0, ge=0, le=65535)
+    """Where the guard takes the e-stop; 0 for a free port."""
     preview_rate: float = Field(default=15.0, ge=0, le=60)
     """JPEG previews per second and camera [Hz]; 0 for none."""
     preview_height: int = Field(default=240, ge=60, le=1080)
+    """Height of a preview [pixels]."""
 
 
 class LockstepSettings(Section):
@@ -131,11 +141,13 @@ class Deployment(Section):
     """One station: a robot, a way to it, a policy, and how they are brought together."""
 
     station: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")
+    """Name of the station, and of its folder in the data folder."""
     robot: str
     """Name of a folder in robots/, or a path to such a folder."""
     task: str = ""
     """The instruction given to the policy."""
     operator: str = ""
+    """Who runs it, for the manifests."""
     data_dir: str | None = None
     """Where episodes and datasets lie; $EVA_DATA_DIR or ./data where it is not given."""
     transport: TransportConfig

@@ -19,7 +19,9 @@ class WorkspaceBox(Section):
     """A box in an arm's declared frame that its end effector must stay in [m]."""
 
     lower: list[float] = Field(min_length=3, max_length=3)
+    """Corner with the smallest x, y and z."""
     upper: list[float] = Field(min_length=3, max_length=3)
+    """Corner with the largest x, y and z."""
 
 
 class SafetySettings(Section):

@@ -42,12 +42,15 @@ class Config(Section):
 
     kind: Literal["openpi"] = "openpi"
     url: Annotated[str, Field(pattern=r"^wss?://.+")] = "ws://127.0.0.1:8000"
+    """Where the server listens."""
     api_key_env: str | None = None
     """Environment variable with the API key; the key itself would end up in every recording's manifest."""
     connect_deadline: Seconds = 5.0
+    """For the connection and the server's metadata [s]."""
     first_inference_deadline: Seconds = 120.0
-    """For the first answer after a server was reached: it may have to compile its model."""
+    """For the first answer after a server was reached [s]: it may have to compile its model."""
     inference_deadline: Seconds = 2.0
+    """For every later answer [s]; after it the connection is dropped."""
     action_space: Space = "joint"
     """What the rows of the answer are: joint targets, or 8 numbers of pose and gripper per arm."""
     observation_space: Space = "joint"
@@ -61,11 +64,13 @@ class Config(Section):
     resize: Resize | Literal["none"] = "pad"
     """"pad" keeps the aspect on black, "stretch" does not, "none" sends pictures as they are."""
     image_layout: Layout = "chw"
+    """Axes of a picture: channels first or last."""
     state_key: str = "state"
-    """"" sends no whole state."""
+    """Request key of the state; "" sends no whole state."""
     state_parts: dict[str, Dims] = Field(default_factory=dict)
     """Further request keys and the places of the state vector they take (DROID: joints and gripper apart)."""
     prompt_key: str = "prompt"
+    """Request key of the instruction."""
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> OpenpiPolicy:

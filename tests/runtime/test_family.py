@@ -1,0 +1,76 @@
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from runtime import family
+from runtime.deployment import load
+from runtime.family import Lifeline, plan
+from runtime.page import Page
+
+DEPLOYMENTS = Path(__file__).parents[2] / "deployments"
+
+
+@pytest.fixture
+def resolved():
+    return load(DEPLOYMENTS / "demo.toml")
+
+
+@pytest.fixture
+def pipe():
+    reading, writing = os.pipe()
+    ends = {"reading": reading, "writing": writing}
+    yield ends
+    for end in ends.values():
+        os.close(end)
+
+
+def test_a_lifeline_is_cut_when_its_other_end_is_gone(pipe):
+    lifeline = Lifeline(pipe["reading"])
+    assert not lifeline.cut
+    os.close(pipe.pop("writing"))
+    assert lifeline.cut
+    assert lifeline.cut
+
+
+def test_words_on_a_lifeline_do_not_cut_it(pipe):
+    lifeline = Lifeline(pipe["reading"])
+    os.write(pipe["writing"], b"hello\n")
+    assert not lifeline.cut
+    assert not lifeline.cut
+
+
+def test_a_plan_knows_the_modules_of_its_kinds(resolved):
+    made = plan(resolved)
+    assert made.transport.__name__ == "runtime.transports.zmq"
+    assert made.policy.__name__ == "runtime.policies.openpi"
+    assert made.strategy.Config.model_fields["kind"].default == "async"
+    assert made.capabilities.moves_robot
+
+
+def test_the_limits_and_the_page_are_the_robots(resolved):
+    made = plan(resolved)
+    limits, robot = made.limits, made.robot
+    assert limits.names == robot.joint_names
+    np.testing.assert_array_equal(limits.upper, robot.upper)
+    assert np.flatnonzero(limits.grippers).tolist() == list(robot.gripper_dims)
+    assert np.flatnonzero(limits.binary).tolist() == list(robot.binary_dims)
+    assert made.layout.dim == robot.dim
+    assert made.layout.cameras == tuple(camera.key for camera in robot.cameras)
+
+
+def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path, monkeypatch):
+    page, descriptor = Page.create(plan(resolved).layout)
+    page.beat("main", 12.5)
+    handed = tmp_path / "resolved.json"
+    handed.write_text(json.dumps(dict(resolved.tree)), "utf-8")
+    arguments = ["runtime.control", "--resolved", str(handed), "--page", str(descriptor), "--boot", "b"]
+    monkeypatch.setattr("sys.argv", arguments)
+    monkeypatch.setattr(family, "start_log", lambda process: None)
+    member = family.join("control", pictures=False)
+    assert member.plan.resolved.digest == resolved.digest
+    assert member.page.last_beat("main") == 12.5
+    assert member.boot == "b"
+    os.close(descriptor)

@@ -1,0 +1,149 @@
+"""What may import what, read off the source."""
+
+import ast
+import re
+import subprocess
+import sys
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+GROUND_FLOOR = {"types", "clock", "messages", "codecs", "errors", "section", "memory"}
+FAMILY = {"control", "main", "media", "guard", "headless"}
+ROOF = FAMILY | {"lockstep", "supervisor", "ctl", "__main__"}
+
+
+def module_name(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {
+    module_name(path): path for folder in ("runtime", "robots") for path in (ROOT / folder).rglob("*.py")
+}
+
+
+def _is_type_checking(node):
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+
+
+def _imported(node, module, path):
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    base = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+    origin = ".".join([*base, *([node.module] if node.module else [])])
+    names = [f"{origin}.{alias.name}" for alias in node.names]
+    # What is taken from a package is a module of it, or else a name that its __init__ must have made by then.
+    return names if all(name in MODULES for name in names) else [origin, *names]
+
+
+def _walk(nodes, everywhere):
+    for node in nodes:
+        if _is_type_checking(node):
+            yield from _walk(node.orelse, everywhere)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            yield node
+        elif everywhere or not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield from _walk(ast.iter_child_nodes(node), everywhere)
+
+
+@cache
+def imports(module, everywhere=False):
+    """Full names that `module` imports when it is itself imported, or anywhere at all."""
+    tree = ast.parse(MODULES[module].read_text("utf-8"))
+    nodes = _walk(tree.body, everywhere)
+    return frozenset(name for node in nodes for name in _imported(node, module, MODULES[module]))
+
+
+def inside(module, everywhere=False):
+    """The modules of ours among them."""
+    return {name for name in imports(module, everywhere) if name in MODULES and name != module}
+
+
+def floor(module):
+    return module.split(".")[1] if "." in module else ""
+
+
+def test_the_modules_were_found():
+    assert {"runtime.tick", "runtime.transports.zmq", "robots.loading", "runtime"} <= set(MODULES)
+    assert "runtime.clock" in inside("runtime.tick") | inside("runtime.main")
+
+
+def test_imports_of_types_alone_and_inside_functions_are_told_apart(tmp_path, monkeypatch):
+    path = tmp_path / "sample.py"
+    path.write_text(
+        "from typing import TYPE_CHECKING\n"
+        "import a.b\n"
+        "from .c import d\n"
+        "try:\n    import e\nexcept ImportError:\n    pass\n"
+        "if TYPE_CHECKING:\n    import f\nelse:\n    import g\n"
+        "def h():\n    import i\n"
+        "class J:\n    import k\n",
+        "utf-8",
+    )
+    monkeypatch.setitem(MODULES, "runtime.sample", path)
+    top = {"typing", "typing.TYPE_CHECKING", "a.b", "runtime.c", "runtime.c.d", "e", "g", "k"}
+    assert imports("runtime.sample") == top
+    assert imports("runtime.sample", True) == top | {"i"}
+
+
+@pytest.mark.parametrize("module", sorted(MODULES))
+def test_neither_the_web_framework_nor_the_web_is_imported(module):
+    named = {name.partition(".")[0] for name in imports(module, True)}
+    assert not named & {"django", "evaweb", "channels", "celery", "rest_framework"}
+
+
+@pytest.mark.parametrize("module", sorted(m for m in MODULES if m.partition(".")[0] == "robots"))
+def test_the_robots_know_nothing_of_the_runtime(module):
+    assert not {name for name in imports(module, True) if name.partition(".")[0] == "runtime"}
+
+
+@pytest.mark.parametrize("module", sorted(m for m in MODULES if floor(m) in GROUND_FLOOR))
+def test_the_ground_floor_stands_on_nothing_above_it(module):
+    assert {floor(name) for name in inside(module, True) if name != "runtime"} <= GROUND_FLOOR
+
+
+@pytest.mark.parametrize("module", sorted(m for m in MODULES if floor(m) not in ROOF | {"sim"}))
+def test_nothing_below_the_roof_imports_a_process(module):
+    assert not {name for name in inside(module, True) if floor(name) in ROOF}
+
+
+@pytest.mark.parametrize("module", sorted(m for m in MODULES if floor(m) not in ROOF | {"sim"}))
+def test_nothing_but_the_roof_knows_the_stand_ins(module):
+    assert not {name for name in inside(module, True) if floor(name) == "sim"}
+
+
+def test_no_import_goes_round_in_a_circle():
+    graph = {module: inside(module) for module in MODULES}
+    try:
+        order = list(TopologicalSorter(graph).static_order())
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
+    assert len(order) == len(MODULES)
+
+
+ROBOTS = sorted(path.parent.name for path in (ROOT / "robots").glob("*/robot.toml"))
+
+
+@pytest.mark.parametrize("module", sorted(m for m in MODULES if m.partition(".")[0] == "runtime"))
+def test_nothing_in_the_runtime_names_a_robot(module):
+    assert ROBOTS
+    names = {name for robot in ROBOTS for name in (robot, robot.replace("_", "-"), robot.replace("_", " "))}
+    pattern = re.compile("|".join(map(re.escape, sorted(names))), re.IGNORECASE)
+    assert pattern.findall(MODULES[module].read_text("utf-8")) == []
+
+
+def run(code):
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+
+
+@pytest.mark.parametrize("module", ["runtime.config", "runtime.control", "runtime.guard", "runtime.ctl"])
+def test_what_control_and_the_terminal_import_is_free_of_codecs_and_tables(module):
+    heavy = ["av", "pyarrow", "PIL", "websockets", "simplejpeg"]
+    assert run(f"import sys, {module}; print([m for m in {heavy} if m in sys.modules])").strip() == "[]"
