@@ -428,3 +428,22 @@ def test_a_motion_that_was_refused_for_a_while_still_comes_to_its_end(bench):
     bench.run(25)
     assert [e.kind for e in bench.said()] == ["refused", "motion_done"]
     assert np.allclose(bench.sink.sent[-1], [0.8, 0.0], atol=1e-6)
+
+
+def test_a_stop_is_no_harder_than_the_brake_allows(bench):
+    following(bench, wave(60, speed=1.5))
+    bench.run(9)
+    bench.say("hold")
+    bench.run(10)
+    steps = np.diff(np.array(bench.sink.sent)[:, 0])
+    assert np.diff(steps).min() == pytest.approx(-20.0 * PERIOD**2, abs=1e-6)
+    assert steps[9] == pytest.approx(1.5 * PERIOD - 0.5 * 20.0 * PERIOD**2, abs=1e-6)
+
+
+def test_full_speed_is_gathered_within_the_acceleration_and_then_kept(bench):
+    following(bench, wave(20, speed=2.9))
+    bench.run(15)
+    steps = np.diff(np.array(bench.sink.sent)[:, 0])
+    assert steps[0] == pytest.approx(60.0 * PERIOD**2, abs=1e-6)
+    assert steps.max() <= 3.0 * PERIOD + 1e-6
+    assert bench.sink.sent[-1][0] == pytest.approx(wave(20, speed=2.9)[15, 0], abs=1e-6)  # caught up
