@@ -24,7 +24,9 @@ class TickSettings:
     velocity: Float64  # [D] of motions of ours
     lower: Float64  # [D] joint limits
     upper: Float64
+    grippers: NDArray[np.bool_]  # [D] dimensions in a unit of their own
     binary: NDArray[np.bool_]  # [D] dimensions that switch and have no velocity
+    reach: Float64  # [D] what one rad of acceleration is in the dimension's own unit
     safety: SafetySettings
     heartbeat_timeout: float
     starvation_hold: float
@@ -59,10 +61,15 @@ class Actuator:
         self._last_planned = float("-inf")
 
     def engage(self, measured: Float64) -> None:
-        """Take the robot over where it stands: from now on something is sent on every tick."""
-        self.engaged = True
-        self.commanded = measured.copy()
+        """Take the robot over where it stands: from now on something is sent on every tick.
+
+        The grippers of a robot that was engaged before keep their command: closing on an object, they measure
+        wider than they were told, and would let go.
+        """
+        keep = self._settings.grippers & self.engaged
+        self.commanded = np.where(keep, self.commanded, measured)
         self.velocity = np.zeros(len(measured))
+        self.engaged = True
 
     def elapsed(self, planned: float) -> float:
         """Time since the last tick as limits may use it: half a period to 1.5 periods."""
@@ -78,8 +85,9 @@ class Actuator:
         bounds, speed = self._settings, self.velocity
         ahead = np.where(speed > 0, bounds.upper - self.commanded, self.commanded - bounds.lower)
         needed = speed * speed / (2.0 * np.maximum(ahead, 1e-9))
-        rate = np.clip(needed, bounds.safety.brake_acceleration, bounds.safety.acceleration)
-        return Brake(self.commanded.copy(), speed.copy(), rate)
+        softest = bounds.safety.brake_acceleration * bounds.reach
+        rate = np.clip(needed, softest, np.maximum(softest, bounds.safety.acceleration * bounds.reach))
+        return Brake(self.commanded.copy(), speed.copy(), rate, bounds.lower, bounds.upper)
 
     def send(
         self, step: int, planned: float, target: Target, action: Float64, notes: tuple[str, ...] = ()

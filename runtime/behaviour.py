@@ -5,6 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import numpy as np
+
 from runtime.motion import Motion
 from runtime.recording.base import ControlSource
 from runtime.safety import Path
@@ -32,8 +34,11 @@ class Behaviour(ABC):
     moving = False  # whether the robot is meant to be in motion
 
     @abstractmethod
-    def target(self, step: int, now: float) -> Target | None:
-        """What to send for tick `step` planned at `now`; None where nothing is to be sent."""
+    def target(self, step: int, elapsed: float) -> Target | None:
+        """What to send for tick `step`, `elapsed` seconds after the one before; None where nothing is to be sent.
+
+        `elapsed` is what limits may use: after a stall a motion goes on where it was, it does not catch up.
+        """
 
 
 class Silent(Behaviour):
@@ -41,7 +46,7 @@ class Silent(Behaviour):
 
     name = "silent"
 
-    def target(self, step: int, now: float) -> Target | None:
+    def target(self, step: int, elapsed: float) -> Target | None:
         return None
 
 
@@ -50,29 +55,45 @@ class Hold(Behaviour):
 
     name = "hold"
 
-    def __init__(self, brake: Motion, started: float) -> None:
+    def __init__(self, brake: Motion) -> None:
         self._brake = brake
-        self._started = started
+        self._time = 0.0
 
-    def target(self, step: int, now: float) -> Target | None:
-        return Target(self._brake.at(now - self._started), "hold", None)
+    @property
+    def standing(self) -> bool:
+        """Whether it has come to a stand."""
+        return self._time >= self._brake.duration
+
+    def target(self, step: int, elapsed: float) -> Target | None:
+        self._time += elapsed
+        return Target(self._brake.at(self._time), "hold", None)
 
 
 class Move(Behaviour):
-    """Runs a trajectory of ours."""
+    """Comes to a stand, then runs a trajectory of ours; its time goes on only with what was sent."""
 
     name = "motion"
     moving = True
 
-    def __init__(self, motion: Motion, started: float) -> None:
+    def __init__(self, brake: Motion, motion: Motion, goal: Float64) -> None:
+        self.goal = goal
+        self._brake = brake
         self._motion = motion
-        self._started = started
+        self._time = self._next = 0.0
 
-    def target(self, step: int, now: float) -> Target | None:
-        return Target(self._motion.at(now - self._started), "motion", "motion")
+    def target(self, step: int, elapsed: float) -> Target | None:
+        self._next = self._time + elapsed
+        if self._next < self._brake.duration:
+            return Target(self._brake.at(self._next), "motion", None)
+        return Target(self._motion.at(self._next - self._brake.duration), "motion", "motion")
 
-    def finished(self, now: float) -> bool:
-        return now - self._started >= self._motion.duration
+    def sent(self) -> None:
+        """The newest target was sent, and not refused."""
+        self._time = self._next
+
+    @property
+    def finished(self) -> bool:
+        return self._time >= self._brake.duration + self._motion.duration
 
 
 class Follow(Behaviour):
@@ -85,7 +106,7 @@ class Follow(Behaviour):
         self.run = run
         self.timeline = timeline
 
-    def target(self, step: int, now: float) -> Target | None:
+    def target(self, step: int, elapsed: float) -> Target | None:
         planned = self.timeline.at(step)
         if planned is None:
             return None
@@ -93,15 +114,26 @@ class Follow(Behaviour):
 
 
 class EStopped(Behaviour):
-    """Sends the measured position on every tick, or the last command where the measurement is old.
+    """Sends where the robot was measured, or the last command where that is not known.
 
-    `position` float64 [D] is renewed by the tick; None, nothing is sent, while it is not known.
+    It goes along with the measurement for `_FOLLOWS_S`, while the arm comes to rest, and then keeps it: an arm
+    that is sent its own measurement for ever sinks under its weight. `position` float64 [D], None before the
+    robot was ever measured: nothing is sent then.
     """
 
     name = "estop"
+    _FOLLOWS_S = 0.5
 
     def __init__(self, position: Float64 | None) -> None:
         self.position = position
+        self._time = 0.0
 
-    def target(self, step: int, now: float) -> Target | None:
+    def see(self, position: Float64, farthest: float) -> None:
+        """Where the robot is now; taken over while it comes to rest, and where it is `farthest` rad away."""
+        late = self._time > self._FOLLOWS_S
+        if self.position is None or not late or np.abs(position - self.position).max() > farthest:
+            self.position = position
+
+    def target(self, step: int, elapsed: float) -> Target | None:
+        self._time += elapsed
         return None if self.position is None else Target(self.position, "estop", None)

@@ -20,17 +20,22 @@ class Motion(ABC):
 
 
 class Brake(Motion):
-    """Constant deceleration of every joint from its velocity to rest."""
+    """Constant deceleration of every joint from its velocity to rest, never beyond `lower` and `upper`."""
 
-    def __init__(self, q: Float64, velocity: Float64, deceleration: Float64) -> None:
+    def __init__(
+        self, q: Float64, velocity: Float64, deceleration: Float64, lower: Float64, upper: Float64
+    ) -> None:
         self._q, self._velocity = q, velocity
         self._deceleration = deceleration
+        # A joint that is outside already may stay there.
+        self._lower, self._upper = np.minimum(lower, q), np.maximum(upper, q)
         self._stop = np.abs(velocity) / deceleration
         self.duration = float(self._stop.max(initial=0.0))
 
     def at(self, elapsed: float) -> Float64:
         t = np.minimum(elapsed, self._stop)
-        return self._q + self._velocity * t - 0.5 * np.sign(self._velocity) * self._deceleration * t * t
+        way = self._velocity * t - 0.5 * np.sign(self._velocity) * self._deceleration * t * t
+        return np.clip(self._q + way, self._lower, self._upper)
 
 
 class Trajectory(Motion):

@@ -13,6 +13,9 @@ from runtime.section import Section
 from runtime.types import Float64
 
 _TOLERANCE = 1e-6
+_MARGIN = 1.05
+# At the default 60 rad/s2 a gripper then covers its travel from rest to rest in 0.1 s, as real ones do.
+GRIPPER_TRAVEL = 6.7
 
 
 class WorkspaceBox(Section):
@@ -88,6 +91,15 @@ class Limits:
     grippers: np.ndarray  # bool [D]: own unit, not radians
     binary: np.ndarray  # bool [D]
 
+    @property
+    def reach(self) -> Float64:
+        """What one radian is worth in each dimension [D]: 1 for angles.
+
+        A gripper's accelerations are scaled so that its whole travel counts as much as GRIPPER_TRAVEL radians,
+        whatever its unit: metres, 0..1, 0..100.
+        """
+        return np.where(self.grippers, (self.upper - self.lower) * GRIPPER_TRAVEL, 1.0)
+
 
 Path = Literal["policy", "motion"]
 
@@ -118,10 +130,10 @@ class SafetyFilter:
         refusal = self._refusal(action, state, path)
         if refusal and not self._settings.report_only:
             return Verdict(None, (refusal,))
-        reachable, notes = self._reachable(action, state)
+        reachable, notes = self._reachable(action, state, path)
         if self._settings.report_only:
             return Verdict(action, (*filter(None, [refusal]), *notes, *self._excess(action)))
-        violation = self._violation(reachable, state)
+        violation = self._violation(reachable, state) or self._box_violation(reachable, state, path)
         if violation:
             return Verdict(None, (*notes, violation))
         return Verdict(reachable, notes)
@@ -172,13 +184,26 @@ class SafetyFilter:
             return ""
         return f"{self._limits.names[worst]} jumps {jump[worst]:.2f} rad, allowed {self._settings.jump:g}"
 
-    def _reachable(self, action: Float64, state: RobotState) -> tuple[Float64, tuple[str, ...]]:
-        limits, dt = self._limits, state.elapsed
-        a = self._settings.acceleration
-        scale = self._settings.velocity_scale
-        top = limits.velocity * scale
-        up = np.minimum(top, _stopping_speed(limits.upper - state.previous, a, dt))
-        down = -np.minimum(top, _stopping_speed(state.previous - limits.lower, a, dt))
+    def _box_violation(self, reachable: Float64, state: RobotState, path: Path) -> str:
+        """The box also holds for what is really sent, and for where the arm would come to a stand after it."""
+        if self._outside is None or path == "motion":
+            return ""
+        velocity = (reachable - state.previous) / state.elapsed
+        a = self._settings.brake_acceleration * self._limits.reach
+        stop = reachable + velocity * np.abs(velocity) / (2.0 * a)
+        return self._leaves_box(reachable) or self._leaves_box(stop)
+
+    def _reachable(self, action: Float64, state: RobotState, path: Path) -> tuple[Float64, tuple[str, ...]]:
+        limits, dt, settings = self._limits, state.elapsed, self._settings
+        stopping = settings.acceleration * limits.reach
+        if path == "motion":
+            # A motion is planned at its limits; the margin keeps rounding from counting as excess.
+            a = settings.motion_acceleration * limits.reach * _MARGIN
+            top = limits.velocity * settings.motion_velocity_scale * _MARGIN
+        else:
+            a, top = stopping, limits.velocity * settings.velocity_scale
+        up = np.minimum(top, _stopping_speed(limits.upper - state.previous, stopping, dt))
+        down = -np.minimum(top, _stopping_speed(state.previous - limits.lower, stopping, dt))
         fastest = np.minimum(up, state.velocity + a * dt)
         slowest = np.maximum(down, state.velocity - a * dt)
         # Where the two contradict (a limit was changed, a stall), braking as hard as allowed wins.
@@ -229,7 +254,7 @@ def _outside(action: Float64, limits: Limits) -> Float64:
     return np.maximum(np.maximum(limits.lower - action, action - limits.upper), 0.0)
 
 
-def _stopping_speed(distance: Float64, acceleration: float, dt: float) -> Float64:
+def _stopping_speed(distance: Float64, acceleration: Float64, dt: float) -> Float64:
     """The largest v with v dt + v^2 / (2 a) <= distance: after this step the joint can still stop in time."""
     d = np.maximum(distance, 0.0)
     return np.asarray(acceleration * (np.sqrt(dt * dt + 2.0 * d / acceleration) - dt))

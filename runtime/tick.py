@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -20,6 +21,10 @@ from runtime.transports.base import Sink
 from runtime.types import Float64
 
 __all__ = ["Tick", "TickSettings"]
+_UNSEEN_S = 0.5  # without joints: whatever has happened to the robot meanwhile was not seen
+_RETURNED_AWAY = 0.1  # [rad] that an arm may be off after that, by sagging
+_ARRIVED = 1e-4  # [rad] of a motion's end: it may have been limited on its last steps
+_JOINED_AT_ONCE = 0.05  # [rad] that a run's first action may be off without being blended in
 
 
 class Tick:
@@ -46,8 +51,12 @@ class Tick:
         self._report = Report(page)
         self.timeline = Timeline(page.layout.dim)
         # A restarted control goes on holding where its predecessor stood; a new one keeps silent.
-        self._behaviour: Behaviour = self._holding(clock()) if self._actuator.engaged else Silent()
+        self._behaviour: Behaviour = self._holding() if self._actuator.engaged else Silent()
+        self._standing: Hold | None = None  # a stop in place of what could not be sent
         self._refused = 0
+        # Refusals among the last actions: every second one refused is as bad as all of them.
+        self._verdicts: deque[bool] = deque(maxlen=2 * settings.safety.refusals_to_hold)
+        self._unseen_since: float | None = None
         self._starved_since: float | None = None
         self._waiting = True  # for a run's first chunk: no starvation yet, the policy's deadline bounds it
         self.orphaned = False
@@ -59,6 +68,7 @@ class Tick:
             self._obey(decode(payload), step, planned)
         self._check_estop(planned)
         self._check_family(planned)
+        self._check_displaced(planned)
         sent = self._send(step, planned)
         self._finish_motion(planned, sent)
         self._report.record(step, planned, self._observation, sent)
@@ -79,18 +89,18 @@ class Tick:
                 self._follow_order(message, now)
 
     def _follow_order(self, order: Order, now: float) -> None:
+        if order.kind != "hold":
+            self._standing = None
         if order.kind == "silent":
             self._actuator.engaged = False
             self._behaviour = Silent()
         elif order.kind == "hold":
             self._hold(now)
         elif order.kind == "motion" and order.goal is not None and self._engage(now):
-            rate = np.full(len(order.goal), self._settings.safety.motion_acceleration)
-            path = Trajectory(self._actuator.commanded, order.goal, self._settings.velocity, rate)
-            self._refused = 0
-            self._behaviour = Move(path, now)
+            self._forget_refusals()
+            self._move(order.goal)
         elif order.kind == "follow" and self._engage(now):
-            self._refused = 0
+            self._forget_refusals()
             self._starved_since = None
             self._waiting = True
             self.timeline.clear()
@@ -103,14 +113,14 @@ class Tick:
             delay = step - chunk.observation_step
             self._report.merged(ChunkMerged(chunk.chunk_id, chunk.run, step, delay, targets, 0, why))
             return
-        starved = self._starved_since is not None and not self._merge.waits
-        if starved:
-            # The plan ran out: blend the new chunk over from the target that is being held.
+        held_before = (self._starved_since is not None or self._far(chunk.rows[0])) and not self._merge.waits
+        if held_before:
+            # Nothing was planned: blend the new chunk over from the target that is being held.
             held = np.repeat(self._actuator.commanded[None], len(chunk.rows), 0)
             self.timeline.replace(step, held, [()] * len(chunk.rows))
         arrival = Arrival(chunk.chunk_id, chunk.observation_step, chunk.rows)
         merged = self._merge(self.timeline, arrival, step)
-        if starved and merged.dropped:
+        if held_before and merged.dropped:
             self.timeline.clear()  # what was only laid out to be blended with is no plan
         self._waiting = False  # also where it was dropped: a policy that is always too late starves
         self._report.merged(
@@ -124,6 +134,13 @@ class Tick:
                 merged.dropped,
             )
         )
+
+    def _far(self, row: Float64) -> bool:
+        """Whether a run's first chunk begins too far from where the robot is held to be joined at once."""
+        if not self._waiting or self._settings.safety.report_only:
+            return False
+        away = np.abs(row - self._actuator.commanded)
+        return bool(np.where(self._settings.grippers, 0.0, away).max() > _JOINED_AT_ONCE)
 
     # --- behaviours ----------------------------------------------------------------------------------------
 
@@ -146,11 +163,21 @@ class Tick:
 
     def _hold(self, now: float) -> None:
         if self._actuator.engaged and not isinstance(self._behaviour, Hold):
-            self._behaviour = self._holding(now)
+            self._behaviour = self._standing or self._holding()
 
-    def _holding(self, now: float) -> Hold:
-        # The first point is already one tick on.
-        return Hold(self._actuator.brake(), now - self._actuator.elapsed(now))
+    def _holding(self) -> Hold:
+        return Hold(self._actuator.brake())
+
+    def _move(self, goal: Float64) -> None:
+        """Come to a stand, then go to `goal`."""
+        brake = self._actuator.brake()
+        rate = self._settings.safety.motion_acceleration * self._settings.reach
+        path = Trajectory(brake.at(brake.duration), goal, self._settings.velocity, rate)
+        self._behaviour = Move(brake, path, goal)
+
+    def _forget_refusals(self) -> None:
+        self._refused = 0
+        self._verdicts.clear()
 
     def _hold_because(self, kind: str, reason: str, now: float) -> None:
         """Hold for a reason of control's own, and say so."""
@@ -165,14 +192,39 @@ class Tick:
             self._behaviour = EStopped(self._actuator.commanded.copy() if self._actuator.engaged else None)
             self._report.say("estopped", "e-stop", now)
         elif not latched and isinstance(self._behaviour, EStopped):
-            self._behaviour = self._holding(now) if self._actuator.engaged else Silent()
+            self._behaviour = self._holding() if self._actuator.engaged else Silent()
             self._report.say("released", "e-stop released", now)
         if isinstance(self._behaviour, EStopped):
             measured = self._measured(now)
             if measured is not None:
-                self._behaviour.position = measured
                 if not self._actuator.engaged:
                     self._actuator.engage(measured)
+                # An object in the gripper keeps it open: its command stays, or it would let go.
+                seen = np.where(self._settings.grippers, self._actuator.commanded, measured)
+                self._behaviour.see(seen, self._settings.safety.following_error)
+
+    def _check_displaced(self, now: float) -> None:
+        """Hold where the robot is, and not where it was told to hold, once these are far apart.
+
+        It was moved by hand, switched off, or its node was restarted: to send the old target would make it move
+        by itself.
+        """
+        measured = self._measured(now)
+        if measured is None:
+            self._unseen_since = now if self._unseen_since is None else self._unseen_since
+            return
+        returned = self._unseen_since is not None and now - self._unseen_since > _UNSEEN_S
+        self._unseen_since = None
+        held = isinstance(self._behaviour, Hold) and self._actuator.engaged
+        if not held or self._settings.safety.report_only:
+            return
+        away = np.where(self._settings.grippers, 0.0, np.abs(measured - self._actuator.commanded))
+        allowed = _RETURNED_AWAY if returned else self._settings.safety.following_error
+        if away.max() > allowed:
+            self._actuator.engage(measured)
+            self._behaviour = self._holding()
+            text = f"the robot is {away.max():.2f} rad from where it was told to hold: holding where it is"
+            self._report.say("displaced", text, now)
 
     def _check_family(self, now: float) -> None:
         if self.orphaned:
@@ -188,15 +240,18 @@ class Tick:
         """A motion is done when its end has been sent: not refused, and not limited on the way there."""
         if not isinstance(self._behaviour, Move) or sent.target is None or sent.executed is None:
             return
-        there = not sent.refused and np.allclose(sent.executed, sent.target.action, atol=1e-6)
-        if there and self._behaviour.finished(now):
-            self._behaviour = self._holding(now)
+        if sent.refused:
+            self._move(self._behaviour.goal)  # from where it stands, when it may go on
+            return
+        self._behaviour.sent()
+        if self._behaviour.finished and np.allclose(sent.executed, self._behaviour.goal, atol=_ARRIVED):
+            self._behaviour = self._holding()
             self._report.say("motion_done", "arrived", now)
 
     # --- sending -------------------------------------------------------------------------------------------
 
     def _send(self, step: int, planned: float) -> Sent:
-        target = self._behaviour.target(step, planned)
+        target = self._behaviour.target(step, self._actuator.elapsed(planned))
         if self._page.estop is EStop.UNKNOWN:
             return Sent(planned)
         if target is None:
@@ -207,6 +262,8 @@ class Tick:
         if verdict.action is None:
             return self._refuse(step, planned, target, verdict.notes)
         self._refused = 0
+        self._verdicts.append(False)
+        self._standing = None
         self._recover(planned)
         return self._actuator.send(step, planned, target, verdict.action, verdict.notes)
 
@@ -224,17 +281,23 @@ class Tick:
 
     def _refuse(self, step: int, planned: float, target: Target, notes: tuple[str, ...]) -> Sent:
         self._refused += 1
+        self._verdicts.append(True)
         if self._refused == 1:
             self._report.say("refused", notes[-1], planned)
-        if self._refused >= self._settings.safety.refusals_to_hold:
-            text = f"{self._refused} actions refused in a row, the last one: {notes[-1]}"
+        refused = sum(self._verdicts)
+        if refused >= self._settings.safety.refusals_to_hold:
+            how = "in a row" if refused == self._refused else f"of the last {len(self._verdicts)}"
+            text = f"{refused} actions refused {how}, the last one: {notes[-1]}"
             self._hold_because("refusals", text, planned)
         return replace(self._stand(step, planned), target=target, notes=notes, refused=True)
 
     def _stand(self, step: int, planned: float) -> Sent:
         """Send the next point of a stop instead of what could not be sent."""
-        point = self._actuator.brake().at(self._actuator.elapsed(planned))
-        return replace(self._actuator.send(step, planned, Target(point, "hold", None), point), target=None)
+        if self._standing is None:
+            self._standing = self._holding()
+        target = self._standing.target(step, self._actuator.elapsed(planned))
+        assert target is not None
+        return replace(self._actuator.send(step, planned, target, target.action), target=None)
 
     def _starve(self, step: int, planned: float) -> Sent:
         if not (self._merge.waits or self._waiting):

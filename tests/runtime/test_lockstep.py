@@ -262,7 +262,8 @@ def test_the_e_stop_in_the_middle_of_a_run_faults_and_sends_the_measured_positio
     station.go(20)
     assert station.state is State.FAULTED
     assert "ada: smoke" in station.reason
-    assert (station.robot.sent[-18:] == (STANDS + 0.01).astype(np.float32)).all()
+    arms = [dim for dim in range(len(STANDS)) if dim not in station.plan.robot.gripper_dims]
+    assert (station.robot.sent[-12:, arms] == (STANDS + 0.01).astype(np.float32)[arms]).all()
     for kind in ("setup", "run", "resume", "home"):
         with pytest.raises(SetupError, match="not allowed while faulted"):
             station.command(kind)

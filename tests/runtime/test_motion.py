@@ -45,9 +45,17 @@ def test_going_nowhere_takes_no_time():
 
 @given(angles, angles, st.floats(1, 60))
 def test_a_brake_never_reverses_and_comes_to_rest(q, velocity, deceleration):
-    brake = Brake(q, velocity, np.full(4, deceleration))
+    brake = Brake(q, velocity, np.full(4, deceleration), np.full(4, -99.0), np.full(4, 99.0))
     end = brake.at(brake.duration)
     assert np.allclose(brake.at(brake.duration + 5), end)
     assert np.allclose(end, q + np.sign(velocity) * velocity**2 / (2 * deceleration), atol=1e-9)
     _, path = samples(brake, 200)
     assert (np.diff(path, axis=0) * np.sign(velocity) >= -1e-9).all()
+
+
+def test_a_brake_never_leaves_the_limits_and_a_joint_outside_them_may_stay():
+    lower, upper = np.full(2, -1.0), np.full(2, 1.0)
+    brake = Brake(np.array([0.99, 1.2]), np.array([2.0, 0.5]), np.full(2, 5.0), lower, upper)
+    _, path = samples(brake, 100)
+    assert path[:, 0].max() <= 1.0
+    assert path[:, 1].max() <= 1.2

@@ -44,12 +44,22 @@ class Bench:
         self.before_send = lambda: None
         self.tick = self.new_tick()
         self.feed = self.alive = True
+        self.moved_by_hand = None
 
     def new_tick(self):
         no = np.zeros(2, bool)
         limits = Limits(("a", "b"), np.full(2, -2.0), np.full(2, 2.0), np.full(2, 3.0), no, no)
         settings = TickSettings(
-            PERIOD, np.full(2, 1.0), limits.lower, limits.upper, limits.binary, self.safety, 1.0, 1.0
+            period=PERIOD,
+            velocity=limits.velocity * self.safety.motion_velocity_scale,
+            lower=limits.lower,
+            upper=limits.upper,
+            grippers=limits.grippers,
+            binary=limits.binary,
+            reach=limits.reach,
+            safety=self.safety,
+            heartbeat_timeout=1.0,
+            starvation_hold=1.0,
         )
         safety = SafetyFilter(self.safety, limits)
         return Tick(self.page, self.sink, safety, self.merge, settings, self.time_of_sending)
@@ -89,7 +99,9 @@ class Bench:
             self.tick(self.step, self.clock.now())
             self.step += 1
             self.clock.advance(PERIOD * stretch)
-            if self.sink.sent:
+            if self.moved_by_hand is not None:
+                self.measured = self.moved_by_hand
+            elif self.sink.sent:
                 self.measured = self.sink.sent[-1].astype(float)
 
     def said(self, kind=None):
@@ -156,7 +168,7 @@ def test_a_stop_decelerates_and_then_the_held_target_is_sent_on_every_tick(bench
 def test_a_motion_arrives_holds_and_says_so(bench):
     bench.say("motion", goal=np.array([0.5, -0.5]))
     bench.run(60)
-    assert np.allclose(bench.sink.sent[-1], [0.5, -0.5], atol=1e-6)
+    assert np.allclose(bench.sink.sent[-1], [0.5, -0.5], atol=1e-3)
     assert [e.kind for e in bench.said("motion_done")] == ["motion_done"]
     assert bench.behaviour == "hold"
 
@@ -427,7 +439,7 @@ def test_a_motion_that_was_refused_for_a_while_still_comes_to_its_end(bench):
     bench.feed = True
     bench.run(25)
     assert [e.kind for e in bench.said()] == ["refused", "motion_done"]
-    assert np.allclose(bench.sink.sent[-1], [0.8, 0.0], atol=1e-6)
+    assert np.allclose(bench.sink.sent[-1], [0.8, 0.0], atol=1e-3)
 
 
 def test_a_stop_is_no_harder_than_the_brake_allows(bench):
@@ -447,3 +459,128 @@ def test_full_speed_is_gathered_within_the_acceleration_and_then_kept(bench):
     assert steps[0] == pytest.approx(60.0 * PERIOD**2, abs=1e-6)
     assert steps.max() <= 3.0 * PERIOD + 1e-6
     assert bench.sink.sent[-1][0] == pytest.approx(wave(20, speed=2.9)[15, 0], abs=1e-6)  # caught up
+
+
+# --- what a robot may do meanwhile -------------------------------------------------------------------------
+
+
+def test_an_arm_that_was_moved_while_held_is_held_where_it_is_now(bench):
+    following(bench)
+    bench.say("hold", run=1)
+    bench.run(10)
+    bench.moved_by_hand = np.array([0.9, 0.1])
+    bench.run(3)
+    assert np.allclose(bench.sink.sent[-1], [0.9, 0.1])
+    assert bench.said("displaced")
+    bench.moved_by_hand = None
+    bench.say("motion", goal=np.zeros(2))
+    bench.run(90)
+    assert np.allclose(bench.sink.sent[-1], 0.0, atol=1e-3)  # and it is not stuck there
+
+
+def test_a_robot_that_comes_back_elsewhere_after_it_was_not_seen_is_held_where_it_is(bench):
+    following(bench, wave(60, speed=1.0))
+    bench.run(20)
+    bench.say("hold", run=1)
+    bench.run(10)
+    held = bench.sink.sent[-1].copy()
+    bench.feed = False
+    bench.run(30)
+    bench.feed = True
+    bench.measured = bench.moved_by_hand = held.astype(float) - 0.3  # less than the following error, as after a power cycle
+    bench.run(3)
+    assert np.allclose(bench.sink.sent[-1], held - 0.3, atol=1e-6)
+
+
+def test_an_arm_that_sags_a_little_is_held_at_its_target(bench):
+    following(bench)
+    bench.say("hold", run=1)
+    bench.run(10)
+    held = bench.sink.sent[-1].copy()
+    bench.moved_by_hand = held.astype(float) - 0.05
+    bench.run(60)
+    assert (bench.sink.sent[-1] == held).all()
+
+
+def test_an_arm_under_e_stop_does_not_sink_under_its_own_measurement(bench):
+    following(bench)
+    bench.run(5)
+    bench.page.set_estop(EStop.LATCHED)
+    bench.run(1)
+    for _ in range(90):  # a joint that always ends up a little below where it is told to be
+        bench.moved_by_hand = bench.sink.sent[-1].astype(float) - 0.02
+        bench.run(1)
+    sunk = bench.sink.sent[5] - bench.sink.sent[-1]
+    assert sunk.max() < 0.5
+
+
+def test_a_gap_brakes_as_hard_as_a_stop_does(bench):
+    fast = Bench(following_error=9.0, jump=9.0)
+    following(fast, wave(12, speed=2.0))
+    fast.run(25)
+    sent = np.array(fast.sink.sent)[:, 0]
+    way = sent[-1] - sent[11]
+    assert way == pytest.approx(2.0**2 / (2 * 20.0), rel=0.05)  # v^2 / 2a, not twice that
+
+
+def test_a_gap_near_a_joint_limit_ends_before_it(bench):
+    fast = Bench(following_error=9.0, jump=9.0)
+    following(fast, wave(20, speed=2.9, start=0.0))
+    fast.run(40)
+    assert np.max(fast.sink.sent) <= 2.0 + 1e-6
+
+
+def test_a_motion_goes_on_where_it_was_after_a_stall_and_keeps_its_own_limits(bench):
+    bench.say("motion", goal=np.array([1.5, 0.0]))
+    bench.run(20)
+    bench.step += 15
+    bench.clock.advance(0.5)
+    bench.run(120)
+    sent = np.array(bench.sink.sent)[:, 0]
+    speed = bench.safety.motion_velocity_scale * 3.0 * 1.06
+    assert np.diff(sent).max() <= speed * 1.5 * PERIOD
+    assert sent[-1] == pytest.approx(1.5, abs=1e-3)
+
+
+def test_a_motion_that_was_refused_for_a_while_starts_anew_from_where_it_stands(bench):
+    bench.say("motion", goal=np.array([1.5, 0.0]))
+    bench.run(20)
+    bench.feed = False
+    bench.run(13)  # some ticks within the joints' age, then refusals, fewer than lead to holding
+    bench.feed = True
+    bench.run(150)
+    sent = np.array(bench.sink.sent)[:, 0]
+    speeds = np.diff(sent) / PERIOD
+    assert speeds.max() <= 0.9 * 1.06
+    assert np.abs(np.diff(speeds)).max() <= 20.0 * PERIOD * 1.06  # the stop's deceleration, never a jerk
+    assert sent[-1] == pytest.approx(1.5, abs=1e-3)
+
+
+def test_a_motion_ordered_in_full_motion_stops_first(bench):
+    fast = Bench(following_error=9.0, jump=9.0)
+    following(fast, wave(60, speed=1.5))
+    fast.run(20)
+    fast.say("motion", goal=np.zeros(2))
+    fast.run(120)
+    speeds = np.diff(np.array(fast.sink.sent)[:, 0]) / PERIOD
+    assert np.abs(np.diff(speeds)[20:]).max() <= 20.0 * PERIOD * 1.06
+    assert fast.sink.sent[-1] == pytest.approx(np.zeros(2), abs=1e-3)
+
+
+def test_a_run_that_begins_elsewhere_is_blended_from_the_held_target(bench):
+    bench.say("follow", run=1)
+    bench.chunk(1, wave(60, speed=0.1, start=0.4))
+    bench.run(30)
+    sent = np.array(bench.sink.sent)[:, 0]
+    assert np.diff(sent).max() < 0.08
+    assert sent[0] == pytest.approx(0.0, abs=1e-6)
+    assert sent[-1] == pytest.approx(wave(60, 0.1, 0.4)[29, 0], abs=1e-5)
+
+
+def test_every_second_action_refused_is_as_bad_as_all_of_them(bench):
+    rows = wave(120)
+    rows[6::2] = np.nan
+    following(bench, rows)
+    bench.run(40)
+    assert bench.behaviour == "hold"
+    assert "of the last" in bench.said("refusals")[0].text
