@@ -43,6 +43,11 @@ class Runner(ABC):
     @abstractmethod
     def ready(self, future: Future[Result]) -> bool: ...
 
+    @property
+    @abstractmethod
+    def busy(self) -> bool:
+        """Whether an earlier call is still being made, and another would wait behind it."""
+
     def tick(self) -> None:  # noqa: B027  # only runners that count have something to do
         """One control period has passed."""
 
@@ -70,12 +75,19 @@ class ThreadRunner(Runner):
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
+        self._newest: Future[Any] | None = None
 
     def submit(self, call: Callable[[], Result]) -> Future[Result]:
-        return self._pool.submit(_told(call))
+        future = self._pool.submit(_told(call))
+        self._newest = future
+        return future
 
     def ready(self, future: Future[Result]) -> bool:
         return future.done()
+
+    @property
+    def busy(self) -> bool:
+        return self._newest is not None and not self._newest.done()
 
     def close(self) -> None:
         self._pool.shutdown(wait=False, cancel_futures=True)
@@ -100,6 +112,10 @@ class LockstepRunner(Runner):
 
     def ready(self, future: Future[Result]) -> bool:
         return self._now >= self._due[future]
+
+    @property
+    def busy(self) -> bool:
+        return False
 
     def tick(self) -> None:
         self._now += 1
@@ -246,7 +262,8 @@ class Inference:
                 return None
             flight, self._flight = self._flight, None
             return self._post(flight.result())
-        if self._query.wants(self._progress()) and self._try_to_ask():
+        # A late answer of an earlier run may keep the policy busy: a request would grow old in the queue.
+        if not self.runner.busy and self._query.wants(self._progress()) and self._try_to_ask():
             return self.pump()
         return None
 

@@ -11,12 +11,12 @@ from typing import Any
 
 from runtime.clock import VirtualClock
 from runtime.control import make_tick
+from runtime.director import Director
 from runtime.errors import SetupError
 from runtime.family import Plan
 from runtime.guard import Guard
 from runtime.inference import LockstepRunner
 from runtime.latch import Latch
-from runtime.main import Main
 from runtime.media import Media, make_recorder
 from runtime.messages import Ack, Command
 from runtime.page import Page
@@ -51,7 +51,7 @@ class Lockstep:
         recorder = make_recorder(plan, self.clock.now, patient=True)
         self.media = Media(self.page, self._source, recorder, self.clock)
         self._runner = LockstepRunner(settings.lockstep.delay_ticks)
-        self.main = Main(plan, self.page, self.clock, self._runner)
+        self.main = Director(plan, self.page, self.clock, self._runner)
         self._tick = make_tick(plan, self.page, self._sink, self.clock.now)
         self.step = 0
 
@@ -137,6 +137,6 @@ def run(plan: Plan, longest: float = 3600.0) -> LockstepRun:
             station.command("stop")
         for _ in range(3):  # the end goes from main to media and back
             station.tick()
-        return LockstepRun(station.main.last_episode, how, why, station.step, station.main.events.since(0))
+        return LockstepRun(station.main.runs.last_episode, how, why, station.step, station.main.events.since(0))
     finally:
         station.close()

@@ -11,6 +11,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -18,12 +19,17 @@ _LENGTH_CRC = struct.Struct("<II")
 _ALIGN = 64  # one cache line, so that two writers never share one
 
 
-def word(memory: mmap.mmap, offset: int, kind: str = "q") -> memoryview:
-    """One aligned 8-byte cell ("q" integer, "d" float) that is always seen whole.
+def word(memory: mmap.mmap, offset: int) -> memoryview[int]:
+    """One aligned 8-byte integer that is always seen whole.
 
     Not struct.pack_into: it clears the bytes before it writes them, and a reader can see the zeros.
     """
-    return memoryview(memory)[offset : offset + 8].cast(kind)
+    return memoryview(memory)[offset : offset + 8].cast("q")
+
+
+def real(memory: mmap.mmap, offset: int) -> memoryview[float]:
+    """One aligned 8-byte float, likewise."""
+    return memoryview(memory)[offset : offset + 8].cast("d")
 
 
 def aligned(size: int) -> int:
@@ -70,7 +76,7 @@ class Record:
         """How often the record was written; 0 = never."""
         return int(self._version[0])
 
-    def write(self, value: np.void) -> None:
+    def write(self, value: np.void | np.ndarray[Any, np.dtype[np.void]]) -> None:
         """Make `value` the record's content; visible to readers whole or not at all."""
         version = self.version + 1
         start = self._offset + _ALIGN + (version & 1) * self._slot
@@ -84,13 +90,18 @@ class Record:
         for _ in range(100):
             version = self.version
             if version == 0:
-                return np.zeros((), self._dtype)[()]
+                return _only(np.zeros(1, self._dtype))
             start = self._offset + _ALIGN + (version & 1) * self._slot
             checksum = self._memory[start : start + 4]
             payload = self._memory[start + 4 : start + 4 + self._dtype.itemsize]
             if zlib.crc32(payload).to_bytes(4, "little") == checksum:
-                return np.frombuffer(payload, self._dtype)[0]
+                return _only(np.frombuffer(payload, self._dtype))
         raise TornReadError(f"record at offset {self._offset} could not be read in 100 tries")
+
+
+def _only(records: np.ndarray[Any, np.dtype[np.void]]) -> np.void:
+    record: np.void = records[0]
+    return record
 
 
 class Ring:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+
 from runtime.errors import RuntimeFault
 from runtime.messages import Message, Order, OrderKind, PostedChunk, encode
 from runtime.page import Page
 from runtime.types import Float64
+
+log = logging.getLogger(__name__)
 
 
 class Orders:
@@ -19,7 +23,10 @@ class Orders:
     def give(self, kind: OrderKind, *, run: int = 0, goal: Float64 | None = None, reason: str = "") -> int:
         """Tell control what to do; returns the order's number, which control's status shows once obeyed."""
         self._number += 1
-        self._push(Order(self._number, kind, run, goal, reason))
+        try:
+            self._push(Order(self._number, kind, run, goal, reason))
+        except RuntimeFault as error:
+            log.error("order %s is lost: %s", kind, error)  # main goes on: it notices that control hangs
         return self._number
 
     def obeyed(self, number: int) -> bool:

@@ -103,7 +103,7 @@ class Page:
         self.layout = layout
         self._shared = shared
         offset = 0
-        self._beats = {name: memory.word(shared, _LINE * index, "d") for index, name in enumerate(PROCESSES)}
+        self._beats = {name: memory.real(shared, _LINE * index) for index, name in enumerate(PROCESSES)}
         offset += _LINE * len(PROCESSES)
         self._generations = {
             name: memory.word(shared, _LINE * index + 8) for index, name in enumerate(PROCESSES)
@@ -201,7 +201,7 @@ class Page:
         for index, camera in enumerate(self.layout.cameras):
             record["picture_captured"][index] = observation.captured.get(camera, np.nan)
             record["picture_number"][index] = pictures.get(camera, 0)
-        self.observation.write(record[()])
+        self.observation.write(record)
 
     def read_observation(self, cameras: Sequence[str]) -> Observation | None:
         """The newest observation with the pictures of `cameras`, copied; None before the first one.
@@ -247,7 +247,7 @@ class Page:
             qpos=np.array(record["qpos"]),
             pictures=pictures,
             last=bool(record["last"]),
-            **optional,
+            **optional,  # type: ignore[arg-type]  # names and types are those of Observation
         )
 
 

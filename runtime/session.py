@@ -28,6 +28,8 @@ class Happening(StrEnum):
     """What the session is told of by the rest of the runtime."""
 
     CONNECTED = "connected"  # a complete observation arrived
+    INCOMPLETE = "incomplete"  # observations arrive, but not from every camera
+    DISPLACED = "displaced"  # the arm is not where it was told to hold
     LINK_LOST = "link_lost"  # observations have been missing for long
     SETUP_DONE = "setup_done"
     SETUP_FAILED = "setup_failed"
@@ -100,7 +102,9 @@ COMMANDS: dict[str, Rule] = {
     "home": Rule((S.READY,), S.SETTING_UP, lambda e: e.go_home()),
     "release": Rule((S.FAULTED,), None, lambda e: e.release_estop()),
     "record_start": Rule((S.IDLE, S.READY), None, lambda e: e.start_recording()),
-    "record_stop": Rule((S.IDLE, S.READY, S.HOLDING), None, lambda e: e.stop_recording()),
+    "record_stop": Rule(
+        (S.DISCONNECTED, S.IDLE, S.SETTING_UP, S.READY, S.HOLDING), None, lambda e: e.stop_recording()
+    ),
 }
 # While it is being set up, both stopping commands mean the same: cancel.
 CANCELLING = ("stop", "halt")
@@ -111,6 +115,8 @@ ANSWERS_KEPT = 5000
 # What happens by itself: (happening, state) -> the state after it. Pairs that are not here change nothing.
 HAPPENINGS: dict[tuple[Happening, State], State] = {
     (Happening.CONNECTED, S.DISCONNECTED): S.IDLE,
+    (Happening.INCOMPLETE, S.DISCONNECTED): S.DISCONNECTED,
+    (Happening.DISPLACED, S.READY): S.IDLE,
     (Happening.LINK_LOST, S.IDLE): S.DISCONNECTED,
     (Happening.LINK_LOST, S.READY): S.DISCONNECTED,
     (Happening.LINK_LOST, S.SETTING_UP): S.DISCONNECTED,
@@ -178,7 +184,7 @@ class Session:
         A RuntimeFault of an effect passes through, with the state as it was: nobody is there to be refused.
         """
         after = HAPPENINGS.get((happening, self.state))
-        if after is None:
+        if after is None or (after is self.state and reason == self.reason):
             return False
         before = self.state
         if happening in (Happening.HELD, Happening.LEASE_ENDED, Happening.LINK_LOST):

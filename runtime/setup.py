@@ -121,7 +121,7 @@ class SetUp:
     def _require_family(self) -> None:
         """An order to a control that is still starting would be lost, and without a guard it only holds."""
         within = self._plan.deployment.control.heartbeat_timeout_s
-        for process in ("control", "guard"):
+        for process in ("control", "media", "guard"):
             if not self._page.alive(process, self._clock.now(), within):
                 raise SetupError(f"the process {process} gives no sign of life")
 

@@ -4,68 +4,92 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from runtime.main import Main
+from runtime.family import Plan
+from runtime.inference import Inference
+from runtime.lease import Lease
+from runtime.messages import MediaReport
+from runtime.page import Page
+from runtime.runs import Runs
+from runtime.session import Session
+from runtime.setup import SetUp
 
 
-def snapshot(main: Main) -> dict[str, Any]:
-    """The station's state at this moment; times in seconds on the runtime's clock, ages in seconds."""
-    now = main.clock.now()
-    session = main.session
+@dataclass(frozen=True, slots=True)
+class View:
+    """The parts of main that a snapshot shows, at the moment `now` of the runtime's clock."""
+
+    plan: Plan
+    page: Page
+    session: Session
+    lease: Lease
+    inference: Inference
+    setup: SetUp
+    runs: Runs
+    media: MediaReport
+    estop: str
+    boot: str
+    now: float
+    newest_event: int
+
+
+def snapshot(view: View) -> dict[str, Any]:
+    """The station's state; times in seconds on the runtime's clock, ages in seconds."""
+    settings, session = view.plan.deployment, view.session
     return {
-        "boot": main.boot,
+        "boot": view.boot,
         "sequence": session.sequence,
-        "clock": now,
-        "station": main.plan.deployment.station,
-        "robot": main.plan.robot.name,
+        "clock": view.now,
+        "station": settings.station,
+        "robot": view.plan.robot.name,
         "state": str(session.state),
         "reason": session.reason,
         "allowed": session.allowed(),
-        "stage": str(main.setup.stage),
-        "validated": main.setup.validated,
-        "task": main.plan.deployment.task,
-        "transport": main.plan.deployment.transport.kind,
-        "policy": {"kind": main.plan.deployment.policy.kind, **_inference(main)},
-        "strategy": main.plan.deployment.strategy.kind,
-        "lease": _lease(main, now),
-        "estop": main.estop_sentence,
-        "run": _run(main, now),
-        "recording": _recording(main),
-        "episode": main.last_episode,
-        "control": _control(main),
-        "link": _link(main, now),
-        "newest_event": main.events.newest,
+        "stage": str(view.setup.stage),
+        "validated": view.setup.validated,
+        "task": settings.task,
+        "transport": settings.transport.kind,
+        "policy": {"kind": settings.policy.kind, **_inference(view)},
+        "strategy": settings.strategy.kind,
+        "lease": _lease(view),
+        "estop": view.estop,
+        "run": _run(view),
+        "last_run": view.runs.last,
+        "recording": {
+            "uuid": view.media.recording,
+            "rows": view.media.rows,
+            "repeated": view.media.repeated,
+        },
+        "episode": view.runs.last_episode,
+        "control": control_figures(view.page, view.plan.rate),
+        "link": _link(view),
+        "newest_event": view.newest_event,
     }
 
 
-def _lease(main: Main, now: float) -> dict[str, Any]:
-    held = main.lease.current(now)
+def _lease(view: View) -> dict[str, Any]:
+    held = view.lease.current(view.now)
     if held is None:
-        return {"holder": "", "epoch": main.lease.epoch, "expires_in": 0.0}
-    return {"holder": held.holder, "epoch": held.epoch, "expires_in": held.until - now}
+        return {"holder": "", "epoch": view.lease.epoch, "expires_in": 0.0}
+    return {"holder": held.holder, "epoch": held.epoch, "expires_in": held.until - view.now}
 
 
-def _recording(main: Main) -> dict[str, Any]:
-    report = main.media_report
-    return {"uuid": report.recording, "rows": report.rows, "repeated": report.repeated}
-
-
-def _run(main: Main, now: float) -> dict[str, Any]:
-    run = main.run
+def _run(view: View) -> dict[str, Any]:
+    run = view.runs.open
     if run is None:
         return {"number": 0, "uuid": "", "elapsed": 0.0, "held": 0.0}
-    held = run.held + (now - run.held_since if run.held_since is not None else 0.0)
-    return {"number": run.number, "uuid": run.uuid, "elapsed": run.elapsed(now), "held": held}
+    held = run.held + (view.now - run.held_since if run.held_since is not None else 0.0)
+    return {"number": run.number, "uuid": run.uuid, "elapsed": run.elapsed(view.now), "held": held}
 
 
-def _inference(main: Main) -> dict[str, Any]:
-    latencies, delays = main.inference.latencies, main.inference.delays
+def _inference(view: View) -> dict[str, Any]:
+    latencies, delays = view.inference.latencies, view.inference.delays
     return {
-        "name": main.setup.info.name if main.setup.info else "",
+        "name": view.setup.info.name if view.setup.info else "",
         "answers": len(latencies),
         "latency_p50_ms": quantile(latencies, 50) * 1000,
         "latency_p90_ms": quantile(latencies, 90) * 1000,
@@ -79,10 +103,11 @@ def quantile(values: Sequence[float], percent: float) -> float:
     return float(np.percentile(np.array(values), percent)) if values else math.nan
 
 
-def _control(main: Main) -> dict[str, Any]:
-    status = main.page.control.read()
+def control_figures(page: Page, rate: float) -> dict[str, Any]:
+    """What control last did and how well it keeps time."""
+    status = page.control.read()
     return {
-        "rate": main.plan.rate,
+        "rate": rate,
         "step": int(status["step"]),
         "behaviour": bytes(status["behaviour"]).decode(),
         "engaged": bool(status["engaged"]),
@@ -97,12 +122,11 @@ def _control(main: Main) -> dict[str, Any]:
     }
 
 
-def _link(main: Main, now: float) -> dict[str, Any]:
-    record = main.page.observation.read()
+def _link(view: View) -> dict[str, Any]:
+    record = view.page.observation.read()
     never = int(record["sequence"]) == 0
-    ages = {"joints": math.inf if never else now - float(record["joints_captured"])}
-    for index, camera in enumerate(main.page.layout.cameras):
+    ages = {"joints": math.inf if never else view.now - float(record["joints_captured"])}
+    for index, camera in enumerate(view.page.layout.cameras):
         seen = bool(record["picture_number"][index])
-        ages[camera] = now - float(record["picture_captured"][index]) if seen else math.inf
-    report = main.media_report
-    return {"ages": ages, "rates": dict(report.rates), "faults": dict(report.faults)}
+        ages[camera] = view.now - float(record["picture_captured"][index]) if seen else math.inf
+    return {"ages": ages, "rates": dict(view.media.rates), "faults": dict(view.media.faults)}

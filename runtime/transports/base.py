@@ -36,8 +36,8 @@ class Source(ABC):
     def close(self) -> None:
         """Release everything; safe to call twice."""
 
-    def begin_run(self) -> None:
-        """A run starts: a recording plays from its first frame; a live robot has nothing to do."""
+    def begin_run(self) -> None:  # noqa: B027  # a live robot has nothing to do
+        """A run starts: a recording plays from its first frame."""
 
     def faults(self) -> dict[str, int]:
         """Counts by name of what went wrong since connect, e.g. {"clock_backwards": 1, "malformed": 3}."""

@@ -73,7 +73,9 @@ class Lab:
         return self
 
     def station(self, *assignments):
-        node = self.addresses.get("node", {"obs_endpoint": "tcp://127.0.0.1:1", "action_endpoint": "tcp://127.0.0.1:1"})
+        node = self.addresses.get(
+            "node", {"obs_endpoint": "tcp://127.0.0.1:1", "action_endpoint": "tcp://127.0.0.1:1"}
+        )
         server = self.addresses.get("server", {"url": "ws://127.0.0.1:1"})
         settings = [
             f'transport.sub_endpoint="{node["obs_endpoint"]}"',
@@ -146,7 +148,9 @@ class Lab:
 
     def outcome(self, seconds=12):
         """The outcome of the only episode."""
-        path = eventually(lambda: list((self.data / "episodes").glob("*/outcome.json")), seconds, "an outcome")
+        path = eventually(
+            lambda: list((self.data / "episodes").glob("*/outcome.json")), seconds, "an outcome"
+        )
         return json.loads(path[0].read_text())
 
     def close(self):

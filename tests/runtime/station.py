@@ -221,7 +221,7 @@ class Station(Lockstep):
         return self.episode()
 
     def episode(self) -> Episode:
-        return open_episode(Path(self.main.last_episode["path"]))
+        return open_episode(Path(self.main.runs.last_episode["path"]))
 
     def prepare(self) -> None:
         """Set up, to whatever end."""

@@ -456,7 +456,7 @@ def test_a_run_whose_recording_was_lost_is_not_resumed(tmp_path: Path) -> None:
     station.reach(State.HOLDING, 5.0)
     assert "must be uint8" in station.reason
     station.go(3)
-    assert station.main.last_episode["status"] == "failed"
+    assert station.main.runs.last_episode["status"] == "failed"
     with pytest.raises(SetupError, match=r"the recording of this run has ended .*stop, then run"):
         station.command("resume")
     assert station.state is State.HOLDING

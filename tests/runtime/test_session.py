@@ -25,9 +25,9 @@ EFFECTS = {
 }
 # Written out a second time, so that a change of the table is a decision and not a slip.
 ALLOWED = {
-    S.DISCONNECTED: {"estop"},
+    S.DISCONNECTED: {"record_stop", "estop"},
     S.IDLE: {"setup", "record_start", "record_stop", "estop"},
-    S.SETTING_UP: {"stop", "halt", "estop"},
+    S.SETTING_UP: {"stop", "halt", "record_stop", "estop"},
     S.READY: {"setup", "run", "stop", "home", "record_start", "record_stop", "estop"},
     S.RUNNING: {"stop", "halt", "estop"},
     S.HOLDING: {"stop", "halt", "resume", "record_stop", "estop"},
@@ -129,7 +129,7 @@ def test_a_command_is_carried_out_exactly_where_the_table_allows_it(kind, state)
         assert bench.session.sequence == sequence
         assert bench.effects.done == []
         return
-    cancels = state is S.SETTING_UP
+    cancels = state is S.SETTING_UP and kind in ("stop", "halt")
     after = S.IDLE if cancels else COMMANDS[kind].after or state
     assert (ack.status, ack.reason) == ("accepted", "")
     assert bench.names == ["cancel_setup" if cancels else EFFECTS[kind]]
@@ -142,7 +142,8 @@ def test_a_command_is_carried_out_exactly_where_the_table_allows_it(kind, state)
 @pytest.mark.parametrize(("kind", "state"), [(k, s) for s in State for k in sorted(ALLOWED[s] - {"estop"})])
 def test_an_effect_that_refuses_is_the_reason_and_nothing_changes(kind, state):
     bench = Bench(state)
-    name = "cancel_setup" if state is S.SETTING_UP else EFFECTS[kind]
+    cancels = state is S.SETTING_UP and kind in ("stop", "halt")
+    name = "cancel_setup" if cancels else EFFECTS[kind]
     bench.effects.refuse = {name}
     sequence, reason = bench.session.sequence, bench.session.reason
     ack = bench.give(kind)

@@ -122,7 +122,7 @@ def test_a_blocked_arm_is_not_pulled_at_further_than_the_following_error(tmp_pat
     station = Station(plan(tmp_path, setup={"home": True}))
     station.robot.blocked = True
     reason = failed(station)
-    assert "10 actions refused in a row" in reason
+    assert "10 actions refused of the last" in reason
     assert "from where it is measured, allowed 0.5" in reason
     assert np.abs(station.robot.sent - STANDS).max() < 0.6
     station.close()

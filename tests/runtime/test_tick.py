@@ -487,7 +487,9 @@ def test_a_robot_that_comes_back_elsewhere_after_it_was_not_seen_is_held_where_i
     bench.feed = False
     bench.run(30)
     bench.feed = True
-    bench.measured = bench.moved_by_hand = held.astype(float) - 0.3  # less than the following error, as after a power cycle
+    bench.measured = bench.moved_by_hand = (
+        held.astype(float) - 0.3
+    )  # less than the following error, as after a power cycle
     bench.run(3)
     assert np.allclose(bench.sink.sent[-1], held - 0.3, atol=1e-6)
 

@@ -1,0 +1,278 @@
+"""What decides: commands, session, set-up, inference, events; it never touches 30 Hz pictures."""
+
+from __future__ import annotations
+
+import logging
+import uuid
+from typing import Any
+
+from runtime.bus import EventLog
+from runtime.clock import Clock
+from runtime.errors import RuntimeFault
+from runtime.family import Plan
+from runtime.inference import Inference, InferenceSettings, Runner
+from runtime.lease import Lease
+from runtime.messages import (
+    Ack,
+    ChunkMerged,
+    Command,
+    EpisodeClosed,
+    EpisodeOpened,
+    Event,
+    MediaReport,
+    Message,
+    decode,
+)
+from runtime.orders import Orders
+from runtime.page import Page
+from runtime.run import Provenance, Run
+from runtime.runs import Runs
+from runtime.session import LEASE_COMMANDS, Effects, Happening, Session, State
+from runtime.setup import SetUp
+from runtime.snapshot import View, control_figures, snapshot
+from runtime.watch import Watch
+
+log = logging.getLogger(__name__)
+# Control's own reasons to hold, as events of these kinds.
+_HOLDS = ("refusals", "starvation", "unmeasured", "family", "orphaned")
+
+
+class Director(Effects):
+    """One `pump` does everything that is due; lockstep calls it tick by tick."""
+
+    def __init__(self, plan: Plan, page: Page, clock: Clock, runner: Runner) -> None:
+        self.plan, self.page, self.clock = plan, page, clock
+        self.boot = str(uuid.uuid4())
+        settings = plan.deployment
+        self.events = EventLog()
+        self.lease = Lease(settings.lease.ttl_s)
+        self.session = Session(self, self.lease, self.boot, clock.now)
+        self._orders = Orders(page)
+        policy = plan.policy.build(settings.policy, plan.robot, clock, plan.rate)
+        query = plan.strategy.query(settings.strategy)
+        self.inference = Inference(
+            policy, query, plan.spaces(), page, self._orders, runner, clock, _inference_settings(plan)
+        )
+        self.setup = SetUp(plan, self.inference, self._orders, page, clock)
+        self._watch = Watch(plan, page, self.lease, clock)
+        provenance = Provenance(plan, self.boot)
+        self.runs = Runs(
+            plan,
+            page,
+            clock,
+            self.inference,
+            self._orders,
+            provenance,
+            lambda: control_figures(page, plan.rate),
+        )
+        self.media_report = MediaReport(0.0, {}, {}, 0, "", 0)
+        for ring in ("control_events", "media_events"):
+            for _ in page.rings[ring].drain():
+                pass  # told to a predecessor that died
+
+    @property
+    def run(self) -> Run | None:
+        """The open run."""
+        return self.runs.open
+
+    def pump(self) -> None:
+        """Hear the family, notice what happened, advance set-up and inference."""
+        self.page.beat("main", self.clock.now())
+        for ring in ("control_events", "media_events"):
+            for payload in self.page.rings[ring].drain():
+                self._hear(decode(payload))
+        for noticed in self._watch.notice(self.session.state, self.runs.open):
+            self._observe(noticed.happening, noticed.reason)
+        self._advance_setup()
+        self._advance_inference()
+
+    def snapshot(self) -> dict[str, Any]:
+        """The station's state at this moment."""
+        return snapshot(
+            View(
+                plan=self.plan,
+                page=self.page,
+                session=self.session,
+                lease=self.lease,
+                inference=self.inference,
+                setup=self.setup,
+                runs=self.runs,
+                media=self.media_report,
+                estop=self._watch.estop,
+                boot=self.boot,
+                now=self.clock.now(),
+                newest_event=self.events.newest,
+            )
+        )
+
+    # --- effects: what the session makes happen ------------------------------------------------------------
+
+    def begin_setup(self) -> None:
+        self.setup.begin()
+
+    def cancel_setup(self, reason: str) -> None:
+        self.setup.cancel()
+        self._orders.give("hold", reason=reason)
+
+    def begin_run(self) -> None:
+        self._require_family()
+        self.runs.begin(self.setup.info)
+
+    def hold(self, reason: str) -> None:
+        self.runs.hold(reason)
+
+    def resume_run(self) -> None:
+        self._require_family()
+        self.runs.resume()
+
+    def end_run(self, status: str, reason: str) -> None:
+        self.runs.end(status, reason)
+
+    def go_home(self) -> None:
+        if not self.plan.capabilities.moves_robot:
+            raise RuntimeFault(f"transport {self.plan.deployment.transport.kind!r} moves no robot")
+        self.setup.begin_homing()
+
+    def release_estop(self) -> None:
+        self.page.ask_release()
+
+    def start_recording(self) -> None:
+        self._require_family()
+        self.runs.record_alone(self.setup.info)
+
+    def stop_recording(self) -> None:
+        self.runs.stop_alone()
+
+    def _require_family(self) -> None:
+        """What is sent to a process that is still starting would be lost."""
+        absent = self._watch.absent()
+        if absent:
+            raise RuntimeFault(f"the process {absent} gives no sign of life yet: try again in a moment")
+
+    # --- what the family says ------------------------------------------------------------------------------
+
+    def _hear(self, message: Message) -> None:
+        if isinstance(message, Event):
+            self._hear_event(message)
+        elif isinstance(message, ChunkMerged):
+            self.inference.merged(message)
+            if message.dropped:
+                text = f"chunk {message.chunk_id} dropped: {message.dropped}"
+                self.say(Event("chunk_dropped", text, self.clock.now(), message.arrival_step))
+        elif isinstance(message, EpisodeOpened):
+            self._episode_opened(message)
+        elif isinstance(message, EpisodeClosed):
+            self.say(self.runs.closed(message))
+        elif isinstance(message, MediaReport):
+            self.media_report = message
+
+    def _hear_event(self, event: Event) -> None:
+        self._log(event)  # control and media write their own events into the episode
+        self.setup.heard(event)
+        evidence = self.plan.deployment.recording.on_failure == "hold"
+        if event.kind in _HOLDS or (event.kind == "recording_failed" and evidence):
+            self._observe(Happening.HELD, event.text)
+        elif event.kind == "displaced":
+            self._observe(Happening.DISPLACED, event.text)
+
+    def _episode_opened(self, opened: EpisodeOpened) -> None:
+        if opened.error:
+            self.say(Event("recording_failed", opened.error, self.clock.now()))
+        elif opened.uuid:
+            self.say(Event("episode_opened", f"recording {opened.uuid}", self.clock.now()))
+        failure = self.runs.opened(opened, self.session.state is State.RUNNING)
+        if failure:
+            self._observe(Happening.RUN_FAILED, failure)
+
+    def say(self, event: Event) -> None:
+        """An event of main's own: to the log, to clients, into the episode."""
+        self._log(event)
+        self.runs.note(event)
+
+    def _log(self, event: Event) -> None:
+        self.events.append(event)
+        log.info("%s: %s", event.kind, event.text)
+
+    def _observe(self, happening: Happening, reason: str) -> None:
+        if happening is Happening.FAMILY_DIED:
+            self.say(Event("family_died", reason, self.clock.now()))
+            self.runs.lost()
+        before = self.session.state
+        if self.session.observe(happening, reason):
+            text = f"{before} -> {self.session.state}: {reason}"
+            self.say(Event("state", text, self.clock.now(), data={"state": str(self.session.state)}))
+
+    # --- what goes on ----------------------------------------------------------------------------------------
+
+    def _advance_setup(self) -> None:
+        if not self.setup.active:
+            return
+        stage = self.setup.stage
+        try:
+            done = self.setup.pump()
+        except RuntimeFault as error:
+            self.setup.cancel()
+            self._orders.give("hold")
+            self._observe(Happening.SETUP_FAILED, str(error))
+            return
+        if self.setup.stage is not stage:
+            self.say(Event("setup", str(self.setup.stage), self.clock.now()))
+        if done:
+            self._observe(Happening.SETUP_DONE, self.setup.outcome)
+
+    def _advance_inference(self) -> None:
+        try:
+            answer = self.inference.pump()
+        except RuntimeFault as error:
+            self.say(Event("policy_failed", str(error), self.clock.now()))
+            self._observe(Happening.HELD, str(error))
+            return
+        if answer is not None:
+            self.runs.note(answer)
+        for note in self.inference.notes:
+            self.say(note)
+        self.inference.notes.clear()
+
+    # --- commands ------------------------------------------------------------------------------------------
+
+    def handle(self, command: Command) -> Ack:
+        """The answer to a command or a query of a client."""
+        if command.kind == "status":
+            return Ack(
+                command.uuid, "done", boot=self.boot, sequence=self.session.sequence, data=self.snapshot()
+            )
+        if command.kind == "events_since":
+            return self._events_since(command)
+        before, sequence = self.session.state, self.session.sequence
+        ack = self.session.handle(command)
+        # A lease that is kept is a stream; only its changes and refusals are worth a line.
+        kept = command.kind in LEASE_COMMANDS and ack.status == "accepted" and ack.sequence == sequence
+        if not kept:
+            who = command.user or command.holder
+            what = f"{command.kind} by {who}: {ack.status}" + (f", {ack.reason}" if ack.reason else "")
+            data = {"uuid": command.uuid, "from": str(before), "to": str(self.session.state)}
+            self.say(Event("command", what, self.clock.now(), data=data))
+        return ack
+
+    def _events_since(self, command: Command) -> Ack:
+        number = command.args.get("number", 0)
+        if not isinstance(number, int):
+            return Ack(command.uuid, "refused", f"events_since number = {number!r}: must be a whole number")
+        return Ack(command.uuid, "done", boot=self.boot, data={"events": self.events.since(number)})
+
+    def close(self) -> None:
+        """Let go of the policy."""
+        self.inference.policy.close()
+        self.inference.runner.close()
+
+
+def _inference_settings(plan: Plan) -> InferenceSettings:
+    settings = plan.deployment
+    return InferenceSettings(
+        plan.rate,
+        settings.task,
+        settings.safety.joint_age_s,
+        settings.safety.picture_age_s,
+        plan.robot.binary_dims,
+        settings.control.starvation_hold_s,
+    )

@@ -1,0 +1,183 @@
+"""Main's side of runs and recordings: what is opened, held, resumed, closed, and what media is told of it."""
+
+from __future__ import annotations
+
+import logging
+import uuid
+from collections.abc import Callable
+from typing import Any
+
+from runtime.clock import Clock
+from runtime.errors import RuntimeFault
+from runtime.family import Plan
+from runtime.inference import Inference
+from runtime.messages import (
+    BeginEpisode,
+    EndEpisode,
+    EpisodeClosed,
+    EpisodeOpened,
+    Event,
+    Message,
+    encode,
+)
+from runtime.orders import Orders
+from runtime.page import Page
+from runtime.policies.base import PolicyInfo
+from runtime.run import Provenance, Run
+
+log = logging.getLogger(__name__)
+
+
+class Runs:
+    """At most one open run, or one recording without a run."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        page: Page,
+        clock: Clock,
+        inference: Inference,
+        orders: Orders,
+        provenance: Provenance,
+        figures: Callable[[], dict[str, Any]],
+    ) -> None:
+        self._plan = plan
+        self._page = page
+        self._clock = clock
+        self._inference = inference
+        self._orders = orders
+        self._provenance = provenance
+        self._figures = figures  # of control, for the outcome
+        self.open: Run | None = None
+        self._count = int(page.control.read()["run"])
+        self._alone = ""  # uuid of a recording without a run
+        self.last: dict[str, Any] = {}  # how the last run ended
+        self.last_episode: dict[str, Any] = {}
+
+    @property
+    def _evidence(self) -> bool:
+        """Whether a run that is not recorded must not go on."""
+        return self._plan.deployment.recording.on_failure == "hold"
+
+    # --- runs ----------------------------------------------------------------------------------------------
+
+    def begin(self, info: PolicyInfo | None) -> None:
+        """Ask media to open an episode; the run begins when it has."""
+        if self._alone:
+            raise RuntimeFault("a recording without a run is open: record stop first")
+        self._count += 1
+        manifest = None
+        if self._plan.deployment.recording.enabled:
+            manifest = self._provenance.manifest(self._plan.deployment.run.mode, info)
+        identity = str(manifest["uuid"]) if manifest else str(uuid.uuid4())
+        self._tell(BeginEpisode(self._count, manifest))
+        self.open = Run(self._count, identity, self._clock.now())
+
+    def opened(self, message: EpisodeOpened, running: bool) -> str:
+        """Media is ready, or could not be: returns why the run cannot go on, "" where it can."""
+        if message.error and message.run == 0:
+            self._alone = ""
+        run = self.open
+        if run is None or message.run != run.number or run.begun is not None:
+            return ""
+        if message.error and self._evidence:
+            return message.error
+        if message.error:
+            self._tell(BeginEpisode(run.number, None))  # unrecorded; the source plays all the same
+            return ""
+        run.opened = True
+        if running:
+            self._start(run)
+        return ""
+
+    def hold(self, reason: str) -> None:
+        """Decelerate, hold, stop asking; an open run's clock pauses."""
+        self._inference.pause()
+        self._orders.give("hold", run=self.open.number if self.open else 0, reason=reason)
+        if self.open:
+            self.open.hold(self._clock.now())
+
+    def resume(self) -> None:
+        """Go on with the open run; raises RuntimeFault where there is none, or its recording has failed."""
+        run = self.open
+        if run is None:
+            raise RuntimeFault("no run is open: stop, then run")
+        if run.unrecorded and self._evidence:
+            raise RuntimeFault(f"the recording of this run has ended ({run.unrecorded}): stop, then run")
+        if run.begun is not None:
+            run.resume(self._clock.now())
+            self._follow(run, fresh=False)
+        elif run.opened:  # it was halted before it began
+            self._start(run)
+
+    def end(self, status: str, reason: str) -> None:
+        """Decelerate, hold, close what is open; a recording alone only where it is interrupted."""
+        self._inference.pause()
+        self._orders.give("hold", reason=reason)
+        run, self.open = self.open, None
+        if run is not None:
+            seconds = run.elapsed(self._clock.now())
+            self.last = {"number": run.number, "uuid": run.uuid, "status": status, "reason": reason}
+            self._tell(EndEpisode(status, reason, {"run_seconds": seconds, "control": self._figures()}))
+        if self._alone and status != "finished":
+            self._end_alone(status, reason)
+
+    def _start(self, run: Run) -> None:
+        run.begin(self._clock.now())
+        self._follow(run, fresh=True)
+
+    def _follow(self, run: Run, fresh: bool) -> None:
+        self._orders.give("follow", run=run.number)
+        self._inference.begin(run.number, fresh)
+
+    # --- recordings ----------------------------------------------------------------------------------------
+
+    def record_alone(self, info: PolicyInfo | None) -> None:
+        """Open an episode of whatever control does."""
+        if self._alone:
+            raise RuntimeFault("a recording is open already")
+        manifest = self._provenance.manifest("observe", info)
+        self._tell(BeginEpisode(0, manifest))
+        self._alone = str(manifest["uuid"])
+
+    def stop_alone(self) -> None:
+        """Close it."""
+        if not self._alone:
+            raise RuntimeFault("no recording is open; a run's own recording ends with the run")
+        self._end_alone("finished", "stopped by the operator")
+
+    def _end_alone(self, status: str, reason: str) -> None:
+        self._alone = ""
+        self._tell(EndEpisode(status, reason, {"control": self._figures()}))
+
+    def lost(self) -> None:
+        """Media was restarted: what it recorded was closed by repair."""
+        self._alone = ""
+
+    def closed(self, message: EpisodeClosed) -> Event:
+        """An episode is on disk; the event that says so."""
+        if self.open is not None and self.open.uuid == message.uuid:
+            self.open.unrecorded = message.error or message.reason
+        if self._alone == message.uuid:
+            self._alone = ""
+        self.last_episode = {
+            "uuid": message.uuid,
+            "path": message.path,
+            "status": message.status,
+            "reason": message.reason,
+            "rows": message.rows,
+            "error": message.error,
+        }
+        text = f"episode {message.uuid} {message.status}, {message.rows} rows: {message.reason}"
+        return Event("episode_closed", text, self._clock.now(), data=self.last_episode)
+
+    def note(self, message: Message) -> None:
+        """Something for the record; where media does not read, the record misses it and the log says so."""
+        try:
+            self._tell(message)
+        except RuntimeFault as error:
+            log.error("%s is missing from the record: %s", type(message).__name__, error)
+
+    def _tell(self, message: Message) -> None:
+        if not self._page.rings["minutes"].push(encode(message)):
+            raise RuntimeFault("media does not read: the ring is full; restart the station")

@@ -1,0 +1,118 @@
+"""What main notices by itself: siblings, e-stop, lease, link, the end of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from runtime.clock import Clock
+from runtime.family import Plan
+from runtime.latch import Latch
+from runtime.lease import Lease
+from runtime.page import EStop, Page
+from runtime.run import Run
+from runtime.session import Happening, State
+
+SIBLINGS = ("control", "media", "guard")
+_LINK_LOST_S = 2.0
+_CONNECTED_S = 1.0
+
+
+class Noticed(NamedTuple):
+    """Something for the session, and the sentence that goes with it."""
+
+    happening: Happening
+    reason: str
+
+
+class Watch:
+    """Looks at page, lease and run once per pump; the session decides what follows."""
+
+    def __init__(self, plan: Plan, page: Page, lease: Lease, clock: Clock) -> None:
+        self._plan = plan
+        self._page = page
+        self._lease = lease
+        self._clock = clock
+        self._latch = Latch(plan.deployment.station_dir)
+        self._generations = {name: page.generation(name) for name in SIBLINGS}
+        self._lease_held = False
+        self.estop = ""  # who pressed and why, while it is latched
+
+    def notice(self, state: State, run: Run | None) -> Iterator[Noticed]:
+        """What there is to tell the session, which is in `state` before the first of it."""
+        yield from self._family(state)
+        yield from self._estop(state)
+        yield from self._leases()
+        yield from self._link()
+        if run is not None and run.begun is not None and state is State.RUNNING:
+            yield from self._end_of(run)
+
+    def absent(self) -> str:
+        """A sibling that gives no sign of life, "" where all do: what it is sent would be lost."""
+        now, within = self._clock.now(), self._plan.deployment.control.heartbeat_timeout_s
+        return next((name for name in SIBLINGS if not self._page.alive(name, now, within)), "")
+
+    def missing_cameras(self) -> list[str]:
+        """Cameras that have not sent a picture yet."""
+        numbers = self._page.observation.read()["picture_number"]
+        return [
+            camera for camera, number in zip(self._page.layout.cameras, numbers, strict=False) if not number
+        ]
+
+    def _family(self, state: State) -> Iterator[Noticed]:
+        for name in SIBLINGS:
+            generation = self._page.generation(name)
+            if generation != self._generations[name]:
+                self._generations[name] = generation
+                reason = f"the process {name} died and was restarted: set up again"
+                yield Noticed(Happening.FAMILY_DIED, reason)
+        absent = self.absent() if state is State.RUNNING else ""  # a set-up looks for itself
+        if absent:
+            silent = self._clock.now() - self._page.last_beat(absent)
+            yield Noticed(Happening.HELD, f"no sign of life from the process {absent} for {silent:.1f} s")
+
+    def _estop(self, state: State) -> Iterator[Noticed]:
+        latched = self._page.estop is EStop.LATCHED
+        if latched and state is not State.FAULTED:
+            pressed = self._latch.read()
+            self.estop = f"by {pressed.by}: {pressed.why}" if pressed else "pressed"
+            yield Noticed(Happening.ESTOPPED, f"e-stop {self.estop}: make safe, then release")
+        elif not latched and state is State.FAULTED:
+            self.estop = ""
+            yield Noticed(Happening.RELEASED, "e-stop released: set up again")
+
+    def _leases(self) -> Iterator[Noticed]:
+        held = self._lease.current(self._clock.now()) is not None
+        if self._lease_held and not held:
+            yield Noticed(Happening.LEASE_ENDED, "the lease was not renewed: claim it, then resume or stop")
+        self._lease_held = held
+
+    def _link(self) -> Iterator[Noticed]:
+        record = self._page.observation.read()
+        if not record["sequence"]:
+            return
+        age = self._clock.now() - float(record["arrived"])
+        missing = self.missing_cameras()
+        if age < _CONNECTED_S and not missing:
+            yield Noticed(Happening.CONNECTED, "observations arrive: set up")
+        elif age < _CONNECTED_S:
+            yield Noticed(Happening.INCOMPLETE, f"no picture has arrived from {', '.join(missing)}")
+        elif age > _LINK_LOST_S and not record["last"]:
+            yield Noticed(Happening.LINK_LOST, f"no observation for {age:.1f} s: {self._who_is_silent()}")
+
+    def _who_is_silent(self) -> str:
+        now, within = self._clock.now(), self._plan.deployment.control.heartbeat_timeout_s
+        if self._page.alive("media", now, within):
+            return "is the execution node running?"
+        return "our process media gives no sign of life (a disk that hangs?)"
+
+    def _end_of(self, run: Run) -> Iterator[Noticed]:
+        duration = self._plan.deployment.run.duration_s
+        if duration is not None and run.elapsed(self._clock.now()) >= duration:
+            yield Noticed(Happening.RUN_ENDED, f"the run's {duration:g} s are over")
+            return
+        record: np.void = self._page.observation.read()
+        if record["last"] and int(self._page.control.read()["sequence"]) == int(record["sequence"]):
+            yield Noticed(Happening.RUN_ENDED, "the recording that is the source has ended")
