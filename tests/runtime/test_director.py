@@ -1,0 +1,107 @@
+"""What main notices and tells, in whole stations in lockstep."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from runtime.errors import SetupError
+from runtime.messages import Command
+from runtime.session import State
+from tests.runtime.station import STANDS, Station, plan
+
+
+def without(station: Station, process: str, seconds: float) -> None:
+    """Let everything go on but the heartbeat of `process`."""
+    beat = station.page.beat
+    station.page.beat = lambda name, now: None if name == process else beat(name, now)
+    station.go(int(seconds * station.plan.rate))
+    station.page.beat = beat
+
+
+@pytest.mark.parametrize("process", ["control", "media"])
+def test_a_process_that_hangs_in_a_run_holds_it_and_is_named(tmp_path: Path, process: str) -> None:
+    station = Station(plan(tmp_path)).running(10)
+    without(station, process, 1.5)
+    assert station.state is State.HOLDING
+    assert f"no sign of life from the process {process}" in station.reason
+    station.go(1)
+    station.command("resume")
+    station.go(5)
+    assert station.state is State.RUNNING
+    station.close()
+
+
+def test_an_arm_that_was_moved_while_ready_makes_the_station_idle_and_stays_where_it_is(
+    tmp_path: Path,
+) -> None:
+    station = Station(plan(tmp_path)).running(10)
+    station.stop()
+    station.robot.blocked = True
+    moved = STANDS.copy()
+    moved[0] += 0.9
+    station.robot.position = moved
+    station.go(5)
+    assert station.state is State.IDLE
+    assert "0.8" in station.reason
+    assert "from where it was told to hold" in station.reason
+    arms = [dim for dim in range(len(STANDS)) if dim not in station.plan.robot.gripper_dims]
+    assert np.allclose(station.robot.sent[-1][arms], moved[arms])
+    station.close()
+
+
+def test_cameras_that_send_nothing_are_named(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path))
+    station.robot.cameras.remove("cam_left_wrist")
+    station.go(10)
+    assert station.state is State.DISCONNECTED
+    assert station.reason == "no picture has arrived from cam_left_wrist"
+    sequence = station.main.session.sequence
+    station.go(30)
+    assert station.main.session.sequence == sequence  # told once: nothing grows stale by it
+    station.close()
+
+
+def test_a_recording_without_a_run_that_fails_is_over_and_a_run_may_begin(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path)).ready()
+    station.command("record_start")
+    station.go(5)
+    station.robot.picture = lambda number: np.zeros((2, 2, 3), np.uint8)  # a camera that changes its size
+    station.go(5)
+    assert station.events("recording_failed")
+    assert station.main.runs.last_episode["status"] == "failed"
+    with pytest.raises(SetupError, match="no recording is open"):
+        station.command("record_stop")
+    station.command("run")
+    station.go(3)
+    assert station.state is State.RUNNING
+    station.close()
+
+
+def test_the_snapshot_says_how_the_last_run_ended(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, run={"duration_s": 0.5}))
+    station.running(30)
+    shown = station.main.snapshot()
+    assert shown["state"] == "ready"
+    assert shown["last_run"]["status"] == "finished"
+    assert shown["last_run"]["reason"] == "the run's 0.5 s are over"
+    assert shown["run"]["number"] == 0
+    station.close()
+
+
+def test_a_query_with_nonsense_is_refused_and_nothing_ends(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path))
+    ack = station.main.handle(Command("1", "events_since", {"number": "seven"}))
+    assert ack.status == "refused"
+    assert "'seven': must be a whole number" in ack.reason
+    station.close()
+
+
+def test_a_media_that_does_not_read_costs_the_record_and_not_the_station(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path)).running(10)
+    station.page.rings["minutes"].push = lambda payload: False
+    station.media.digest = lambda: None
+    station.go(20)
+    assert station.state in (State.RUNNING, State.HOLDING)
+    assert np.isfinite(station.robot.sent).all()
+    station.close()
