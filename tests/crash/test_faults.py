@@ -38,9 +38,8 @@ def holds(lab, *words, seconds=15):
 
 
 def test_policy_server_absent(lab):
-    lab.children["server"] = None  # up() starts none
-    lab.up()
-    del lab.children["server"]
+    lab.node().station()
+    lab.reach("idle")
     fails_to_set_up(lab, "no policy server listens at ws://127.0.0.1:1", "start it")
 
 
