@@ -50,8 +50,9 @@ class Director(Effects):
         self._orders = Orders(page)
         policy = plan.policy.build(settings.policy, plan.robot, clock, plan.rate)
         query = plan.strategy.query(settings.strategy)
+        self.spaces = plan.spaces()
         self.inference = Inference(
-            policy, query, plan.spaces(), page, self._orders, runner, clock, _inference_settings(plan)
+            policy, query, self.spaces, page, self._orders, runner, clock, _inference_settings(plan)
         )
         self.setup = SetUp(plan, self.inference, self._orders, page, clock)
         self._watch = Watch(plan, page, self.lease, clock)

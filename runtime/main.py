@@ -1,10 +1,11 @@
-"""Main's sockets: answers commands at once, publishes snapshots at 10 Hz and joints at 30."""
+"""Main's sockets: answers commands at once, publishes snapshots at 10 Hz, joints and poses at 30."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import zmq
 
 from runtime.bus import STREAM_HIGH_WATER, CommandServer, Endpoints, Publisher
@@ -56,6 +57,7 @@ class Service:
         main, now = self._main, self._main.clock.now()
         self._every("state", 0.1, now, main.snapshot)
         self._every("joints", 1 / 30, now, self._joints)
+        self._every("poses", 1 / 30, now, self._poses)
         for event in main.events.since(self._told):
             self._streams.publish("event", event)
         self._told = main.events.newest
@@ -73,6 +75,14 @@ class Service:
             "commanded": status["commanded"].copy(),
             "engaged": bool(status["engaged"]),
         }
+
+    def _poses(self) -> np.ndarray:
+        """End effectors as one float32 frame [2, 8 * arms]: measured, commanded (NaN while nothing is sent)."""
+        status, seen = self._main.page.control.read(), self._main.page.observation.read()
+        poses = self._main.spaces.eef_of(np.stack([seen["qpos"], status["commanded"]]))
+        if not status["engaged"]:
+            poses[1] = np.nan
+        return poses
 
     def close(self) -> None:
         self._server.close()

@@ -1,0 +1,86 @@
+"""What a client of a running station is shown: snapshots, joints, poses, pictures, numbered events."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import simplejpeg
+import zmq
+
+from runtime.bus import Endpoints, Subscriber
+from tests.crash.lab import ROOT, eventually
+
+pytestmark = pytest.mark.slow
+
+
+def watched(subscriber, seconds):
+    """Every stream's contents of a while."""
+    seen = {}
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        for name, content in subscriber.receive(0.1).items():
+            seen.setdefault(name, []).append(content)
+    return seen
+
+
+def test_every_stream_of_a_run_is_live_and_the_pictures_are_jpegs_of_preview_size(lab):
+    lab.node("--width", "640", "--height", "480").up("bus.preview_rate=15.0").running(0.5)
+    cameras = Endpoints(lab.data / "stations" / "demo").read("media")["cameras"]
+    pictures = Subscriber(zmq.Context.instance(), cameras, "camera/")
+    streams = lab.client.subscribe("state", "joints", "poses")
+    seen, shown = watched(streams, 1.5), watched(pictures, 1.5)
+    streams.close()
+    pictures.close()
+    states = [status for status in seen["state"] if status["state"] == "running"]
+    assert len(states) > 5
+    assert states[-1]["run"]["elapsed"] > states[0]["run"]["elapsed"]
+    assert np.abs(seen["joints"][-1]["commanded"] - seen["joints"][0]["commanded"]).max() > 0
+    assert seen["poses"][-1].shape == (2, 16)
+    assert np.isfinite(seen["poses"][-1]).all()
+    assert sorted(shown) == ["camera/cam_high", "camera/cam_left_wrist", "camera/cam_right_wrist"]
+    assert all(len(frames) > 10 for frames in shown.values())
+    picture = simplejpeg.decode_jpeg(shown["camera/cam_high"][-1])
+    assert picture.shape == (240, 320, 3)
+    assert picture.std() > 5
+
+
+def test_events_are_numbered_without_gaps_and_can_be_fetched_later(lab):
+    lab.up().running(0.3)
+    lab.client.command("stop")
+    eventually(lambda: lab.events("episode_closed"), 10, "the episode")
+    events = lab.client.events_since(0)
+    assert [event["number"] for event in events] == list(range(1, len(events) + 1))
+    middle = events[len(events) // 2]["number"]
+    later = lab.client.events_since(middle)
+    assert later[: len(events) - middle] == events[middle:]
+
+
+def test_a_terminal_sets_up_runs_and_stops_a_station(lab):
+    def ctl(*words):
+        return subprocess.Popen(
+            [sys.executable, "-m", "runtime.ctl", "--data-dir", str(lab.data), "demo", *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+        )
+
+    lab.up()
+    setup = ctl("setup")
+    out, err = setup.communicate(timeout=30)
+    assert setup.returncode == 0, err
+    assert "READY" in out
+    run = ctl("run")
+    eventually(lambda: lab.client.status()["run"]["elapsed"] > 0.5, 15, "a run")
+    second = ctl("record", "start")
+    _, refused = second.communicate(timeout=30)
+    assert second.returncode == 1
+    assert "record_start is not allowed while running" in refused
+    os.kill(run.pid, signal.SIGINT)  # Ctrl-C stops the run
+    assert run.wait(15) == 0
+    assert lab.client.status()["state"] == "ready"
+    assert lab.outcome()["status"] == "finished"
