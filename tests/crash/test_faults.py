@@ -17,7 +17,7 @@ from tests.crash.lab import eventually
 pytestmark = pytest.mark.slow
 
 
-def fails_to_set_up(lab, *words):
+def assert_setup_fails(lab, *words):
     lab.client.command("setup")
     status = lab.reach("idle", "ready")
     assert status["state"] == "idle"
@@ -25,7 +25,7 @@ def fails_to_set_up(lab, *words):
         assert word in status["reason"], status["reason"]
 
 
-def holds(lab, *words, seconds=15):
+def assert_holds(lab, *words, seconds=15):
     status = lab.reach("holding", seconds=seconds)
     for word in words:
         assert word in status["reason"], status["reason"]
@@ -40,25 +40,25 @@ def holds(lab, *words, seconds=15):
 def test_policy_server_absent(lab):
     lab.node().station()
     lab.reach("idle")
-    fails_to_set_up(lab, "no policy server listens at ws://127.0.0.1:1", "start it")
+    assert_setup_fails(lab, "no policy server listens at ws://127.0.0.1:1", "start it")
 
 
 def test_policy_server_mute_on_connect(lab):
     lab.server("--fault", "mute_on_connect").up("policy.connect_deadline=1.0")
-    fails_to_set_up(lab, "1 s")
+    assert_setup_fails(lab, "1 s")
 
 
 def test_policy_server_mute_in_the_middle_of_a_run(lab):
     lab.server("--fault", "mute_on_infer:20").up("policy.inference_deadline=1.0")
     lab.running(0.5)
-    holds(lab, "1 s")
+    assert_holds(lab, "1 s")
     assert lab.events("policy_failed")
 
 
 def test_policy_server_dying_in_the_middle_of_a_run(lab):
     lab.server("--fault", "die:25").up()
     lab.running(0.2)
-    status = holds(lab)
+    status = assert_holds(lab)
     assert lab.events("policy_failed")[0]["text"] in status["reason"]
     assert status["recording"]["uuid"]  # the run is open: resume or stop
     lab.client.command("stop")
@@ -68,12 +68,12 @@ def test_policy_server_dying_in_the_middle_of_a_run(lab):
 
 def test_policy_with_a_wrong_dimension(lab):
     lab.server("--fault", "wrong_dim").up()
-    fails_to_set_up(lab, "13", "14")
+    assert_setup_fails(lab, "13", "14")
 
 
 def test_policy_answering_nan(lab):
     lab.server("--fault", "nan").up()
-    fails_to_set_up(lab, "nan", "row 3")
+    assert_setup_fails(lab, "nan", "row 3")
 
 
 # --- the execution node ------------------------------------------------------------------------------------
@@ -91,7 +91,7 @@ def test_node_absent(lab):
 def test_node_dying_in_the_middle_of_a_run(lab):
     lab.up().running(0.5)
     lab.children.pop("node").kill()
-    holds(lab, "10 actions refused in a row", "old")
+    assert_holds(lab, "10 actions refused in a row", "old")
 
 
 def test_node_restarted_with_a_smaller_clock_is_noticed_and_seen_again(lab):
@@ -220,7 +220,7 @@ def small_disk(lab):
 def test_a_full_disk_ends_the_recording_with_a_sentence_and_holds_the_robot(small_disk):
     lab = small_disk.up().running(0.5)
     media = lab.pids()["media"]
-    holds(lab, "disk full while writing", "bytes free", seconds=60)
+    assert_holds(lab, "disk full while writing", "bytes free", seconds=60)
     assert lab.pids()["media"] == media
     episode = open_episode(lab.episodes()[0])
     assert episode.frames > 15
@@ -232,7 +232,7 @@ def test_a_file_that_may_not_grow_ends_the_recording_and_holds_the_robot(lab):
     lab.up().running(1.0)
     media = lab.pids()["media"]
     resource.prlimit(media, resource.RLIMIT_FSIZE, (20_000, 20_000))
-    holds(lab, "too large while writing")
+    assert_holds(lab, "too large while writing")
     assert lab.pids()["media"] == media
     assert lab.outcome()["status"] == "failed"
     assert open_episode(lab.episodes()[0]).frames > 15

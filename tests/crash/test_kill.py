@@ -61,6 +61,7 @@ def test_nothing_is_left_ten_seconds_after_the_supervisor_was_killed(lab, state)
     killed_at = time.time()
     lab.kill("supervisor")
     eventually(lambda: not any(map(alive, pids)), 10, "the end of the family")
+    assert not any(map(alive, pids))
     if state == "recording":
         readable_to_the_last_second(lab, killed_at)
 

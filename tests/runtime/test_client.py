@@ -152,6 +152,7 @@ def test_a_lease_can_be_given_up(client, connect):
     client.claim()
     client.give_up()
     connect("ben").claim()
+    assert client.status()["lease"]["holder"] == "ben"
 
 
 def test_what_was_decided_before_a_restart_is_stale(client, station):
