@@ -10,7 +10,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from runtime.errors import PolicyError
 
@@ -37,6 +37,7 @@ class WebsocketLink:
         self._connect_deadline = connect_deadline
         self._stack = contextlib.ExitStack()
         self._connection: ClientConnection | None = None
+        self._shaking: ClientConnection | None = None  # its handshake is under way
         self._aborted = False
 
     @property
@@ -48,10 +49,16 @@ class WebsocketLink:
         """Connect anew and return the server's first frame; both within the connect deadline."""
         self.drop()
         deadline = time.monotonic() + self._connect_deadline
-        self._connection = self._connect()
+        try:
+            self._require_not_aborted()
+            self._connection = self._connect()
+        except PolicyError:
+            self._require_not_aborted()
+            raise
+        finally:
+            self._shaking = None
         with self._dropping_on_error():
-            if self._aborted:
-                raise PolicyError(f"the connection to {self._url} was closed from our side")
+            self._require_not_aborted()
             return self._receive(self._connection, deadline, "its metadata", self._connect_deadline)
 
     def exchange(self, request: bytes, seconds: float) -> bytes:
@@ -67,12 +74,16 @@ class WebsocketLink:
     def abort(self) -> None:
         """Unblock, from another thread, whoever waits here: they raise PolicyError, now and later.
 
-        Only the handshake itself is not interrupted; it ends within the connect deadline.
+        Only reaching a host that does not answer at all goes on until the connect deadline.
         """
         self._aborted = True
-        connection = self._connection
-        if connection is not None:
-            _shut(connection)
+        for connection in (self._shaking, self._connection):
+            if connection is not None:
+                _shut(connection)
+
+    def _require_not_aborted(self) -> None:
+        if self._aborted:
+            raise PolicyError(f"the connection to {self._url} was closed from our side")
 
     def drop(self) -> None:
         """End the connection without waiting for the server's consent; safe to call twice."""
@@ -83,7 +94,18 @@ class WebsocketLink:
 
     def _connect(self) -> ClientConnection:
         from websockets.exceptions import InvalidStatus, InvalidURI, WebSocketException
-        from websockets.sync.client import connect
+        from websockets.sync.client import ClientConnection, connect
+
+        link = self
+
+        class Connection(ClientConnection):
+            """Known before its handshake, so that `abort` can end that too."""
+
+            def __init__(self, *arguments: Any, **options: Any) -> None:
+                super().__init__(*arguments, **options)
+                link._shaking = self
+                if link._aborted:
+                    _shut(self)
 
         try:
             return self._stack.enter_context(
@@ -97,6 +119,7 @@ class WebsocketLink:
                     proxy=None,
                     open_timeout=self._connect_deadline,
                     close_timeout=_CLOSE_TIMEOUT,
+                    create_connection=Connection,
                 )
             )
         except ConnectionRefusedError as error:

@@ -56,7 +56,7 @@ class Config(Section):
     observation_space: Space = "joint"
     """What is sent as state: joints, or poses."""
     cameras: dict[str, str] | None = None
-    """Observation key = request key; without it all of the robot's cameras under their own keys."""
+    """Observation key = request key; without it all pictures that there are, under their own keys."""
     images_key: str = "images"
     """The map that holds the pictures; "" puts them into the request itself (DROID, LIBERO)."""
     image_size: Size | None = Field(default_factory=lambda: [224, 224])
@@ -94,17 +94,19 @@ class OpenpiPolicy(Policy):
         _check_parts(config, self._state_width)
         self._headers = _headers(config)
         self._link = self._new_link()
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # of the wire: held through every wait
+        self._turning = threading.Lock()  # between open and closed: held for a moment
         self._closed = False
         self._warm = False
 
     def connect(self) -> PolicyInfo:
         """Reach the server and read its metadata; an open connection is replaced."""
         with self._lock:
-            self._closed = False
             self._warm = False
             self._link.drop()
-            self._link = self._new_link()
+            with self._turning:
+                self._closed = False
+                self._link = self._new_link()
             return self._open()
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
@@ -128,12 +130,13 @@ class OpenpiPolicy(Policy):
         """Nothing to forget: the protocol has no reset, and no answer depends on an earlier one."""
 
     def close(self) -> None:
-        """Drop the connection; an `infer` that waits in another thread raises PolicyError at once."""
-        self._closed = True
-        self._link.abort()
-        with self._lock:
+        """Cut the connection and return at once; a call that waits in another thread raises PolicyError.
+
+        What is left of the connection is dropped by whoever uses it, now or at the next `connect`.
+        """
+        with self._turning:
             self._closed = True
-            self._link.drop()
+            self._link.abort()
 
     def request(self, observation: Observation) -> dict[str, object]:
         """The request map for an observation, in the declared layout."""
@@ -141,7 +144,8 @@ class OpenpiPolicy(Policy):
         state = self._state(observation)
         request: dict[str, object] = {config.state_key: state} if config.state_key else {}
         request |= {key: state[dims] for key, dims in config.state_parts.items()}
-        pictures = {key: self._picture(observation, camera) for camera, key in self._cameras.items()}
+        cameras = self._cameras if self._cameras is not None else {key: key for key in observation.pictures}
+        pictures = {key: self._picture(observation, camera) for camera, key in cameras.items()}
         request |= {config.images_key: pictures} if config.images_key else pictures
         if config.prompt_key:
             request[config.prompt_key] = observation.prompt
@@ -241,10 +245,11 @@ class OpenpiPolicy(Policy):
         return space
 
 
-def _cameras(config: Config, robot: Robot) -> dict[str, str]:
-    known = [camera.key for camera in robot.cameras]
+def _cameras(config: Config, robot: Robot) -> dict[str, str] | None:
+    """The named cameras; None for whatever the observation has: a deployment may do without some."""
     if config.cameras is None:
-        return {key: key for key in known}
+        return None
+    known = [camera.key for camera in robot.cameras]
     unknown = [key for key in config.cameras if key not in known]
     if unknown:
         raise ConfigurationError(

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
+import logging
 import threading
 import uuid
 from collections import Counter
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -22,17 +24,20 @@ from runtime.clock import Clock, ClockMap
 from runtime.errors import ConfigurationError, TransportError
 from runtime.section import Section
 from runtime.transports.base import Capabilities, Sink, Source
+from runtime.transports.freshness import FROZEN_S, Freshness
 from runtime.transports.node_messages import Encoding, MessageRefused, NodeFrame, NodeMessages, NodeStatus
 from runtime.types import Observation, RobotCommand, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot
 
+log = logging.getLogger(__name__)
 Endpoint = Annotated[str, Field(pattern=r"^(tcp|ipc|inproc)://.+")]
 MESSAGE_LIMIT = 64 * 1024 * 1024  # bytes; three 1080p pictures are 19 MB
 _QUEUED_FRAMES = 4
 _QUEUED_COMMANDS = 2
 _WAKE_MS = 50  # how soon the reader notices that it is to end
+_REOPEN_S = 1.0
 
 
 class Config(Section):
@@ -47,6 +52,8 @@ class Config(Section):
     """Colour order of the node's pictures; an `encoding` field on the wire wins."""
     disabled_cameras: list[str] = Field(default_factory=list)
     """Observation keys of cameras that this deployment does without."""
+    detect_frozen: bool = True
+    """A picture exactly like the one before counts as no newer; off for simulated cameras that may stand still."""
     insecure_link: bool = False
     """Allow endpoints beyond this machine although anybody on that network can command the robot."""
 
@@ -90,6 +97,11 @@ def capabilities(config: Config) -> Capabilities:
     return Capabilities(moves_robot=True, measures_eef=True)
 
 
+def cameras(config: Config, robot: Robot) -> tuple[str, ...]:
+    """Keys of the robot's cameras that this deployment has."""
+    return tuple(camera.key for camera in robot.cameras if camera.key not in config.disabled_cameras)
+
+
 def source(config: Config, robot: Robot, clock: Clock) -> NodeSource:
     """The observations of the node; ConfigurationError for a disabled camera that the robot does not have."""
     return NodeSource(config, robot, clock)
@@ -104,7 +116,8 @@ class NodeSource(Source):
     """One SUB socket, emptied all the time by a thread of its own, so that no frame grows old in a queue.
 
     Newest is newest by arrival: a node that restarts has a smaller clock, and its frames count at once.
-    `Observation.sequence` counts the usable frames since connect, whatever the node's own numbers do.
+    `Observation.sequence` counts the usable frames since connect, whatever the node's own numbers do. What
+    goes wrong in the thread is counted, and where the socket itself fails another one is opened.
     """
 
     def __init__(self, config: Config, robot: Robot, clock: Clock) -> None:
@@ -116,6 +129,7 @@ class NodeSource(Source):
                 f"allowed: {', '.join(known)}"
             )
         self._endpoint = config.sub_endpoint
+        self._detect_frozen = config.detect_frozen
         self._clock = clock
         self._messages = NodeMessages(
             robot, config.encoding, frozenset(config.disabled_cameras), MESSAGE_LIMIT
@@ -123,8 +137,7 @@ class NodeSource(Source):
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
         self._ending = threading.Event()
-        self._newest: tuple[int, float, float, NodeFrame] | None = None
-        self._failure: Exception | None = None
+        self._newest: tuple[int, float, Mapping[str, float], NodeFrame] | None = None
         self._forget()
 
     def connect(self) -> None:
@@ -132,15 +145,9 @@ class NodeSource(Source):
         self.close()
         self._forget()
         self._ending.clear()
-        socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
         try:
-            socket.setsockopt(zmq.RCVHWM, _QUEUED_FRAMES)
-            socket.setsockopt(zmq.LINGER, 0)
-            socket.setsockopt(zmq.MAXMSGSIZE, MESSAGE_LIMIT)
-            socket.setsockopt(zmq.SUBSCRIBE, b"")
-            socket.connect(self._endpoint)
+            socket = self._subscribed()
         except zmq.ZMQError as error:
-            socket.close()
             raise TransportError(f"cannot listen to the node at {self._endpoint}: {error}") from error
         self._thread = threading.Thread(target=self._read, args=(socket,), name="node-source", daemon=True)
         self._thread.start()
@@ -148,11 +155,7 @@ class NodeSource(Source):
     def receive(self, timeout: float) -> Observation | None:
         """The newest complete frame not yet delivered, as RGB; None after `timeout` seconds without one."""
         with self._changed:
-            self._changed.wait_for(lambda: self._newest is not None or self._failure is not None, timeout)
-            if self._failure is not None:
-                raise TransportError(
-                    f"listening to {self._endpoint} ended: {self._failure}"
-                ) from self._failure
+            self._changed.wait_for(lambda: self._newest is not None, timeout)
             newest, self._newest = self._newest, None
         return None if newest is None else _observation(*newest)
 
@@ -166,6 +169,7 @@ class NodeSource(Source):
     def faults(self) -> dict[str, int]:
         """Refused messages by reason, `clock_backwards`, `frames_lost` (gaps in the node's own numbers).
 
+        `frozen_<camera>` counts how often that camera's picture stayed the same for too long.
         Commands that the node itself refused appear as `node_refused.<reason>`.
         """
         with self._changed:
@@ -186,24 +190,46 @@ class NodeSource(Source):
 
     def _forget(self) -> None:
         self._map = ClockMap()
+        self._freshness = Freshness()
         self._faults: Counter[str] = Counter()
         self._last_fault = ""
         self._status = NodeStatus()
         self._count = 0
         self._peer_sequence: int | None = None
         self._newest = None
-        self._failure = None
 
-    def _read(self, socket: zmq.Socket[bytes]) -> None:
+    def _subscribed(self) -> zmq.Socket[bytes]:
+        """A socket that hears the node; raises ZMQError."""
+        socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
         try:
-            while not self._ending.is_set():
+            socket.setsockopt(zmq.RCVHWM, _QUEUED_FRAMES)
+            socket.setsockopt(zmq.LINGER, 0)
+            socket.setsockopt(zmq.MAXMSGSIZE, MESSAGE_LIMIT)
+            socket.setsockopt(zmq.SUBSCRIBE, b"")
+            socket.connect(self._endpoint)
+        except zmq.ZMQError:
+            socket.close()
+            raise
+        return socket
+
+    def _read(self, socket: zmq.Socket[bytes] | None) -> None:
+        """The thread: nothing that happens in it may end it, because nobody else listens to the node."""
+        while not self._ending.is_set():
+            try:
+                if socket is None:
+                    socket = self._subscribed()
                 if socket.poll(_WAKE_MS):
                     self._take(_drain(socket), self._clock.now())
-        except Exception as error:  # nobody would hear of it in a thread: receive() raises it in the caller
-            with self._changed:
-                self._failure = error
-                self._changed.notify_all()
-        finally:
+            except zmq.ZMQError as error:
+                self._blame("socket_failed", f"the socket failed and is opened anew: {error}")
+                if socket is not None:
+                    socket.close()
+                    socket = None
+                self._ending.wait(_REOPEN_S)
+            except Exception as error:
+                self._blame_ourselves(error)
+                self._ending.wait(_WAKE_MS / 1000)  # so that an error that stays does not spin
+        if socket is not None:
             socket.close()
 
     def _take(self, payloads: list[bytes], arrived: float) -> None:
@@ -220,13 +246,23 @@ class NodeSource(Source):
     def _keep(self, frame: NodeFrame, arrived: float) -> None:
         for fault, text in frame.remarks:
             self._blame(fault, text)
+        captured = self._captured(frame, arrived)
         with self._changed:
-            captured = self._map.map(frame.stamp, arrived)
             self._count_lost(frame.sequence)
             self._count += 1
             self._status = frame.status
             self._newest = (self._count, arrived, captured, frame)
             self._changed.notify_all()
+
+    def _captured(self, frame: NodeFrame, arrived: float) -> dict[str, float]:
+        """The time of each stream: the message's, but for pictures that are no new ones."""
+        time = self._map.map(frame.stamp, arrived)
+        times = dict.fromkeys(["joints", *(["eef"] if frame.eef is not None else []), *frame.pictures], time)
+        if self._detect_frozen:
+            times |= self._freshness.captured(frame.pictures, time)
+            for camera in self._freshness.newly_frozen(time):
+                self._blame(f"frozen_{camera}", f"{camera} shows the same picture for over {FROZEN_S:g} s")
+        return times
 
     def _count_lost(self, sequence: int | None) -> None:
         if sequence is not None and self._peer_sequence is not None and sequence > self._peer_sequence + 1:
@@ -237,6 +273,12 @@ class NodeSource(Source):
         with self._changed:
             self._faults[fault] += 1
             self._last_fault = f"{self._endpoint}: {text}"
+
+    def _blame_ourselves(self, error: Exception) -> None:
+        text = f"reading failed: {type(error).__name__}: {error}"
+        if not self._last_fault.endswith(text):  # once, not thirty times a second
+            log.error("%s: %s", self._endpoint, text, exc_info=error)
+        self._blame("reader_failed", text)
 
 
 class NodeSink(Sink):
@@ -304,15 +346,16 @@ def _drain(socket: zmq.Socket[bytes]) -> list[bytes]:
     return payloads
 
 
-def _observation(sequence: int, arrived: float, captured: float, frame: NodeFrame) -> Observation:
-    streams = ["joints", *(["eef"] if frame.eef is not None else []), *frame.pictures]
+def _observation(
+    sequence: int, arrived: float, captured: Mapping[str, float], frame: NodeFrame
+) -> Observation:
     pictures = frame.pictures
     if frame.encoding == "bgr":
         pictures = {key: _swapped(picture) for key, picture in pictures.items()}
     return Observation(
         sequence=sequence,
         arrived=arrived,
-        captured=MappingProxyType(dict.fromkeys(streams, captured)),
+        captured=MappingProxyType(captured),
         qpos=frame.qpos,
         pictures=MappingProxyType(pictures),
         eef=frame.eef,

@@ -19,7 +19,7 @@ from runtime import codecs
 from runtime.clock import MonotonicClock
 from runtime.errors import ConfigurationError, PolicyError
 from runtime.policies import openpi
-from runtime.policies.link import PolicyGone, PolicyTimeout
+from runtime.policies.link import PolicyGone, PolicyTimeout, WebsocketLink
 from runtime.policies.openpi import Config, OpenpiPolicy
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
@@ -253,8 +253,15 @@ def test_poses_are_the_state_if_the_policy_was_trained_so() -> None:
 
 
 def test_a_missing_picture_is_named() -> None:
+    two = observation(pictures={key: np.zeros((8, 8, 3), np.uint8) for key in CAMERAS[:2]})
     with pytest.raises(PolicyError, match="no picture 'cam_right_wrist'; it has cam_high, cam_left_wrist"):
-        request_of(observation(pictures={key: np.zeros((8, 8, 3), np.uint8) for key in CAMERAS[:2]}))
+        request_of(two, cameras={key: key for key in CAMERAS})
+
+
+def test_without_named_cameras_the_policy_gets_the_pictures_that_there_are() -> None:
+    two = observation(pictures={key: np.zeros((8, 8, 3), np.uint8) for key in CAMERAS[:2]})
+    assert set(request_of(two)["images"]) == set(CAMERAS[:2])
+    assert request_of(two, cameras={})["images"] == {}
 
 
 @pytest.mark.parametrize(
@@ -554,6 +561,50 @@ def test_close_unblocks_an_inference_that_waits_in_another_thread() -> None:
         assert not thread.is_alive()
         policy.close()
     assert "closed from our side" in str(errors[0])
+
+
+def test_close_does_not_wait_for_a_handshake_and_ends_it() -> None:
+    """A server that accepts and says nothing: the deadline is a minute, the test's own far below it."""
+    errors: list[PolicyError] = []
+
+    def connect(policy: OpenpiPolicy) -> None:
+        try:
+            policy.connect()
+        except PolicyError as error:
+            errors.append(error)
+
+    with raw_server(b"") as port, policy_at(f"ws://127.0.0.1:{port}", connect_deadline=60.0) as policy:
+        thread = threading.Thread(target=connect, args=(policy,))
+        thread.start()
+        while policy._link._shaking is None:
+            assert thread.is_alive()
+        closing = threading.Thread(target=policy.close)
+        closing.start()
+        closing.join(10)
+        thread.join(10)
+        assert not closing.is_alive()
+        assert not thread.is_alive()
+    assert "closed from our side" in str(errors[0])
+
+
+def test_close_returns_while_the_wire_is_in_use() -> None:
+    with served() as url, policy_at(url) as policy:
+        policy.connect()
+        with policy._lock:  # held by a call that cannot be woken, as by a host that does not answer
+            closing = threading.Thread(target=policy.close)
+            closing.start()
+            closing.join(10)
+            assert not closing.is_alive()
+        policy.connect()
+        assert row_zero_starts_at(policy.infer(observation(0.3)), 0.3)
+
+
+def test_a_link_that_was_aborted_before_it_opened_says_so() -> None:
+    with served() as url:
+        link = WebsocketLink(url, {}, 10.0)
+        link.abort()
+        with pytest.raises(PolicyError, match="closed from our side"):
+            link.open()
 
 
 def test_a_closed_policy_does_not_connect_by_itself_but_when_asked() -> None:

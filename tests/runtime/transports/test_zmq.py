@@ -426,17 +426,98 @@ def test_an_address_that_libzmq_refuses_is_a_transport_error() -> None:
         link.sink(config, ROBOT, MonotonicClock()).connect()
 
 
-def test_a_reader_that_broke_says_so_in_the_caller(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_in_the_reader_is_counted_and_the_next_frame_comes(
+    node: Node, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     with listening(node) as source:
         joined(node, source)
+        read, broken = source._messages.read, ["no room", "no room"]
 
-        def broken(payload: bytes) -> None:
-            raise MemoryError("no room")
+        def breaking(payload: bytes) -> Any:
+            if broken:
+                raise MemoryError(broken.pop())
+            return read(payload)
 
-        monkeypatch.setattr(source._messages, "read", broken)
-        node.say(frame(time.monotonic()))
-        with pytest.raises(TransportError, match="no room"):
-            source.receive(PATIENCE)
+        monkeypatch.setattr(source._messages, "read", breaking)
+        for _ in range(2):
+            counted = source.faults().get("reader_failed", 0)
+            node.say(frame(time.monotonic()))
+            wait_for(lambda counted=counted: source.faults().get("reader_failed", 0) > counted)  # type: ignore[misc]
+        node.say(frame(time.monotonic(), 7))
+        observation = source.receive(PATIENCE)
+        assert observation is not None
+        assert observation.qpos[0] == 7
+        assert source.faults()["reader_failed"] == 2
+        assert source.last_fault.endswith("reading failed: MemoryError: no room")
+    assert len([row for row in caplog.records if "no room" in row.message]) == 1  # said once, counted twice
+
+
+def test_a_socket_that_fails_is_opened_anew(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link, "_REOPEN_S", 0.05)
+    with listening(node) as source:
+        joined(node, source)
+        drain, failing = link._drain, [True]
+
+        def failed(socket: zmq.Socket[bytes]) -> list[bytes]:
+            if failing:
+                raise zmq.ZMQError(failing.pop() and zmq.ENOTSOCK)
+            return drain(socket)
+
+        monkeypatch.setattr(link, "_drain", failed)
+        node.say(frame(time.monotonic(), 1))
+        wait_for(lambda: source.faults().get("socket_failed") == 1)
+        assert until_heard(node, source, lambda: frame(time.monotonic(), 9)).qpos[0] == 9
+
+
+# Frozen cameras
+
+
+def pictures(**values: int) -> dict[str, Any]:
+    return {key: np.full((6, 8, 3), values.get(key, 0), np.uint8) for key in CAMERAS}
+
+
+def received(node: Node, source: NodeSource, **values: int) -> Observation:
+    node.say(frame(time.monotonic(), images=pictures(**values)))
+    observation = source.receive(PATIENCE)
+    assert observation is not None
+    return observation
+
+
+def test_a_picture_that_does_not_change_keeps_its_time_while_all_else_goes_on(node: Node) -> None:
+    with listening(node) as source:
+        joined(node, source)
+        first = received(node, source, cam_high=1, cam_left_wrist=1, cam_right_wrist=1)
+        second = received(node, source, cam_high=1, cam_left_wrist=2, cam_right_wrist=2)
+        third = received(node, source, cam_high=2, cam_left_wrist=3, cam_right_wrist=3)
+    assert second.captured["cam_high"] == first.captured["cam_high"] < second.captured["joints"]
+    assert second.captured["cam_left_wrist"] == second.captured["joints"] > first.captured["joints"]
+    assert third.captured["cam_high"] == third.captured["joints"]
+
+
+def test_a_frozen_camera_is_a_fault_with_its_name(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("runtime.transports.freshness.FROZEN_S", 0.05)
+    with listening(node) as source:
+        joined(node, source)
+        mark = 0
+        while "frozen_cam_high" not in source.faults():
+            mark = mark % 200 + 1
+            received(node, source, cam_high=250, cam_left_wrist=mark, cam_right_wrist=mark)
+        faults = source.faults()
+    assert faults["frozen_cam_high"] == 1
+    assert "frozen_cam_left_wrist" not in faults
+
+
+def test_where_cameras_may_stand_still_every_picture_is_new(node: Node) -> None:
+    with listening(node, detect_frozen=False) as source:
+        joined(node, source)
+        received(node, source, cam_high=1)
+        second = received(node, source, cam_high=1)
+    assert set(second.captured.values()) == {second.captured["joints"]}
+
+
+def test_the_cameras_of_a_deployment_are_those_that_are_not_disabled() -> None:
+    assert link.cameras(Config(), ROBOT) == CAMERAS
+    assert link.cameras(Config(disabled_cameras=["cam_high"]), ROBOT) == CAMERAS[1:]
 
 
 # Commands
