@@ -8,9 +8,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from runtime import deployment, lockstep
+from runtime import deployment, lockstep, log
 from runtime.errors import RuntimeFault
-from runtime.family import Plan, plan, start_log
+from runtime.family import Plan, plan
 from runtime.session import State
 from runtime.supervisor import Supervisor
 
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--headless", action="store_true", help="set up, run once, publish, end; holds the lease itself"
     )
     given = parser.parse_args(arguments)
-    start_log("supervisor")
+    log.start("supervisor")
     try:
         made = plan(deployment.load(given.deployment, given.assignments))
     except RuntimeFault as fault:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import os
 import select
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -16,7 +14,7 @@ import numpy as np
 
 import robots
 from robots import Robot
-from runtime import deployment
+from runtime import deployment, log
 from runtime.config import Deployment
 from runtime.deployment import Resolved
 from runtime.errors import ConfigurationError, SetupError
@@ -67,10 +65,17 @@ class Plan:
         return found
 
     @property
+    def cameras(self) -> tuple[str, ...]:
+        """Keys of the cameras that this deployment has: the robot's, unless its transport names fewer."""
+        named = getattr(self.transport, "cameras", None)
+        if named is None:
+            return tuple(camera.key for camera in self.robot.cameras)
+        fewer: tuple[str, ...] = named(self.deployment.transport, self.robot)
+        return fewer
+
+    @property
     def layout(self) -> PageLayout:
-        return PageLayout(
-            self.robot.dim, self.robot.eef_dim, tuple(camera.key for camera in self.robot.cameras)
-        )
+        return PageLayout(self.robot.dim, self.robot.eef_dim, self.cameras)
 
     @property
     def limits(self) -> Limits:
@@ -148,18 +153,7 @@ def join(process: str, pictures: bool = True) -> Member:
     parser.add_argument("--page", required=True, type=int)
     parser.add_argument("--boot", required=True)
     given = parser.parse_args()
-    start_log(process)
+    log.start(process)
     tree = json.loads(Path(given.resolved).read_text("utf-8"))
     made = plan(deployment.resolve(tree, {}, given.resolved))
     return Member(made, Page.attach(made.layout, given.page, pictures), given.boot, Lifeline())
-
-
-def start_log(process: str) -> None:
-    """Log lines on standard error: time, process, level, sentence."""
-    logging.basicConfig(
-        stream=sys.stderr,
-        level=os.environ.get("EVA_LOG_LEVEL", "INFO"),
-        format=f"%(asctime)s {process:<10} %(levelname)-7s %(message)s",
-        datefmt="%H:%M:%S",
-        force=True,
-    )

@@ -19,13 +19,14 @@ _OUTLIVES_S = 1.0  # how long it stays after control's own end, so that a press 
 
 
 class Guard:
-    """Presses and releases; the flag first, the disk second, so that no disk delays a stop."""
+    """Presses and releases: the flag, the disk, the answer, then the log; none delays what comes before it."""
 
     def __init__(self, page: Page, latch: Latch, clock: Clock, period: float) -> None:
         self._page = page
         self._latch = latch
         self._clock = clock
         self._patience = max(0.05, 2.0 * period)
+        self._unsaid: list[tuple[int, str]] = []  # level and line, for after the answer
         self._releases = page.releases  # what was asked for before is void
         latched = latch.read()
         # A restarted guard also trusts the flag of its predecessor, which may not have reached the disk.
@@ -37,26 +38,32 @@ class Guard:
         """Raise the flag, then latch on disk; returns "" or why the latch will not outlive a restart."""
         self._page.set_estop(EStop.LATCHED)
         self._releases = self._page.releases  # a release asked for before this press is not for this press
-        log.warning("E-STOP by %s: %s", by, why)
+        self._unsaid.append((logging.WARNING, f"E-STOP by {by}: {why}"))
         try:
             self._latch.set(by, why)
         except OSError as error:
-            log.error("the e-stop is not on disk: %s", error)
+            self._unsaid.append((logging.ERROR, f"the e-stop is not on disk: {error}"))
             return f"; not on disk ({error.strerror or error}): a restart of the station may forget it"
         return ""
 
     def watch(self) -> None:
-        """Release where main has asked for it, which has checked the lease; not where the disk refuses."""
-        if self._page.releases == self._releases:
-            return
+        """Release where main has asked for it, then log what there is to say."""
+        if self._page.releases != self._releases:
+            self._release()
+        for level, line in self._unsaid:
+            log.log(level, "%s", line)
+        self._unsaid.clear()
+
+    def _release(self) -> None:
+        """Main has checked the lease; where the disk refuses, the e-stop stays."""
         self._releases = self._page.releases
         try:
             self._latch.clear()
         except OSError as error:
-            log.error("the e-stop stays: its latch cannot be removed: %s", error)
+            self._unsaid.append((logging.ERROR, f"the e-stop stays: its latch cannot be removed: {error}"))
             return
         self._page.set_estop(EStop.CLEAR)
-        log.warning("e-stop released")
+        self._unsaid.append((logging.WARNING, "e-stop released"))
 
     def obeyed(self, version: int) -> bool:
         """Whether control has said since `version` of its status that it obeys.

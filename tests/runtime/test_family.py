@@ -61,6 +61,17 @@ def test_the_limits_and_the_page_are_the_robots(resolved):
     assert made.layout.cameras == tuple(camera.key for camera in robot.cameras)
 
 
+def test_disabled_cameras_are_not_in_the_page(tmp_path):
+    resolved = load(DEPLOYMENTS / "demo.toml", ['transport.disabled_cameras=["cam_high"]'])
+    assert plan(resolved).layout.cameras == ("cam_left_wrist", "cam_right_wrist")
+
+
+def test_a_transport_that_says_nothing_of_cameras_has_all_of_them():
+    resolved = load(DEPLOYMENTS / "replay_dataset.toml", ["transport.path=x", "policy.path=x"])
+    made = plan(resolved)
+    assert made.cameras == tuple(camera.key for camera in made.robot.cameras)
+
+
 def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path, monkeypatch):
     page, descriptor = Page.create(plan(resolved).layout)
     page.beat("main", 12.5)
@@ -68,7 +79,7 @@ def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path,
     handed.write_text(json.dumps(dict(resolved.tree)), "utf-8")
     arguments = ["runtime.control", "--resolved", str(handed), "--page", str(descriptor), "--boot", "b"]
     monkeypatch.setattr("sys.argv", arguments)
-    monkeypatch.setattr(family, "start_log", lambda process: None)
+    monkeypatch.setattr(family.log, "start", lambda process: None)
     member = family.join("control", pictures=False)
     assert member.plan.resolved.digest == resolved.digest
     assert member.page.last_beat("main") == 12.5

@@ -114,6 +114,16 @@ def test_the_flag_is_raised_before_the_disk_is_touched(page, control, latch, mon
     assert seen == [EStop.LATCHED]
 
 
+def test_nothing_is_logged_before_the_flag_the_disk_and_the_answer(guard, page, latch, caplog):
+    ack = press(guard)
+    assert (ack.status, caplog.text) == ("done", "")
+    guard.watch()
+    assert "E-STOP by anna: arm too low" in caplog.text
+    caplog.clear()
+    guard.watch()
+    assert caplog.text == ""
+
+
 def test_a_disk_that_fails_does_not_keep_the_flag_down(page, control, tmp_path):
     guard = Guard(page, FailingLatch(tmp_path), control, PERIOD)
     ack = press(guard)

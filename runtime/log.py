@@ -1,0 +1,85 @@
+"""Log lines on standard error through a thread, so that a stuck terminal never stops who logs."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import threading
+from queue import SimpleQueue
+from types import TracebackType
+
+LINES_KEPT = 1000
+_AT_EXIT_S = 1.0  # for what is left when the process ends
+_STDERR = 2
+_STACK_BYTES = 256 * 1024  # control locks its memory
+
+
+def start(process: str) -> None:
+    """Log lines: time, process, level, sentence. EVA_LOG_LEVEL says from which level on."""
+    lines = Lines(_STDERR)
+    lines.setFormatter(
+        logging.Formatter(f"%(asctime)s {process:<10} %(levelname)-7s %(message)s", "%H:%M:%S")
+    )
+    logging.basicConfig(level=os.environ.get("EVA_LOG_LEVEL", "INFO"), handlers=[lines], force=True)
+    sys.excepthook = _last_words
+
+
+class Lines(logging.Handler):
+    """Hands lines to a thread that writes them to a descriptor.
+
+    Where that takes no more (a stopped terminal, a pager, a pipe nobody reads), lines are dropped beyond
+    LINES_KEPT and counted; nobody ever waits, but for a second when the process ends. The writing goes around
+    Python's own buffers, whose locks a stuck writer would hold for ever.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        super().__init__()
+        self._descriptor = descriptor
+        self._queue: SimpleQueue[bytes | threading.Event] = SimpleQueue()
+        self._dropped = 0
+        before = threading.stack_size(_STACK_BYTES)
+        threading.Thread(target=self._write, name="log", daemon=True).start()
+        threading.stack_size(before)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Queue the line; no I/O and no lock that the writing thread could hold."""
+        if self._queue.qsize() >= LINES_KEPT:
+            self._dropped += 1
+            return
+        try:
+            self._queue.put(f"{self.format(record)}\n".encode(errors="backslashreplace"))
+        except (TypeError, ValueError, LookupError) as error:  # of a wrong format string
+            self._queue.put(f"{record.pathname}:{record.lineno}: cannot be logged: {error}\n".encode())
+
+    def flush(self) -> None:
+        """Wait until everything is written, at most a second; `logging` calls it when the process ends."""
+        written = threading.Event()
+        self._queue.put(written)
+        written.wait(_AT_EXIT_S)
+
+    def _write(self) -> None:
+        while True:
+            line = self._queue.get()
+            if isinstance(line, threading.Event):
+                line.set()
+                continue
+            dropped, self._dropped = self._dropped, 0
+            if dropped:
+                line = f"({dropped} lines were dropped: nobody took them)\n".encode() + line
+            self._put(line)
+
+    def _put(self, line: bytes) -> None:
+        try:
+            while line:
+                line = line[os.write(self._descriptor, line) :]
+        except OSError:
+            self._dropped += 1  # the terminal is gone; it may come back
+
+
+def _last_words(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """What ends the process goes the same way: a traceback must not wait for a terminal either."""
+    if issubclass(kind, Exception):
+        logging.getLogger(__name__).critical("this process ends", exc_info=(kind, error, trace))
+    else:
+        sys.__excepthook__(kind, error, trace)
