@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from runtime.errors import RuntimeFault
+
 _LENGTH_CRC = struct.Struct("<II")
 _ALIGN = 64  # one cache line, so that two writers never share one
 
@@ -49,7 +51,7 @@ def attach(descriptor: int, size: int = 0) -> mmap.mmap:
     return mmap.mmap(descriptor, size or os.fstat(descriptor).st_size)
 
 
-class TornReadError(Exception):
+class TornReadError(RuntimeFault):
     """A record changed under the reader several times in a row; its writer is far faster than expected."""
 
 

@@ -2,16 +2,28 @@ import mmap
 import multiprocessing
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.memory import Record, Ring
+from runtime.errors import RuntimeFault
+from runtime.memory import Record, Ring, TornReadError
 
 DTYPE = np.dtype([("a", "i8"), ("b", "f4", 7)])
 
 
 def record() -> Record:
     return Record(mmap.mmap(-1, Record.size(DTYPE)), 0, DTYPE)
+
+
+def test_a_record_that_cannot_be_read_whole_is_a_fault_that_main_can_tell():
+    memory = mmap.mmap(-1, Record.size(DTYPE))
+    torn = Record(memory, 0, DTYPE)
+    torn.write(value(7))
+    memory[: Record.size(DTYPE)] = memory[:8] + bytes(Record.size(DTYPE) - 8)  # all but its version
+    with pytest.raises(TornReadError, match="could not be read in 100 tries") as torn_error:
+        torn.read()
+    assert isinstance(torn_error.value, RuntimeFault)
 
 
 def ring(capacity: int) -> Ring:
