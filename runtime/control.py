@@ -153,7 +153,7 @@ def main() -> None:
     loop = Loop(tick, page, clock, plan.rate, scheduling)
     while not member.lifeline.cut:
         loop.once()
-    log.warning("the supervisor is gone: holding for %g s, then ending", settings.orphan_hold_s)
+    log.info("the supervisor has ended: holding for %g s, then ending", settings.orphan_hold_s)
     tick.orphaned = True
     until = clock.now() + settings.orphan_hold_s
     while clock.now() < until:
