@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import os
+import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +31,7 @@ from runtime.messages import (
     event_row,
 )
 from runtime.page import Page
-from runtime.recorder import Grid, Recorder
+from runtime.recorder import Closed, Grid, Recorder
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.repair import repair
 from runtime.transports.base import Source
@@ -37,6 +40,31 @@ from runtime.types import Observation
 log = logging.getLogger(__name__)
 _REPORT_PERIOD = 0.2
 _RATE_WINDOW = 40  # arrivals per stream
+_LAST_S = 8.0  # for the last episode, before the supervisor's patience ends
+_CLOSING_S = 1.0  # how long a new episode waits for the one before it; longer is a disk in trouble
+
+Close = Callable[[], Closed]
+
+
+def at_once(close: Close) -> Future[Closed]:
+    """Close an episode here and now, as lockstep does."""
+    done: Future[Closed] = Future()
+    done.set_result(close())
+    return done
+
+
+def in_background(close: Close) -> Future[Closed]:
+    """Close an episode on a thread of its own, so that a slow disk stops nothing else."""
+    done: Future[Closed] = Future()
+
+    def run() -> None:
+        try:
+            done.set_result(close())
+        except Exception as error:  # raised where the result is asked for
+            done.set_exception(error)
+
+    threading.Thread(target=run, name="closing", daemon=True).start()
+    return done
 
 
 class Media:
@@ -49,12 +77,18 @@ class Media:
         recorder: Recorder,
         clock: Clock,
         preview: Callable[[Observation], None] = lambda observation: None,
+        closer: Callable[[Close], Future[Closed]] = at_once,
     ) -> None:
         self._page = page
         self._source = source
         self._recorder = recorder
         self._clock = clock
         self._preview = preview
+        self._closer = closer
+        self._closing: Future[Closed] | None = None
+        self._closing_uuid = ""
+        self._waiting: BeginEpisode | None = None  # for the episode before it to be closed
+        self._waiting_since = 0.0
         self._numbers: Counter[str] = Counter({c: self._newest(c) for c in page.layout.cameras})
         self._captured: dict[str, float] = {}
         self._arrivals: dict[str, deque[float]] = {}
@@ -83,6 +117,7 @@ class Media:
 
     def digest(self) -> None:
         """Write down what control and main have posted."""
+        self._collect()
         self._drain("minutes")
         self._drain("ticks")
         now = self._clock.now()
@@ -91,8 +126,23 @@ class Media:
             self._report(now)
 
     def _drain(self, ring: str) -> None:
+        if ring == "minutes" and not self._ready_to_begin():
+            return
         for payload in self._page.rings[ring].drain():
             self._hear(decode(payload))
+            if self._waiting is not None and ring == "minutes":
+                return  # what follows belongs to an episode that has not begun
+
+    def _ready_to_begin(self) -> bool:
+        """Begin what has waited for long enough; False where it has to wait on."""
+        waiting = self._waiting
+        if waiting is None:
+            return True
+        if self._closing is not None and self._clock.now() - self._waiting_since < _CLOSING_S:
+            return False
+        self._waiting = None
+        self._begin(waiting)
+        return True
 
     # --- observations --------------------------------------------------------------------------------------
 
@@ -154,6 +204,8 @@ class Media:
             recorder.answered(message)
         elif isinstance(message, Event):
             recorder.mark(event_row(message))
+        elif isinstance(message, BeginEpisode) and self._closing is not None:
+            self._waiting, self._waiting_since = message, self._clock.now()
         elif isinstance(message, BeginEpisode):
             self._begin(message)
         elif isinstance(message, EndEpisode):
@@ -162,7 +214,9 @@ class Media:
 
     def _begin(self, message: BeginEpisode) -> None:
         identity, path, error = "", Path(), ""
-        if message.manifest is not None:
+        if message.manifest is not None and self._closing is not None:
+            error = "the last episode is still being written: is the disk slow? try again in a moment"
+        elif message.manifest is not None:
             try:
                 identity, path = self._recorder.begin(message.manifest, message.run)
             except RecordingError as fault:
@@ -175,14 +229,29 @@ class Media:
         self._tell(EpisodeOpened(message.run, identity, str(path), error))
 
     def end(self, status: str, reason: str, details: Mapping[str, Any] | None = None) -> None:
-        """Close the open episode, if there is one."""
+        """Close the open episode, if there is one; main is told when that is done."""
         if self._recorder.recording:
-            closed = self._recorder.end(status, reason, details or {})  # type: ignore[arg-type]
-            self._tell(
-                EpisodeClosed(
-                    closed.uuid, str(closed.path), closed.status, closed.reason, closed.rows, closed.error
-                )
+            self._closing_uuid = self._recorder.recording
+            self._closing = self._closer(self._recorder.end(status, reason, details or {}))  # type: ignore[arg-type]
+            self._collect()
+
+    def finish(self, seconds: float) -> None:
+        """Wait for an episode that is being closed, at most so long; what is missing then, repair completes."""
+        if self._closing is not None:
+            wait([self._closing], seconds)
+            self._collect()
+        if self._closing is not None:
+            log.error("episode %s was not closed within %g s", self._closing_uuid, seconds)
+
+    def _collect(self) -> None:
+        if self._closing is None or not self._closing.done():
+            return
+        closed, self._closing, self._closing_uuid = self._closing.result(), None, ""
+        self._tell(
+            EpisodeClosed(
+                closed.uuid, str(closed.path), closed.status, closed.reason, closed.rows, closed.error
             )
+        )
 
     def _fail(self, error: RecordingError) -> None:
         log.error("recording failed: %s", error)
@@ -198,7 +267,8 @@ class Media:
         self._faults = dict(faults)
         rates = {stream: self._rate(stream, now) for stream in self._arrivals}
         recorder = self._recorder
-        self._tell(MediaReport(now, rates, faults, recorder.rows, recorder.recording, recorder.repeated))
+        recording = recorder.recording or self._closing_uuid  # until it is on disk
+        self._tell(MediaReport(now, rates, faults, recorder.rows, recording, recorder.repeated))
 
     def _say(self, event: Event) -> None:
         """An event of media's own: to main, and into the episode."""
@@ -257,12 +327,27 @@ class _Previews:
             self._publisher.publish(f"camera/{camera}", simplejpeg.encode_jpeg(small, quality=80))
 
 
-def _repair_leftovers(plan: Plan) -> None:
-    """Close what this station's last start left open: nobody else writes its episodes."""
-    for manifest in plan.deployment.episodes_dir.glob("*/manifest.json"):
-        if (manifest.parent / "outcome.json").exists() or _station_of(manifest) != plan.deployment.station:
+def leftovers(root: Path) -> list[Path]:
+    """The folders of episodes without an outcome, to be found before the first new one begins."""
+    folders = [manifest.parent for manifest in root.glob("*/manifest.json")]
+    return [folder for folder in folders if not os.path.exists(folder / "outcome.json")]
+
+
+def repair_leftovers(folders: list[Path], station: str) -> None:
+    """Close what the last start of `station` left open: nobody else writes its episodes.
+
+    One that cannot be repaired is left as it is, for `python -m runtime.recording repair` and a person.
+    """
+    for folder in folders:
+        if _station_of(folder / "manifest.json") != station:
             continue
-        log.warning("an episode was left open: %s", repair(manifest.parent))
+        try:
+            report = repair(folder)
+            log.warning("episode %s was left open: %s, %d rows", folder.name, report.verdict, report.frames)
+        except RecordingError as error:
+            log.error("episode %s was left open and stays as it is: %s", folder.name, error)
+        except Exception:  # of a file that nobody foresaw: it must not keep the others
+            log.exception("episode %s was left open and stays as it is", folder.name)
 
 
 def _station_of(manifest: Path) -> str:
@@ -278,9 +363,10 @@ def main() -> None:
     member = join("media")
     plan, page = member.plan, member.page
     clock = MonotonicClock()
-    _repair_leftovers(plan)
+    page.beat("media", clock.now())
+    _start_repair(plan)
     source: Source = plan.transport.source(plan.deployment.transport, plan.robot, clock)
-    media = Media(page, source, make_recorder(plan, clock.now), clock, _Previews(member))
+    media = Media(page, source, make_recorder(plan, clock.now), clock, _Previews(member), in_background)
     connected = False
     try:
         while not member.lifeline.cut:
@@ -297,7 +383,16 @@ def main() -> None:
                 media.end("interrupted", f"main has given no sign of life for {silent:.1f} s")
     finally:
         media.end("interrupted", "the station's supervisor ended")
+        media.finish(_LAST_S)
         source.close()
+
+
+def _start_repair(plan: Plan) -> None:
+    """On a thread: what is to be received and recorded now does not wait for what was left."""
+    left = leftovers(plan.deployment.episodes_dir)
+    threading.Thread(
+        target=repair_leftovers, args=(left, plan.deployment.station), name="repair", daemon=True
+    ).start()
 
 
 _retry_at = 0.0

@@ -114,22 +114,31 @@ class Recorder:
             "started_monotonic": self._now(),
         }
 
-    def end(self, status: Status, reason: str, details: Mapping[str, Any]) -> Closed:
-        """Close the episode; what could not be saved is named in `error`."""
-        error = ""
+    def end(self, status: Status, reason: str, details: Mapping[str, Any]) -> Callable[[], Closed]:
+        """End the episode: nothing more is taken for it.
+
+        What is returned closes its files, on any thread, and may wait for the disk; until it is done no other
+        episode may begin. What could not be saved is named in `Closed.error`.
+        """
+        error, rows = "", self.rows
         identity, path = self._uuid, self._root / self._uuid
         try:
             for answer in list(self._answers.values()):
                 self._write_chunk(answer, None)
         except RecordingError as fault:
             error = str(fault)
-        try:
-            outcome = Outcome("failed" if error else status, error or reason, time.time(), details)
-            self._journal.end(outcome)
-        except RecordingError as fault:
-            error = str(fault)
         self._uuid = ""
-        return Closed(identity, path, "failed" if error else status, error or reason, self.rows, error)
+        outcome = Outcome("failed" if error else status, error or reason, time.time(), details)
+
+        def close() -> Closed:
+            failure = error
+            try:
+                self._journal.end(outcome)
+            except RecordingError as fault:
+                failure = str(fault)
+            return Closed(identity, path, "failed" if failure else status, failure or reason, rows, failure)
+
+        return close
 
     # --- what comes in -------------------------------------------------------------------------------------
 

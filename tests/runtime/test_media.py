@@ -1,16 +1,20 @@
 from __future__ import annotations
 
+import json
 import mmap
+import threading
 from collections import deque
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from runtime import media
 from runtime.clock import VirtualClock
-from runtime.errors import TransportError
-from runtime.media import Media
+from runtime.errors import RecordingError, TransportError
+from runtime.media import Media, at_once, in_background, leftovers, repair_leftovers
 from runtime.messages import (
     BeginEpisode,
     EndEpisode,
@@ -25,6 +29,7 @@ from runtime.messages import (
 )
 from runtime.page import Page, PageLayout
 from runtime.recorder import Grid, Recorder
+from runtime.recording.repair import Report
 from runtime.transports.base import Source
 from runtime.types import Observation
 from tests.runtime.test_recorder import FakeJournal
@@ -66,7 +71,7 @@ class FakeSource(Source):
 
 
 class Desk:
-    def __init__(self) -> None:
+    def __init__(self, closer: Any = at_once) -> None:
         layout = PageLayout(2, 8, CAMERAS, 300)
         self.page = Page(layout, mmap.mmap(-1, Page.size(layout)))
         self.clock, self.source, self.journal = VirtualClock(100.0), FakeSource(), FakeJournal()
@@ -75,7 +80,7 @@ class Desk:
         recorder = Recorder(self.journal, Path("/episodes"), grid, self.clock.now)
         self.previewed: list[int] = []
         self.media = Media(
-            self.page, self.source, recorder, self.clock, lambda o: self.previewed.append(o.sequence)
+            self.page, self.source, recorder, self.clock, lambda o: self.previewed.append(o.sequence), closer
         )
 
     def observation(self, sequence: int, **changes: Any) -> Observation:
@@ -309,6 +314,180 @@ def test_the_report_counts_rows_and_repeated_pictures(desk: Desk) -> None:
     desk.media.pump(0.0)
     report = desk.told(MediaReport)[-1]
     assert (report.rows, report.recording, report.repeated) == (2, "one", 2)
+
+
+# --- an end that takes long --------------------------------------------------------------------------------
+
+
+class SlowDisk:
+    """Closes an episode when the test lets it."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Future[Any], Any]] = []
+
+    def __call__(self, close: Any) -> Future[Any]:
+        done: Future[Any] = Future()
+        self.calls.append((done, close))
+        return done
+
+    def finish(self) -> None:
+        done, close = self.calls.pop(0)
+        done.set_result(close())
+
+
+@pytest.fixture
+def disk() -> SlowDisk:
+    return SlowDisk()
+
+
+@pytest.fixture
+def slow(disk: SlowDisk) -> Desk:
+    """A desk whose first episode is being closed."""
+    desk = Desk(disk)
+    desk.receive(1)
+    desk.begin()
+    desk.tick(0, 1)
+    desk.post(EndEpisode("finished", "over"))
+    desk.media.pump(0.0)
+    desk.told(Event)
+    return desk
+
+
+def test_while_an_episode_is_being_closed_media_receives_and_still_counts_it_as_recording(
+    slow: Desk, disk: SlowDisk
+) -> None:
+    slow.receive(*range(2, 12))
+    messages = [decode(payload) for payload in slow.page.rings["media_events"].drain()]
+    assert slow.page.observation.read()["sequence"] == 11
+    assert [m.recording for m in messages if isinstance(m, MediaReport)][-1] == "one"
+    assert [m for m in messages if isinstance(m, EpisodeClosed)] == []
+    disk.finish()
+    slow.media.digest()
+    (closed,) = slow.told(EpisodeClosed)
+    assert (closed.uuid, closed.status, closed.rows) == ("one", "finished", 1)
+    slow.clock.advance(1.0)
+    slow.media.digest()
+    assert slow.told(MediaReport)[-1].recording == ""
+
+
+def test_a_run_that_is_asked_for_meanwhile_begins_when_the_disk_is_done(slow: Desk, disk: SlowDisk) -> None:
+    slow.post(BeginEpisode(2, {"uuid": "two"}))
+    slow.post(Event("x", "of the second", 1.0))
+    slow.media.digest()
+    assert slow.told(EpisodeOpened) == []
+    disk.finish()
+    slow.media.digest()
+    messages = [decode(payload) for payload in slow.page.rings["media_events"].drain()]
+    kept = [m for m in messages if isinstance(m, EpisodeClosed | EpisodeOpened)]
+    assert [m.uuid for m in kept] == ["one", "two"]
+    assert slow.journal.events[-1]["text"] == "of the second"
+
+
+def test_a_run_is_refused_where_the_disk_takes_its_time(slow: Desk, disk: SlowDisk) -> None:
+    slow.post(BeginEpisode(2, {"uuid": "two"}))
+    slow.media.digest()
+    slow.clock.advance(1.01)
+    slow.media.digest()
+    (opened,) = slow.told(EpisodeOpened)
+    assert opened.run == 2
+    assert "the last episode is still being written" in opened.error
+    assert slow.source.begun == 1  # of the first run
+    disk.finish()
+    slow.media.digest()
+    slow.begin(run=3, uuid="three")
+    assert slow.told(EpisodeOpened)[-1].uuid == "three"
+
+
+def test_a_run_that_is_not_recorded_waits_for_no_disk_longer_than_that(slow: Desk) -> None:
+    slow.post(BeginEpisode(2, None))
+    slow.media.digest()
+    slow.clock.advance(1.01)
+    slow.media.digest()
+    (opened,) = slow.told(EpisodeOpened)
+    assert (opened.run, opened.error) == (2, "")
+
+
+def test_at_the_end_of_the_process_the_last_episode_is_waited_for_but_not_for_ever(
+    slow: Desk, disk: SlowDisk, caplog: pytest.LogCaptureFixture
+) -> None:
+    slow.media.finish(0.01)
+    assert "episode one was not closed within 0.01 s" in caplog.text
+    disk.finish()
+    slow.media.finish(10.0)
+    assert [closed.uuid for closed in slow.told(EpisodeClosed)] == ["one"]
+
+
+def test_a_thread_closes_while_the_caller_goes_on() -> None:
+    let, desk = threading.Event(), Desk(in_background)
+    end = desk.journal.end
+
+    def waiting(outcome: Any) -> None:
+        assert let.wait(10)
+        end(outcome)
+
+    desk.journal.end = waiting  # type: ignore[method-assign]
+    desk.receive(1)
+    desk.begin()
+    desk.media.end("interrupted", "because")
+    assert not desk.media.recording
+    assert desk.told(EpisodeClosed) == []
+    let.set()
+    desk.media.finish(10.0)
+    assert [(c.status, c.reason) for c in desk.told(EpisodeClosed)] == [("interrupted", "because")]
+
+
+def test_an_error_of_our_own_while_closing_ends_media_as_it_would_anywhere() -> None:
+    desk = Desk(in_background)
+    desk.receive(1)
+    desk.begin()
+
+    def broken(outcome: Any) -> None:
+        raise ZeroDivisionError("a mistake")
+
+    desk.journal.end = broken  # type: ignore[method-assign]
+    with pytest.raises(ZeroDivisionError, match="a mistake"):  # noqa: PT012  # whichever comes first
+        desk.media.end("finished", "over")
+        desk.media.finish(10.0)
+
+
+# --- what was left open ------------------------------------------------------------------------------------
+
+
+def left(root: Path, name: str, station: str = "bench") -> Path:
+    """The folder of an episode that was begun and not closed; its manifest is none that can be repaired."""
+    folder = root / name
+    folder.mkdir(parents=True)
+    (folder / "manifest.json").write_text(json.dumps({"station": station}), "utf-8")
+    return folder
+
+
+def test_only_folders_without_an_outcome_are_left_over(tmp_path: Path) -> None:
+    (left(tmp_path, "closed") / "outcome.json").write_text("{}", "utf-8")
+    (tmp_path / "no episode").mkdir()
+    left_open = left(tmp_path, "open")
+    assert leftovers(tmp_path) == [left_open]
+    assert leftovers(tmp_path / "nothing was ever recorded") == []
+
+
+@pytest.mark.parametrize("error", [RecordingError("disk full"), ZeroDivisionError("a mistake")])
+def test_a_leftover_that_cannot_be_repaired_keeps_no_other_from_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: Exception
+) -> None:
+    seen: list[str] = []
+
+    def repaired(folder: Path) -> Report:
+        seen.append(folder.name)
+        if folder.name == "bad":
+            raise error
+        return Report(folder, "repaired", frames=7)
+
+    monkeypatch.setattr(media, "repair", repaired)
+    folders = [left(tmp_path, "bad"), left(tmp_path, "foreign", "bench-2"), left(tmp_path, "good")]
+    repair_leftovers(folders, "bench")
+    assert seen == ["bad", "good"]
+    assert "episode bad was left open and stays as it is" in caplog.text
+    assert str(error) in caplog.text
+    assert "episode good was left open: repaired, 7 rows" in caplog.text
 
 
 def test_ending_without_an_episode_says_nothing(desk: Desk) -> None:

@@ -253,7 +253,7 @@ def test_a_resampled_row_counts_for_the_first_step_that_was_made_from_it(desk: D
 
 def test_answers_that_were_never_merged_are_written_at_the_end(desk: Desk) -> None:
     desk.answer(4)
-    desk.recorder.end("finished", "over", {})
+    desk.recorder.end("finished", "over", {})()
     (chunk,) = desk.journal.of(RawChunk)
     assert (chunk.arrival_step, chunk.delay) == (-1, -1)
     assert chunk.target_steps.tolist() == [-1, -1, -1]
@@ -327,7 +327,7 @@ def test_a_journal_that_cannot_begin_leaves_nothing_open() -> None:
 
 def test_the_end_says_how_it_went_and_a_next_episode_counts_from_zero(desk: Desk) -> None:
     desk.tick(0)
-    closed = desk.recorder.end("interrupted", "because", {"a": 1})
+    closed = desk.recorder.end("interrupted", "because", {"a": 1})()
     assert (closed.uuid, closed.status, closed.reason, closed.rows, closed.error) == (
         "one",
         "interrupted",
@@ -351,12 +351,23 @@ def test_a_journal_that_fails_at_the_end_closes_the_episode_as_failed_with_the_e
     desk.tick(0)
     desk.answer(4)
     desk.journal.failing = {failing}
-    closed = desk.recorder.end("finished", "over", {})
+    closed = desk.recorder.end("finished", "over", {})()
     assert closed.status == "failed"
     assert closed.error == f"disk full while {failing}"
     assert closed.reason == closed.error
     assert desk.journal.outcome is not None  # it was told to end all the same
     assert desk.recorder.recording == ""
+
+
+def test_an_ended_episode_takes_nothing_more_although_its_files_are_not_closed_yet(desk: Desk) -> None:
+    desk.tick(0)
+    close = desk.recorder.end("finished", "over", {})
+    assert desk.recorder.recording == ""
+    desk.tick(1)
+    assert len(desk.journal.rows) == 1
+    assert desk.journal.outcome is None
+    assert close().rows == 1
+    assert desk.journal.outcome is not None
 
 
 def test_a_journal_that_fails_in_the_middle_raises(desk: Desk) -> None:
