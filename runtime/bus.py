@@ -7,7 +7,9 @@ leaves its endpoints.
 from __future__ import annotations
 
 import json
+import logging
 import os
+import threading
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -20,6 +22,8 @@ from runtime.codecs import pack, unpack
 from runtime.errors import CodecError, TransportError
 from runtime.messages import Ack, Command, Event, decode, encode
 
+log = logging.getLogger(__name__)
+RETRY_S = 1.0
 # What a publisher queues per reader that does not keep up, beyond which ZMQ drops the newest. It counts a
 # queue as emptied only when half of it is, so it has to take two bursts: all events, all cameras at once.
 STREAM_HIGH_WATER = 64
@@ -35,13 +39,46 @@ class Endpoints:
 
     def __init__(self, station_dir: Path) -> None:
         self._folder = station_dir / "endpoints"
+        self._wanted: dict[str, str] = {}  # by process, what is not on disk yet
+        self._lock = threading.Lock()
 
-    def write(self, process: str, endpoints: Mapping[str, str]) -> None:
-        """Leave this process's endpoints, replacing those of its predecessor at once."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        new = self._folder / f".{process}.{os.getpid()}"
-        new.write_text(json.dumps({**endpoints, "pid": os.getpid()}), "utf-8")
-        new.replace(self._folder / f"{process}.json")
+    def write(self, process: str, endpoints: Mapping[str, str]) -> bool:
+        """Leave this process's endpoints, replacing those of its predecessor at once.
+
+        Where the disk refuses, a line in the log says so, and a thread tries again once a second until it does
+        not: the work of the process does not depend on it. Returns whether they are there.
+        """
+        with self._lock:
+            retried = bool(self._wanted)
+            self._wanted[process] = json.dumps({**endpoints, "pid": os.getpid()})
+            failure = self._try()
+        if failure is not None:
+            log.error(
+                "clients cannot find the process %s until the disk takes its file: %s", process, failure
+            )
+            if not retried:
+                threading.Thread(target=self._retry, name="endpoints", daemon=True).start()
+        return failure is None
+
+    def _retry(self) -> None:
+        while True:
+            time.sleep(RETRY_S)
+            with self._lock:
+                if self._try() is None:
+                    return
+
+    def _try(self) -> OSError | None:
+        """Write what is wanted; the error that kept some of it from the disk."""
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            for process in list(self._wanted):
+                new = self._folder / f".{process}.{os.getpid()}"
+                new.write_text(self._wanted[process], "utf-8")
+                new.replace(self._folder / f"{process}.json")
+                del self._wanted[process]
+        except OSError as error:
+            return error
+        return None
 
     def read(self, process: str) -> dict[str, Any]:
         """The endpoints of `process`; raises TransportError where the station has none."""
@@ -59,7 +96,9 @@ class Endpoints:
         return found
 
     def clear(self) -> None:
-        """Remove what a former family left."""
+        """Remove what a former family left, and forget what is not written yet."""
+        with self._lock:
+            self._wanted.clear()
         for path in self._folder.glob("*.json"):
             path.unlink(missing_ok=True)
 

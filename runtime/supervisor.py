@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 _START_ORDER = ("guard", "media", "control", "main")
 _MOST_RESTARTS, _RESTART_WINDOW_S = 5, 60.0
 _PATIENCE_S = 9.0  # after the lifeline is cut; then what is left is killed
+_DRIVER_PATIENCE_S = 2.0  # for what drives a headless run, after it was told to end
 _POLL_S = 0.05
 
 
@@ -34,26 +35,38 @@ class Supervisor:
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
         self._station_dir = plan.deployment.station_dir
+        self._endpoints = Endpoints(self._station_dir)
+        self._environment = dict(os.environ)
         self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._driver: subprocess.Popen[bytes] | None = None
         self._restarts: deque[float] = deque()
         self._ending = False
         self.boot = str(uuid.uuid4())
 
     def run(self, headless: bool) -> int:
         """Start, watch until a signal or the end of a headless run, end; returns the exit code."""
-        lock = self._lock()
-        Endpoints(self._station_dir).clear()
+        try:
+            lock = self._lock()
+            self._resolved = self._write_resolved()
+        except OSError as error:
+            raise SetupError(
+                f"{self._station_dir} cannot be written ({error.strerror}): make room there, or name another "
+                "folder with data_dir"
+            ) from None
+        self._endpoints.clear()
         self._page, self._page_fd = Page.create(self._plan.layout)
-        self._resolved = self._write_resolved()
         # Children hold the reading end as their standard input: it ends when this process does, however it does.
         self._lifeline_out, self._lifeline_in = os.pipe()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
         try:
+            if headless:  # its output is for a person: what matters, without the log of every process
+                self._environment.setdefault("EVA_LOG_LEVEL", "WARNING")
             for process in _START_ORDER:
                 self._start(process)
-            driver = self._spawn("headless") if headless else None
-            return self._watch(driver)
+            if headless:
+                self._driver = self._spawn("headless")
+            return self._watch()
         finally:
             self._end()
             lock.close()
@@ -70,8 +83,7 @@ class Supervisor:
                 "end it first, or give this one another name with --set station=NAME"
             ) from None
         lock.truncate(0)
-        lock.write(str(os.getpid()))
-        lock.flush()
+        os.write(lock.fileno(), str(os.getpid()).encode())
         return lock
 
     def _write_resolved(self) -> Path:
@@ -84,7 +96,7 @@ class Supervisor:
         self._page.set_generation(process, self._page.generation(process) + 1)
         self._children[process] = self._spawn(process)
         pids = {name: str(child.pid) for name, child in self._children.items()}
-        Endpoints(self._station_dir).write("supervisor", {"boot": self.boot, **pids})
+        self._endpoints.write("supervisor", {"boot": self.boot, **pids})
 
     def _spawn(self, process: str) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
@@ -94,21 +106,19 @@ class Supervisor:
             ],
             stdin=self._lifeline_out,
             pass_fds=(self._page_fd,),
+            env=self._environment,
             start_new_session=True,  # Ctrl-C reaches the supervisor alone, which ends them in order
         )
 
-    def _watch(self, driver: subprocess.Popen[bytes] | None) -> int:
+    def _watch(self) -> int:
         while not self._ending:
-            if driver is not None and driver.poll() is not None:
-                return driver.returncode
+            if self._driver is not None and self._driver.poll() is not None:
+                return self._driver.returncode
             for process in PROCESSES:
                 code = self._children[process].poll()
                 if code is not None and not self._restart(process, code):
                     return 1
             time.sleep(_POLL_S)
-        if driver is not None:
-            driver.terminate()
-            driver.wait()
         return 130
 
     def _restart(self, process: str, code: int) -> bool:
@@ -132,16 +142,24 @@ class Supervisor:
         self._ending = True
 
     def _end(self) -> None:
-        """Cut the lifeline; each child closes its files, control holds for its time; kill what does not end."""
+        """End the driver, which commands the others; cut the lifeline: each child closes its files, control holds
+        for its time; kill what does not end.
+        """
+        if self._driver is not None and self._driver.poll() is None:
+            self._driver.terminate()
+            self._await("headless", self._driver, _DRIVER_PATIENCE_S)
         os.close(self._lifeline_in)
         deadline = time.monotonic() + _PATIENCE_S
         for process, child in self._children.items():
-            try:
-                child.wait(max(0.1, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                log.error("%s does not end: killed", process)
-                child.kill()
-                child.wait()
+            self._await(process, child, max(0.1, deadline - time.monotonic()))
         os.close(self._lifeline_out)
         os.close(self._page_fd)
-        Endpoints(self._station_dir).clear()
+        self._endpoints.clear()
+
+    def _await(self, process: str, child: subprocess.Popen[bytes], seconds: float) -> None:
+        try:
+            child.wait(seconds)
+        except subprocess.TimeoutExpired:
+            log.error("%s does not end: killed", process)
+            child.kill()
+            child.wait()

@@ -1,3 +1,4 @@
+import errno
 import socket
 import time
 
@@ -320,6 +321,47 @@ def test_what_a_former_family_left_can_be_cleared(tmp_path):
     endpoints.clear()
     with pytest.raises(TransportError):
         endpoints.read("main")
+
+
+@pytest.fixture
+def refusing(monkeypatch):
+    """A disk that takes nothing until the test says so."""
+    disk = {"full": True}
+    write = bus.Path.write_text
+
+    def written(path, *arguments):
+        if disk["full"]:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, *arguments)
+
+    monkeypatch.setattr(bus.Path, "write_text", written)
+    monkeypatch.setattr(bus, "RETRY_S", 0.01)
+    return disk
+
+
+def test_endpoints_that_the_disk_refuses_are_said_and_come_when_it_takes_them(tmp_path, refusing, caplog):
+    endpoints = Endpoints(tmp_path / "bench-1")
+    assert endpoints.write("media", {"cameras": "tcp://127.0.0.1:1"}) is False
+    assert endpoints.write("media", {"cameras": "tcp://127.0.0.1:2"}) is False
+    assert "cannot find the process media until the disk takes its file" in caplog.text
+    with pytest.raises(TransportError):
+        endpoints.read("media")
+    refusing["full"] = False
+    deadline = time.monotonic() + 10
+    while not list(tmp_path.glob("bench-1/endpoints/*.json")):
+        assert time.monotonic() < deadline
+    assert endpoints.read("media")["cameras"] == "tcp://127.0.0.1:2"
+    assert endpoints.write("media", {"cameras": "tcp://127.0.0.1:3"}) is True
+    assert endpoints.read("media")["cameras"] == "tcp://127.0.0.1:3"
+
+
+def test_endpoints_that_are_cleared_do_not_come_later(tmp_path, refusing):
+    endpoints = Endpoints(tmp_path / "bench-1")
+    endpoints.write("media", {})
+    endpoints.clear()
+    refusing["full"] = False
+    assert endpoints.write("main", {}) is True
+    assert [path.name for path in tmp_path.glob("bench-1/endpoints/*.json")] == ["main.json"]
 
 
 # --- events ------------------------------------------------------------------------------------------------
