@@ -53,7 +53,7 @@ def _do(client: StationClient, given: argparse.Namespace) -> int:
         return 0 if ack.status == "done" else 1
     if given.command == "status":
         status = client.status()
-        print(json.dumps(status, indent=1, default=str) if given.json else line(status))
+        print(json.dumps(status, indent=1, default=str) if given.json else line(status, client.holder))
         return 0
     if given.command == "watch":
         return _watch(client, given.json)
@@ -104,7 +104,7 @@ def _watch(client: StationClient, as_json: bool) -> int:
             seen = _print_events(client, seen, as_json)
         if time.monotonic() - shown > 0.5:
             shown = time.monotonic()
-            print(json.dumps(status, default=str) if as_json else line(status), flush=True)
+            print(json.dumps(status, default=str) if as_json else line(status, client.holder), flush=True)
 
 
 def _print_events(client: StationClient, after: int, as_json: bool) -> int:
@@ -116,21 +116,41 @@ def _print_events(client: StationClient, after: int, as_json: bool) -> int:
     return after
 
 
-def line(status: dict[str, Any]) -> str:
-    """One line of figures for a terminal."""
-    control, policy, link = status["control"], status["policy"], status["link"]
-    run = f"  run {status['run']['elapsed']:6.1f} s" if status["run"]["number"] else ""
-    rows = f"  {status['recording']['rows']} rows" if status["recording"]["uuid"] else ""
-    rates = " ".join(f"{name} {rate:.1f}" for name, rate in sorted(link["rates"].items()))
-    latency = policy["latency_p50_ms"]
-    asked = "" if math.isnan(latency) else f"  policy {latency:.0f} ms (delay {policy['delay_p50']:.0f})"
-    stage = f" {status['stage']}" if status["state"] == "setting_up" else ""
-    holder = status["lease"]["holder"] or "nobody"
-    return (
-        f"{status['station']}  {status['state'].upper()}{stage}: {status['reason']}{run}{rows}{asked}  "
-        f"tick p99 {control['lateness_p99_ms']:.2f} ms, {control['missed']} missed  "
-        f"Hz {rates or '-'}  lease {holder}"
-    )
+def line(status: dict[str, Any], me: str | None = None) -> str:
+    """One line for a person; with `me`, a lease that somebody else holds is named too."""
+    stage = f" ({status['stage']})" if status["state"] == "setting_up" else ""
+    reason = f": {status['reason']}" if status["reason"] else ""
+    parts = [f"{status['state'].upper()}{stage}{reason}", *_run_figures(status), *_tick_figures(status)]
+    holder = status["lease"]["holder"]
+    if me is not None and holder not in ("", me):
+        parts.append(f"lease: {holder}")
+    return "  ".join(parts)
+
+
+def _run_figures(status: dict[str, Any]) -> list[str]:
+    parts = []
+    if status["run"]["number"]:
+        parts.append(f"{status['run']['elapsed']:.1f} s")
+    if status["recording"]["uuid"]:
+        parts.append(f"{status['recording']['rows']} rows")
+    policy = status["policy"]
+    if not math.isnan(policy["latency_p50_ms"]):
+        parts.append(f"policy {policy['latency_p50_ms']:.0f} ms, delay {figure(policy['delay_p50'])}")
+    return parts
+
+
+def _tick_figures(status: dict[str, Any]) -> list[str]:
+    control = status["control"]
+    parts = [f"tick p99 {control['lateness_p99_ms']:.2f} ms, {control['missed']} missed"]
+    rates = [rate for name, rate in status["link"]["rates"].items() if name not in ("joints", "eef")]
+    if rates:
+        parts.append(f"cameras {min(rates):.0f} Hz")  # the slowest
+    return parts
+
+
+def figure(value: float) -> str:
+    """A whole number, or a dash for what has not been measured."""
+    return "-" if math.isnan(value) else f"{value:.0f}"
 
 
 if __name__ == "__main__":

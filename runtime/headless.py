@@ -3,93 +3,155 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from runtime.client import StationClient
-from runtime.ctl import line
+from runtime.ctl import figure, line
 from runtime.errors import RuntimeFault
 from runtime.family import Plan, join
 
-log = logging.getLogger(__name__)
 _START_S = 30.0
 _SETUP_S = 240.0
 _CLOSE_S = 30.0
+_SHOWN_EVERY_S = 2.0
+_POLL_S = 0.05
+# Events that a person who gave no command does not need to read; states are shown as they change.
+_SILENT = frozenset({"command", "setup", "motion_done", "episode_opened", "episode_closed"})
 RESULT_NAME = "headless.json"
 
 
 def drive(plan: Plan, client: StationClient) -> dict[str, Any]:
     """One run from start to published dataset; returns what came of it. Raises RuntimeFault with the reason."""
-    _wait_for_start(client)
-    client.claim()
-    status = client.wait(lambda s: s["state"] != "disconnected", _START_S)
-    client.command("setup")
-    status = _follow(client, "setting_up", _SETUP_S)
-    if status["state"] != "ready":
-        raise RuntimeFault(f"set-up failed: {status['reason']}")
-    print(f"set up: {status['validated']}", flush=True)
-    client.command("run")
-    status = _follow(client, "running", math.inf)
-    how = status["reason"]
-    failed = status["state"] != "ready"
+    attended = Attended(client)
+    attended.begin()
+    status = attended.run()
+    how, well = status["reason"], status["state"] == "ready"
     if status["state"] == "holding":
         client.command("stop")
-    status = client.wait(lambda s: _closed(plan, s), _CLOSE_S)
-    result = _result(status, how)
-    if failed:
-        raise RuntimeFault(f"the run did not end well: {how}; episode: {result['episode_path'] or 'none'}")
-    if plan.deployment.publish.dataset and result["episode_path"]:
+    try:
+        status = attended.conclude()
+        result = _result(status, how, attended.seconds)
+        well = well and status["last_run"].get("status", "finished") == "finished"
+    except RuntimeFault as fault:  # on top of why the run ended
+        raise RuntimeFault(f"the run ended ({how}), but then: {fault}") from None
+    if well and plan.deployment.publish.dataset and result["episode_path"]:
         result |= _publish(plan, Path(result["episode_path"]))
+    print("\n".join(summary(result)), flush=True)
+    if not well:
+        raise RuntimeFault(f"the run did not end well: {how}; episode: {result['episode_path'] or 'none'}")
     return result
 
 
-def _wait_for_start(client: StationClient) -> None:
-    deadline = time.monotonic() + _START_S
-    while True:
-        try:
-            client.status()
-        except RuntimeFault:
+class Attended:
+    """A station under a lease that is kept, its events told as they come."""
+
+    def __init__(self, client: StationClient) -> None:
+        self._client = client
+        self._boot = ""
+        self._heard = 0  # number of the newest event
+        self._shown = -math.inf
+        self.opened = self.closed = False  # an episode, on this drive
+        self.seconds = 0.0  # the run's time, when it was last seen
+
+    def begin(self) -> None:
+        """Wait for the station, claim it, set it up; raises RuntimeFault with the reason where it is not ready."""
+        self._wait_for_start()
+        self._client.claim()
+        self.until(lambda s: s["state"] != "disconnected", _START_S, "the first observation")
+        self._client.command("setup")
+        status = self.until(lambda s: s["state"] != "setting_up", _SETUP_S, "set-up")
+        if status["state"] != "ready":
+            raise RuntimeFault(f"set-up failed: {status['reason']}")
+
+    def run(self) -> dict[str, Any]:
+        """One run to its end, however it ends; returns the status then."""
+        self._client.command("run")
+        return self.until(lambda s: s["state"] != "running", math.inf, "the end of the run")
+
+    def conclude(self) -> dict[str, Any]:
+        """Wait until what was recorded, if anything was, is on disk; returns the status then."""
+        status = self.look()
+        if self.opened:
+            status = self.until(lambda _: self.closed, _CLOSE_S, "the end of the recording")
+        return status
+
+    def until(self, reached: Callable[[dict[str, Any]], bool], seconds: float, what: str) -> dict[str, Any]:
+        """Look until `reached`, showing figures now and then; raises RuntimeFault after `seconds`."""
+        deadline = time.monotonic() + seconds
+        while not reached(status := self.look()):
             if time.monotonic() > deadline:
-                raise
-            time.sleep(0.1)
-        else:
-            return
+                raise RuntimeFault(f"{what}: not within {seconds:g} s; {status['state']}: {status['reason']}")
+            if time.monotonic() - self._shown >= _SHOWN_EVERY_S:
+                self._shown = time.monotonic()
+                print(line(status), flush=True)
+            time.sleep(_POLL_S)
+        return status
+
+    def look(self) -> dict[str, Any]:
+        """The status, once its events were told."""
+        self._client.renew()
+        status = self._client.status()
+        if status["boot"] != self._boot:  # another main counts its events anew
+            self._boot, self._heard = status["boot"], 0
+        if status["newest_event"] > self._heard:
+            for event in self._client.events_since(self._heard):
+                self._hear(event)
+        if status["run"]["number"]:
+            self.seconds = status["run"]["elapsed"]
+        return status
+
+    def _hear(self, event: dict[str, Any]) -> None:
+        self._heard = event["number"]
+        self.opened |= event["kind"] == "episode_opened"
+        self.closed |= event["kind"] == "episode_closed"
+        if event["kind"] not in _SILENT:
+            print(f"  {event['kind']}: {event['text']}", flush=True)
+
+    def _wait_for_start(self) -> None:
+        deadline = time.monotonic() + _START_S
+        while True:
+            try:
+                self._client.status()
+            except RuntimeFault:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.1)
+            else:
+                return
 
 
-def _follow(client: StationClient, state: str, timeout: float) -> dict[str, Any]:
-    """Print live figures while the station is in `state`; the lease is kept."""
-    deadline, shown = time.monotonic() + timeout, 0.0
-    while (status := client.status())["state"] == state:
-        client.renew()
-        if time.monotonic() - shown >= 1.0:
-            shown = time.monotonic()
-            print(line(status), flush=True)
-        if time.monotonic() > deadline:
-            raise RuntimeFault(f"still {state} after {timeout:g} s: {status['reason']}")
-        time.sleep(0.05)
-    return status
-
-
-def _closed(plan: Plan, status: dict[str, Any]) -> bool:
-    return not plan.deployment.recording.enabled or (
-        bool(status["episode"]) and not status["recording"]["uuid"]
-    )
-
-
-def _result(status: dict[str, Any], how: str) -> dict[str, Any]:
+def _result(status: dict[str, Any], how: str, seconds: float) -> dict[str, Any]:
     episode = status["episode"]
-    return {
+    path = episode.get("path", "")
+    result = {
         "ended": how,
-        "episode_path": episode.get("path", ""),
+        "run_seconds": seconds,
+        "episode_path": path,
         "episode_status": episode.get("status", ""),
         "frames": episode.get("rows", 0),
         "control": status["control"],
         "policy": status["policy"],
         "link": status["link"],
+    }
+    return result | (_of_episode(Path(path)) if path else {})
+
+
+def _of_episode(path: Path) -> dict[str, Any]:
+    """What its files say: how long it is, and of its ticks how many safety refused or limited."""
+    from runtime.recording.reader import open_episode
+
+    episode = open_episode(path)
+    refused = episode.ticks["refused"].to_pylist()
+    changes = episode.ticks["changes"].to_pylist()
+    limited = sum(bool(changed) and not no for changed, no in zip(changes, refused, strict=True))
+    return {
+        "duration_s": episode.frames / episode.layout.fps,
+        "safety": {"ticks": len(refused), "refused": sum(refused), "limited": limited},
     }
 
 
@@ -103,6 +165,30 @@ def _publish(plan: Plan, episode: Path) -> dict[str, Any]:
         "episode_index": published.episode_index,
         "published_frames": published.frames,
     }
+
+
+def summary(result: dict[str, Any]) -> list[str]:
+    """How a run went, for a person."""
+    policy, control = result["policy"], result["control"]
+    rows = [("ended", f"{result['ended']}, after {result['run_seconds']:.1f} s")]
+    if "duration_s" in result:
+        recorded = f"{result['frames']} rows, {result['duration_s']:.1f} s, {result['episode_status']}"
+        rows.append(("recorded", recorded))
+    if policy["answers"]:
+        latency = f"p50 {policy['latency_p50_ms']:.0f} ms, p90 {policy['latency_p90_ms']:.0f} ms"
+        delay = f"delay {figure(policy['delay_p50'])} ticks, at most {figure(policy['delay_max'])}"
+        rows.append(("policy", f"{latency}, {delay}"))
+    late = f"ticks late by p99 {control['lateness_p99_ms']:.2f} ms, {control['missed']} missed"
+    rows.append(("control", f"{control['rate']:g} Hz, {late}"))
+    if "safety" in result:
+        safety = result["safety"]
+        ticks = f"{safety['refused']} of {safety['ticks']} ticks refused, {safety['limited']} limited"
+        rows.append(("safety", ticks))
+    rows.append(("episode", result["episode_path"] or "none"))
+    if "dataset_path" in result:
+        place = f"episode {result['episode_index']}, {result['published_frames']} frames"
+        rows.append(("dataset", f"{result['dataset_path']}  {place}"))
+    return ["", "How it went", *(f"  {name:<9} {text}" for name, text in rows)]
 
 
 def main() -> int:
@@ -119,9 +205,6 @@ def main() -> int:
     finally:
         client.close()
     (station_dir / RESULT_NAME).write_text(json.dumps(result, indent=1), "utf-8")
-    print(f"episode  {result['episode_path']}  {result['frames']} rows, {result['episode_status']}")
-    if "dataset_path" in result:
-        print(f"dataset  {result['dataset_path']}  episode {result['episode_index']}")
     return 0
 
 

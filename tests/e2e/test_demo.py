@@ -34,10 +34,12 @@ def demo(tmp_path_factory):
 def test_the_demo_says_where_the_episode_lies_and_how_it_went(demo):
     done, result = demo
     assert result["episode_status"] == "finished"
-    assert result["frames"] == 240  # 8 s at 30 fps
+    assert 236 <= result["frames"] <= 244  # 8 s at 30 fps; the end is decided between two ticks
+    assert result["published_frames"] == result["frames"]
     assert Path(result["episode_path"], "outcome.json").exists()
     assert result["control"]["rate"] == 30.0
-    assert result["control"]["ticks"] > 240
+    assert result["control"]["ticks"] > result["frames"]
+    assert result["safety"]["refused"] == 0
     assert result["policy"]["answers"] > 20
     assert result["episode_path"] in done.stdout
     assert result["dataset_path"] in done.stdout

@@ -32,6 +32,8 @@ def status(state="ready", **changes):
 class Script:
     """A station that answers as written down; a status that is an exception is raised."""
 
+    holder = "terminal:me"
+
     def __init__(self, statuses=(), refusal=None, streams=(), events=()):
         self.statuses, self.refusal, self.streams = list(statuses), refusal, list(streams)
         self.events = list(events)
@@ -102,9 +104,7 @@ def test_the_station_is_looked_for_in_the_data_folder(run):
 
 def test_a_status_is_one_line_or_json(run, capsys):
     run(Script([status()]), "status")
-    assert capsys.readouterr().out == (
-        "bench-1  READY: set up  tick p99 0.50 ms, 2 missed  Hz joints 30.0  lease nobody\n"
-    )
+    assert capsys.readouterr().out == "READY: set up  tick p99 0.50 ms, 2 missed\n"
     run(Script([status()]), "status", "--json")
     assert json.loads(capsys.readouterr().out)["state"] == "ready"
 
@@ -112,16 +112,30 @@ def test_a_status_is_one_line_or_json(run, capsys):
 def test_the_line_of_a_run_says_how_it_is_going():
     running = status(
         "running",
+        reason="",
         run={"number": 1, "elapsed": 12.34},
         recording={"uuid": "u", "rows": 370},
         policy={"latency_p50_ms": 81.6, "delay_p50": 2.0},
-        lease={"holder": "anna"},
+        link={"rates": {"joints": 60.0, "cam_high": 30.1, "cam_low": 14.6}},
     )
     assert ctl.line(running) == (
-        "bench-1  RUNNING: set up  run   12.3 s  370 rows  policy 82 ms (delay 2)  "
-        "tick p99 0.50 ms, 2 missed  Hz joints 30.0  lease anna"
+        "RUNNING  12.3 s  370 rows  policy 82 ms, delay 2  tick p99 0.50 ms, 2 missed  cameras 15 Hz"
     )
-    assert "SETTING_UP warming up: set up" in ctl.line(status("setting_up", stage="warming up"))
+    assert "SETTING_UP (warming up): set up" in ctl.line(status("setting_up", stage="warming up"))
+
+
+def test_a_delay_that_is_not_known_yet_is_a_dash():
+    asked = status(policy={"latency_p50_ms": 81.6, "delay_p50": math.nan})
+    assert "policy 82 ms, delay -" in ctl.line(asked)
+
+
+@pytest.mark.parametrize("command", ["status", "watch"])
+def test_a_lease_is_named_where_somebody_else_holds_it(run, capsys, command):
+    theirs, mine = status(lease={"holder": "anna"}), status(lease={"holder": Script.holder})
+    run(Script([theirs], streams=[{"state": theirs}, KeyboardInterrupt()]), command)
+    assert capsys.readouterr().out.endswith("  lease: anna\n")
+    run(Script([mine], streams=[{"state": mine}, KeyboardInterrupt()]), command)
+    assert "lease" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("kind", ["stop", "halt", "release"])

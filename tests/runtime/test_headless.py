@@ -1,0 +1,240 @@
+import itertools
+import math
+from copy import deepcopy
+from types import SimpleNamespace
+
+import pytest
+
+from runtime import headless
+from runtime.errors import RecordingError, RuntimeFault, TransportError
+from runtime.headless import drive, summary
+
+STATUS = {
+    "boot": "boot-1",
+    "state": "idle",
+    "reason": "",
+    "stage": "idle",
+    "newest_event": 0,
+    "run": {"number": 0, "elapsed": 0.0},
+    "last_run": {},
+    "recording": {"uuid": "", "rows": 0},
+    "episode": {},
+    "control": {"rate": 30.0, "lateness_p99_ms": 0.25, "missed": 1},
+    "policy": {
+        "answers": 40,
+        "latency_p50_ms": 81.6,
+        "latency_p90_ms": 95.0,
+        "delay_p50": 3.0,
+        "delay_max": 4,
+    },
+    "lease": {"holder": "headless"},
+    "link": {"rates": {"joints": 30.0, "cam_high": 30.0}},
+}
+RUNNING = {"number": 1, "elapsed": 8.0}
+FINISHED = {"number": 1, "status": "finished", "reason": "the run's 8 s are over"}
+CLOSED = {"path": "/data/episodes/one", "status": "finished", "rows": 240}
+
+
+def status(state, **changes):
+    return deepcopy(STATUS) | {"state": state} | changes
+
+
+def event(number, kind, text=""):
+    return {"number": number, "kind": kind, "text": text}
+
+
+class Station:
+    """Answers with one status after the other, the last for ever; an exception is raised."""
+
+    def __init__(self, *statuses, events=()):
+        self.statuses, self.events, self.given = list(statuses), list(events), []
+
+    def status(self):
+        found = self.statuses.pop(0) if len(self.statuses) > 1 else self.statuses[0]
+        if isinstance(found, Exception):
+            raise found
+        newest = max((e["number"] for e in self.events), default=0)
+        return {"newest_event": newest} | found if "newest_event" not in found else found
+
+    def claim(self):
+        self.given.append("claim")
+
+    def renew(self):
+        assert "claim" in self.given
+
+    def command(self, kind):
+        self.given.append(kind)
+
+    def events_since(self, number):
+        return [e for e in self.events if e["number"] > number]
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch):
+    """Sleeping and looking at the clock take no time but the test's."""
+    now = itertools.count(0.0, 0.5)
+    monkeypatch.setattr(headless.time, "sleep", lambda _: None)
+    monkeypatch.setattr(headless.time, "monotonic", lambda: next(now))
+
+
+@pytest.fixture
+def plan(tmp_path):
+    publish = SimpleNamespace(dataset=None)
+    return SimpleNamespace(deployment=SimpleNamespace(publish=publish, data=tmp_path))
+
+
+@pytest.fixture(autouse=True)
+def files(monkeypatch):
+    """What is on disk of an episode: here nothing, only what would be read from it."""
+    found = {"duration_s": 8.0, "safety": {"ticks": 240, "refused": 0, "limited": 2}}
+    monkeypatch.setattr(headless, "_of_episode", lambda path: found)
+    return found
+
+
+def a_good_run(*events):
+    return Station(
+        TransportError("not running here"),
+        status("disconnected"),
+        status("disconnected", newest_event=0),
+        status("idle"),
+        status("setting_up", stage="warming up"),
+        status("ready"),
+        status("running", run=RUNNING, newest_event=2),
+        status("ready", reason=FINISHED["reason"], last_run=FINISHED, newest_event=2),
+        status("ready", reason=FINISHED["reason"], last_run=FINISHED, episode=CLOSED, newest_event=9),
+        events=[event(1, "command"), event(2, "episode_opened"), *events, event(9, "episode_closed")],
+    )
+
+
+def test_a_run_is_set_up_run_and_its_end_on_disk_waited_for(plan, capsys):
+    station = a_good_run()
+    result = drive(plan, station)
+    assert station.given == ["claim", "setup", "run"]
+    assert (result["ended"], result["frames"], result["episode_status"]) == (
+        FINISHED["reason"],
+        240,
+        "finished",
+    )
+    assert result["run_seconds"] == 8.0
+    shown = capsys.readouterr().out
+    assert "RUNNING  8.0 s" in shown
+    assert "/data/episodes/one" in shown
+
+
+def test_events_that_matter_are_told_once_and_others_not(plan, capsys):
+    drive(plan, a_good_run(event(3, "chunk_dropped", "chunk 7 dropped"), event(4, "command", "stop by anna")))
+    shown = capsys.readouterr().out
+    assert shown.count("  chunk_dropped: chunk 7 dropped\n") == 1
+    assert "stop by anna" not in shown
+
+
+def test_the_events_of_another_main_are_read_from_its_first(plan, capsys):
+    station = Station(
+        status("idle", newest_event=40),
+        status("idle", newest_event=40),
+        status("setting_up", newest_event=40),
+        status("idle", boot="boot-2", newest_event=1, reason="the process main died"),
+        events=[event(40, "state", "of the first"), event(1, "state", "of the second")],
+    )
+    station.events_since = lambda number: [e for e in station.events if e["number"] == number + 1]
+    with pytest.raises(RuntimeFault, match="set-up failed: the process main died"):
+        drive(plan, station)
+    assert "of the second" in capsys.readouterr().out
+
+
+def test_a_set_up_that_fails_is_an_error_with_its_reason(plan):
+    station = Station(status("idle"), status("idle"), status("idle", reason="no policy server listens"))
+    with pytest.raises(RuntimeFault, match="set-up failed: no policy server listens"):
+        drive(plan, station)
+    assert station.given == ["claim", "setup"]
+
+
+def test_a_run_that_fell_back_without_an_episode_raises_at_once_with_its_reason(plan, capsys, monkeypatch):
+    failed = {"number": 1, "status": "failed", "reason": "3 GB free, 1000 needed"}
+    station = Station(
+        *[status("idle")] * 2, status("ready"), status("ready", reason=failed["reason"], last_run=failed)
+    )
+    monkeypatch.setattr(headless, "_CLOSE_S", -math.inf)  # any wait for the episode would be an error
+    with pytest.raises(RuntimeFault, match="did not end well: 3 GB free, 1000 needed; episode: none"):
+        drive(plan, station)
+    assert "ended     3 GB free, 1000 needed" in capsys.readouterr().out
+
+
+def test_a_run_that_is_not_recorded_ends_without_waiting_for_an_episode(plan, monkeypatch):
+    station = Station(
+        *[status("idle")] * 2,
+        *[status("ready")] * 1,
+        status("running", run=RUNNING),
+        status("ready", reason=FINISHED["reason"], last_run=FINISHED),
+    )
+    monkeypatch.setattr(headless, "_CLOSE_S", -math.inf)
+    result = drive(plan, station)
+    assert (result["episode_path"], result["frames"]) == ("", 0)
+
+
+def test_a_run_that_held_is_stopped_and_no_success_although_it_was_recorded(plan):
+    held = status("holding", reason="policy lost", newest_event=1)
+    station = Station(
+        *[status("idle")] * 2,
+        status("ready"),
+        held,
+        status("ready", last_run=FINISHED, newest_event=1),
+        status("ready", last_run=FINISHED, episode=CLOSED, newest_event=2),
+        events=[event(1, "episode_opened"), event(2, "episode_closed")],
+    )
+    with pytest.raises(RuntimeFault, match="did not end well: policy lost; episode: /data/episodes/one"):
+        drive(plan, station)
+    assert station.given[-1] == "stop"
+
+
+def test_an_episode_that_is_never_closed_is_an_error(plan):
+    station = Station(
+        *[status("idle")] * 2,
+        status("ready"),
+        status("ready", reason="over", last_run=FINISHED, newest_event=1),
+        events=[event(1, "episode_opened")],
+    )
+    with pytest.raises(
+        RuntimeFault,
+        match=r"ended \(over\), but then: the end of the recording: not within 30 s; ready: over",
+    ):
+        drive(plan, station)
+
+
+def test_an_episode_that_cannot_be_read_is_no_success(plan, monkeypatch):
+    def damaged(path):
+        raise RecordingError("rows.arrow is damaged")
+
+    monkeypatch.setattr(headless, "_of_episode", damaged)
+    with pytest.raises(
+        RuntimeFault, match=r"the run ended \(the run's 8 s are over\), but then: rows.arrow is damaged"
+    ):
+        drive(plan, a_good_run())
+
+
+def test_the_summary_says_how_it_went():
+    result = {
+        "ended": "the run's 8 s are over",
+        "run_seconds": 8.0,
+        "frames": 240,
+        "duration_s": 8.0,
+        "episode_status": "finished",
+        "episode_path": "/data/episodes/one",
+        "policy": STATUS["policy"],
+        "control": STATUS["control"],
+        "safety": {"ticks": 240, "refused": 3, "limited": 2},
+        "dataset_path": "/data/datasets/demo",
+        "episode_index": 4,
+        "published_frames": 240,
+    }
+    assert summary(result) == [
+        "",
+        "How it went",
+        "  ended     the run's 8 s are over, after 8.0 s",
+        "  recorded  240 rows, 8.0 s, finished",
+        "  policy    p50 82 ms, p90 95 ms, delay 3 ticks, at most 4",
+        "  control   30 Hz, ticks late by p99 0.25 ms, 1 missed",
+        "  safety    3 of 240 ticks refused, 2 limited",
+        "  episode   /data/episodes/one",
+        "  dataset   /data/datasets/demo  episode 4, 240 frames",
+    ]
