@@ -343,7 +343,8 @@ def repair_leftovers(folders: list[Path], station: str) -> None:
             continue
         try:
             report = repair(folder)
-            log.warning("episode %s was left open: %s, %d rows", folder.name, report.verdict, report.frames)
+            found = report.problem or f"{report.frames} rows"
+            log.warning("episode %s was left open: %s, %s", folder.name, report.verdict, found)
         except RecordingError as error:
             log.error("episode %s was left open and stays as it is: %s", folder.name, error)
         except Exception:  # of a file that nobody foresaw: it must not keep the others
