@@ -137,6 +137,8 @@ def run(plan: Plan, longest: float = 3600.0) -> LockstepRun:
             station.command("stop")
         for _ in range(3):  # the end goes from main to media and back
             station.tick()
-        return LockstepRun(station.main.runs.last_episode, how, why, station.step, station.main.events.since(0))
+        return LockstepRun(
+            station.main.runs.last_episode, how, why, station.step, station.main.events.since(0)
+        )
     finally:
         station.close()

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import os
-import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, wait
@@ -13,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from runtime.clock import Clock, MonotonicClock
+from runtime.closing import Close, at_once, in_background
 from runtime.errors import RecordingError, RuntimeFault, TransportError
-from runtime.family import Member, Plan, join
+from runtime.family import Plan, join
+from runtime.leftovers import start_repair
 from runtime.messages import (
     BeginEpisode,
     ChunkMerged,
@@ -31,9 +30,9 @@ from runtime.messages import (
     event_row,
 )
 from runtime.page import Page
+from runtime.previews import Previews
 from runtime.recorder import Closed, Grid, Recorder
 from runtime.recording.episode import EpisodeJournal
-from runtime.recording.repair import repair
 from runtime.transports.base import Source
 from runtime.types import Observation
 
@@ -42,29 +41,6 @@ _REPORT_PERIOD = 0.2
 _RATE_WINDOW = 40  # arrivals per stream
 _LAST_S = 8.0  # for the last episode, before the supervisor's patience ends
 _CLOSING_S = 1.0  # how long a new episode waits for the one before it; longer is a disk in trouble
-
-Close = Callable[[], Closed]
-
-
-def at_once(close: Close) -> Future[Closed]:
-    """Close an episode here and now, as lockstep does."""
-    done: Future[Closed] = Future()
-    done.set_result(close())
-    return done
-
-
-def in_background(close: Close) -> Future[Closed]:
-    """Close an episode on a thread of its own, so that a slow disk stops nothing else."""
-    done: Future[Closed] = Future()
-
-    def run() -> None:
-        try:
-            done.set_result(close())
-        except Exception as error:  # raised where the result is asked for
-            done.set_exception(error)
-
-    threading.Thread(target=run, name="closing", daemon=True).start()
-    return done
 
 
 class Media:
@@ -296,78 +272,15 @@ def make_recorder(plan: Plan, now: Callable[[], float], patient: bool = False) -
     return Recorder(journal, root, grid, now)
 
 
-class _Previews:
-    """JPEG previews of every camera on the bus, at most at a rate."""
-
-    def __init__(self, member: Member) -> None:
-        import zmq
-
-        from runtime.bus import CAMERA_HIGH_WATER, Endpoints, Publisher
-
-        settings = member.plan.deployment.bus
-        self._publisher = Publisher(
-            zmq.Context.instance(), settings.host, settings.camera_port, CAMERA_HIGH_WATER
-        )
-        self._period = 1.0 / settings.preview_rate if settings.preview_rate else float("inf")
-        self._height = settings.preview_height
-        self._due: dict[str, float] = {}
-        Endpoints(member.plan.deployment.station_dir).write("media", {"cameras": self._publisher.endpoint})
-
-    def __call__(self, observation: Observation) -> None:
-        import numpy as np
-        import simplejpeg
-
-        for camera, picture in observation.pictures.items():
-            if observation.arrived < self._due.get(camera, 0.0):
-                continue
-            # A little early counts, so that 15 of 30 pictures a second are shown and not 10.
-            self._due[camera] = observation.arrived + 0.9 * self._period
-            stride = max(1, picture.shape[0] // self._height)
-            small = np.ascontiguousarray(picture[::stride, ::stride])
-            self._publisher.publish(f"camera/{camera}", simplejpeg.encode_jpeg(small, quality=80))
-
-
-def leftovers(root: Path) -> list[Path]:
-    """The folders of episodes without an outcome, to be found before the first new one begins."""
-    folders = [manifest.parent for manifest in root.glob("*/manifest.json")]
-    return [folder for folder in folders if not os.path.exists(folder / "outcome.json")]
-
-
-def repair_leftovers(folders: list[Path], station: str) -> None:
-    """Close what the last start of `station` left open: nobody else writes its episodes.
-
-    One that cannot be repaired is left as it is, for `python -m runtime.recording repair` and a person.
-    """
-    for folder in folders:
-        if _station_of(folder / "manifest.json") != station:
-            continue
-        try:
-            report = repair(folder)
-            found = report.problem or f"{report.frames} rows"
-            log.warning("episode %s was left open: %s, %s", folder.name, report.verdict, found)
-        except RecordingError as error:
-            log.error("episode %s was left open and stays as it is: %s", folder.name, error)
-        except Exception:  # of a file that nobody foresaw: it must not keep the others
-            log.exception("episode %s was left open and stays as it is", folder.name)
-
-
-def _station_of(manifest: Path) -> str:
-    try:
-        return str(json.loads(manifest.read_text("utf-8"))["station"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        log.error("%s cannot be read (%r): left as it is", manifest, error)
-        return ""
-
-
 def main() -> None:
     """Run media until the supervisor is gone."""
     member = join("media")
     plan, page = member.plan, member.page
     clock = MonotonicClock()
     page.beat("media", clock.now())
-    _start_repair(plan)
+    start_repair(plan.deployment.episodes_dir, plan.deployment.station)
     source: Source = plan.transport.source(plan.deployment.transport, plan.robot, clock)
-    media = Media(page, source, make_recorder(plan, clock.now), clock, _Previews(member), in_background)
+    media = Media(page, source, make_recorder(plan, clock.now), clock, Previews(plan), in_background)
     connected = False
     try:
         while not member.lifeline.cut:
@@ -386,14 +299,6 @@ def main() -> None:
         media.end("interrupted", "the station's supervisor ended")
         media.finish(_LAST_S)
         source.close()
-
-
-def _start_repair(plan: Plan) -> None:
-    """On a thread: what is to be received and recorded now does not wait for what was left."""
-    left = leftovers(plan.deployment.episodes_dir)
-    threading.Thread(
-        target=repair_leftovers, args=(left, plan.deployment.station), name="repair", daemon=True
-    ).start()
 
 
 _retry_at = 0.0

@@ -13,8 +13,10 @@ import pytest
 
 from runtime import media
 from runtime.clock import VirtualClock
+from runtime.closing import at_once, in_background
 from runtime.errors import RecordingError, TransportError
-from runtime.media import Media, at_once, in_background, leftovers, repair_leftovers
+from runtime.leftovers import leftovers, repair_leftovers
+from runtime.media import Media
 from runtime.messages import (
     BeginEpisode,
     EndEpisode,

@@ -1,0 +1,52 @@
+"""Episodes that the last start of a station left open."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import threading
+from pathlib import Path
+
+from runtime.errors import RecordingError
+from runtime.recording.repair import repair
+
+log = logging.getLogger(__name__)
+
+
+def start_repair(root: Path, station: str) -> None:
+    """On a thread: what is to be received and recorded now does not wait for what was left."""
+    left = leftovers(root)
+    threading.Thread(target=repair_leftovers, args=(left, station), name="repair", daemon=True).start()
+
+
+def leftovers(root: Path) -> list[Path]:
+    """The folders of episodes without an outcome, to be found before the first new one begins."""
+    folders = [manifest.parent for manifest in root.glob("*/manifest.json")]
+    return [folder for folder in folders if not os.path.exists(folder / "outcome.json")]
+
+
+def repair_leftovers(folders: list[Path], station: str) -> None:
+    """Close what the last start of `station` left open: nobody else writes its episodes.
+
+    One that cannot be repaired is left as it is, for `python -m runtime.recording repair` and a person.
+    """
+    for folder in folders:
+        if _station_of(folder / "manifest.json") != station:
+            continue
+        try:
+            report = repair(folder)
+            found = report.problem or f"{report.frames} rows"
+            log.warning("episode %s was left open: %s, %s", folder.name, report.verdict, found)
+        except RecordingError as error:
+            log.error("episode %s was left open and stays as it is: %s", folder.name, error)
+        except Exception:  # of a file that nobody foresaw: it must not keep the others
+            log.exception("episode %s was left open and stays as it is", folder.name)
+
+
+def _station_of(manifest: Path) -> str:
+    try:
+        return str(json.loads(manifest.read_text("utf-8"))["station"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        log.error("%s cannot be read (%r): left as it is", manifest, error)
+        return ""

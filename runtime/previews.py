@@ -1,0 +1,35 @@
+"""JPEG previews of every camera on the bus."""
+
+from __future__ import annotations
+
+import numpy as np
+import simplejpeg
+import zmq
+
+from runtime.bus import CAMERA_HIGH_WATER, Endpoints, Publisher
+from runtime.family import Plan
+from runtime.types import Observation
+
+
+class Previews:
+    """Shows each picture small, at most `bus.preview_rate` times a second and camera."""
+
+    def __init__(self, plan: Plan) -> None:
+        settings = plan.deployment.bus
+        self._publisher = Publisher(
+            zmq.Context.instance(), settings.host, settings.camera_port, CAMERA_HIGH_WATER
+        )
+        self._period = 1.0 / settings.preview_rate if settings.preview_rate else float("inf")
+        self._height = settings.preview_height
+        self._due: dict[str, float] = {}
+        Endpoints(plan.deployment.station_dir).write("media", {"cameras": self._publisher.endpoint})
+
+    def __call__(self, observation: Observation) -> None:
+        for camera, picture in observation.pictures.items():
+            if observation.arrived < self._due.get(camera, 0.0):
+                continue
+            # A little early counts, so that 15 of 30 pictures a second are shown and not 10.
+            self._due[camera] = observation.arrived + 0.9 * self._period
+            stride = max(1, picture.shape[0] // self._height)
+            small = np.ascontiguousarray(picture[::stride, ::stride])
+            self._publisher.publish(f"camera/{camera}", simplejpeg.encode_jpeg(small, quality=80))
