@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime import media
 from runtime.clock import VirtualClock
 from runtime.closing import at_once, in_background
 from runtime.errors import RecordingError, TransportError
@@ -483,7 +482,7 @@ def test_a_leftover_that_cannot_be_repaired_keeps_no_other_from_it(
             raise error
         return Report(folder, "repaired", frames=7)
 
-    monkeypatch.setattr(media, "repair", repaired)
+    monkeypatch.setattr("runtime.leftovers.repair", repaired)
     folders = [left(tmp_path, "bad"), left(tmp_path, "foreign", "bench-2"), left(tmp_path, "good")]
     repair_leftovers(folders, "bench")
     assert seen == ["bad", "good"]
