@@ -198,8 +198,9 @@ def test_a_stall_of_half_a_second_is_no_burst(lab):
     steps = np.array(ticks["step"].to_pylist())
     stall = int(np.argmax(np.diff(sent)))
     assert np.diff(steps)[stall] >= 10  # skipped, not caught up
-    after = np.diff(sent[stall + 1 : stall + 20])
-    assert (after > 0.5 / 30).all(), after  # and nothing sent in a burst afterwards
+    resumed = sent[stall + 1]
+    soon = sent[(sent >= resumed) & (sent < resumed + 0.5)]
+    assert len(soon) <= 0.5 * 30 + 1  # the first one comes on the next deadline, then one a period, no burst
 
 
 @pytest.fixture
