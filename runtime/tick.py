@@ -257,6 +257,7 @@ class Tick:
         if target is None:
             return self._starve(step, planned) if isinstance(self._behaviour, Follow) else Sent(planned)
         if target.path is None:
+            self._standing = None  # what is sent now is another stop: the old one must not go on later
             return self._actuator.send(step, planned, target, target.action)
         verdict = self._safety.judge(target.action, self._state(planned), target.path)
         if verdict.action is None:

@@ -122,7 +122,10 @@ def test_a_blocked_arm_is_not_pulled_at_further_than_the_following_error(tmp_pat
     station = Station(plan(tmp_path, setup={"home": True}))
     station.robot.blocked = True
     reason = failed(station)
-    assert "10 actions refused of the last" in reason
+    assert "10 actions refused in a row" in reason
+    way = np.abs(station.robot.sent - station.robot.sent[0]).max(axis=1)
+    assert np.diff(way[:-1]).min() >= -1e-6  # it goes on or stands, and never jumps back
+    assert way[-1] < 0.05  # then it is held where it is measured
     assert "from where it is measured, allowed 0.5" in reason
     assert np.abs(station.robot.sent - STANDS).max() < 0.6
     station.close()

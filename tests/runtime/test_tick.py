@@ -586,3 +586,17 @@ def test_every_second_action_refused_is_as_bad_as_all_of_them(bench):
     bench.run(40)
     assert bench.behaviour == "hold"
     assert "of the last" in bench.said("refusals")[0].text
+
+
+def test_a_motion_refused_again_after_it_stopped_never_jumps_back(bench):
+    """The stop of the first refusal is over once something else was sent: it must not go on from there."""
+    bench.say("motion", goal=np.array([1.5, 0.0]))
+    bench.run(20)
+    fresh = bench.feed
+    for _ in range(4):  # the joints are old for a few ticks, seen again for one, and old again
+        bench.feed = False
+        bench.run(9)
+        bench.feed = fresh
+        bench.run(1)
+    sent = np.array(bench.sink.sent)[:, 0]
+    assert np.diff(sent).min() >= -1e-6
