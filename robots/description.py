@@ -38,6 +38,13 @@ class Table(BaseModel):
         return given
 
 
+class TipTable(Table):
+    """A frame in `eef_link` between the fingertips: z the way they point, y the way they open."""
+
+    xyz: Triple
+    wxyz: Quadruple
+
+
 class GripperTable(Table):
     """A group's gripper, one number in the robot's own unit."""
 
@@ -55,6 +62,8 @@ class GripperTable(Table):
     """Whether it knows only open and close."""
     threshold: float | None = None
     """Where a binary gripper switches; a value at or above it means open if `open` is above `close`."""
+    tip: TipTable | None = None
+    """Where its fingertips are; else read off the fingers of the URDF, the sliding children of `eef_link`."""
 
 
 class MountTable(Table):

@@ -13,7 +13,7 @@ from robots.chain import Chain
 from robots.description import GripperTable, GroupTable, MountTable, OverrideTable, RobotTable
 from robots.errors import RobotError
 from robots.robot import Camera, Gripper, Group, Robot
-from robots.rotations import Float64
+from robots.rotations import Float64, matrix_of_quaternion
 from robots.urdf import Urdf
 
 _HERE = Path(__file__).resolve().parent
@@ -113,6 +113,7 @@ def _group(file: Path, tree: Urdf, table: GroupTable, start: int) -> Group:
         frame=table.frame,
         chain=_chain(key, tree, table),
         mount=_mount(key, table.mount),
+        tip=_tip(key, tree, table),
         slice=slice(start, start + len(table.joints)),
     )
 
@@ -130,7 +131,7 @@ def _gripper(key: str, table: GripperTable, dof: int) -> Gripper:
     low, high = sorted((table.open, table.close))
     if table.threshold is not None and not low < table.threshold < high:
         raise RobotError(f"{key}.gripper.threshold = {table.threshold}; allowed: between {low} and {high}")
-    return Gripper(**table.model_dump(exclude={"velocity"}))
+    return Gripper(**table.model_dump(exclude={"velocity", "tip"}))
 
 
 def _chain(key: str, tree: Urdf, table: GroupTable) -> Chain | None:
@@ -146,10 +147,47 @@ def _chain(key: str, tree: Urdf, table: GroupTable) -> Chain | None:
 def _mount(key: str, table: MountTable | None) -> Float64:
     if table is None:
         return _frozen([0, 0, 0, 1, 0, 0, 0])
-    norm = float(np.linalg.norm(table.wxyz))
+    return _frozen([*table.xyz, *_unit(f"{key}.mount.wxyz", table.wxyz)])
+
+
+def _unit(key: str, wxyz: list[float]) -> list[float]:
+    norm = float(np.linalg.norm(wxyz))
     if abs(norm - 1) > 1e-6:
-        raise RobotError(f"{key}.mount.wxyz has length {norm}; allowed: 1 within 1e-6")
-    return _frozen([*table.xyz, *(part / norm for part in table.wxyz)])
+        raise RobotError(f"{key} has length {norm}; allowed: 1 within 1e-6")
+    return [part / norm for part in wxyz]
+
+
+def _tip(key: str, tree: Urdf, table: GroupTable) -> Float64 | None:
+    """The frame of the fingertips in `eef_link`: what is declared, else what the URDF's fingers show."""
+    if table.eef_link is None or table.gripper is None:
+        return None
+    declared = table.gripper.tip
+    if declared is None:
+        tip = _between_fingers(tree, table.eef_link)
+    else:
+        tip = np.eye(4)
+        tip[:3, :3] = matrix_of_quaternion(np.array(_unit(f"{key}.gripper.tip.wxyz", declared.wxyz)))
+        tip[:3, 3] = declared.xyz
+    tip.setflags(write=False)
+    return tip
+
+
+def _between_fingers(tree: Urdf, link: str) -> Float64:
+    """Midway between the origins of the link's sliding children, in the link's axes turned about z only.
+
+    y is the way the first of them slides; the link itself where nothing slides on it across its z.
+    """
+    tip = np.eye(4)
+    fingers = [joint for joint in tree.joints.values() if joint.parent == link and joint.kind == "prismatic"]
+    if not fingers:
+        return tip
+    tip[:3, 3] = np.mean([finger.origin[:3, 3] for finger in fingers], axis=0)
+    x, y, _ = fingers[0].origin[:3, :3] @ fingers[0].axis
+    across = float(np.hypot(x, y))
+    if across > 1e-6:
+        cosine, sine = abs(y) / across, -x / across * (1 if y >= 0 else -1)
+        tip[:2, :2] = [[cosine, -sine], [sine, cosine]]
+    return tip
 
 
 def _limits(file: Path, tree: Urdf, table: GroupTable) -> _Limits:

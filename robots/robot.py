@@ -38,7 +38,8 @@ class Group:
 
     `urdf_joints` name the same joints in the URDF, without the gripper; `chain` leads from `frame` to
     `eef_link`; all three are None where the group has no end effector. `mount` [7] (x, y, z, qw, qx, qy, qz)
-    places the frame in a scene for drawing; kinematics never uses it.
+    places the frame in a scene for drawing; kinematics never uses it. `tip` [4, 4] in `eef_link` lies between
+    the fingertips, z the way they point, y the way they open; None where there is no end effector.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Group:
     frame: str | None
     chain: Chain | None
     mount: Float64
+    tip: Float64 | None
     slice: builtins.slice
 
     @property

@@ -1,0 +1,290 @@
+"""The simulated bench: what lies on its table and where, and where its cameras are; no robot, no physics.
+
+World frame: z up, the table's surface at z = 0, the plane on which the arms are mounted; metres, radians.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from robots.rotations import matrix_of_quaternion
+from runtime.errors import RuntimeFault
+from runtime.types import Float64
+
+if TYPE_CHECKING:
+    from robots import Camera, Group, Robot
+
+Colour = tuple[int, int, int]
+
+NOISE_M = 0.005  # by which things lie beside where they were asked for, at most, in x and in y
+NOISE_RAD = math.radians(4.0)
+APART_M = 0.15  # block and plate, centre to centre, at least
+_CROWD_M = 0.09  # two blocks, centre to centre, at least
+_TRIES = 1000
+_MIDDLE = 0.03  # m beyond the middle that each side reaches
+_OVERHEAD_EYE, _OVERHEAD_AIM = (0.0, 0.36, 0.85), (0.0, 0.27, 0.0)
+_OVERHEAD_FOCAL = 1.0  # per picture width
+_WRIST_EYE, _WRIST_AIM = (-0.08, 0.0, -0.13), (0.0, 0.0, 0.01)  # in the tip's frame
+_WRIST_FOCAL = 0.75
+_OVERHEAD_CAMERA = "front"
+
+
+class BenchError(RuntimeFault):
+    """A layout was asked for that the bench cannot have."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """Sizes [m] and colours (red, green, blue; 0 to 255) of everything on the table.
+
+    `area` is where things may lie: x from, x to, y from, y to. The first block, the task's, has the first of
+    `block_colours`, the others the next ones in turn.
+    """
+
+    block_edge: float = 0.04
+    plate_radius: float = 0.075
+    plate_height: float = 0.012
+    area: tuple[float, float, float, float] = (-0.22, 0.22, 0.18, 0.40)
+    table_colour: Colour = (176, 164, 146)
+    plate_colour: Colour = (226, 234, 244)
+    plate_rim_colour: Colour = (58, 104, 190)
+    block_colours: tuple[Colour, ...] = ((226, 74, 22), (40, 150, 70), (150, 70, 170), (235, 190, 40))
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where blocks (x, y, yaw) and plate (x, y) lie after a reset; the first block is the task's."""
+
+    blocks: tuple[tuple[float, float, float], ...]
+    plate: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockState:
+    """A block's centre and axes in the world, `pose` [4, 4], and the name of the arm that holds it, or ""."""
+
+    pose: Float64
+    held_by: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BenchState:
+    """Everything on the table that can move, at one instant."""
+
+    blocks: tuple[BlockState, ...]
+    plate: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PinholeCamera:
+    """A camera without distortion; `pose` [4, 4] is its frame in the world: z ahead, x right, y down.
+
+    Pixels are (u, v), columns and rows; whole numbers are the centres of pixels.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    pose: Float64
+
+    def project(self, points: Float64) -> Float64:
+        """Pixels [..., 2] of world points [..., 3]; NaN for those not in front of the camera."""
+        inside = (np.asarray(points, np.float64) - self.pose[:3, 3]) @ self.pose[:3, :3]
+        depth = np.where(inside[..., 2:] > 1e-6, inside[..., 2:], np.nan)
+        return np.asarray(inside[..., :2] / depth * (self.fx, self.fy) + (self.cx, self.cy))
+
+    def pixel_to_table(self, u: float, v: float, z: float = 0.0) -> tuple[float, float]:
+        """World x, y of what a pixel shows at height `z`; BenchError where its ray never gets there."""
+        ray = self.pose[:3, :3] @ [(u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0]
+        way = (z - self.pose[2, 3]) / ray[2] if abs(ray[2]) > 1e-9 else -1.0
+        if way <= 0:
+            raise BenchError(f"pixel ({u}, {v}) shows nothing at height {z} m")
+        x, y, _ = self.pose[:3, 3] + way * ray
+        return float(x), float(y)
+
+
+def layout_of(seed: int, positions: Mapping[str, Any] | None = None, blocks: int = 1) -> Layout:
+    """The layout of a seed: always the same one for the same arguments.
+
+    `positions` may say where the task's block ("block": [x, y, yaw in degrees]) and the plate ("plate":
+    [x, y]) are wanted, they then lie within NOISE_M and NOISE_RAD of it; what it leaves out lies anywhere,
+    so that one side of the bench reaches both. BenchError where `positions` is not of this form, lies outside
+    the area or has block and plate closer than APART_M, or where `blocks` do not fit.
+    """
+    block, plate = _wanted(positions or {})
+    if blocks < 1:
+        raise BenchError(f"{blocks} blocks were asked for; allowed: one or more")
+    chance = np.random.default_rng(seed)
+    placed_block, placed_plate = _pair(chance, block, plate)
+    placed = [placed_block]
+    for _ in range(blocks - 1):
+        placed.append(_distractor(chance, placed, placed_plate))
+    return Layout(tuple(placed), placed_plate)
+
+
+def on_table(block: tuple[float, float, float], bench: Bench) -> Float64:
+    """The pose [4, 4] of a block that lies flat on the table at (x, y, yaw)."""
+    x, y, yaw = block
+    pose = np.eye(4)
+    pose[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+    pose[:3, 3] = x, y, bench.block_edge / 2
+    return pose
+
+
+def yaw_of(pose: Float64) -> float:
+    """The turn about z of a pose [4, 4], or of its y axis where x points up or down."""
+    if math.hypot(pose[0, 0], pose[1, 0]) > 0.1:
+        return math.atan2(pose[1, 0], pose[0, 0])
+    return math.atan2(-pose[0, 1], pose[1, 1])
+
+
+def eef_in_world(arm: Group, q: Float64) -> Float64:
+    """The arm's end-effector link in the world, [4, 4], at the robot's joints q [D]."""
+    if arm.chain is None:
+        raise BenchError(f"group {arm.name} has no end effector; allowed: an arm")
+    return mount_of(arm) @ arm.chain.forward(q[arm.joint_dims])
+
+
+def tip_in_world(arm: Group, q: Float64) -> Float64:
+    """The arm's fingertips in the world, [4, 4], at the robot's joints q [D]: z ahead, y the way they open."""
+    eef = eef_in_world(arm, q)
+    return eef if arm.tip is None else eef @ arm.tip
+
+
+def mount_of(group: Group) -> Float64:
+    """The frame of a group in the world, [4, 4]."""
+    mount = np.eye(4)
+    mount[:3, :3] = matrix_of_quaternion(group.mount[3:])
+    mount[:3, 3] = group.mount[:3]
+    return mount
+
+
+def camera_arm(robot: Robot, camera: Camera) -> Group | None:
+    """The arm that carries a camera: its name without "_arm" begins the camera's; None for the overhead one."""
+    if camera.name == _OVERHEAD_CAMERA:
+        return None
+    for arm in robot.arms:
+        if camera.name.startswith(arm.name.removesuffix("_arm")):
+            return arm
+    return None
+
+
+def cameras(robot: Robot, q: Float64, width: int, height: int) -> dict[str, PinholeCamera]:
+    """All cameras of the robot by key, where they are at joints q [D]; what is on no arm looks from above."""
+    carriers = {camera.key: camera_arm(robot, camera) for camera in robot.cameras}
+    return {
+        key: overhead_camera(width, height)
+        if arm is None
+        else wrist_camera(tip_in_world(arm, q), width, height)
+        for key, arm in carriers.items()
+    }
+
+
+def overhead_camera(width: int, height: int) -> PinholeCamera:
+    """The camera above the bench: the arms reach into its picture from below."""
+    pose = _looking(_OVERHEAD_EYE, _OVERHEAD_AIM, up=(0.0, 1.0, 0.0))
+    return _camera(pose, _OVERHEAD_FOCAL, width, height)
+
+
+def wrist_camera(tip: Float64, width: int, height: int) -> PinholeCamera:
+    """The camera behind the fingers of an arm whose fingertips are at `tip` [4, 4]."""
+    return _camera(tip @ _looking(_WRIST_EYE, _WRIST_AIM, up=(-1.0, 0.0, 0.0)), _WRIST_FOCAL, width, height)
+
+
+def _camera(pose: Float64, focal: float, width: int, height: int) -> PinholeCamera:
+    return PinholeCamera(focal * width, focal * width, (width - 1) / 2, (height - 1) / 2, width, height, pose)
+
+
+def _looking(eye: tuple[float, ...], aim: tuple[float, ...], up: tuple[float, ...]) -> Float64:
+    """A camera frame [4, 4] at `eye` that looks at `aim`, with `up` towards the top of its picture."""
+    ahead = np.subtract(aim, eye) / math.dist(aim, eye)
+    right = np.cross(ahead, up)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([right, np.cross(ahead, right), ahead])
+    pose[:3, 3] = eye
+    return pose
+
+
+def _wanted(positions: Mapping[str, Any]) -> tuple[list[float] | None, list[float] | None]:
+    """Block (x, y, yaw in rad) and plate (x, y) as asked for."""
+    unknown = sorted(str(name) for name in positions if name not in ("block", "plate"))
+    if unknown:
+        raise BenchError(f"positions name {', '.join(unknown)}; allowed: block, plate")
+    block = _place("block", positions.get("block"), 3)
+    plate = _place("plate", positions.get("plate"), 2)
+    if block is not None:
+        block[2] = math.radians(block[2])
+    if block is not None and plate is not None and math.dist(block[:2], plate) < APART_M:
+        raise BenchError(
+            f"block and plate are {math.dist(block[:2], plate):.3f} m apart; allowed: {APART_M} m or more"
+        )
+    return block, plate
+
+
+def _place(name: str, given: Any, count: int) -> list[float] | None:
+    if given is None:
+        return None
+    numbers = list(given) if isinstance(given, list | tuple) else []
+    right = len(numbers) == count and all(
+        isinstance(number, int | float) and not isinstance(number, bool) and math.isfinite(number)
+        for number in numbers
+    )
+    if not right:
+        raise BenchError(f"positions.{name} = {given!r}; allowed: {count} finite numbers")
+    x_from, x_to, y_from, y_to = Bench().area
+    x, y = numbers[:2]
+    if not (x_from <= x <= x_to and y_from <= y <= y_to):
+        raise BenchError(
+            f"positions.{name} = {given!r}; allowed: x {x_from} to {x_to} m, y {y_from} to {y_to} m"
+        )
+    return [float(number) for number in numbers]
+
+
+def _pair(
+    chance: np.random.Generator, block: list[float] | None, plate: list[float] | None
+) -> tuple[tuple[float, float, float], tuple[float, float]]:
+    """Block and plate, tried until they are far enough apart and reached from one side."""
+    for _ in range(_TRIES):
+        block_x, block_y, yaw = _somewhere(chance) if block is None else _near(chance, block)
+        plate_x, plate_y, _ = _somewhere(chance) if plate is None else _near(chance, [*plate, 0.0])
+        asked = block is not None and plate is not None
+        apart = math.dist((block_x, block_y), (plate_x, plate_y)) >= APART_M
+        if asked or (apart and _one_side(block_x, plate_x)):
+            return (block_x, block_y, yaw), (plate_x, plate_y)
+    raise BenchError(f"no place was found beside block {block}, plate {plate}; allowed: other positions")
+
+
+def _one_side(first: float, second: float) -> bool:
+    return min(first, second) >= -_MIDDLE or max(first, second) <= _MIDDLE
+
+
+def _somewhere(chance: np.random.Generator) -> tuple[float, float, float]:
+    x_from, x_to, y_from, y_to = Bench().area
+    x, y = chance.uniform((x_from, y_from), (x_to, y_to))
+    return float(x), float(y), float(chance.uniform(-math.pi / 4, math.pi / 4))
+
+
+def _near(chance: np.random.Generator, place: list[float]) -> tuple[float, float, float]:
+    noise = chance.uniform(-1.0, 1.0, 3) * (NOISE_M, NOISE_M, NOISE_RAD)
+    x, y, yaw = np.add(place, noise)
+    return float(x), float(y), float(yaw)
+
+
+def _distractor(
+    chance: np.random.Generator, placed: list[tuple[float, float, float]], plate: tuple[float, float]
+) -> tuple[float, float, float]:
+    for _ in range(_TRIES):
+        x, y, yaw = _somewhere(chance)
+        clear = all(math.dist((x, y), other[:2]) >= _CROWD_M for other in placed)
+        if clear and math.dist((x, y), plate) >= APART_M:
+            return x, y, yaw
+    raise BenchError(f"no place was found for block {len(placed) + 1}; allowed: fewer blocks")
