@@ -1,0 +1,1 @@
+"""Everything persistent or visible: pages, live console, trials, episodes, jobs, REST."""

@@ -1,0 +1,38 @@
+"""The worker's application: a doorbell over the filesystem, or over Redis where there is one."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
+
+from celery import Celery
+from django.conf import settings
+
+app = Celery("evaweb")
+
+
+def _filesystem() -> dict[str, object]:
+    folder = settings.DATA_DIR / "broker"
+    for part in ("queue", "processed", "control"):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    return {
+        "data_folder_in": str(folder / "queue"),
+        "data_folder_out": str(folder / "queue"),
+        "processed_folder": str(folder / "processed"),
+        "control_folder": str(folder / "control"),
+        "store_processed": False,
+        "polling_interval": 1.0,
+    }
+
+
+app.conf.update(
+    broker_url=settings.REDIS_URL or "filesystem://",
+    broker_transport_options={} if settings.REDIS_URL else _filesystem(),
+    task_ignore_result=True,
+    task_acks_late=True,
+    worker_prefetch_multiplier=1,
+    worker_hijack_root_logger=False,
+    broker_connection_retry_on_startup=True,
+)
+app.autodiscover_tasks(["evaweb.jobs"])

@@ -1,0 +1,10 @@
+"""Registers the app."""
+
+from django.apps import AppConfig
+
+
+class ConsoleConfig(AppConfig):
+    """The live page: what it shows and what it asks."""
+
+    name = "evaweb.console"
+    default_auto_field = "django.db.models.BigAutoField"

@@ -1,0 +1,73 @@
+"""Reads settings from the environment; a value that cannot be used ends the start with a sentence."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from pathlib import Path
+
+from django.core.exceptions import ImproperlyConfigured
+
+_TRUE, _FALSE = ("1", "true", "yes", "on"), ("0", "false", "no", "off", "")
+
+
+def flag(name: str, default: bool) -> bool:
+    """A yes or no."""
+    given = os.environ.get(name)
+    if given is None:
+        return default
+    word = given.strip().lower()
+    if word not in _TRUE + _FALSE:
+        raise ImproperlyConfigured(f"{name} = {given!r}; allowed: {', '.join(_TRUE + _FALSE[:-1])}")
+    return word in _TRUE
+
+
+def words(name: str, default: tuple[str, ...] = ()) -> list[str]:
+    """A list separated by commas."""
+    given = os.environ.get(name)
+    return list(default) if given is None else [word.strip() for word in given.split(",") if word.strip()]
+
+
+def seconds(name: str, default: float) -> float:
+    """A time above zero [s]."""
+    given = os.environ.get(name)
+    if given is None:
+        return default
+    try:
+        value = float(given)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise ImproperlyConfigured(f"{name} = {given!r}; allowed: seconds above zero")
+    return value
+
+
+def data_dir(default: Path) -> Path:
+    """The folder that holds everything of this lab; created where it is absent."""
+    folder = Path(os.environ.get("EVA_DATA_DIR") or default).expanduser().absolute()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ImproperlyConfigured(
+            f"EVA_DATA_DIR = {folder}: {error.strerror}; name a folder that can be written"
+        ) from None
+    return folder
+
+
+def secret_key(folder: Path) -> str:
+    """EVA_SECRET_KEY, or one of the lab's own that is made once and readable by its user alone."""
+    given = os.environ.get("EVA_SECRET_KEY")
+    if given:
+        return given
+    path = folder / "secret_key"
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError:
+        found = path.read_text("utf-8").strip()
+        if not found:
+            raise ImproperlyConfigured(f"{path} is empty: remove it, and everybody logs in anew") from None
+        return found
+    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+        made = secrets.token_urlsafe(50)
+        file.write(made)
+    return made

@@ -1,0 +1,1 @@
+"""Recorded episodes: index, replay, datasets, reconcile."""

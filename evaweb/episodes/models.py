@@ -1,0 +1,51 @@
+"""Episodes: what the database knows of the folders in DATA/episodes, which are the authority."""
+
+from __future__ import annotations
+
+import uuid
+
+from django.db import models
+
+from evaweb.stations.models import Station
+
+
+class EpisodeStatus(models.TextChoices):
+    """How a recording stands; the last three are the words of its outcome."""
+
+    RECORDING = "recording", "recording"
+    FINISHED = "finished", "finished"
+    INTERRUPTED = "interrupted", "interrupted"
+    FAILED = "failed", "failed"
+    MISSING = "missing", "not on this disk"
+
+
+class Episode(models.Model):
+    """One recorded run or demonstration."""
+
+    uuid = models.UUIDField(primary_key=True, default=uuid.uuid4)
+    station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="episodes")
+    status = models.CharField(max_length=12, choices=EpisodeStatus, default=EpisodeStatus.RECORDING)
+    reason = models.TextField(blank=True, help_text="Why it ended.")
+    kind = models.CharField(max_length=16, default="rollout")
+    task = models.TextField(blank=True)
+    robot = models.CharField(max_length=63, blank=True)
+    checkpoint = models.CharField(max_length=120, blank=True)
+    operator = models.CharField(max_length=150, blank=True)
+    cameras = models.JSONField(default=list, blank=True)
+    fps = models.FloatField(null=True, blank=True)
+    frames = models.PositiveIntegerField(default=0)
+    duration_s = models.FloatField(null=True, blank=True, help_text="Without the time it was held.")
+    started_at = models.DateTimeField(null=True, blank=True)
+    configuration_hash = models.CharField(max_length=64, blank=True)
+    control = models.JSONField(default=dict, blank=True, help_text="The control loop's figures at the end.")
+    previewed_at = models.DateTimeField(null=True, blank=True, help_text="Since when videos can be played.")
+    dataset = models.CharField(max_length=240, blank=True, help_text="Relative to the data folder.")
+    dataset_index = models.PositiveIntegerField(null=True, blank=True)
+    published_at = models.DateTimeField(null=True, blank=True)
+    created_at = models.DateTimeField(auto_now_add=True)
+
+    class Meta:
+        ordering = ("-started_at", "-created_at")
+
+    def __str__(self) -> str:
+        return f"{self.uuid} ({self.get_status_display()})"

@@ -1,0 +1,1 @@
+"""Work for the worker: rows that are claimed, done and swept."""

@@ -1,0 +1,34 @@
+"""Who may do what: three groups, each with the rights of the one before it."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Any
+
+from evaweb.errors import NotAllowed
+
+
+class Role(StrEnum):
+    """The groups; a user without any is a viewer."""
+
+    VIEWER = "viewer"
+    OPERATOR = "operator"
+    ADMIN = "admin"
+
+
+_RANK = {Role.VIEWER: 0, Role.OPERATOR: 1, Role.ADMIN: 2}
+
+
+def role_of(user: Any) -> Role:
+    """The highest role of a user; a superuser is an admin."""
+    if user.is_superuser:
+        return Role.ADMIN
+    held = set(user.groups.values_list("name", flat=True))
+    return max((role for role in Role if role.value in held), key=_RANK.__getitem__, default=Role.VIEWER)
+
+
+def require(user: Any, role: Role) -> None:
+    """Raise NotAllowed unless the user has at least `role`."""
+    has = role_of(user)
+    if _RANK[has] < _RANK[role]:
+        raise NotAllowed(f"{user.get_username()} is a {has}; this needs an {role}: ask an administrator")

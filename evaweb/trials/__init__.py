@@ -1,0 +1,1 @@
+"""Scenes, milestones, checkpoints, trials and their scores."""

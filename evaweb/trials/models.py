@@ -1,0 +1,239 @@
+"""Scenes with positions and milestones, checkpoints, evaluations, trials and their scores."""
+
+from __future__ import annotations
+
+import uuid
+
+from django.conf import settings
+from django.core.validators import MaxValueValidator, MinValueValidator
+from django.db import models
+
+from evaweb.episodes.models import Episode
+from evaweb.stations.models import Station
+
+
+class Scene(models.Model):
+    """A task on a bench: what the robot is told, how the bench is laid out, what counts as success."""
+
+    name = models.SlugField(max_length=60, unique=True, help_text="Short name for addresses and exports.")
+    title = models.CharField(max_length=120)
+    instruction = models.TextField(help_text="The words the policy is given.")
+    criterion = models.TextField(
+        blank=True, help_text="When is it a success? Written down before the first trial."
+    )
+    layout = models.TextField(blank=True, help_text="How to lay out the bench before each trial.")
+    time_limit_s = models.FloatField(
+        null=True,
+        blank=True,
+        validators=[MinValueValidator(1), MaxValueValidator(3600)],
+        help_text="A run ends by itself after this many seconds.",
+    )
+    active = models.BooleanField(default=True, help_text="Off: not offered to operators.")
+    created_at = models.DateTimeField(auto_now_add=True)
+
+    class Meta:
+        ordering = ("title",)
+
+    def __str__(self) -> str:
+        return self.title
+
+
+class Position(models.Model):
+    """One initial condition of a scene, by number."""
+
+    scene = models.ForeignKey(Scene, on_delete=models.CASCADE, related_name="positions")
+    number = models.PositiveSmallIntegerField()
+    label = models.CharField(max_length=120, blank=True)
+    description = models.TextField(blank=True, help_text="Where things stand, in words.")
+    bench = models.JSONField(
+        null=True,
+        blank=True,
+        help_text='For simulated benches: {"block": [x, y, yaw in degrees], "plate": [x, y]} in metres.',
+    )
+
+    class Meta:
+        ordering = ("scene", "number")
+        constraints = [models.UniqueConstraint(fields=("scene", "number"), name="position_number_once")]
+
+    def __str__(self) -> str:
+        return f"{self.number}" + (f" · {self.label}" if self.label else "")
+
+
+class Milestone(models.Model):
+    """One step on the way to success; the score of a trial is the share of points it reached."""
+
+    scene = models.ForeignKey(Scene, on_delete=models.CASCADE, related_name="milestones")
+    order = models.PositiveSmallIntegerField()
+    text = models.CharField(max_length=200)
+    points = models.PositiveSmallIntegerField(
+        default=1, validators=[MinValueValidator(1), MaxValueValidator(100)]
+    )
+    required = models.BooleanField(default=False, help_text="Without it the trial is no success.")
+    truth = models.CharField(
+        max_length=40,
+        blank=True,
+        help_text="For simulated benches: the name of what the bench itself reports.",
+    )
+
+    class Meta:
+        ordering = ("scene", "order")
+        constraints = [models.UniqueConstraint(fields=("scene", "order"), name="milestone_order_once")]
+
+    def __str__(self) -> str:
+        return self.text
+
+
+class Checkpoint(models.Model):
+    """A trained policy and how it is reached."""
+
+    name = models.CharField(max_length=120, unique=True)
+    description = models.TextField(blank=True, help_text="Trained on what, for how long, by whom.")
+    policy = models.JSONField(
+        default=dict,
+        help_text='Keys of the deployment\'s [policy] table, e.g. {"url": "ws://127.0.0.1:8000"}.',
+    )
+    active = models.BooleanField(default=True, help_text="Off: not offered to operators.")
+    created_at = models.DateTimeField(auto_now_add=True)
+
+    class Meta:
+        ordering = ("name",)
+
+    def __str__(self) -> str:
+        return self.name
+
+
+class Evaluation(models.Model):
+    """A set of trials that belong together; the open bench of a station takes those outside any plan."""
+
+    class Kind(models.TextChoices):
+        OPEN_BENCH = "open_bench", "open bench"
+        PLAN = "plan", "plan"
+
+    name = models.CharField(max_length=120)
+    version = models.PositiveIntegerField(default=1)
+    kind = models.CharField(max_length=12, choices=Kind, default=Kind.PLAN)
+    station = models.ForeignKey(
+        Station, null=True, blank=True, on_delete=models.PROTECT, related_name="evaluations"
+    )
+    description = models.TextField(blank=True)
+    created_at = models.DateTimeField(auto_now_add=True)
+
+    class Meta:
+        ordering = ("name", "version")
+        constraints = [
+            models.UniqueConstraint(fields=("name", "version"), name="evaluation_version_once"),
+            models.UniqueConstraint(
+                fields=("station",), condition=models.Q(kind="open_bench"), name="evaluation_one_open_bench"
+            ),
+        ]
+
+    def __str__(self) -> str:
+        return f"{self.name} v{self.version}"
+
+
+class TrialStatus(models.TextChoices):
+    """Where a trial stands; evaweb.trials.services alone moves it."""
+
+    PREPARED = "prepared", "prepared"
+    RUNNING = "running", "running"
+    PAUSED = "paused", "paused"
+    ENDED = "ended", "to be scored"
+    INTERRUPTED = "interrupted", "interrupted"
+    SCORED = "scored", "scored"
+    VOIDED = "voided", "voided"
+    ABANDONED = "abandoned", "never run"
+
+
+class Trial(models.Model):
+    """One attempt of one checkpoint at one position of a scene; a repetition is a new attempt, never a new score."""
+
+    uuid = models.UUIDField(unique=True, default=uuid.uuid4, editable=False)
+    evaluation = models.ForeignKey(Evaluation, on_delete=models.PROTECT, related_name="trials")
+    evaluation_version = models.PositiveIntegerField()
+    checkpoint = models.ForeignKey(Checkpoint, on_delete=models.PROTECT, related_name="trials")
+    scene = models.ForeignKey(Scene, on_delete=models.PROTECT, related_name="trials")
+    position = models.ForeignKey(Position, on_delete=models.PROTECT, related_name="trials")
+    number = models.PositiveIntegerField(help_text="Counts the trials of this checkpoint at this position.")
+    attempt = models.PositiveSmallIntegerField(
+        default=1, help_text="Above 1: the one before was interrupted or voided."
+    )
+    station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="trials")
+    operator = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="trials")
+    status = models.CharField(max_length=12, choices=TrialStatus, default=TrialStatus.PREPARED)
+    reason = models.TextField(blank=True, help_text="Why it is where it is, in one sentence.")
+    instruction = models.TextField(help_text="As the policy was given it.")
+    time_limit_s = models.FloatField(null=True, blank=True)
+    seed = models.PositiveIntegerField(null=True, blank=True, help_text="Of a simulated bench.")
+    episode = models.OneToOneField(
+        Episode, null=True, blank=True, on_delete=models.PROTECT, related_name="trial"
+    )
+    prepared_at = models.DateTimeField(auto_now_add=True)
+    started_at = models.DateTimeField(null=True, blank=True)
+    ended_at = models.DateTimeField(null=True, blank=True)
+    duration_s = models.FloatField(null=True, blank=True, help_text="Without the time it was paused.")
+    changed_at = models.DateTimeField(auto_now=True)
+
+    class Meta:
+        ordering = ("-prepared_at",)
+        constraints = [
+            models.UniqueConstraint(
+                fields=(
+                    "evaluation",
+                    "evaluation_version",
+                    "checkpoint",
+                    "scene",
+                    "position",
+                    "number",
+                    "attempt",
+                ),
+                name="trial_attempt_once",
+            ),
+            models.UniqueConstraint(
+                fields=("station",),
+                condition=models.Q(status__in=("prepared", "running", "paused")),
+                name="trial_one_open_per_station",
+            ),
+        ]
+
+    def __str__(self) -> str:
+        return f"trial {self.pk}: {self.checkpoint} at {self.scene} {self.position.number}"
+
+
+class Score(models.Model):
+    """What one rater says of a trial; a correction is another row, and the newest one counts."""
+
+    trial = models.ForeignKey(Trial, on_delete=models.PROTECT, related_name="scores")
+    rater = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="scores")
+    success = models.BooleanField()
+    score = models.FloatField(help_text="Share of the points of all milestones, 0 to 1.")
+    note = models.TextField(blank=True)
+    failure = models.CharField(max_length=60, blank=True, help_text="What went wrong, in a word or two.")
+    source = models.CharField(
+        max_length=16, default="human", help_text="human, or truth: of a simulated bench."
+    )
+    scored_at = models.DateTimeField(auto_now_add=True)
+
+    class Meta:
+        ordering = ("trial", "id")
+
+    def __str__(self) -> str:
+        return f"{'success' if self.success else 'failure'}, {self.score:.0%}"
+
+
+class MilestoneOutcome(models.Model):
+    """Whether a milestone was reached, with its words and points as they were when it was scored."""
+
+    score = models.ForeignKey(Score, on_delete=models.CASCADE, related_name="outcomes")
+    milestone = models.ForeignKey(Milestone, null=True, on_delete=models.SET_NULL, related_name="outcomes")
+    order = models.PositiveSmallIntegerField()
+    text = models.CharField(max_length=200)
+    points = models.PositiveSmallIntegerField()
+    required = models.BooleanField()
+    reached = models.BooleanField()
+
+    class Meta:
+        ordering = ("score", "order")
+        constraints = [models.UniqueConstraint(fields=("score", "order"), name="outcome_order_once")]
+
+    def __str__(self) -> str:
+        return f"{self.text}: {'reached' if self.reached else 'not reached'}"

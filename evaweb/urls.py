@@ -1,0 +1,27 @@
+"""Every address over HTTP."""
+
+from __future__ import annotations
+
+from django.contrib import admin
+from django.contrib.auth import views as auth_views
+from django.contrib.auth.decorators import login_not_required
+from django.http import HttpRequest, HttpResponse
+from django.urls import include, path
+
+
+@login_not_required
+async def healthz(request: HttpRequest) -> HttpResponse:
+    """This process answers; says nothing of database or stations."""
+    return HttpResponse("ok\n", content_type="text/plain")
+
+
+urlpatterns = [
+    path("healthz", healthz),
+    path("login/", auth_views.LoginView.as_view(redirect_authenticated_user=True), name="login"),
+    path("logout/", auth_views.LogoutView.as_view(), name="logout"),
+    path("admin/", admin.site.urls),
+    path("", include("evaweb.console.urls")),
+    path("", include("evaweb.stations.urls")),
+    path("", include("evaweb.episodes.urls")),
+    path("", include("evaweb.trials.urls")),
+]
