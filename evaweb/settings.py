@@ -124,7 +124,8 @@ def _viewer() -> Path:
 
 
 STATIC_URL = "static/"
-STATIC_ROOT = DATA_DIR / "static"
+STATIC_ROOT = DATA_DIR / "static"  # for a web server in front; our own processes serve from the sources
+STATIC_ROOT.mkdir(exist_ok=True)
 STATICFILES_DIRS: list[object] = [BASE_DIR / "static", ("meshcat", _viewer())]
 _UPLOT = BASE_DIR / "node_modules" / "uplot" / "dist"
 if _UPLOT.is_dir():  # `make setup` brings it; the system check of evaweb.console says so where it is absent
