@@ -4,5 +4,19 @@ from robots.chain import Chain
 from robots.errors import RobotError
 from robots.loading import load, names
 from robots.robot import EEF_FIELDS, Camera, Gripper, Group, Robot
+from robots.visuals import RobotScene, Visual, scene_of
 
-__all__ = ["EEF_FIELDS", "Camera", "Chain", "Gripper", "Group", "Robot", "RobotError", "load", "names"]
+__all__ = [
+    "EEF_FIELDS",
+    "Camera",
+    "Chain",
+    "Gripper",
+    "Group",
+    "Robot",
+    "RobotError",
+    "RobotScene",
+    "Visual",
+    "load",
+    "names",
+    "scene_of",
+]

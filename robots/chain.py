@@ -33,8 +33,9 @@ class Chain:
         self.frame = frame
         self.tip = tip
         self.joints = tuple(joints)
+        self.pinned = dict(pinned or {})
         self._path = urdf.path
-        self._build(urdf, pinned or {})
+        self._build(urdf, self.pinned)
 
     @property
     def size(self) -> int:
@@ -99,7 +100,7 @@ class Chain:
             if joint.kind == "fixed":
                 continue
             row, offset = self._drive(urdf, joint, pinned)
-            table = _table(fixed, joint)
+            table = motion_table(fixed, joint)
             if not row.any():
                 fixed = np.tensordot([1.0, np.cos(offset), np.sin(offset), offset], table, axes=1).reshape(
                     4, 4
@@ -148,7 +149,7 @@ class Chain:
         return row, offset + factor * pinned[joint.name]
 
 
-def _table(fixed: Float64, joint: Joint) -> Float64:
+def motion_table(fixed: Float64, joint: Joint) -> Float64:
     """Four matrices [4, 16] whose sum weighted by (1, cos v, sin v, v) is `fixed` times the joint's motion.
 
     A rotation about the unit vector a is a a^T + (I - a a^T) cos v + [a]x sin v (Rodrigues).

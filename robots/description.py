@@ -12,6 +12,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 from robots.errors import RobotError
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
 Quadruple = Annotated[list[float], Field(min_length=4, max_length=4)]
 Positive = Annotated[float, Field(gt=0)]
@@ -62,6 +63,8 @@ class GripperTable(Table):
     """Whether it knows only open and close."""
     threshold: float | None = None
     """Where a binary gripper switches; a value at or above it means open if `open` is above `close`."""
+    fingers: dict[str, Pair] = {}
+    """URDF joints that move with it: their values [rad or m] at `lower` and at `upper`; drawing only."""
     tip: TipTable | None = None
     """Where its fingertips are; else read off the fingers of the URDF, the sliding children of `eef_link`."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,7 +92,7 @@ def _refuse_twice(file: Path, key: str, given: list[str]) -> None:
 def _group(file: Path, tree: Urdf, table: GroupTable, start: int) -> Group:
     key = f"{file}: groups.{table.name}"
     _refuse_twice(file, f"groups.{table.name}.joints", table.joints)
-    gripper = None if table.gripper is None else _gripper(key, table.gripper, len(table.joints))
+    gripper = None if table.gripper is None else _gripper(key, tree, table.gripper, len(table.joints))
     movers = len(table.joints) - (gripper is not None)
     if len(table.urdf_joints) != movers:
         raise RobotError(
@@ -118,7 +118,7 @@ def _group(file: Path, tree: Urdf, table: GroupTable, start: int) -> Group:
     )
 
 
-def _gripper(key: str, table: GripperTable, dof: int) -> Gripper:
+def _gripper(key: str, tree: Urdf, table: GripperTable, dof: int) -> Gripper:
     if table.index >= dof:
         raise RobotError(f"{key}.gripper.index = {table.index}; allowed: 0 to {dof - 1}")
     for name, value in (("open", table.open), ("close", table.close)):
@@ -131,7 +131,19 @@ def _gripper(key: str, table: GripperTable, dof: int) -> Gripper:
     low, high = sorted((table.open, table.close))
     if table.threshold is not None and not low < table.threshold < high:
         raise RobotError(f"{key}.gripper.threshold = {table.threshold}; allowed: between {low} and {high}")
-    return Gripper(**table.model_dump(exclude={"velocity", "tip"}))
+    return Gripper(
+        **table.model_dump(exclude={"velocity", "tip", "fingers"}), fingers=_fingers(key, tree, table.fingers)
+    )
+
+
+def _fingers(key: str, tree: Urdf, table: Mapping[str, list[float]]) -> dict[str, tuple[float, float]]:
+    for name in table:
+        joint = tree.joint(name)
+        if joint.kind == "fixed" or joint.mimic is not None:
+            raise RobotError(
+                f"{key}.gripper.fingers: {name} is fixed or a mimic; allowed: joints that move by themselves"
+            )
+    return {name: (at_lower, at_upper) for name, (at_lower, at_upper) in table.items()}
 
 
 def _chain(key: str, tree: Urdf, table: GroupTable) -> Chain | None:

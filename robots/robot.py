@@ -20,7 +20,10 @@ EEF_FIELDS = ("x", "y", "z", "qw", "qx", "qy", "qz", "gripper")
 
 @dataclass(frozen=True, slots=True)
 class Gripper:
-    """One number of a group in the robot's own `unit`; `index` is its place inside the group."""
+    """One number of a group in the robot's own `unit`; `index` is its place inside the group.
+
+    `fingers` are URDF joints and their values [rad or m] where the number is `lower` and where it is `upper`.
+    """
 
     index: int
     open: float
@@ -30,6 +33,7 @@ class Gripper:
     unit: str
     binary: bool
     threshold: float | None
+    fingers: Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""Reads the kinematic tree of a URDF: links, joints, origins, axes, limits, mimics; no shapes, no masses."""
+"""Reads the kinematic tree of a URDF: links, joints, origins, axes, limits, mimics; shapes are read elsewhere."""
 
 from __future__ import annotations
 
@@ -77,13 +77,8 @@ class Urdf:
 
 def read(path: Path) -> Urdf:
     """The kinematic tree in the file; RobotError names the file, the joint and what is wrong with it."""
-    try:
-        robot = ET.parse(path).getroot()
-    except (OSError, ET.ParseError) as error:
-        raise RobotError(f"{path}: cannot be read as URDF: {error}") from error
-    if robot.tag != "robot":
-        raise RobotError(f"{path}: the outermost element is <{robot.tag}>; a URDF has <robot>")
-    links = [_text(path, link, "name") for link in robot.findall("link")]
+    robot = document(path)
+    links = [text_of(path, link, "name") for link in robot.findall("link")]
     joints = [_joint(path, element) for element in robot.findall("joint")]
     _refuse_twice(path, "link", links)
     _refuse_twice(path, "joint", [joint.name for joint in joints])
@@ -91,8 +86,19 @@ def read(path: Path) -> Urdf:
     return Urdf(path, root, frozenset(links), {joint.name: joint for joint in joints})
 
 
+def document(path: Path) -> ET.Element:
+    """The file's outermost element, <robot>."""
+    try:
+        robot = ET.parse(path).getroot()
+    except (OSError, ET.ParseError) as error:
+        raise RobotError(f"{path}: cannot be read as URDF: {error}") from error
+    if robot.tag != "robot":
+        raise RobotError(f"{path}: the outermost element is <{robot.tag}>; a URDF has <robot>")
+    return robot
+
+
 def _joint(path: Path, element: ET.Element) -> Joint:
-    name = _text(path, element, "name")
+    name = text_of(path, element, "name")
     kind = element.get("type")
     if kind not in KINDS:
         raise RobotError(f"{path}: joint {name!r} has type {kind!r}; allowed: {', '.join(KINDS)}")
@@ -102,7 +108,7 @@ def _joint(path: Path, element: ET.Element) -> Joint:
         kind=kind,
         parent=_end(path, element, name, "parent"),
         child=_end(path, element, name, "child"),
-        origin=_origin(path, element, name),
+        origin=origin_of(path, f"joint {name!r}", element),
         axis=_axis(path, element, name),
         lower=-math.inf if kind == "continuous" else lower,
         upper=math.inf if kind == "continuous" else upper,
@@ -111,7 +117,8 @@ def _joint(path: Path, element: ET.Element) -> Joint:
     )
 
 
-def _text(path: Path, element: ET.Element, key: str) -> str:
+def text_of(path: Path, element: ET.Element, key: str) -> str:
+    """An attribute that has to be there."""
     value = element.get(key)
     if not value:
         raise RobotError(f"{path}: a <{element.tag}> has no {key!r}")
@@ -122,33 +129,35 @@ def _end(path: Path, element: ET.Element, name: str, which: str) -> str:
     end = element.find(which)
     if end is None or not end.get("link"):
         raise RobotError(f"{path}: joint {name!r} names no {which} link")
-    return _text(path, end, "link")
+    return text_of(path, end, "link")
 
 
-def _numbers(path: Path, name: str, what: str, text: str, count: int) -> list[float]:
+def numbers(path: Path, owner: str, what: str, text: str, count: int) -> list[float]:
+    """`count` finite numbers in `text`; RobotError names the file, the owner and what of it."""
     try:
         values = [float(part) for part in text.split()]
     except ValueError:
         values = []
     if len(values) != count or not all(math.isfinite(value) for value in values):
-        raise RobotError(f"{path}: joint {name!r}: {what} is {text!r}; allowed: {count} finite number(s)")
+        raise RobotError(f"{path}: {owner}: {what} is {text!r}; allowed: {count} finite number(s)")
     return values
 
 
-def _origin(path: Path, element: ET.Element, name: str) -> Float64:
+def origin_of(path: Path, owner: str, element: ET.Element) -> Float64:
+    """The transform [4, 4] that the element's <origin> declares; the identity where it has none."""
     matrix = np.eye(4)
     origin = element.find("origin")
     if origin is not None:
-        roll, pitch, yaw = _numbers(path, name, "origin rpy", origin.get("rpy", "0 0 0"), 3)
+        roll, pitch, yaw = numbers(path, owner, "origin rpy", origin.get("rpy", "0 0 0"), 3)
         matrix[:3, :3] = matrix_of_rpy(roll, pitch, yaw)
-        matrix[:3, 3] = _numbers(path, name, "origin xyz", origin.get("xyz", "0 0 0"), 3)
+        matrix[:3, 3] = numbers(path, owner, "origin xyz", origin.get("xyz", "0 0 0"), 3)
     return matrix
 
 
 def _axis(path: Path, element: ET.Element, name: str) -> Float64:
     declared = element.find("axis")
     text = "1 0 0" if declared is None else declared.get("xyz", "1 0 0")  # the default of the URDF format
-    axis = np.array(_numbers(path, name, "axis xyz", text, 3))
+    axis = np.array(numbers(path, f"joint {name!r}", "axis xyz", text, 3))
     length = float(np.linalg.norm(axis))
     if length < 1e-9:
         raise RobotError(f"{path}: joint {name!r}: axis xyz is {text!r}; allowed: a vector that is not zero")
@@ -158,16 +167,16 @@ def _axis(path: Path, element: ET.Element, name: str) -> Float64:
 def _limit(path: Path, element: ET.Element, name: str, key: str) -> float | None:
     limit = element.find("limit")
     text = None if limit is None else limit.get(key)
-    return None if text is None else _numbers(path, name, f"limit {key}", text, 1)[0]
+    return None if text is None else numbers(path, f"joint {name!r}", f"limit {key}", text, 1)[0]
 
 
 def _mimic(path: Path, element: ET.Element, name: str) -> Mimic | None:
     mimic = element.find("mimic")
     if mimic is None:
         return None
-    multiplier = _numbers(path, name, "mimic multiplier", mimic.get("multiplier", "1"), 1)[0]
-    offset = _numbers(path, name, "mimic offset", mimic.get("offset", "0"), 1)[0]
-    return Mimic(_text(path, mimic, "joint"), multiplier, offset)
+    multiplier = numbers(path, f"joint {name!r}", "mimic multiplier", mimic.get("multiplier", "1"), 1)[0]
+    offset = numbers(path, f"joint {name!r}", "mimic offset", mimic.get("offset", "0"), 1)[0]
+    return Mimic(text_of(path, mimic, "joint"), multiplier, offset)
 
 
 def _refuse_twice(path: Path, what: str, names: list[str]) -> None:
