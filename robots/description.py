@@ -70,7 +70,7 @@ class GripperTable(Table):
 
 
 class MountTable(Table):
-    """Where the group's `frame` stands in the scene; drawing only, never kinematics."""
+    """Where the group's `frame` stands in the scene: drawings and the simulated bench, never kinematics."""
 
     xyz: Triple
     wxyz: Quadruple

@@ -42,8 +42,9 @@ class Group:
 
     `urdf_joints` name the same joints in the URDF, without the gripper; `chain` leads from `frame` to
     `eef_link`; all three are None where the group has no end effector. `mount` [7] (x, y, z, qw, qx, qy, qz)
-    places the frame in a scene for drawing; kinematics never uses it. `tip` [4, 4] in `eef_link` lies between
-    the fingertips, z the way they point, y the way they open; None where there is no end effector.
+    places the frame in drawings and on the simulated bench; kinematics never uses it. `tip` [4, 4] in
+    `eef_link` lies between the fingertips, z the way they point, y the way they open; None where there is no
+    end effector.
     """
 
     name: str

@@ -26,7 +26,8 @@ NOISE_RAD = math.radians(4.0)
 APART_M = 0.15  # block and plate, centre to centre, at least
 _CROWD_M = 0.09  # two blocks, centre to centre, at least
 _TRIES = 1000
-_MIDDLE = 0.03  # m beyond the middle that each side reaches
+_SIDES = ((-0.25, 0.0), (0.25, 0.0))  # where arms stand, and how far they reach [m] to grasp from above
+_REACH = 0.42
 _OVERHEAD_EYE, _OVERHEAD_AIM = (0.0, 0.36, 0.85), (0.0, 0.27, 0.0)
 _OVERHEAD_FOCAL = 1.0  # per picture width
 _WRIST_EYE, _WRIST_AIM = (-0.08, 0.0, -0.13), (0.0, 0.0, 0.01)  # in the tip's frame
@@ -258,13 +259,13 @@ def _pair(
         plate_x, plate_y, _ = _somewhere(chance) if plate is None else _near(chance, [*plate, 0.0])
         asked = block is not None and plate is not None
         apart = math.dist((block_x, block_y), (plate_x, plate_y)) >= APART_M
-        if asked or (apart and _one_side(block_x, plate_x)):
+        if asked or (apart and _one_side((block_x, block_y), (plate_x, plate_y))):
             return (block_x, block_y, yaw), (plate_x, plate_y)
     raise BenchError(f"no place was found beside block {block}, plate {plate}; allowed: other positions")
 
 
-def _one_side(first: float, second: float) -> bool:
-    return min(first, second) >= -_MIDDLE or max(first, second) <= _MIDDLE
+def _one_side(*places: tuple[float, float]) -> bool:
+    return any(all(math.dist(side, place) <= _REACH for place in places) for side in _SIDES)
 
 
 def _somewhere(chance: np.random.Generator) -> tuple[float, float, float]:

@@ -96,7 +96,7 @@ def test_a_robot_travels_between_processes() -> None:
         ("binary = false", "threshold = 0.05", "threshold = 0.05; needed if and only if binary = true"),
         ("binary = false", "binary = true\nthreshold = 0.1", "threshold = 0.1; allowed: between 0.0 and 0.1"),
         ("wxyz = [0.7071067811865476", "wxyz = [0.5", "mount.wxyz has length"),
-        ("[poses.home]", "[poses.start]", "poses: start given; needed: home"),
+        ("[poses.home]", "[poses.start]", "poses: start, ready given; needed: home"),
         ("left_arm = [0.0,", "arm = [0.0,", "poses.home gives arm, right_arm; needed: left_arm, right_arm"),
         ("left_arm = [0.0,", "left_arm = [", "poses.home.left_arm has 6 numbers; needed: 7"),
         ("left_arm = [0.0, 0.0", "left_arm = [0.0, -0.1", "joint1 = -0.1; allowed: 0.0 to 3.14"),
