@@ -35,6 +35,7 @@ INSTALLED_APPS = [
     "evaweb.trials",
     "evaweb.console",
     "evaweb.api",
+    "evaweb.lab",
 ]
 
 MIDDLEWARE = [

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from runtime import deployment, lockstep, log
 from runtime.errors import RuntimeFault
-from runtime.family import Plan, plan
+from runtime.family import Lifeline, Plan, plan
 from runtime.session import State
 from runtime.supervisor import Supervisor
 
@@ -20,6 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m runtime", description=__doc__)
     parser.add_argument("deployment", type=Path, help="a TOML file; deployments/ has examples")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
+    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends")
     how = parser.add_mutually_exclusive_group()
     how.add_argument(
         "--check", action="store_true", help="print the resolved deployment and its hash, start nothing"
@@ -40,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _check(made)
         if given.lockstep:
             return run_in_lockstep(made)
-        return Supervisor(made).run(given.headless)
+        return Supervisor(made, Lifeline() if given.lifeline else None).run(given.headless)
     except RuntimeFault as fault:
         print(f"error: {fault}", file=sys.stderr)
         return 1

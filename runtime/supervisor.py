@@ -18,7 +18,7 @@ from typing import IO
 
 from runtime.bus import Endpoints
 from runtime.errors import SetupError
-from runtime.family import Plan
+from runtime.family import Lifeline, Plan
 from runtime.page import PROCESSES, Page
 
 log = logging.getLogger(__name__)
@@ -32,8 +32,9 @@ _POLL_S = 0.05
 class Supervisor:
     """One family; everything it starts ends with it, however it ends."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, lifeline: Lifeline | None = None) -> None:
         self._plan = plan
+        self._lifeline = lifeline  # of our own parent, where it wants us to end with it
         self._station_dir = plan.deployment.station_dir
         self._endpoints = Endpoints(self._station_dir)
         self._environment = dict(os.environ)
@@ -111,7 +112,7 @@ class Supervisor:
         )
 
     def _watch(self) -> int:
-        while not self._ending:
+        while not self._ending and not (self._lifeline and self._lifeline.cut):
             if self._driver is not None and self._driver.poll() is not None:
                 return self._driver.returncode
             for process in PROCESSES:

@@ -1,0 +1,102 @@
+"""`manage.py demo`: a small lab with a simulated bench and two policies of different skill."""
+
+from __future__ import annotations
+
+import json
+from argparse import ArgumentParser
+from pathlib import Path
+from typing import Any
+
+from django.conf import settings
+from django.core.management.base import BaseCommand, CommandError
+
+from evaweb.errors import EvaError
+from evaweb.lab import programs, seed
+from evaweb.lab.lab import Bench, Lab, a_lab
+from evaweb.lab.lifetime import Ended
+from evaweb.lab.once import Choice, perform, report
+from evaweb.lab.seed import Login
+from evaweb.lab.visitor import Visitor
+from evaweb.roles import Role
+
+_DEPLOYMENT = settings.BASE_DIR / "deployments" / "tabletop.toml"
+_STATION, _ROBOT = "bench-1", "agilex_piper"
+_SKILLED, _CLUMSY = "pick-place-skilled", "pick-place-clumsy"
+_POLICIES = {
+    _SKILLED: (
+        "Scripted; sees the block within a millimetre or two, answers in 80 ms.",
+        ("--noise", "1", "--latency-ms", "80"),
+    ),
+    _CLUMSY: (
+        "Scripted; misjudges the block by a centimetre or more, sometimes lets go early, answers in 250 ms.",
+        ("--noise", "14", "--failure-rate", "0.25", "--latency-ms", "250"),
+    ),
+}
+
+
+class Command(BaseCommand):
+    """Bring up the demo and stay until Ctrl-C, or run one trial with --once."""
+
+    help = "A lab on this machine that needs no robot: web, worker, a simulated bench, two policy servers."
+
+    def add_arguments(self, parser: ArgumentParser) -> None:
+        parser.add_argument("--host", default="127.0.0.1", help="address that the web listens on")
+        parser.add_argument("--port", type=int, default=8000, help="port of the web; 0 takes a free one")
+        parser.add_argument("--once", action="store_true", help="run, score and publish one trial, then end")
+        parser.add_argument("--json", type=Path, metavar="FILE", help="with --once: write the result there")
+        parser.add_argument("--seed", type=int, default=1, help="of the bench and of the policies")
+        parser.add_argument("--position", type=int, default=1, help="with --once: the position of the scene")
+        parser.add_argument(
+            "--checkpoint", default=_SKILLED, choices=sorted(_POLICIES), help="with --once: which policy"
+        )
+
+    def handle(self, *args: Any, **options: Any) -> None:
+        try:
+            with a_lab(options["host"], options["port"]) as lab:
+                url, logins = self._up(lab, options["seed"])
+                if options["once"]:
+                    self._once(url, logins[0], options)
+                else:
+                    self._welcome(url, logins)
+                    lab.watch()
+        except Ended:
+            self.stdout.write("ended; the data stays in " + str(settings.DATA_DIR))
+        except EvaError as error:
+            if options["json"]:
+                options["json"].write_text(json.dumps({"error": str(error)}), "utf-8")
+            raise CommandError(str(error)) from None
+
+    def _up(self, lab: Lab, seed_number: int) -> tuple[str, list[Login]]:
+        node = lab.processes.start(programs.tabletop(_ROBOT, seed_number))
+        for name, (description, options) in _POLICIES.items():
+            serving = programs.policy(name, _ROBOT, (*options, "--seed", str(seed_number)))
+            policy = {"url": lab.processes.start(serving)["url"]}
+            seed.demo_checkpoint(name=name, description=description, policy=policy)
+        seed.demo_scene()
+        assignments = [
+            f'transport.sub_endpoint="{node["obs_endpoint"]}"',
+            f'transport.pub_endpoint="{node["action_endpoint"]}"',
+        ]
+        url = lab.up([Bench(_DEPLOYMENT, assignments)])
+        roles = {"operator": Role.OPERATOR, "admin": Role.ADMIN}
+        return url, [seed.demo_login(username=name, role=role) for name, role in roles.items()]
+
+    def _welcome(self, url: str, logins: list[Login]) -> None:
+        self.stdout.write(f"\nEVA Web is at {url}\n")
+        for login in logins:
+            self.stdout.write(f"  {login.username:<10}{login.password}")
+        self.stdout.write(f"\nThe data is in {settings.DATA_DIR}, logs in its folder logs.")
+        self.stdout.write("Ctrl-C ends everything.")
+        self.stdout.flush()
+
+    def _once(self, url: str, operator: Login, options: dict[str, Any]) -> None:
+        visitor = Visitor(url)
+        visitor.login(operator.username, operator.password)
+        choice = Choice(
+            _STATION, "block-on-plate", options["position"], options["checkpoint"], options["seed"]
+        )
+        done = perform(visitor, choice)
+        text = json.dumps(report(done), indent=1)
+        if options["json"]:
+            options["json"].write_text(text, "utf-8")
+        self.stdout.write(text)

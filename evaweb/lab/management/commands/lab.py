@@ -1,0 +1,42 @@
+"""`manage.py lab DEPLOYMENT...`: web, worker and the stations of this machine; all end with it."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser
+from pathlib import Path
+from typing import Any
+
+from django.conf import settings
+from django.core.management.base import BaseCommand, CommandError
+
+from evaweb.errors import EvaError
+from evaweb.lab.lab import Bench, a_lab
+from evaweb.lab.lifetime import Ended
+
+
+class Command(BaseCommand):
+    """Bring up a lab and stay until Ctrl-C."""
+
+    help = "Start web, worker and the stations of the given deployments; Ctrl-C ends all of them."
+
+    def add_arguments(self, parser: ArgumentParser) -> None:
+        parser.add_argument(
+            "deployments", nargs="*", type=Path, metavar="DEPLOYMENT", help="a TOML file per station"
+        )
+        parser.add_argument("--host", default="127.0.0.1", help="address that the web listens on")
+        parser.add_argument("--port", type=int, default=8000, help="port of the web; 0 takes a free one")
+
+    def handle(self, *args: Any, **options: Any) -> None:
+        benches = [Bench(path.absolute()) for path in options["deployments"]]
+        try:
+            with a_lab(options["host"], options["port"]) as lab:
+                url = lab.up(benches)
+                self.stdout.write(
+                    f"EVA Web is at {url}   (data in {settings.DATA_DIR})\nCtrl-C ends everything."
+                )
+                self.stdout.flush()
+                lab.watch()
+        except Ended:
+            self.stdout.write("ended")
+        except EvaError as error:
+            raise CommandError(str(error)) from None

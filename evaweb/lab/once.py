@@ -1,0 +1,155 @@
+"""One trial from choosing to dataset, as an operator does it, scored from the bench's own truth."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
+
+_STATION_UP_S = 60.0
+_READY_S = 60.0
+_STOPPED_S = 10.0
+_PUBLISHED_S = 60.0
+_REST_S = 1.0  # how long success has to last before the operator presses Stop
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What is run."""
+
+    station: str
+    scene: str
+    position: int
+    checkpoint: str
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """A complete scored and recorded trial."""
+
+    trial: int
+    success: bool
+    score: float
+    duration_s: float
+    episode: str
+    frames: int
+    dataset: str
+    dataset_index: int
+    control: Mapping[str, Any]
+    viewer_frames: int
+    wall_s: float
+
+
+def perform(visitor: Visitor, choice: Choice) -> Done:
+    """Take the station, set up, run until it succeeds or its time is over, stop, score, wait for the dataset."""
+    begun = time.monotonic()
+    with closing(LivePage(visitor, choice.station)) as page:
+        page.wait(lambda state: state["state"] != "disconnected", _STATION_UP_S, "waiting for the station")
+        page.claim()
+        trial = visitor.post(
+            f"stations/{choice.station}/trials",
+            {
+                "scene": choice.scene,
+                "position": choice.position,
+                "checkpoint": choice.checkpoint,
+                "seed": choice.seed,
+            },
+        )["id"]
+        page.wait(lambda state: state["lease"]["epoch"] == page.epoch, _STOPPED_S, "waiting for the lease")
+        page.command("setup", trial)
+        set_up = page.wait(_settled, _READY_S, "setting up")
+        if set_up["state"] != "ready":
+            raise VisitFailed(f"set-up ended {set_up['state']}: {set_up['reason']}")
+        page.command("run", trial)
+        truth = _run(page, float(visitor.get(f"trials/{trial}")["time_limit_s"]))
+        scored = _score(visitor, trial, truth)
+        episode = _published(visitor, scored["episode"])
+    return Done(
+        trial=trial,
+        success=scored["success"],
+        score=scored["score"],
+        duration_s=scored["duration_s"],
+        episode=episode["uuid"],
+        frames=episode["frames"],
+        dataset=episode["dataset"],
+        dataset_index=episode["dataset_index"],
+        control=episode["control"],
+        viewer_frames=page.frames,
+        wall_s=time.monotonic() - begun,
+    )
+
+
+def report(done: Done) -> dict[str, Any]:
+    """The result as JSON."""
+    return asdict(done)
+
+
+def _settled(state: Mapping[str, Any]) -> bool:
+    return state["state"] not in ("setting_up", "idle") or bool(
+        state["state"] == "idle" and "failed" in state["reason"]
+    )
+
+
+def _run(page: LivePage, limit: float) -> Mapping[str, Any]:
+    """Watch until the bench says it is done or the run ends by itself; press Stop; the truth at the end."""
+    page.wait(lambda state: state["state"] == "running", _STOPPED_S, "starting the run")
+    succeeded = 0.0
+
+    def over(state: Mapping[str, Any]) -> bool:
+        nonlocal succeeded
+        if not state["truth"].get("success"):
+            succeeded = 0.0
+        elif not succeeded:
+            succeeded = state["clock"]
+        return state["state"] != "running" or bool(succeeded and state["clock"] - succeeded >= _REST_S)
+
+    state = page.wait(over, limit + 30.0, "running")
+    if state["state"] in ("running", "holding"):
+        page.command("stop")
+    state = page.wait(lambda now: now["state"] not in ("running", "holding"), _STOPPED_S, "stopping")
+    truth: Mapping[str, Any] = state["truth"]
+    if not truth:
+        raise VisitFailed("the station tells no truth: is transport.simulated set in its deployment?")
+    return truth
+
+
+def _score(visitor: Visitor, trial: int, truth: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Tick what the bench says was reached, once the trial waits to be scored."""
+    facts = _poll(
+        lambda: visitor.get(f"trials/{trial}"),
+        lambda found: found["status"] in ("ended", "interrupted"),
+        _STOPPED_S,
+        "waiting for the trial to end",
+    )
+    reached = {
+        str(milestone["id"]): bool(truth["milestones"].get(milestone["truth"]))
+        for milestone in facts["milestones"]
+    }
+    content = {"milestones": reached, "note": "scored from the bench's truth", "source": "truth"}
+    visitor.post(f"trials/{trial}/score", content)
+    scored: Mapping[str, Any] = visitor.get(f"trials/{trial}")
+    return scored
+
+
+def _published(visitor: Visitor, episode: str) -> Mapping[str, Any]:
+    found: Mapping[str, Any] = _poll(
+        lambda: visitor.get(f"episodes/{episode}"),
+        lambda facts: facts["dataset_index"] is not None,
+        _PUBLISHED_S,
+        "waiting for the dataset",
+    )
+    return found
+
+
+def _poll(ask: Any, reached: Any, seconds: float, what: str) -> Any:
+    deadline = time.monotonic() + seconds
+    while not reached(found := ask()):
+        if time.monotonic() > deadline:
+            raise VisitFailed(f"{what}: not within {seconds:g} s; it is {found}")
+        time.sleep(0.25)
+    return found

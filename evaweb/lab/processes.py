@@ -1,0 +1,158 @@
+"""The processes of a lab: started with a lifeline, restarted when they die, ended in order.
+
+A child's standard input is a pipe whose other end only we hold. It closes when we end, however we end, and
+every program of ours ends by itself then: nothing is ever looked for and killed.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import selectors
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from evaweb.errors import EvaError
+
+log = logging.getLogger(__name__)
+_MOST_RESTARTS, _RESTART_WINDOW_S = 5, 60.0
+_LONGEST_LOG = 20_000_000  # bytes, beyond which a log starts anew and the old one is kept beside it
+
+
+class LabError(EvaError):
+    """The lab cannot start or go on; the message says which part and why."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """One process: `python ARGUMENTS --lifeline`.
+
+    One that `announces` prints its addresses as a line of JSON when it is ready; started again after a death
+    it gets the arguments that `again` makes of them, so that it is found where it was.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    announces: bool = False
+    again: Callable[[Mapping[str, Any]], tuple[str, ...]] | None = None
+    patience_s: float = 5.0  # to end by itself
+
+
+@dataclass
+class _Child:
+    program: Program
+    process: subprocess.Popen[bytes]
+    log: IO[bytes]
+    addresses: Mapping[str, Any] = field(default_factory=dict)
+    restarts: deque[float] = field(default_factory=deque)
+
+
+class Processes:
+    """All children; `start` in order, `watch` now and then, `end` in reverse order."""
+
+    def __init__(self, folder: Path, logs: Path, environment: Mapping[str, str]) -> None:
+        self._folder = folder
+        self._logs = logs
+        self._environment = dict(environment)
+        self._children: dict[str, _Child] = {}
+        logs.mkdir(parents=True, exist_ok=True)
+
+    def start(self, program: Program, ready_s: float = 60.0) -> Mapping[str, Any]:
+        """Start it; returns the addresses that it announces, {} where it announces none."""
+        child = _Child(program, *self._spawn(program, program.arguments))
+        self._children[program.name] = child
+        if program.announces:
+            child.addresses = self._announcement(child, ready_s)
+        return child.addresses
+
+    def pids(self) -> dict[str, int]:
+        """The processes that there are now."""
+        return {name: child.process.pid for name, child in self._children.items()}
+
+    def watch(self) -> None:
+        """Restart what has died; LabError where one dies too often."""
+        for child in self._children.values():
+            code = child.process.poll()
+            if code is not None:
+                self._restart(child, code)
+
+    def end(self) -> None:
+        """Cut the lifelines in reverse order, wait for each; one that does not end in its time is killed."""
+        for child in reversed(self._children.values()):
+            assert child.process.stdin is not None
+            child.process.stdin.close()
+        for child in reversed(self._children.values()):
+            try:
+                child.process.wait(child.program.patience_s)
+            except subprocess.TimeoutExpired:
+                log.error("%s does not end by itself: killed", child.program.name)
+                child.process.kill()
+                child.process.wait()
+            child.log.close()
+        self._children.clear()
+
+    def _spawn(
+        self, program: Program, arguments: tuple[str, ...]
+    ) -> tuple[subprocess.Popen[bytes], IO[bytes]]:
+        path = self._logs / f"{program.name}.log"
+        if path.exists() and path.stat().st_size > _LONGEST_LOG:
+            path.replace(path.with_suffix(".log.old"))
+        output = path.open("ab")
+        process = subprocess.Popen(
+            [sys.executable, *arguments, "--lifeline"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE if program.announces else output,
+            stderr=output,
+            env=self._environment,
+            cwd=self._folder,
+            start_new_session=True,  # Ctrl-C reaches us alone; we end them in order
+        )
+        return process, output
+
+    def _announcement(self, child: _Child, ready_s: float) -> Mapping[str, Any]:
+        output = child.process.stdout
+        assert output is not None
+        deadline = time.monotonic() + ready_s
+        with selectors.DefaultSelector() as selector:
+            selector.register(output, selectors.EVENT_READ)
+            while not selector.select(0.2):
+                if time.monotonic() > deadline:
+                    raise LabError(
+                        f"{child.program.name} was not ready within {ready_s:g} s: {self._why(child)}"
+                    )
+        line = output.readline()
+        try:
+            found = json.loads(line)
+        except ValueError:
+            child.process.wait(5)
+            raise LabError(f"{child.program.name} did not start: {self._why(child)}") from None
+        if not isinstance(found, dict):
+            raise LabError(f"{child.program.name} announced {found!r}; expected a map of addresses")
+        return found
+
+    def _why(self, child: _Child) -> str:
+        path = self._logs / f"{child.program.name}.log"
+        lines = path.read_text("utf-8", "replace").strip().splitlines()
+        return f"{lines[-1] if lines else 'it said nothing'} (see {path})"
+
+    def _restart(self, child: _Child, code: int) -> None:
+        program, now = child.program, time.monotonic()
+        child.restarts.append(now)
+        while child.restarts[0] < now - _RESTART_WINDOW_S:
+            child.restarts.popleft()
+        if len(child.restarts) > _MOST_RESTARTS:
+            raise LabError(
+                f"{program.name} ended with {code} for the {len(child.restarts)}th time in a minute: {self._why(child)}"
+            )
+        log.error("%s ended with %d: restarting it", program.name, code)
+        child.log.close()
+        arguments = program.again(child.addresses) if program.again else program.arguments
+        child.process, child.log = self._spawn(program, arguments)
+        if program.announces:
+            child.addresses = self._announcement(child, 60.0)

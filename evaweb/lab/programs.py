@@ -1,0 +1,68 @@
+"""What a lab consists of, each part as the command line that starts it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from django.conf import settings
+
+from evaweb.lab.processes import Program
+
+_MANAGE = str(settings.BASE_DIR / "manage.py")
+
+
+def web(host: str, port: int) -> Program:
+    """Pages, REST and websockets."""
+
+    def arguments(where: object) -> tuple[str, ...]:
+        return (_MANAGE, "serve", "--host", host, "--port", str(where))
+
+    return Program("web", arguments(port), announces=True, again=lambda found: arguments(found["port"]))
+
+
+def worker(queues: Sequence[str]) -> Program:
+    """What turns finished episodes into datasets; what it was about to do is done at the next start."""
+    return Program("worker", (_MANAGE, "worker", "--queues", ",".join(queues)), patience_s=20.0)
+
+
+def station(deployment: str, assignments: Sequence[str]) -> Program:
+    """A runtime: a family of processes with a supervisor of its own."""
+    sets = [part for assignment in assignments for part in ("--set", assignment)]
+    return Program(f"station-{_stem(deployment)}", ("-m", "runtime", deployment, *sets), patience_s=15.0)
+
+
+def tabletop(robot: str, seed: int) -> Program:
+    """The simulated bench, on free ports that it keeps."""
+
+    def arguments(observations: str, commands: str) -> tuple[str, ...]:
+        ends = ("--obs-endpoint", observations, "--action-endpoint", commands)
+        return ("-m", "runtime.sim.node", "--robot", robot, "--bench", "tabletop", "--seed", str(seed), *ends)
+
+    free = "tcp://127.0.0.1:0"
+    return Program(
+        "bench",
+        arguments(free, free),
+        announces=True,
+        again=lambda found: arguments(found["obs_endpoint"], found["action_endpoint"]),
+    )
+
+
+def policy(name: str, robot: str, options: Sequence[str]) -> Program:
+    """A scripted policy that looks at the pictures, on a free port that it keeps."""
+
+    def arguments(port: object) -> tuple[str, ...]:
+        serving = ("-m", "runtime.sim.serve", "openpi", "--robot", robot, "--behaviour", "pick_place")
+        return (*serving, "--name", name, "--port", str(port), *options)
+
+    return Program(
+        f"policy-{name}", arguments(0), announces=True, again=lambda found: arguments(_port(found))
+    )
+
+
+def _port(found: Mapping[str, Any]) -> str:
+    return str(found["url"]).rstrip("/").rpartition(":")[2]
+
+
+def _stem(path: str) -> str:
+    return path.rpartition("/")[2].removesuffix(".toml")

@@ -1,0 +1,109 @@
+"""What a lab finds in its database when it starts, and what the demo has besides."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from django.contrib.auth.models import Group, User
+from django.db import transaction
+
+from evaweb.roles import Role
+from evaweb.stations.models import Station
+from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
+
+_ALPHABET = "abcdefghjkmnpqrstuvwxyz23456789"  # nothing that looks like something else on a screen
+
+
+@dataclass(frozen=True, slots=True)
+class Login:
+    """An account and its fresh password."""
+
+    username: str
+    password: str
+
+
+def fresh_password() -> str:
+    """Fifteen characters in three groups, 74 bits."""
+    return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(5)) for _ in range(3))
+
+
+@transaction.atomic
+def demo_login(*, username: str, role: Role) -> Login:
+    """The account of that name with its role and a password that was never used before."""
+    user, _ = User.objects.get_or_create(username=username)
+    password = fresh_password()
+    user.set_password(password)
+    user.is_active = True
+    user.is_staff = role is Role.ADMIN
+    user.save()
+    user.groups.set(Group.objects.filter(name=role.value))
+    return Login(username, password)
+
+
+def station_registered(*, name: str, robot: str, deployment: str, simulated: bool) -> Station:
+    """The station of a deployment that this lab starts; its title and message are an administrator's."""
+    facts = {"robot": robot, "deployment": deployment, "simulated": simulated}
+    station, _ = Station.objects.update_or_create(name=name, defaults=facts, create_defaults=facts)
+    return station
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    text: str
+    points: int
+    required: bool
+    truth: str
+
+
+_MILESTONES = (
+    _Step("The gripper holds the block", 1, False, "grasped"),
+    _Step("The block is lifted clear of the table", 1, False, "lifted"),
+    _Step("The block is above the plate", 1, False, "over_plate"),
+    _Step("The block rests on the plate, released", 2, True, "placed"),
+)
+_POSITIONS = (
+    ("block left", [-0.14, 0.26, 0], [0.08, 0.34]),
+    ("block right", [0.14, 0.26, 20], [-0.08, 0.34]),
+    ("block far left", [-0.16, 0.36, -30], [0.05, 0.24]),
+    ("block turned", [0.12, 0.32, 40], [-0.10, 0.26]),
+)
+
+
+@transaction.atomic
+def demo_scene() -> Scene:
+    """The tabletop scene, made once; what an administrator changed in it stays changed."""
+    scene, made = Scene.objects.get_or_create(
+        name="block-on-plate",
+        defaults={
+            "title": "Block on plate",
+            "instruction": "put the block on the plate",
+            "criterion": "The block rests on the plate and the gripper has let go of it.",
+            "layout": "The simulated bench lays itself out at set-up.",
+            "time_limit_s": 40.0,
+        },
+    )
+    if made:
+        for number, (label, block, plate) in enumerate(_POSITIONS, start=1):
+            bench = {"block": block, "plate": plate}
+            Position.objects.create(scene=scene, number=number, label=label, bench=bench)
+        for order, step in enumerate(_MILESTONES, start=1):
+            Milestone.objects.create(
+                scene=scene,
+                order=order,
+                text=step.text,
+                points=step.points,
+                required=step.required,
+                truth=step.truth,
+            )
+    return scene
+
+
+def demo_checkpoint(*, name: str, description: str, policy: Mapping[str, object]) -> Checkpoint:
+    """A checkpoint of the demo, led to where its policy server listens this time."""
+    facts = {"policy": dict(policy)}
+    checkpoint, _ = Checkpoint.objects.update_or_create(
+        name=name, defaults=facts, create_defaults={"description": description, **facts}
+    )
+    return checkpoint

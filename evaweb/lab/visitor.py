@@ -1,0 +1,216 @@
+"""A visitor in Python: logs in, asks over REST and watches over the websocket, exactly as a browser does."""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from http.cookiejar import CookieJar
+from typing import Any
+from urllib.error import HTTPError, URLError
+from urllib.parse import urlencode, urlsplit
+from urllib.request import HTTPCookieProcessor, HTTPRedirectHandler, OpenerDirector, Request, build_opener
+
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+from evaweb.errors import EvaError
+from evaweb.frames import decode
+
+_RENEW_S = 1.0
+_TIMEOUT_S = 30.0
+_LARGEST_FRAME = 16 * 1024 * 1024
+_TOKEN = re.compile(r'name="csrfmiddlewaretoken" value="([^"]+)"')
+
+
+class VisitFailed(EvaError):
+    """The lab answered something else than was asked for; the message has its words."""
+
+
+class _NoRedirect(HTTPRedirectHandler):
+    """A login that worked answers with a redirect; one that did not, with the form."""
+
+    def redirect_request(self, *args: Any, **kwargs: Any) -> None:
+        return None
+
+
+class Visitor:
+    """One logged-in session over HTTP."""
+
+    def __init__(self, url: str) -> None:
+        self.url = url.rstrip("/")
+        self._cookies = CookieJar()
+        self._opener: OpenerDirector = build_opener(HTTPCookieProcessor(self._cookies), _NoRedirect())
+
+    def login(self, username: str, password: str) -> None:
+        """Fill in the form; VisitFailed where it comes back."""
+        page = self._open(Request(f"{self.url}/login/")).decode()
+        found = _TOKEN.search(page)
+        if not found:
+            raise VisitFailed(f"{self.url}/login/ has no login form")
+        form = {"username": username, "password": password, "csrfmiddlewaretoken": found[1]}
+        request = Request(f"{self.url}/login/", urlencode(form).encode(), {"Referer": f"{self.url}/login/"})
+        try:
+            self._opener.open(request, timeout=_TIMEOUT_S).close()
+        except HTTPError as answer:
+            answer.close()
+            if answer.code == 302:
+                return
+            raise VisitFailed(f"login as {username}: HTTP {answer.code}") from None
+        raise VisitFailed(f"login as {username}: name or password is wrong")
+
+    def get(self, path: str) -> Any:
+        """The JSON of `path` under /api/v1."""
+        return json.loads(self._open(Request(f"{self.url}/api/v1/{path}")))
+
+    def post(self, path: str, content: Mapping[str, Any]) -> Any:
+        """Send JSON to `path` under /api/v1; VisitFailed with the sentence of the answer where it refuses."""
+        headers = {
+            "Content-Type": "application/json",
+            "X-CSRFToken": self.cookie("csrftoken"),
+            "Referer": self.url,
+        }
+        request = Request(f"{self.url}/api/v1/{path}", json.dumps(content).encode(), headers)
+        return json.loads(self._open(request))
+
+    def cookie(self, name: str) -> str:
+        """The value of a cookie of this session, "" where there is none."""
+        return next((cookie.value or "" for cookie in self._cookies if cookie.name == name), "")
+
+    def _open(self, request: Request) -> bytes:
+        try:
+            with self._opener.open(request, timeout=_TIMEOUT_S) as answer:
+                return bytes(answer.read())
+        except HTTPError as refusal:
+            with refusal:
+                body = refusal.read().decode("utf-8", "replace")
+            raise VisitFailed(
+                f"{request.method} {request.selector}: HTTP {refusal.code}: {_sentence(body)}"
+            ) from None
+        except URLError as error:
+            raise VisitFailed(f"{self.url} does not answer: {error.reason}") from None
+
+
+def _sentence(body: str) -> str:
+    """What an error's body says to a person."""
+    try:
+        found = json.loads(body)
+    except ValueError:
+        return body[:300]
+    if isinstance(found, dict):
+        return str(found.get("error") or found.get("reason") or found.get("detail") or found)
+    return str(found)
+
+
+class LivePage:
+    """A page that is open on a station: newest state, the lease renewed while it is held, credits paid."""
+
+    def __init__(self, visitor: Visitor, station: str) -> None:
+        self.page = uuid.uuid4().hex
+        self.station = station
+        self.epoch = 0  # of our lease; 0: none
+        self.frames = 0
+        self._visitor = visitor
+        self._state: Mapping[str, Any] = {}
+        self._failure = ""
+        self._changed = threading.Condition()
+        address = urlsplit(visitor.url)
+        self._socket: ClientConnection = connect(
+            f"ws://{address.netloc}/ws/stations/{station}?page={self.page}",
+            origin=visitor.url,  # type: ignore[arg-type]
+            additional_headers={"Cookie": f"sessionid={visitor.cookie('sessionid')}"},
+            max_size=_LARGEST_FRAME,
+        )
+        self._send({"type": "watch", "streams": ["state"]})
+        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._read, self._renew)]
+        for thread in self._threads:
+            thread.start()
+
+    def wait(
+        self, reached: Callable[[Mapping[str, Any]], bool], seconds: float, what: str
+    ) -> Mapping[str, Any]:
+        """The first state that satisfies `reached`; VisitFailed with the state where none comes in time."""
+        deadline = time.monotonic() + seconds
+        with self._changed:
+            while not (self._state and reached(self._state)):
+                if self._failure:
+                    raise VisitFailed(f"{what}: {self._failure}")
+                if not self._changed.wait(deadline - time.monotonic()) and time.monotonic() >= deadline:
+                    now = (
+                        f"{self._state.get('state')}: {self._state.get('reason')}"
+                        if self._state
+                        else "no state"
+                    )
+                    raise VisitFailed(f"{what}: not within {seconds:g} s; the station is {now}")
+            return self._state
+
+    def claim(self) -> None:
+        """Take the station; renewed from then on."""
+        path = f"stations/{self.station}/lease"
+        self.epoch = int(self._visitor.post(path, {"action": "claim", "page": self.page})["epoch"])
+
+    def command(self, kind: str, trial: int | None = None) -> Mapping[str, Any]:
+        """Give one command, decided by the newest state; VisitFailed with the reason where it is refused."""
+        state = self._state
+        content = {
+            "uuid": str(uuid.uuid4()),
+            "kind": kind,
+            "page": self.page,
+            "epoch": self.epoch,
+            "boot": state.get("boot", ""),
+            "sequence": state.get("sequence", 0),
+        }
+        if trial is not None:
+            content["trial"] = trial
+        answer: Mapping[str, Any] = self._visitor.post(f"stations/{self.station}/commands", content)
+        return answer
+
+    def close(self) -> None:
+        """Close the page; the lease ends by itself."""
+        self.epoch = 0
+        self._socket.close()
+
+    def _read(self) -> None:
+        try:
+            for message in self._socket:
+                if isinstance(message, bytes):
+                    self._frame(message)
+                else:
+                    self._told(json.loads(message))
+        except (ConnectionClosed, EvaError, ValueError) as error:
+            self._fail(f"the live connection broke: {error}")
+        else:
+            self._fail("the live connection was closed")
+
+    def _frame(self, message: bytes) -> None:
+        streams = decode(message).header["streams"]
+        with self._changed:
+            self.frames += 1
+            if "state" in streams:
+                self._state = streams["state"]["json"]
+            self._changed.notify_all()
+        self._send({"type": "credit"})
+
+    def _told(self, message: Mapping[str, Any]) -> None:
+        if message.get("type") == "renewed" and not message.get("ok") and self.epoch:
+            self._fail(f"the lease was lost: {message.get('reason')}")
+
+    def _fail(self, why: str) -> None:
+        with self._changed:
+            self._failure = self._failure or why
+            self._changed.notify_all()
+
+    def _renew(self) -> None:
+        while not self._failure:
+            time.sleep(_RENEW_S)
+            if self.epoch:
+                self._send({"type": "renew", "epoch": self.epoch})
+
+    def _send(self, message: Mapping[str, Any]) -> None:
+        try:
+            self._socket.send(json.dumps(message))
+        except ConnectionClosed as error:
+            self._fail(f"the live connection broke: {error}")
