@@ -143,6 +143,23 @@ class TrialStatus(models.TextChoices):
     VOIDED = "voided", "voided"
     ABANDONED = "abandoned", "never run"
 
+    @property
+    def tone(self) -> str:
+        """Its colour, by the name the style sheets have for it."""
+        return _TONES[self]
+
+
+_TONES = {
+    TrialStatus.PREPARED: "ready",
+    TrialStatus.RUNNING: "running",
+    TrialStatus.PAUSED: "holding",
+    TrialStatus.ENDED: "holding",
+    TrialStatus.INTERRUPTED: "faulted",
+    TrialStatus.SCORED: "idle",
+    TrialStatus.VOIDED: "idle",
+    TrialStatus.ABANDONED: "idle",
+}
+
 
 class Trial(models.Model):
     """One attempt of one checkpoint at one position of a scene; a repetition is a new attempt, never a new score."""
@@ -166,6 +183,25 @@ class Trial(models.Model):
     seed = models.PositiveIntegerField(null=True, blank=True, help_text="Of a simulated bench.")
     episode = models.OneToOneField(
         Episode, null=True, blank=True, on_delete=models.PROTECT, related_name="trial"
+    )
+    verdict = models.ForeignKey(
+        "Score",
+        null=True,
+        blank=True,
+        on_delete=models.PROTECT,
+        related_name="+",
+        help_text="The newest of its scores: the one that counts.",
+    )
+    truth = models.JSONField(
+        null=True, blank=True, help_text="How a simulated bench says it was left at the end of the run."
+    )
+    # Which commands made it, and from where on the station's events are about it.
+    setup = models.UUIDField(null=True, blank=True, editable=False, help_text="Of its newest set-up.")
+    run = models.UUIDField(null=True, blank=True, editable=False, help_text="Of the command that ran it.")
+    run_boot = models.CharField(max_length=64, blank=True, editable=False)
+    run_event = models.PositiveBigIntegerField(null=True, blank=True, editable=False)
+    run_since = models.FloatField(
+        null=True, blank=True, editable=False, help_text="Since when it goes on, on the runtime's clock [s]."
     )
     prepared_at = models.DateTimeField(auto_now_add=True)
     started_at = models.DateTimeField(null=True, blank=True)
@@ -194,6 +230,10 @@ class Trial(models.Model):
                 name="trial_one_open_per_station",
             ),
         ]
+        indexes = [
+            models.Index(fields=("status", "scene", "checkpoint")),
+            models.Index(fields=("station", "status")),
+        ]
 
     def __str__(self) -> str:
         return f"trial {self.pk}: {self.checkpoint} at {self.scene} {self.position.number}"
@@ -202,19 +242,30 @@ class Trial(models.Model):
 class Score(models.Model):
     """What one rater says of a trial; a correction is another row, and the newest one counts."""
 
+    class Source(models.TextChoices):
+        HUMAN = "human", "a person"
+        TRUTH = "truth", "the simulated bench"
+
+    uuid = models.UUIDField(unique=True, default=uuid.uuid4, editable=False)
     trial = models.ForeignKey(Trial, on_delete=models.PROTECT, related_name="scores")
     rater = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="scores")
     success = models.BooleanField()
-    score = models.FloatField(help_text="Share of the points of all milestones, 0 to 1.")
+    score = models.FloatField(
+        help_text="Share of the points of all milestones, 0 to 1; without milestones 1 for a success, else 0."
+    )
     note = models.TextField(blank=True)
     failure = models.CharField(max_length=60, blank=True, help_text="What went wrong, in a word or two.")
-    source = models.CharField(
-        max_length=16, default="human", help_text="human, or truth: of a simulated bench."
-    )
+    source = models.CharField(max_length=16, choices=Source, default=Source.HUMAN)
     scored_at = models.DateTimeField(auto_now_add=True)
 
     class Meta:
         ordering = ("trial", "id")
+
+    def save(self, *args: object, **kwargs: object) -> None:
+        """Write it once; a correction is another row."""
+        if self.pk is not None:
+            raise TypeError(f"score {self.pk} is never changed: a correction is another score")
+        super().save(*args, **kwargs)
 
     def __str__(self) -> str:
         return f"{'success' if self.success else 'failure'}, {self.score:.0%}"
