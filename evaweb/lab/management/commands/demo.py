@@ -21,14 +21,14 @@ from evaweb.roles import Role
 
 _DEPLOYMENT = settings.BASE_DIR / "deployments" / "tabletop.toml"
 _STATION, _ROBOT = "bench-1", "agilex_piper"
-_SKILLED, _CLUMSY = "pick-place-skilled", "pick-place-clumsy"
+_SKILLED, _CLUMSY = "pick-place-40k", "pick-place-8k"
 _POLICIES = {
     _SKILLED: (
         "Scripted; sees the block within a millimetre or two, answers in 80 ms.",
         ("--noise", "1", "--latency-ms", "80"),
     ),
     _CLUMSY: (
-        "Scripted; misjudges the block by a centimetre or more, sometimes lets go early, answers in 250 ms.",
+        "Scripted; misjudges the block by centimetres, sometimes lets go early, answers in 250 ms.",
         ("--noise", "14", "--failure-rate", "0.25", "--latency-ms", "250"),
     ),
 }
@@ -47,7 +47,7 @@ class Command(BaseCommand):
         parser.add_argument("--seed", type=int, default=1, help="of the bench and of the policies")
         parser.add_argument("--position", type=int, default=1, help="with --once: the position of the scene")
         parser.add_argument(
-            "--checkpoint", default=_SKILLED, choices=sorted(_POLICIES), help="with --once: which policy"
+            "--checkpoint", default=_SKILLED, choices=list(_POLICIES), help="with --once: which policy"
         )
 
     def handle(self, *args: Any, **options: Any) -> None:

@@ -1,0 +1,40 @@
+import os
+import socket
+
+import pytest
+
+from evaweb.lab import lifetime
+from evaweb.lab.processes import LabError
+
+
+def test_a_taken_port_names_the_option_and_leaves_its_holder_alone():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(
+            LabError, match=rf"cannot listen on 127.0.0.1:{port}: .*; name another port with --port"
+        ):
+            lifetime.require_free("127.0.0.1", port)
+        assert other.fileno() > 0
+
+
+def test_a_free_port_stays_free_after_the_look():
+    with socket.socket() as mine:
+        mine.bind(("127.0.0.1", 0))
+        port = mine.getsockname()[1]
+    lifetime.require_free("127.0.0.1", port)
+    with socket.socket() as mine:
+        mine.bind(("127.0.0.1", port))
+        assert mine.getsockname()[1] == port
+
+
+def test_a_second_lab_on_the_same_folder_is_refused_with_the_first_ones_number(tmp_path):
+    with (
+        lifetime.only_one(tmp_path),
+        pytest.raises(LabError, match=f"process {os.getpid()}"),
+        lifetime.only_one(tmp_path),
+    ):
+        pass
+    with lifetime.only_one(tmp_path):
+        assert (tmp_path / "lab.lock").read_text() == str(os.getpid())

@@ -1,0 +1,97 @@
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from evaweb.lab.processes import LabError, Processes, Program
+
+WAITS = "import sys\nsys.stdin.read()\n"
+SAYS = 'import sys\nprint(\'{"url": "here %s"}\' % sys.argv[1], flush=True)\nsys.stdin.read()\n'
+STUBBORN = "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\ntime.sleep(600)\n"
+
+
+@pytest.fixture
+def processes(tmp_path):
+    made = Processes(tmp_path, tmp_path / "logs", os.environ)
+    yield made
+    made.end()
+
+
+def gone(pid):
+    """Whether the process is over; one that waits to be reaped is."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+def until(check):
+    deadline = time.monotonic() + 20
+    while not check():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_a_program_that_announces_is_ready_when_it_says_where_it_is(processes):
+    found = processes.start(Program("one", ("-c", SAYS, "first"), announces=True))
+    assert found == {"url": "here first"}
+
+
+def test_what_dies_is_started_again_where_it_was(processes):
+    again = Program(
+        "one", ("-c", SAYS, "first"), announces=True, again=lambda found: ("-c", SAYS, found["url"])
+    )
+    processes.start(again)
+    before = processes.pids()["one"]
+    os.kill(before, signal.SIGKILL)
+    until(lambda: gone(before))
+    processes.watch()
+    assert processes.pids()["one"] != before
+    assert processes._children["one"].addresses == {"url": "here here first"}
+
+
+def test_what_dies_too_often_ends_the_lab_with_its_last_words(processes):
+    processes.start(Program("one", ("-c", "raise SystemExit('the disk is on fire')")))
+    with pytest.raises(LabError, match="one ended with 1 for the 6th time in a minute: the disk is on fire"):
+        until(lambda: processes.watch())
+
+
+def test_a_program_that_does_not_start_is_named_with_what_it_said(processes):
+    with pytest.raises(LabError, match="one did not start: no such robot"):
+        processes.start(Program("one", ("-c", "raise SystemExit('no such robot')"), announces=True))
+
+
+def test_a_program_that_says_nothing_is_given_up(processes):
+    with pytest.raises(LabError, match=r"one was not ready within 0\.5 s"):
+        processes.start(Program("one", ("-c", WAITS), announces=True), ready_s=0.5)
+
+
+def test_all_end_with_their_lifelines_and_the_stubborn_are_killed(processes):
+    processes.start(Program("one", ("-c", WAITS)))
+    processes.start(Program("two", ("-c", STUBBORN), patience_s=0.2))
+    pids = processes.pids().values()
+    processes.end()
+    assert all(gone(pid) for pid in pids)
+    assert processes.pids() == {}
+
+
+@pytest.mark.slow
+def test_they_end_with_us_even_when_we_are_killed(tmp_path):
+    script = (
+        "import os, sys, time\nfrom pathlib import Path\nfrom evaweb.lab.processes import Processes, Program\n"
+        f"p = Processes(Path({str(tmp_path)!r}), Path({str(tmp_path)!r}), os.environ)\n"
+        f"p.start(Program('one', ('-c', {WAITS!r})))\n"
+        f"Path({str(tmp_path / 'pid')!r}).write_text(str(p.pids()['one']))\ntime.sleep(600)\n"
+    )
+    import subprocess
+
+    parent = subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parents[3])
+    written = tmp_path / "pid"
+    until(lambda: written.exists() and written.read_text())
+    parent.kill()
+    parent.wait()
+    until(lambda: gone(int(written.read_text())))
+    assert parent.returncode == -signal.SIGKILL
