@@ -121,8 +121,8 @@ def layout_of(seed: int, positions: Mapping[str, Any] | None = None, blocks: int
     the area or has block and plate closer than APART_M, or where `blocks` do not fit.
     """
     block, plate = _wanted(positions or {})
-    if blocks < 1:
-        raise BenchError(f"{blocks} blocks were asked for; allowed: one or more")
+    if blocks < 1 or seed < 0:
+        raise BenchError(f"{blocks} blocks by seed {seed} were asked for; allowed: one or more, from 0 on")
     chance = np.random.default_rng(seed)
     placed_block, placed_plate = _pair(chance, block, plate)
     placed = [placed_block]

@@ -1,4 +1,7 @@
-"""What a careful execution node lets through: one master, finite targets within limits, a deadline."""
+"""What a careful execution node lets through: one master, finite targets within limits, a deadline.
+
+A node with a bench also takes the word "scene_reset", with `id`, `seed` and, if wanted, `positions`.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import numpy as np
 
 from runtime import codecs
 from runtime.errors import CodecError
+from runtime.sim.tabletop import Reset
 from runtime.types import Float64
 
 if TYPE_CHECKING:
@@ -19,23 +23,30 @@ Control = Literal["collect_start", "collect_stop", "hil_start", "hil_stop"]
 ANONYMOUS = "anonymous"  # older clients do not say who they are
 MASTER_SILENCE = 1.0  # s after which another client may take over
 _TOLERANCE = 1e-5  # limits travel as float32
+_RESET = "scene_reset"
+_LONGEST_ID = 128
 _MESSAGE_LIMIT = 1024 * 1024  # bytes; a command has a few hundred
 
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """A message that counts: a target [D] to go to, or a control word."""
+    """A message that counts: a target [D] to go to, a control word, or a wish to lay the bench anew."""
 
     target: Float64 | None = None
     control: Control | None = None
+    reset: Reset | None = None
 
 
 class Gate:
-    """Judges commands by their arrival on our own clock; `refused` counts what it sent away, by reason."""
+    """Judges commands by their arrival on our own clock; `refused` counts what it sent away, by reason.
 
-    def __init__(self, robot: Robot, deadline: float) -> None:
+    `bench` says whether there is one that could be laid anew.
+    """
+
+    def __init__(self, robot: Robot, deadline: float, bench: bool = False) -> None:
         self._robot = robot
         self._deadline = deadline
+        self._bench = bench
         self._heard = float("-inf")  # the master's last message, accepted or not
         self._accepted = float("-inf")
         self.master: str | None = None
@@ -51,6 +62,8 @@ class Gate:
             return self._target(message, arrival)
         if word in get_args(Control):
             return Accepted(control=word)
+        if word == _RESET:
+            return self._reset(message)
         if word != "sim":
             self.refused["unknown_target"] += 1
         return None
@@ -79,6 +92,18 @@ class Gate:
         self.master = name
         self._heard = arrival
         return True
+
+    def _reset(self, message: dict[Any, Any]) -> Accepted | None:
+        name, seed, positions = (message.get(key) for key in ("id", "seed", "positions"))
+        if not self._bench:
+            self.refused["no_bench"] += 1
+            return None
+        named = isinstance(name, str) and 0 < len(name) <= _LONGEST_ID
+        seeded = isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0
+        if not (named and seeded and (positions is None or isinstance(positions, dict))):
+            self.refused["malformed"] += 1
+            return None
+        return Accepted(reset=Reset(str(name), int(seed or 0), positions))
 
     def _target(self, message: dict[Any, Any], arrival: float) -> Accepted | None:
         action = message.get("action")

@@ -2,7 +2,8 @@
 
 Each tick: take the newest command, move the plant, publish one observation. Beyond the plain protocol it
 says its frame number (`seq`), colour order (`encoding`), whom it obeys (`master`), what it `refused`, by
-reason, and whether it is `holding` because nobody commands it.
+reason, and whether it is `holding` because nobody commands it. With `--bench tabletop` there is something to
+touch, which the word "scene_reset" lays anew and of which the field `truth` says how it really is.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ import zmq
 from runtime import codecs
 from runtime.clock import Clock, MonotonicClock
 from runtime.errors import RuntimeFault, SetupError
-from runtime.sim import standin
+from runtime.sim import standin, surroundings
+from runtime.sim.bench import BenchError
 from runtime.sim.gate import Accepted, Gate
 from runtime.sim.gestures import Gesture
-from runtime.sim.pictures import Scene
 from runtime.sim.plant import Plant, poses
+from runtime.sim.tabletop import Reset
 from runtime.transports.zmq import is_loopback
-from runtime.types import UInt8
+from runtime.types import Float64, UInt8
 
 if TYPE_CHECKING:
     from threading import Event
@@ -50,9 +52,9 @@ class Node:
         self._robot = robot
         self._options = options
         self._clock = clock
-        self._plant = Plant(robot)
-        self._gate = Gate(robot, options.deadline)
-        self._scene = Scene(robot, options.height, options.width, options.seed)
+        self._plant = Plant(robot, start=_start(robot, options.start_pose))
+        self._gate = Gate(robot, options.deadline, bench=options.bench != "none")
+        self._surroundings = surroundings.surroundings(robot, options)
         self._leader = Gesture(robot, options.seed)
         self._leader_phase: float | None = None  # None unless it collects
         self._hil_error = ""
@@ -103,6 +105,8 @@ class Node:
             accepted = self._gate.judge(payload, self._clock.now())
             if accepted is not None and accepted.control is not None:
                 self._control(accepted)
+            elif accepted is not None and accepted.reset is not None:
+                self._lay(accepted.reset)
             elif accepted is not None:
                 newest = accepted.target
         if newest is not None and self._leader_phase is not None:
@@ -130,6 +134,12 @@ class Node:
         elif accepted.control == "hil_stop":
             self._hil_error = ""
 
+    def _lay(self, wish: Reset) -> None:
+        try:
+            self._surroundings.reset(wish)
+        except BenchError:
+            self._gate.refused["layout"] += 1
+
     def _move(self, seconds: float) -> None:
         silent = self._gate.silent(self._clock.now())
         if self._leader_phase is not None:
@@ -138,7 +148,7 @@ class Node:
         elif silent and not self._holding:
             self._plant.hold()
         self._holding = silent and self._leader_phase is None
-        self._plant.advance(seconds)
+        self._surroundings.move(self._plant, seconds)
 
     def _publish(self) -> None:
         assert self._publisher is not None
@@ -168,10 +178,12 @@ class Node:
         if self._hil_error:
             message["hil_error"] = self._hil_error
         message |= {"proto": 1, "seq": self._sequence, "encoding": "bgr", "holding": self._holding}
-        return message | {"refused": dict(self._gate.refused), "master": self._gate.master or ""}
+        message |= {"refused": dict(self._gate.refused), "master": self._gate.master or ""}
+        truth = self._surroundings.truth()
+        return message if truth is None else message | {"truth": truth}
 
     def _pictures(self) -> dict[str, UInt8]:
-        pictures = self._scene.draw(self._sequence, self._clock.now(), self._plant.q)
+        pictures = self._surroundings.pictures(self._sequence, self._clock.now(), self._plant.q)
         frozen = self._options.freeze_camera
         if frozen is not None:
             if self._frozen is None:
@@ -208,7 +220,14 @@ def parser() -> argparse.ArgumentParser:
     line.add_argument(
         "--deadline", type=_positive, default=0.3, help="seconds without a command until it holds"
     )
-    line.add_argument("--seed", type=int, default=0, help="grain of the pictures, gestures of the leader")
+    line.add_argument(
+        "--seed", type=int, default=0, help="grain of the pictures, gestures of the leader, first layout"
+    )
+    line.add_argument(
+        "--bench", choices=surroundings.NAMES, default="none", help="what there is to touch (default: none)"
+    )
+    line.add_argument("--blocks", type=int, default=1, help="on the tabletop; the first is the task's")
+    line.add_argument("--start-pose", metavar="NAME", default="home", help="a pose of the robot")
     line.add_argument(
         "--freeze-camera", metavar="KEY", help="fault: this camera sends its first picture forever"
     )
@@ -239,6 +258,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     return 0
+
+
+def _start(robot: Robot, name: str) -> Float64:
+    if name not in robot.poses:
+        raise SetupError(f"{robot.name} has no pose {name!r}; it has {', '.join(robot.poses)}")
+    return robot.poses[name]
 
 
 def _address(socket: zmq.Socket[bytes]) -> str:

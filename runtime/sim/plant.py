@@ -16,12 +16,12 @@ LAG = 0.06  # s, the time constant of each joint
 
 
 class Plant:
-    """Joints `q` float64 [D] that start at home; `target` is where they are going."""
+    """Joints `q` float64 [D] that start at home, or at `start`; `target` is where they are going."""
 
-    def __init__(self, robot: Robot, lag: float = LAG) -> None:
+    def __init__(self, robot: Robot, lag: float = LAG, start: Float64 | None = None) -> None:
         self._robot = robot
         self._lag = lag
-        self.q: Float64 = robot.poses["home"].copy()
+        self.q: Float64 = (robot.poses["home"] if start is None else start).copy()
         self.target: Float64 = self.q.copy()
 
     def advance(self, seconds: float) -> None:

@@ -1,0 +1,92 @@
+"""What a simulated node's arms stand in: nothing but test pictures, or a bench with blocks and a plate."""
+
+from __future__ import annotations
+
+import argparse
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
+
+from runtime.sim.pictures import Scene
+from runtime.sim.plant import Plant
+from runtime.sim.tabletop import Reset, Tabletop
+from runtime.types import Float64, UInt8
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+NAMES = ("none", "tabletop")
+
+
+class Surroundings(ABC):
+    """What time does to everything but the node itself, and what its cameras see."""
+
+    @abstractmethod
+    def move(self, plant: Plant, seconds: float) -> None:
+        """Let time pass for the plant and all that it touches."""
+
+    @abstractmethod
+    def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
+        """One BGR uint8 [H, W, 3] per camera key, fresh memory each time."""
+
+    @abstractmethod
+    def truth(self) -> dict[str, object] | None:
+        """What really lies on the bench, None where there is none."""
+
+    @abstractmethod
+    def reset(self, wish: Reset) -> None:
+        """Lay the bench anew; BenchError where that cannot be."""
+
+
+class TestCard(Surroundings):
+    """Moving test pictures and nothing to touch."""
+
+    __test__ = False  # no test case, whatever its name begins with
+
+    def __init__(self, robot: Robot, options: argparse.Namespace) -> None:
+        self._scene = Scene(robot, options.height, options.width, options.seed)
+
+    def move(self, plant: Plant, seconds: float) -> None:
+        """The plant moves freely."""
+        plant.advance(seconds)
+
+    def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
+        """Test pictures with the frame's number in them."""
+        return self._scene.draw(frame, seconds, q)
+
+    def truth(self) -> None:
+        """Nothing lies anywhere."""
+
+    def reset(self, wish: Reset) -> None:
+        """There is nothing to lay; the gate lets no wish come here."""
+        raise AssertionError(f"reset {wish.id} of a bench that is not there")
+
+
+class Workbench(Surroundings):
+    """The tabletop, and its pictures."""
+
+    def __init__(self, robot: Robot, options: argparse.Namespace) -> None:
+        from runtime.sim.render import Renderer  # takes OpenCV along, which no other node needs
+
+        self._tabletop = Tabletop(robot, options.seed, options.blocks)
+        self._renderer = Renderer(robot, self._tabletop.bench, options.width, options.height)
+
+    def move(self, plant: Plant, seconds: float) -> None:
+        """The plant moves, and what its fingers touch."""
+        self._tabletop.advance(plant, seconds)
+
+    def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
+        """The bench as the cameras see it."""
+        return self._renderer.draw(q, self._tabletop.state())
+
+    def truth(self) -> dict[str, object]:
+        """What lies where, and how far the task has come."""
+        return self._tabletop.truth()
+
+    def reset(self, wish: Reset) -> None:
+        """Lay the bench as wished."""
+        self._tabletop.reset(wish)
+
+
+def surroundings(robot: Robot, options: argparse.Namespace) -> Surroundings:
+    """Those that `options.bench` names."""
+    return Workbench(robot, options) if options.bench == "tabletop" else TestCard(robot, options)
