@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from argparse import ArgumentParser
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,9 @@ class Command(BaseCommand):
         parser.add_argument("--port", type=int, default=8000, help="port of the web; 0 takes a free one")
         parser.add_argument("--once", action="store_true", help="run, score and publish one trial, then end")
         parser.add_argument("--json", type=Path, metavar="FILE", help="with --once: write the result there")
+        parser.add_argument(
+            "--ready-file", type=Path, help="write address and logins there as JSON, for scripts"
+        )
         parser.add_argument("--seed", type=int, default=1, help="of the bench and of the policies")
         parser.add_argument("--position", type=int, default=1, help="with --once: the position of the scene")
         parser.add_argument(
@@ -54,6 +58,8 @@ class Command(BaseCommand):
         try:
             with a_lab(options["host"], options["port"]) as lab:
                 url, logins = self._up(lab, options["seed"])
+                if options["ready_file"]:
+                    _announce(options["ready_file"], url, logins)
                 if options["once"]:
                     self._once(url, logins[0], options)
                 else:
@@ -100,3 +106,14 @@ class Command(BaseCommand):
         if options["json"]:
             options["json"].write_text(text, "utf-8")
         self.stdout.write(text)
+
+
+def _announce(path: Path, url: str, logins: list[Login]) -> None:
+    """Whole or not at all, and readable by its user alone."""
+    draft = path.with_name(f"{path.name}.{os.getpid()}")
+    passwords = {login.username: login.password for login in logins}
+    with os.fdopen(
+        os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8"
+    ) as file:
+        json.dump({"url": url, "passwords": passwords}, file)
+    draft.replace(path)
