@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runtime.behaviour import Target
+from runtime.errors import RuntimeFault
 from runtime.motion import Brake
 from runtime.page import EStop, Page
 from runtime.safety import SafetySettings
@@ -88,6 +90,16 @@ class Actuator:
         softest = bounds.safety.brake_acceleration * bounds.reach
         rate = np.clip(needed, softest, np.maximum(softest, bounds.safety.acceleration * bounds.reach))
         return Brake(self.commanded.copy(), speed.copy(), rate, bounds.lower, bounds.upper)
+
+    def tell(self, word: str, data: Mapping[str, Any]) -> str:
+        """Pass a control word on to the node, unless the e-stop is pressed; why it was not, "" where it was."""
+        if self._page.estop is not EStop.CLEAR:
+            return f"{word} is not passed on to the node while the e-stop is not known to be clear"
+        try:
+            self._sink.tell(word, data)
+        except RuntimeFault as error:
+            return str(error)
+        return ""
 
     def send(
         self, step: int, planned: float, target: Target, action: Float64, notes: tuple[str, ...] = ()

@@ -6,7 +6,7 @@ import getpass
 import socket
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -71,11 +71,14 @@ class StationClient:
         """End the lease before its time."""
         self._command("lease_give_up", 2.0, epoch=self._epoch)
 
-    def command(self, kind: str, timeout: float = 2.0, identity: str = "") -> Ack:
-        """Give one command under the lease; raises Refused, or TransportError: outcome unknown."""
+    def command(self, kind: str, timeout: float = 2.0, identity: str = "", **arguments: Any) -> Ack:
+        """Give one command with its arguments under the lease.
+
+        Raises Refused, or TransportError: outcome unknown.
+        """
         self.claim()
         self.status()
-        return self._command(kind, timeout, epoch=self._epoch, identity=identity)
+        return self._command(kind, timeout, self._epoch, identity, arguments)
 
     def estop(self, why: str) -> Ack:
         """Press the software e-stop at the guard, which needs neither lease nor main."""
@@ -107,10 +110,18 @@ class StationClient:
                 self.renew()
             time.sleep(0.02)
 
-    def _command(self, kind: str, timeout: float, epoch: int = 0, identity: str = "") -> Ack:
+    def _command(
+        self,
+        kind: str,
+        timeout: float,
+        epoch: int = 0,
+        identity: str = "",
+        arguments: Mapping[str, Any] | None = None,
+    ) -> Ack:
         command = Command(
             identity or str(uuid.uuid4()),
             kind,
+            arguments or {},
             user=self.holder,
             holder=self.holder,
             epoch=epoch,

@@ -6,8 +6,10 @@ import json
 import logging
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from runtime.messages import Ack, Command
 
@@ -48,7 +50,7 @@ class CommandJournal:
         row = {
             "uuid": command.uuid,
             "kind": command.kind,
-            "args": dict(command.args),
+            "args": _told(command.args),
             "user": command.user,
             "holder": command.holder,
             "epoch": command.epoch,
@@ -75,3 +77,12 @@ class CommandJournal:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def _told(arguments: Mapping[str, Any]) -> object:
+    """The arguments as JSON can say them; those of no JSON were refused, and must not end who refused them."""
+    try:
+        json.dumps(arguments, default=str)
+    except (TypeError, ValueError, RecursionError) as error:
+        return f"no JSON: {type(error).__name__}"
+    return dict(arguments)

@@ -19,6 +19,7 @@ from runtime.errors import RuntimeFault
 _LASTING = {"setup": ("setting_up",), "home": ("setting_up",), "run": ("running",), "resume": ("running",)}
 _AT_ONCE = ("stop", "halt", "release")
 _GOOD_END = "ready"
+_OPTIONS = {"policy_url": "setup", "task": "setup", "duration": "run"}  # by the command they go with
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -28,10 +29,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("command", choices=[*_LASTING, *_AT_ONCE, "estop", "status", "watch", "record"])
     parser.add_argument("what", nargs="?", help="record: start or stop; estop: why")
     parser.add_argument("--data-dir", default=os.environ.get("EVA_DATA_DIR") or "data")
+    parser.add_argument("--policy-url", metavar="URL", help="setup: another server than the deployment's")
+    parser.add_argument("--task", help="setup: another instruction than the deployment's")
+    parser.add_argument(
+        "--duration", type=float, metavar="S", help="run: seconds after which it ends by itself"
+    )
     parser.add_argument("--json", action="store_true", help="status and watch as JSON")
     given = parser.parse_args(arguments)
     if given.command == "record" and given.what not in ("start", "stop"):
         parser.error("record needs start or stop")
+    for option, command in _OPTIONS.items():
+        if getattr(given, option) is not None and given.command != command:
+            parser.error(f"--{option.replace('_', '-')} goes with {command}, not with {given.command}")
     client = StationClient(Path(given.data_dir).expanduser().absolute() / "stations" / given.station)
     try:
         return _do(client, given)
@@ -62,15 +71,22 @@ def _do(client: StationClient, given: argparse.Namespace) -> int:
     elif given.command in _AT_ONCE:
         client.command(given.command)
     else:
-        return _attend(client, given.command)
+        return _attend(client, given.command, _arguments(given))
     print(line(client.status()))
     return 0
 
 
-def _attend(client: StationClient, kind: str) -> int:
+def _arguments(given: argparse.Namespace) -> dict[str, Any]:
+    """What goes with the command, without what was not said."""
+    policy = None if given.policy_url is None else {"url": given.policy_url}
+    said = {"policy": policy, "task": given.task, "duration_s": given.duration}
+    return {name: value for name, value in said.items() if value is not None}
+
+
+def _attend(client: StationClient, kind: str, arguments: dict[str, Any]) -> int:
     """Give a lasting command and stay with it: the lease lives as long as this terminal."""
     try:
-        client.command(kind)
+        client.command(kind, **arguments)
         status = client.status()
         shown = 0.0
         while status["state"] in _LASTING[kind]:

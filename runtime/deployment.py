@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any
 
-from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import ValidationError
 
 from runtime.config import Deployment
 from runtime.errors import ConfigurationError
-
-Key = tuple[str, ...]
+from runtime.explanation import Key, explanation
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,14 +48,22 @@ def resolve(tree: Mapping[str, Any], origin: Mapping[Key, str], source: str) -> 
     try:
         deployment = Deployment.model_validate(tree)
     except ValidationError as invalid:
-        raise ConfigurationError(
-            "\n".join(_sentence(e, tree, origin, source) for e in invalid.errors())
-        ) from None
+        raise ConfigurationError(explanation(invalid, Deployment, tree, source, origin)) from None
     except ConfigurationError as error:  # of a variant's own check, which knows no file
         raise ConfigurationError(f"{source}: {error}") from None
     canonical = deployment.model_dump(mode="json")
     text = json.dumps(canonical, sort_keys=True, separators=(",", ":"))
     return Resolved(deployment, canonical, hashlib.sha256(text.encode()).hexdigest())
+
+
+def changed(resolved: Resolved, changes: Mapping[str, Any], source: str) -> Resolved:
+    """`resolved` with the tables of `changes` on top, merged as those of a file over what it extends.
+
+    Raises ConfigurationError, which names `source` for what came with the changes.
+    """
+    tree = deepcopy(dict(resolved.tree))
+    _merge(tree, deepcopy(dict(changes)))
+    return resolve(tree, dict.fromkeys(_keys(changes), source), source)
 
 
 def _read(path: Path, chain: tuple[Path, ...]) -> tuple[dict[str, Any], dict[Key, str]]:
@@ -128,88 +134,3 @@ def _put(tree: dict[str, Any], key: Key, value: Any, source: str) -> None:
     if key[-1] == "kind" and tree.get("kind") not in (None, value):
         tree.clear()  # settings of another kind would be unknown keys here
     tree[key[-1]] = value
-
-
-def _sentence(error: ErrorDetails, tree: Mapping[str, Any], origin: Mapping[Key, str], source: str) -> str:
-    key = _plain(error["loc"], tree)
-    where = next((origin[key[:n]] for n in range(len(key), 0, -1) if key[:n] in origin), source)
-    name = ".".join(key)
-    kind = error["type"]
-    if kind == "extra_forbidden":
-        allowed = _allowed(key[:-1], tree)
-        near = difflib.get_close_matches(key[-1], allowed, 1)
-        hint = f" (did you mean {near[0]}?)" if near else ""
-        return f"{where}: {name} = {error['input']!r}: unknown key{hint}; allowed here: {', '.join(allowed)}"
-    if kind == "missing":
-        return f"{where}: {name} is missing and has no default"
-    if kind in ("union_tag_invalid", "union_tag_not_found"):
-        where = origin.get((*key, "kind"), where)
-        given = f"= {error['input']['kind']!r}" if "kind" in error["input"] else "is missing"
-        return f"{where}: {name}.kind {given}: must be one of {', '.join(_kinds(key, tree))}"
-    if kind in ("model_type", "model_attributes_type", "dict_type"):
-        return f"{where}: {name} = {error['input']!r}: must be a table"
-    return f"{where}: {name} = {error['input']!r}: {error['msg'].removeprefix('Value error, ')}"
-
-
-def _plain(loc: tuple[int | str, ...], tree: Mapping[str, Any]) -> Key:
-    """The key as it stands in the file: without the tags that pydantic adds for unions."""
-    key: list[str] = []
-    at: Any = tree
-    for index, part in enumerate(loc):
-        last = index == len(loc) - 1
-        if isinstance(at, Mapping) and part in at:
-            at = at[part]
-            key.append(str(part))
-        elif isinstance(at, list) and isinstance(part, int):
-            at = at[part] if part < len(at) else None
-            key.append(str(part))
-        elif last and isinstance(at, Mapping) and at.get("kind") != part:
-            key.append(str(part))
-    return tuple(key)
-
-
-def _allowed(key: Key, tree: Mapping[str, Any]) -> list[str]:
-    """The keys that the table at `key` may have."""
-    return sorted({name for model in _tables(key, tree) for name in model.model_fields})
-
-
-def _kinds(key: Key, tree: Mapping[str, Any]) -> list[str]:
-    """The kinds that the table at `key` may be of."""
-    return [repr(model.model_fields["kind"].default) for model in _tables(key, tree)]
-
-
-def _tables(key: Key, tree: Mapping[str, Any]) -> list[type[BaseModel]]:
-    """What the table at `key` may be: one model where its kind says so, else each it could be."""
-    annotations: list[Any] = [Deployment]
-    at: Any = tree
-    for name in key:
-        annotations = [found for annotation in annotations for found in _under(name, annotation)]
-        at = at.get(name) if isinstance(at, Mapping) else None
-        chosen = [model for model in _models(annotations) if _is_of_kind(model, at)]
-        annotations = list(chosen or annotations)
-    return _models(annotations)
-
-
-def _under(name: str, annotation: Any) -> list[Any]:
-    """The annotations of what stands under `name` in something of type `annotation`."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        field = annotation.model_fields.get(name)
-        return [field.annotation] if field else []
-    if get_origin(annotation) in (dict, list):
-        return [get_args(annotation)[-1]]
-    return [found for part in get_args(annotation) for found in _under(name, part)]
-
-
-def _is_of_kind(model: type[BaseModel], table: Any) -> bool:
-    declared = model.model_fields.get("kind")
-    return declared is not None and isinstance(table, Mapping) and table.get("kind") == declared.default
-
-
-def _models(annotations: Sequence[Any]) -> list[type[BaseModel]]:
-    found: list[type[BaseModel]] = []
-    for annotation in annotations:
-        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-            found.append(annotation)
-        else:
-            found.extend(_models(get_args(annotation)))
-    return found

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import uuid
+from dataclasses import replace
 from typing import Any
 
+from runtime import deployment
 from runtime.bus import EventLog
 from runtime.clock import Clock
 from runtime.errors import RuntimeFault
@@ -25,11 +27,13 @@ from runtime.messages import (
 )
 from runtime.orders import Orders
 from runtime.page import Page
+from runtime.policies.base import Policy
+from runtime.requests import RunRequest, SetUpRequest
 from runtime.run import Provenance, Run
 from runtime.runs import Runs
-from runtime.session import LEASE_COMMANDS, Effects, Happening, Session, State
+from runtime.session import LEASE_COMMANDS, Effects, Happening, Session, State, Told
 from runtime.setup import SetUp
-from runtime.snapshot import View, control_figures, snapshot
+from runtime.snapshot import View, control_figures, facts, snapshot
 from runtime.watch import Watch
 
 log = logging.getLogger(__name__)
@@ -41,20 +45,23 @@ class Director(Effects):
     """One `pump` does everything that is due; lockstep calls it tick by tick."""
 
     def __init__(self, plan: Plan, page: Page, clock: Clock, runner: Runner) -> None:
-        self.plan, self.page, self.clock = plan, page, clock
+        self._own = plan  # the deployment's
+        self.plan, self.page, self.clock = plan, page, clock  # the plan as it was last set up
+        self._facts = facts(plan)
         self.boot = str(uuid.uuid4())
         settings = plan.deployment
         self.events = EventLog()
         self.lease = Lease(settings.lease.ttl_s)
         self.session = Session(self, self.lease, self.boot, clock.now)
         self._orders = Orders(page)
-        policy = plan.policy.build(settings.policy, plan.robot, clock, plan.rate)
+        self.media_report = MediaReport(0.0, {}, {}, 0, "", 0)
+        policy = _policy_of(plan, clock)
         query = plan.strategy.query(settings.strategy)
         self.spaces = plan.spaces()
         self.inference = Inference(
             policy, query, self.spaces, page, self._orders, runner, clock, _inference_settings(plan)
         )
-        self.setup = SetUp(plan, self.inference, self._orders, page, clock)
+        self.setup = SetUp(plan, self.inference, self._orders, page, clock, lambda: self.media_report)
         self._watch = Watch(plan, page, self.lease, clock)
         provenance = Provenance(plan, self.boot)
         self.runs = Runs(
@@ -66,7 +73,6 @@ class Director(Effects):
             provenance,
             lambda: control_figures(page, plan.rate),
         )
-        self.media_report = MediaReport(0.0, {}, {}, 0, "", 0)
         for ring in ("control_events", "media_events"):
             for _ in page.rings[ring].drain():
                 pass  # told to a predecessor that died
@@ -103,21 +109,41 @@ class Director(Effects):
                 boot=self.boot,
                 now=self.clock.now(),
                 newest_event=self.events.newest,
+                facts=self._facts,
             )
         )
 
     # --- effects: what the session makes happen ------------------------------------------------------------
 
-    def begin_setup(self) -> None:
-        self.setup.begin()
+    def begin_setup(self, asked: SetUpRequest) -> Told:
+        plan, reset = self._changed(asked), self.setup.reset_of(asked.bench)
+        policy = self.inference.policy
+        if plan.deployment.policy != self.plan.deployment.policy:
+            policy = _policy_of(plan, self.clock)
+        # Nothing is refused from here on.
+        checkpoint = asked.checkpoint.model_dump() if asked.checkpoint else {}
+        self.plan = plan
+        self.runs.provenance = replace(self.runs.provenance, plan=plan, checkpoint=checkpoint)
+        self.inference.exchange(policy, plan.deployment.task)
+        self.setup.begin(reset)
+        return {"bench": reset["id"]} if reset else {}
+
+    def _changed(self, asked: SetUpRequest) -> Plan:
+        """The plan of a set-up; raises RuntimeFault where it is none, or an open recording would not be about it."""
+        resolved = deployment.changed(self._own.resolved, asked.changes, "setup")
+        if self.runs.alone and resolved.digest != self.plan.resolved.digest:
+            raise RuntimeFault(
+                "a recording is open, whose manifest says another policy or task: record stop first"
+            )
+        return replace(self._own, resolved=resolved)
 
     def cancel_setup(self, reason: str) -> None:
         self.setup.cancel()
         self._orders.give("hold", reason=reason)
 
-    def begin_run(self) -> None:
+    def begin_run(self, asked: RunRequest) -> Told:
         self._require_family()
-        self.runs.begin(self.setup.info)
+        return {"episode": self.runs.begin(self.setup.info, asked)}
 
     def hold(self, reason: str) -> None:
         self.runs.hold(reason)
@@ -137,9 +163,9 @@ class Director(Effects):
     def release_estop(self) -> None:
         self.page.ask_release()
 
-    def start_recording(self) -> None:
+    def start_recording(self) -> Told:
         self._require_family()
-        self.runs.record_alone(self.setup.info)
+        return {"episode": self.runs.record_alone(self.setup.info)}
 
     def stop_recording(self) -> None:
         self.runs.stop_alone()
@@ -265,6 +291,12 @@ class Director(Effects):
         """Let go of the policy."""
         self.inference.policy.close()
         self.inference.runner.close()
+
+
+def _policy_of(plan: Plan, clock: Clock) -> Policy:
+    """The policy of a plan, not yet connected; raises ConfigurationError where it does not fit the robot."""
+    made: Policy = plan.policy.build(plan.deployment.policy, plan.robot, clock, plan.rate)
+    return made
 
 
 def _inference_settings(plan: Plan) -> InferenceSettings:

@@ -167,12 +167,27 @@ class Inference:
         self._run = 0
         self._fresh = True
         self._flight: Future[Answered] | None = None
-        self._unmerged: set[int] = set()
+        self._unmerged: dict[int, Float64] = {}  # by chunk: the rows that were posted
+        self._raw: tuple[np.ndarray, Float64] | None = None  # of the newest merged chunk: its steps, its rows
         self._stale_since: float | None = None
         self._asked_at = float("-inf")
         self.latencies: deque[float] = deque(maxlen=200)  # [s]
         self.delays: deque[int] = deque(maxlen=200)  # control steps
         self.notes: list[Event] = []  # for main to collect
+
+    def exchange(self, policy: Policy, task: str) -> None:
+        """Ask `policy`, with the instruction `task`, from now on; figures are counted anew.
+
+        Another policy takes the place of the former one, which is closed first. Calls are made one after the
+        other: the new one is reached when the last call of the former one is over, and nobody waits for that.
+        """
+        self.pause()
+        if policy is not self.policy:
+            self.policy.close()
+            self.policy, self._fresh = policy, True
+        self._settings = replace(self._settings, task=task)
+        self.latencies.clear()
+        self.delays.clear()
 
     # --- asking --------------------------------------------------------------------------------------------
 
@@ -206,16 +221,16 @@ class Inference:
     def ask(self) -> Future[Answered]:
         """Send one request about the newest observation; raises PolicyError where that is too old."""
         observation = self.observe()
-        fresh, self._fresh = self._fresh, False
-        return self.runner.submit(lambda: self._infer(observation, fresh))
+        policy, fresh, self._fresh = self.policy, self._fresh, False
+        return self.runner.submit(lambda: self._infer(policy, observation, fresh))
 
-    def _infer(self, observation: Observation, fresh: bool) -> Answered:
+    def _infer(self, policy: Policy, observation: Observation, fresh: bool) -> Answered:
         if fresh:
-            self.policy.reset()
+            policy.reset()
         begun = self._clock.now()
         if observation.eef is None:
             observation = replace(observation, eef=self._spaces.eef_of(observation.qpos))
-        chunk = self.policy.infer(observation)
+        chunk = policy.infer(observation)
         return Answered(chunk, self._clock.now() - begun, observation)
 
     def command_rows(self, answered: Answered) -> tuple[Float64, np.ndarray]:
@@ -245,13 +260,24 @@ class Inference:
         """Stop asking; an answer still in flight is ignored."""
         self._run = 0
         self._flight = None
+        self._raw = None
         self._unmerged.clear()
 
     def merged(self, merged: ChunkMerged) -> None:
         """Control has put a chunk on the timeline, or dropped it."""
-        self._unmerged.discard(merged.chunk_id)
+        rows = self._unmerged.pop(merged.chunk_id, None)
         if merged.run == self._run:
             self.delays.append(merged.delay)
+            if rows is not None and not merged.dropped:
+                self._raw = (merged.targets, rows)
+
+    def raw(self, step: int) -> Float64 | None:
+        """What the newest chunk that control has merged wants for `step` [D]; None where it says nothing of it."""
+        if self._raw is None:
+            return None
+        steps, rows = self._raw
+        meant = np.flatnonzero(steps == step)
+        return rows[meant[-1]] if len(meant) else None
 
     def pump(self) -> PolicyAnswer | None:
         """Collect an answer, or ask; returns the answer, for the record. Raises PolicyError."""
@@ -294,7 +320,7 @@ class Inference:
         number = self._orders.next_chunk()
         step = answered.observation.step
         self._orders.post(PostedChunk(number, self._run, step, rows))
-        self._unmerged.add(number)
+        self._unmerged[number] = rows
         self.latencies.append(answered.seconds)
         chunk = answered.chunk
         return PolicyAnswer(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import mmap
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -74,20 +74,21 @@ class Lockstep:
         # From the start and not by adding up, so that tick k is at k / rate exactly.
         self.clock.sleep_until(self.step / self.plan.rate)
 
-    def command(self, kind: str) -> Ack:
+    def command(self, kind: str, **arguments: Any) -> Ack:
         """Give a command under a lease of lockstep's own; raises SetupError where it is refused."""
         self._handle("lease_claim")
-        ack = self._handle(kind)
+        ack = self._handle(kind, arguments)
         if ack.status == "refused":
             raise SetupError(f"{kind}: {ack.reason}")
         return ack
 
-    def _handle(self, kind: str) -> Ack:
+    def _handle(self, kind: str, arguments: Mapping[str, Any] | None = None) -> Ack:
         session = self.main.session
         return self.main.handle(
             Command(
                 str(uuid.uuid4()),
                 kind,
+                arguments or {},
                 user=_HOLDER,
                 holder=_HOLDER,
                 epoch=0 if kind == "lease_claim" else self.main.lease.epoch,

@@ -68,10 +68,19 @@ class Service:
             self._streams.publish(stream, content())
 
     def _joints(self) -> dict[str, Any]:
+        """One control step joint by joint, float32 [D] each: NaN in `planned` and `raw` where there is none.
+
+        `raw` is what the newest chunk wants for the step, `planned` what was made of all chunks before safety.
+        """
         status, seen = self._main.page.control.read(), self._main.page.observation.read()
+        step = int(status["step"])
+        raw, ticked = self._main.inference.raw(step), bool(status["behaviour"])
+        nothing = np.full(len(seen["qpos"]), np.nan, np.float32)
         return {
-            "step": int(status["step"]),
+            "step": step,
             "measured": seen["qpos"].copy(),
+            "raw": nothing if raw is None else raw.astype(np.float32),
+            "planned": status["smoothed"].copy() if ticked else nothing,
             "commanded": status["commanded"].copy(),
             "engaged": bool(status["engaged"]),
         }

@@ -72,6 +72,7 @@ class Media:
         self._faults: dict[str, int] = {}
         self._too_large: Counter[str] = Counter()
         self._source_failure = ""
+        self._truth: Mapping[str, Any] = {}  # what a simulated bench last said of itself
         for ring in ("minutes", "ticks"):
             for _ in page.rings[ring].drain():
                 pass  # addressed to a predecessor that died
@@ -149,6 +150,7 @@ class Media:
                 self._numbers[camera] += 1
                 self._page.pictures[camera].write(self._numbers[camera], picture)
         self._count("joints", observation.arrived)
+        self._truth = observation.truth or {}
         self._recorder.see(observation)
         self._page.publish_observation(observation, self._numbers)
         self._preview(observation)
@@ -186,6 +188,7 @@ class Media:
             self._begin(message)
         elif isinstance(message, EndEpisode):
             self._drain("ticks")  # those that control did before main decided to end
+            self._say_truth()
             self.end(message.status, message.reason, message.details)
 
     def _begin(self, message: BeginEpisode) -> None:
@@ -244,7 +247,15 @@ class Media:
         rates = {stream: self._rate(stream, now) for stream in self._arrivals}
         recorder = self._recorder
         recording = recorder.recording or self._closing_uuid  # until it is on disk
-        self._tell(MediaReport(now, rates, faults, recorder.rows, recording, recorder.repeated))
+        rows, repeated = recorder.rows, recorder.repeated
+        self._tell(MediaReport(now, rates, faults, rows, recording, repeated, self._truth))
+
+    def _say_truth(self) -> None:
+        """How a simulated bench is left: what the episode is scored by."""
+        if self._truth:
+            how = "success" if self._truth["success"] else "no success"
+            data = {**self._truth, "episode": self._recorder.recording}
+            self._say(Event("truth", f"the simulated bench says: {how}", self._clock.now(), data=data))
 
     def _say(self, event: Event) -> None:
         """An event of media's own: to main, and into the episode."""

@@ -47,6 +47,14 @@ class PostedChunk:
     rows: Float64
 
 
+@dataclass(frozen=True, slots=True)
+class NodeRequest:
+    """A control word for the execution node, passed on at once beside the commands; `data` are its fields."""
+
+    word: str
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
 # --- control -> main and media -----------------------------------------------------------------------------
 
 
@@ -161,6 +169,7 @@ class MediaReport:
     rows: int
     recording: str  # uuid of the open episode, "" where none is
     repeated: int
+    truth: Mapping[str, Any] = field(default_factory=dict)  # of a simulated bench, as its node last said it
 
 
 # --- clients <-> runtime -----------------------------------------------------------------------------------
@@ -204,6 +213,7 @@ class Ack:
 Message = (
     Order
     | PostedChunk
+    | NodeRequest
     | TickDone
     | ChunkMerged
     | Event

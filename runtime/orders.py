@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
+from typing import Any
 
 from runtime.errors import RuntimeFault
-from runtime.messages import Message, Order, OrderKind, PostedChunk, encode
+from runtime.messages import Message, NodeRequest, Order, OrderKind, PostedChunk, encode
 from runtime.page import Page
 from runtime.types import Float64
 
@@ -41,6 +43,10 @@ class Orders:
     def post(self, chunk: PostedChunk) -> None:
         """Hand a chunk over, unmerged."""
         self._push(chunk)
+
+    def ask_node(self, word: str, data: Mapping[str, Any]) -> None:
+        """Have control pass a control word on to the node."""
+        self._push(NodeRequest(word, data))
 
     def _push(self, message: Message) -> None:
         if not self._page.rings["orders"].push(encode(message)):

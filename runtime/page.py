@@ -84,6 +84,11 @@ class PageLayout:
                 ("estop_obeyed", "u1"),
                 ("commanded", "f4", self.dim),
                 ("velocity", "f4", self.dim),
+                (
+                    "smoothed",
+                    "f4",
+                    self.dim,
+                ),  # what was wanted at `step` before safety; NaN where nothing was
                 ("ticks", "i8"),
                 ("missed", "i8"),
                 ("refused_in_row", "i8"),

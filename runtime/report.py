@@ -8,6 +8,7 @@ from runtime.actuator import Actuator, Sent
 from runtime.behaviour import Behaviour, EStopped
 from runtime.messages import ChunkMerged, Event, Message, TickDone, encode
 from runtime.page import Page
+from runtime.types import Float32
 
 
 class Report:
@@ -17,6 +18,7 @@ class Report:
         self._page = page
         self._outbox: list[ChunkMerged | Event] = []
         self._records_lost = 0
+        self._smoothed: Float32 | None = None  # of this tick: what was wanted before safety
         self.order = 0  # number of the newest order obeyed
         self.run = 0
 
@@ -32,6 +34,7 @@ class Report:
         """The tick, for the episode."""
         target, executed = sent.target, sent.executed
         wanted = target is not None and target.path is not None
+        self._smoothed = target.action.astype(np.float32) if target and wanted else None
         source = "none" if executed is None else "hold"
         if target is not None and executed is not None and not sent.refused:
             source = target.source
@@ -43,7 +46,7 @@ class Report:
             sequence=int(observation["sequence"]),
             source=source,
             qpos=np.array(observation["qpos"]),
-            smoothed=target.action.astype(np.float32) if target and wanted else None,
+            smoothed=self._smoothed,
             executed=None if executed is None else executed.astype(np.float32),
             chunk_ids=[maker for maker, _ in target.makers] if target else [],
             weights=[share for _, share in target.makers] if target else [],
@@ -74,6 +77,7 @@ class Report:
         status["engaged"], status["moving"] = actuator.engaged, behaviour.moving
         status["estop_obeyed"] = isinstance(behaviour, EStopped)
         status["commanded"], status["velocity"] = actuator.commanded, actuator.velocity
+        status["smoothed"] = np.nan if self._smoothed is None else self._smoothed
         status["refused_in_row"] = refused
         status["records_lost"] = self._records_lost
         self._page.control.write(status)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import time
 import uuid
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any
@@ -22,6 +23,7 @@ class Run:
     number: int
     uuid: str
     asked: float
+    duration_s: float | None = None  # after which it ends by itself
     begun: float | None = None  # control follows
     held_since: float | None = None
     held: float = 0.0  # in total
@@ -52,10 +54,13 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """What every manifest of this start of the runtime says."""
+    """What every manifest says of the station as it was last set up; `plan` is the one in force since then."""
 
     plan: Plan
     boot: str
+    checkpoint: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # as the one who asked for the set-up named it
     versions: dict[str, str] = field(
         default_factory=lambda: {"python": platform.python_version()} | {p: version(p) for p in _PACKAGES}
     )
@@ -69,6 +74,9 @@ class Provenance:
             "boot": self.boot,
             "task": settings.task,
             "operator": settings.operator,
+            "trial": {},
+            "checkpoint": dict(self.checkpoint),
+            "duration_s": None,
             "kind": settings.recording.kind,
             "mode": mode,
             "strategy": settings.strategy.kind,

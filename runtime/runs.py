@@ -23,6 +23,7 @@ from runtime.messages import (
 from runtime.orders import Orders
 from runtime.page import Page
 from runtime.policies.base import PolicyInfo
+from runtime.requests import RunRequest
 from runtime.run import Provenance, Run
 
 log = logging.getLogger(__name__)
@@ -46,7 +47,7 @@ class Runs:
         self._clock = clock
         self._inference = inference
         self._orders = orders
-        self._provenance = provenance
+        self.provenance = provenance  # of the next manifest
         self._figures = figures  # of control, for the outcome
         self.open: Run | None = None
         self._count = int(page.control.read()["run"])
@@ -61,17 +62,22 @@ class Runs:
 
     # --- runs ----------------------------------------------------------------------------------------------
 
-    def begin(self, info: PolicyInfo | None) -> None:
-        """Ask media to open an episode; the run begins when it has."""
+    def begin(self, info: PolicyInfo | None, asked: RunRequest) -> str:
+        """Ask media to open an episode; the run begins when it has. Returns the episode's uuid, "" for none."""
         if self._alone:
             raise RuntimeFault("a recording without a run is open: record stop first")
+        settings = self._plan.deployment
         self._count += 1
+        limit = settings.run.duration_s if asked.duration_s is None else asked.duration_s
         manifest = None
-        if self._plan.deployment.recording.enabled:
-            manifest = self._provenance.manifest(self._plan.deployment.run.mode, info)
+        if settings.recording.enabled:
+            manifest = self.provenance.manifest(settings.run.mode, info)
+            manifest |= {"trial": asked.trial or {}, "duration_s": limit}
+            manifest |= {} if asked.operator is None else {"operator": asked.operator}
         identity = str(manifest["uuid"]) if manifest else str(uuid.uuid4())
         self._tell(BeginEpisode(self._count, manifest))
-        self.open = Run(self._count, identity, self._clock.now())
+        self.open = Run(self._count, identity, self._clock.now(), limit)
+        return identity if manifest else ""
 
     def opened(self, message: EpisodeOpened, running: bool) -> str:
         """Media is ready, or could not be: returns why the run cannot go on, "" where it can."""
@@ -132,13 +138,19 @@ class Runs:
 
     # --- recordings ----------------------------------------------------------------------------------------
 
-    def record_alone(self, info: PolicyInfo | None) -> None:
-        """Open an episode of whatever control does."""
+    @property
+    def alone(self) -> bool:
+        """Whether a recording without a run is open."""
+        return bool(self._alone)
+
+    def record_alone(self, info: PolicyInfo | None) -> str:
+        """Open an episode of whatever control does; returns its uuid."""
         if self._alone:
             raise RuntimeFault("a recording is open already")
-        manifest = self._provenance.manifest("observe", info)
+        manifest = self.provenance.manifest("observe", info)
         self._tell(BeginEpisode(0, manifest))
         self._alone = str(manifest["uuid"])
+        return self._alone
 
     def stop_alone(self) -> None:
         """Close it."""

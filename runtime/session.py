@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 from runtime.errors import RuntimeFault
 from runtime.lease import Lease
 from runtime.messages import Ack, AckStatus, Command
+from runtime.requests import Nothing, RunRequest, SetUpRequest, read
+from runtime.section import Section
 
 
 class State(StrEnum):
@@ -42,20 +45,23 @@ class Happening(StrEnum):
     FAMILY_DIED = "family_died"  # a process of the family was restarted
 
 
+Told = Mapping[str, Any]  # for the data of an answer
+
+
 class Effects(ABC):
     """What the session makes happen; implemented by main, recorded by tests.
 
-    Each raises RuntimeFault to refuse.
+    Each raises RuntimeFault to refuse, and has changed nothing then. What is returned goes into the answer.
     """
 
     @abstractmethod
-    def begin_setup(self) -> None: ...
+    def begin_setup(self, asked: SetUpRequest) -> Told: ...
 
     @abstractmethod
     def cancel_setup(self, reason: str) -> None: ...
 
     @abstractmethod
-    def begin_run(self) -> None: ...
+    def begin_run(self, asked: RunRequest) -> Told: ...
 
     @abstractmethod
     def hold(self, reason: str) -> None:
@@ -75,7 +81,7 @@ class Effects(ABC):
     def release_estop(self) -> None: ...
 
     @abstractmethod
-    def start_recording(self) -> None: ...
+    def start_recording(self) -> Told: ...
 
     @abstractmethod
     def stop_recording(self) -> None: ...
@@ -83,27 +89,32 @@ class Effects(ABC):
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """A command: the states it is allowed in, the state after it, what it does."""
+    """A command: the states it is allowed in, the state after it, what it does, what it takes.
+
+    `takes` None: whatever comes with it is not looked at, because a stop is not refused for a word too many.
+    """
 
     allowed: tuple[State, ...]
     after: State | None
-    effect: Callable[[Effects], None]
+    effect: Callable[[Effects, Any], Told | None]
+    takes: type[Section] | None = Nothing
 
 
 S = State
+_STOPPED = "stopped by the operator"
 COMMANDS: dict[str, Rule] = {
-    "setup": Rule((S.IDLE, S.READY), S.SETTING_UP, lambda e: e.begin_setup()),
-    "run": Rule((S.READY,), S.RUNNING, lambda e: e.begin_run()),
+    "setup": Rule((S.IDLE, S.READY), S.SETTING_UP, lambda e, asked: e.begin_setup(asked), SetUpRequest),
+    "run": Rule((S.READY,), S.RUNNING, lambda e, asked: e.begin_run(asked), RunRequest),
     "stop": Rule(
-        (S.RUNNING, S.HOLDING, S.READY), S.READY, lambda e: e.end_run("finished", "stopped by the operator")
+        (S.RUNNING, S.HOLDING, S.READY), S.READY, lambda e, _: e.end_run("finished", _STOPPED), None
     ),
-    "halt": Rule((S.RUNNING, S.HOLDING), S.HOLDING, lambda e: e.hold("halted by the operator")),
-    "resume": Rule((S.HOLDING,), S.RUNNING, lambda e: e.resume_run()),
-    "home": Rule((S.READY,), S.SETTING_UP, lambda e: e.go_home()),
-    "release": Rule((S.FAULTED,), None, lambda e: e.release_estop()),
-    "record_start": Rule((S.IDLE, S.READY), None, lambda e: e.start_recording()),
+    "halt": Rule((S.RUNNING, S.HOLDING), S.HOLDING, lambda e, _: e.hold("halted by the operator"), None),
+    "resume": Rule((S.HOLDING,), S.RUNNING, lambda e, _: e.resume_run()),
+    "home": Rule((S.READY,), S.SETTING_UP, lambda e, _: e.go_home()),
+    "release": Rule((S.FAULTED,), None, lambda e, _: e.release_estop()),
+    "record_start": Rule((S.IDLE, S.READY), None, lambda e, _: e.start_recording()),
     "record_stop": Rule(
-        (S.DISCONNECTED, S.IDLE, S.SETTING_UP, S.READY, S.HOLDING), None, lambda e: e.stop_recording()
+        (S.DISCONNECTED, S.IDLE, S.SETTING_UP, S.READY, S.HOLDING), None, lambda e, _: e.stop_recording()
     ),
 }
 # While it is being set up, both stopping commands mean the same: cancel.
@@ -168,10 +179,13 @@ class Session:
             return self._ack(command, "refused", "a command needs a uuid of its own")
         if command.uuid in self._answers:
             return self._answers[command.uuid]
-        refusal = self._refusal(command)
+        refusal, told = self._refusal(command), None
         if not refusal:
-            refusal = self._carry_out(command)
-        ack = self._ack(command, "refused" if refusal else "accepted", refusal)
+            try:
+                told = self._carry_out(command)
+            except RuntimeFault as error:
+                refusal = str(error)
+        ack = self._ack(command, "refused" if refusal else "accepted", refusal, told)
         if command.kind != "lease_renew":  # a stream, not a discrete command: nothing to repeat
             self._answers[command.uuid] = ack
             if len(self._answers) > ANSWERS_KEPT:
@@ -241,24 +255,24 @@ class Session:
             f"{kind} is not allowed while {self.state} ({self.reason}); allowed: {', '.join(self.allowed())}"
         )
 
-    def _carry_out(self, command: Command) -> str:
+    def _carry_out(self, command: Command) -> Told | None:
+        """Do it; raises RuntimeFault where something in it, or who is to do it, refuses."""
         if command.kind in LEASE_COMMANDS:
-            return self._lease_command(command)
+            self._lease_command(command)
+            return None
         if command.kind == "estop":
-            return "the e-stop has a socket of its own: send it to the guard"
+            raise RuntimeFault("the e-stop has a socket of its own: send it to the guard")
         rule = COMMANDS[command.kind]
         if self.state is State.SETTING_UP and command.kind in CANCELLING:
             rule = _CANCEL
-        try:
-            rule.effect(self._effects)
-        except RuntimeFault as error:
-            return str(error)
+        asked = read(command.kind, rule.takes, command.args) if rule.takes else None
+        told = rule.effect(self._effects, asked)
         if rule.after:
             reason = _CANCELLED if rule is _CANCEL else _REASONS.get(command.kind, "")
             self._enter(rule.after, reason)
-        return ""
+        return told
 
-    def _lease_command(self, command: Command) -> str:
+    def _lease_command(self, command: Command) -> None:
         now = self._now()
         before = self._lease.current(now)
         act = {
@@ -270,22 +284,25 @@ class Session:
         after = self._lease.current(now)
         if (before and before.epoch) != (after and after.epoch):
             self.sequence += 1
-        return refusal
+        if refusal:
+            raise RuntimeFault(refusal)
 
     def _enter(self, state: State, reason: str) -> None:
         self.state, self.reason = state, reason
         self.sequence += 1
 
-    def _ack(self, command: Command, status: AckStatus, reason: str) -> Ack:
+    def _ack(self, command: Command, status: AckStatus, reason: str, told: Told | None = None) -> Ack:
         held = self._lease.current(self._now())
-        data = {"epoch": held.epoch, "holder": held.holder} if held else {}
-        return Ack(command.uuid, status, reason, self.allowed(), self._boot, self.sequence, data)
+        lease = {"epoch": held.epoch, "holder": held.holder} if held else {}
+        return Ack(
+            command.uuid, status, reason, self.allowed(), self._boot, self.sequence, {**(told or {}), **lease}
+        )
 
 
 _CANCELLED = "set-up cancelled by the operator"
-_CANCEL = Rule((S.SETTING_UP,), S.IDLE, lambda e: e.cancel_setup(_CANCELLED))
+_CANCEL = Rule((S.SETTING_UP,), S.IDLE, lambda e, _: e.cancel_setup(_CANCELLED), None)
 _REASONS = {
-    "stop": "stopped by the operator",
+    "stop": _STOPPED,
     "halt": "halted by the operator: resume or stop",
     "home": "going home",
     "setup": "setting up",

@@ -1,9 +1,12 @@
-"""What `setup` does, stage by stage, never blocking main: connect, observe, home, warm up, validate."""
+"""What `setup` does, stage by stage, never blocking main: connect, observe, home, reset, warm up, validate."""
 
 from __future__ import annotations
 
+import uuid
+from collections.abc import Callable
 from concurrent.futures import Future
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 
@@ -11,14 +14,17 @@ from runtime.clock import Clock
 from runtime.errors import PolicyError, SetupError
 from runtime.family import Plan
 from runtime.inference import Answered, Inference
-from runtime.messages import Event
+from runtime.messages import Event, MediaReport
 from runtime.motion import Trajectory
 from runtime.orders import Orders
 from runtime.page import Page
 from runtime.policies.base import PolicyInfo
+from runtime.requests import BenchRequest
 
 _SETTLE_S = 2.0  # for the arm to follow the last target of a motion
 _ARRIVED_RAD = 0.1
+_RESET_S = 3.0  # for a simulated bench to be laid out
+_REPEAT_S = 0.2  # a control word may be lost on its way
 
 
 class Stage(StrEnum):
@@ -29,22 +35,33 @@ class Stage(StrEnum):
     OBSERVE = "waiting for a complete observation"
     HOME = "going to the pose"
     SETTLE = "waiting for the arm to arrive"
+    RESET = "resetting the bench"
     WARM_UP = "warming up the policy"
 
 
 class SetUp:
     """A set-up in progress; `pump` advances it and is cheap."""
 
-    def __init__(self, plan: Plan, inference: Inference, orders: Orders, page: Page, clock: Clock) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        inference: Inference,
+        orders: Orders,
+        page: Page,
+        clock: Clock,
+        media: Callable[[], MediaReport],
+    ) -> None:
         self._plan = plan
         self._inference = inference
         self._orders = orders
         self._page = page
         self._clock = clock
+        self._media = media  # what it last reported
         self.stage = Stage.IDLE
         self.info: PolicyInfo | None = None
         self.validated = ""
         self._homing_only = False
+        self._reset: dict[str, Any] | None = None  # of the bench, that has been asked for
 
     @property
     def active(self) -> bool:
@@ -55,8 +72,24 @@ class SetUp:
         """What came of it, in one sentence."""
         return f"at the pose {self._plan.deployment.setup.pose!r}" if self._homing_only else self.validated
 
-    def begin(self) -> None:
-        """Start from the first stage."""
+    def reset_of(self, bench: BenchRequest | None) -> dict[str, Any] | None:
+        """What the node is to be told to reset its bench; SetupError where it has none, or has done that already."""
+        if bench is None:
+            return None
+        if not self._plan.capabilities.resets_bench:
+            raise SetupError(
+                "setup: bench cannot be reset here: the transport is not declared simulated "
+                "(transport.simulated = true, for a node that simulates a bench); set up without bench"
+            )
+        if bench.id is not None and bench.id == self._media().truth.get("reset"):
+            raise SetupError(
+                f"setup: bench.id = {bench.id!r} was reset already; give each reset an id of its own"
+            )
+        return bench.model_dump(exclude_none=True) | {"id": bench.id or str(uuid.uuid4())}
+
+    def begin(self, reset: dict[str, Any] | None) -> None:
+        """Start from the first stage; `reset` as by `reset_of`."""
+        self._reset = reset
         self.info, self.validated = None, ""
         self._homing_only = False
         self._connection = self._inference.runner.submit(self._inference.policy.connect)
@@ -77,6 +110,8 @@ class SetUp:
         """Control's events: the one that says that the motion is done."""
         if self.stage is Stage.HOME and event.kind == "motion_done":
             self._enter(Stage.SETTLE)
+        elif event.kind == "word_refused":
+            self._word_refused = event.text
 
     def pump(self) -> bool:
         """Advance; True when done. Raises RuntimeFault where it cannot go on."""
@@ -90,6 +125,8 @@ class SetUp:
             self._wait_for_motion()
         elif self.stage is Stage.SETTLE:
             return self._settle()
+        elif self.stage is Stage.RESET:
+            self._reset_bench()
         elif self.stage is Stage.WARM_UP:
             return self._warm_up()
         return False
@@ -115,7 +152,7 @@ class SetUp:
         if settings.home and self._plan.capabilities.moves_robot:
             self._go()
         else:
-            self._start_warm_up()
+            self._start_reset()
         return False
 
     def _require_family(self) -> None:
@@ -162,8 +199,44 @@ class SetUp:
         if self._homing_only:
             self.stage = Stage.IDLE
             return True
-        self._start_warm_up()
+        self._start_reset()
         return False
+
+    def _start_reset(self) -> None:
+        """The arms are out of the way: lay the bench out anew, where that was asked for."""
+        if self._reset is None:
+            self._start_warm_up()
+            return
+        self._word_refused = ""
+        self._asked_node = float("-inf")
+        self._refused_before = self._refused_by_node()
+        self._enter(Stage.RESET)
+
+    def _reset_bench(self) -> None:
+        """Say it until the node says that it is done: what is shown to the policy from then on is the new bench."""
+        assert self._reset is not None
+        if self._media().truth.get("reset") == self._reset["id"]:
+            self._start_warm_up()
+            return
+        if self._word_refused:
+            raise SetupError(f"the bench cannot be reset: {self._word_refused}")
+        if self._waited() > _RESET_S:
+            raise SetupError(f"the bench was not reset within {_RESET_S:g} s: {self._why_not_reset()}")
+        if self._clock.now() - self._asked_node >= _REPEAT_S:
+            self._asked_node = self._clock.now()
+            self._orders.ask_node("scene_reset", self._reset)
+
+    def _why_not_reset(self) -> str:
+        if not self._media().truth:
+            return "the node says no truth of a bench; does it simulate one?"
+        before = self._refused_before
+        new = [reason for reason, count in self._refused_by_node().items() if count > before.get(reason, 0)]
+        return f"the node refused it ({', '.join(new)})" if new else "the node does not answer to it"
+
+    def _refused_by_node(self) -> dict[str, int]:
+        prefix = "node_refused."
+        faults = self._media().faults.items()
+        return {name.removeprefix(prefix): count for name, count in faults if name.startswith(prefix)}
 
     def _start_warm_up(self) -> None:
         self._left = self._plan.deployment.setup.warmup_chunks

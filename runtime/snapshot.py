@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +35,7 @@ class View:
     boot: str
     now: float
     newest_event: int
+    facts: Mapping[str, Any]  # as by `facts`, which never change
 
 
 def snapshot(view: View) -> dict[str, Any]:
@@ -52,6 +53,9 @@ def snapshot(view: View) -> dict[str, Any]:
         "stage": str(view.setup.stage),
         "validated": view.setup.validated,
         "task": settings.task,
+        "checkpoint": dict(view.runs.provenance.checkpoint),
+        "simulated": view.plan.capabilities.resets_bench,
+        "truth": dict(view.media.truth),
         "transport": settings.transport.kind,
         "policy": {"kind": settings.policy.kind, **_inference(view)},
         "strategy": settings.strategy.kind,
@@ -68,6 +72,29 @@ def snapshot(view: View) -> dict[str, Any]:
         "control": control_figures(view.page, view.plan.rate),
         "link": _link(view),
         "newest_event": view.newest_event,
+        "facts": dict(view.facts),
+    }
+
+
+def facts(plan: Plan) -> dict[str, Any]:
+    """What never changes while a station runs: names, sizes, limits [rad or the gripper's unit], rates [Hz]."""
+    robot, bus = plan.robot, plan.deployment.bus
+    return {
+        "robot": robot.name,
+        "joint_names": list(robot.joint_names),
+        "arms": [arm.name for arm in robot.arms],
+        "eef_names": list(robot.eef_names),
+        "gripper_dims": list(robot.gripper_dims),
+        "lower": robot.lower.tolist(),
+        "upper": robot.upper.tolist(),
+        "home": robot.poses[plan.deployment.setup.pose].tolist(),
+        "poses": sorted(robot.poses),
+        "cameras": list(plan.cameras),
+        "rate": plan.rate,
+        "fps": plan.fps,
+        "preview_rate": bus.preview_rate,
+        "recorded": plan.deployment.recording.enabled,
+        "lease_ttl_s": plan.deployment.lease.ttl_s,
     }
 
 
@@ -81,9 +108,15 @@ def _lease(view: View) -> dict[str, Any]:
 def _run(view: View) -> dict[str, Any]:
     run = view.runs.open
     if run is None:
-        return {"number": 0, "uuid": "", "elapsed": 0.0, "held": 0.0}
+        return {"number": 0, "uuid": "", "elapsed": 0.0, "held": 0.0, "duration_s": None}
     held = run.held + (view.now - run.held_since if run.held_since is not None else 0.0)
-    return {"number": run.number, "uuid": run.uuid, "elapsed": run.elapsed(view.now), "held": held}
+    return {
+        "number": run.number,
+        "uuid": run.uuid,
+        "elapsed": run.elapsed(view.now),
+        "held": held,
+        "duration_s": run.duration_s,
+    }
 
 
 def _inference(view: View) -> dict[str, Any]:

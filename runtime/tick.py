@@ -10,7 +10,7 @@ import numpy as np
 
 from runtime.actuator import Actuator, Sent, TickSettings
 from runtime.behaviour import Behaviour, EStopped, Follow, Hold, Move, Silent, Target
-from runtime.messages import ChunkMerged, Order, PostedChunk, decode
+from runtime.messages import ChunkMerged, NodeRequest, Order, PostedChunk, decode
 from runtime.motion import Trajectory
 from runtime.page import EStop, Page
 from runtime.report import Report
@@ -83,6 +83,10 @@ class Tick:
     def _obey(self, message: object, step: int, now: float) -> None:
         if isinstance(message, PostedChunk):
             self._merge_chunk(message, step)
+        elif isinstance(message, NodeRequest):
+            refusal = self._actuator.tell(message.word, message.data)
+            if refusal:
+                self._report.say("word_refused", refusal, now)
         elif isinstance(message, Order):
             self._report.order, self._report.run = message.number, message.run
             if not isinstance(self._behaviour, EStopped):

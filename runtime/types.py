@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,9 @@ class Observation:
     last: bool = False  # the source ends with this frame (a recording has played out)
     step: int = -1  # the control tick it was assembled for; -1 until a tick has seen it
     prompt: str = ""
+    truth: Mapping[str, Any] | None = (
+        None  # what a simulated bench says of itself: JSON, never shown to a policy
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -109,9 +109,9 @@ class Watch:
         return "our process media gives no sign of life (a disk that hangs?)"
 
     def _end_of(self, run: Run) -> Iterator[Noticed]:
-        duration = self._plan.deployment.run.duration_s
-        if duration is not None and run.elapsed(self._clock.now()) >= duration:
-            yield Noticed(Happening.RUN_ENDED, f"the run's {duration:g} s are over")
+        limit = run.duration_s
+        if limit is not None and run.elapsed(self._clock.now()) >= limit:
+            yield Noticed(Happening.RUN_ENDED, f"the run's {limit:g} s are over")
             return
         record: np.void = self._page.observation.read()
         if record["last"] and int(self._page.control.read()["sequence"]) == int(record["sequence"]):

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
+from runtime.errors import TransportError
 from runtime.types import Observation, RobotCommand
 
 
@@ -16,6 +19,9 @@ class Capabilities:
     ends: bool = False  # the source runs out (a recording)
     measures_eef: bool = False
     spaces: frozenset[str] = frozenset({"joint"})  # command spaces it can publish
+    resets_bench: bool = (
+        False  # declared simulated: it lays out its bench when told, and says the truth of it
+    )
 
 
 class Source(ABC):
@@ -54,6 +60,13 @@ class Sink(ABC):
     @abstractmethod
     def send(self, command: RobotCommand) -> None:
         """Hand over one command without waiting for anybody."""
+
+    def tell(self, word: str, data: Mapping[str, Any]) -> None:
+        """Hand over a control word with its fields, without waiting; raises TransportError where it takes none.
+
+        A word may be lost like a command: who needs it obeyed repeats it until the observations show that it was.
+        """
+        raise TransportError(f"this transport takes no control words; {word!r} was to be sent")
 
     @abstractmethod
     def close(self) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
+from pydantic import ConfigDict, JsonValue, TypeAdapter, ValidationError
 
 from runtime import codecs
 from runtime.errors import CodecError
@@ -17,6 +18,11 @@ if TYPE_CHECKING:
     from robots import Robot
 
 Encoding = Literal["bgr", "rgb"]
+TRUTH_LIMIT = 16 * 1024  # bytes; it goes into snapshots ten times a second
+Part = TypeVar("Part")
+_JSON: TypeAdapter[dict[str, JsonValue]] = TypeAdapter(
+    dict[str, JsonValue], config=ConfigDict(strict=True, allow_inf_nan=False)
+)
 
 
 class MessageRefused(CodecError):
@@ -43,7 +49,8 @@ class NodeStatus:
 class NodeFrame:
     """One complete observation as sent: `stamp` in the node's own clock [s], pictures in its own `encoding`.
 
-    `remarks` are (fault, text) of optional parts that were left out because they are unusable.
+    `truth` is what a simulated bench says of itself, as JSON. `remarks` are (fault, text) of optional parts that
+    were left out because they are unusable.
     """
 
     stamp: float
@@ -55,6 +62,7 @@ class NodeFrame:
     action_eef: Float32 | None
     sequence: int | None
     status: NodeStatus
+    truth: Mapping[str, Any] | None = None
     remarks: tuple[tuple[str, str], ...] = ()
 
 
@@ -82,6 +90,7 @@ class NodeMessages:
             action_eef=self._optional(remarks, "action_eef", self._poses, message.get("action_eef")),
             sequence=_sequence(message),
             status=_status(message),
+            truth=self._optional(remarks, "truth", _truth, message.get("truth")),
             remarks=tuple(remarks),
         )
 
@@ -120,17 +129,16 @@ class NodeMessages:
         raise MessageRefused("unknown_encoding", f"encoding is {given!r}; allowed: 'bgr', 'rgb'")
 
     def _optional(
-        self, remarks: list[tuple[str, str]], name: str, read: Any, given: object
-    ) -> Float32 | None:
+        self, remarks: list[tuple[str, str]], name: str, read: Callable[[str, object], Part], given: object
+    ) -> Part | None:
         """The part as read, None where it is absent or unusable; the latter leaves a remark."""
         if given is None:
             return None
         try:
-            part: Float32 = read(name, given)
+            return read(name, given)
         except MessageRefused as error:
             remarks.append((f"{name}_unusable", str(error)))
             return None
-        return part
 
     def _eef(self, name: str, given: object) -> Float32:
         if not isinstance(given, dict):
@@ -189,6 +197,27 @@ def _picture(key: str, given: object) -> UInt8:
             "wrong_dimension", f"images.{key} has shape {list(given.shape)}; expected [H, W, 3]"
         )
     return given
+
+
+def _truth(name: str, given: object) -> Mapping[str, Any]:
+    """A map of JSON that says at least which reset it is about, what was achieved since, and whether that is all."""
+    try:
+        truth: dict[str, Any] = _JSON.validate_python(given)
+    except ValidationError as invalid:
+        error = invalid.errors()[0]
+        where = ".".join(map(str, (name, *error["loc"])))
+        raise MessageRefused("malformed", f"{where}: {error['msg']}") from None
+    size = len(codecs.pack(truth))
+    if size > TRUTH_LIMIT:
+        raise MessageRefused("malformed", f"{name} has {size} bytes; expected at most {TRUTH_LIMIT}")
+    reset, milestones, success = truth.get("reset"), truth.get("milestones"), truth.get("success")
+    if not isinstance(reset, str):
+        raise MessageRefused("malformed", f"{name}.reset is {reset!r:.80}; expected the id of a reset or ''")
+    if not isinstance(milestones, dict) or not all(isinstance(done, bool) for done in milestones.values()):
+        raise MessageRefused("malformed", f"{name}.milestones is {milestones!r:.80}; expected a map of bools")
+    if not isinstance(success, bool):
+        raise MessageRefused("malformed", f"{name}.success is {success!r:.80}; expected true or false")
+    return truth
 
 
 def _sequence(message: Mapping[Any, Any]) -> int | None:

@@ -12,8 +12,9 @@ import threading
 import uuid
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import zmq
@@ -54,6 +55,8 @@ class Config(Section):
     """Observation keys of cameras that this deployment does without."""
     detect_frozen: bool = True
     """A picture exactly like the one before counts as no newer; off for simulated cameras that may stand still."""
+    simulated: bool = False
+    """The node is a simulated bench: it may be reset by us, and what it says is the truth of it is believed."""
     insecure_link: bool = False
     """Allow endpoints beyond this machine although anybody on that network can command the robot."""
 
@@ -94,7 +97,7 @@ def _has_port(endpoint: str) -> bool:
 
 def capabilities(config: Config) -> Capabilities:
     """A real robot may hang on it; poses are delivered where the node sends them."""
-    return Capabilities(moves_robot=True, measures_eef=True)
+    return Capabilities(moves_robot=True, measures_eef=True, resets_bench=config.simulated)
 
 
 def cameras(config: Config, robot: Robot) -> tuple[str, ...]:
@@ -130,6 +133,7 @@ class NodeSource(Source):
             )
         self._endpoint = config.sub_endpoint
         self._detect_frozen = config.detect_frozen
+        self._simulated = config.simulated
         self._clock = clock
         self._messages = NodeMessages(
             robot, config.encoding, frozenset(config.disabled_cameras), MESSAGE_LIMIT
@@ -170,6 +174,7 @@ class NodeSource(Source):
         """Refused messages by reason, `clock_backwards`, `frames_lost` (gaps in the node's own numbers).
 
         `frozen_<camera>` counts how often that camera's picture stayed the same for too long.
+        `truth_ignored` is 1 where a node that is not declared simulated says what only a simulated one can know.
         Commands that the node itself refused appear as `node_refused.<reason>`.
         """
         with self._changed:
@@ -246,6 +251,9 @@ class NodeSource(Source):
     def _keep(self, frame: NodeFrame, arrived: float) -> None:
         for fault, text in frame.remarks:
             self._blame(fault, text)
+        if frame.truth is not None and not self._simulated:
+            self._ignore_truth()
+            frame = replace(frame, truth=None)
         captured = self._captured(frame, arrived)
         with self._changed:
             self._count_lost(frame.sequence)
@@ -253,6 +261,12 @@ class NodeSource(Source):
             self._status = frame.status
             self._newest = (self._count, arrived, captured, frame)
             self._changed.notify_all()
+
+    def _ignore_truth(self) -> None:
+        """Said once: every message of such a node has it."""
+        if "truth_ignored" not in self._faults:
+            text = "it says the truth of a bench, but transport.simulated is false"
+            self._blame("truth_ignored", text)
 
     def _captured(self, frame: NodeFrame, arrived: float) -> dict[str, float]:
         """The time of each stream: the message's, but for pictures that are no new ones."""
@@ -290,6 +304,7 @@ class NodeSink(Sink):
     def __init__(self, config: Config, robot: Robot, clock: Clock) -> None:
         self._endpoint = config.pub_endpoint
         self._dim = robot.dim
+        self._clock = clock
         self._socket: zmq.Socket[bytes] | None = None
         self._sequence = 0
         self.master = uuid.uuid4().hex
@@ -311,22 +326,26 @@ class NodeSink(Sink):
 
     def send(self, command: RobotCommand) -> None:
         """Hand over one absolute target; TransportError for a vector that no node may be given."""
-        if self._socket is None:
-            raise TransportError(f"the link to {self._endpoint} is not connected; connect it before sending")
         action = np.asarray(command.action, dtype=np.float32)
         if action.shape != (self._dim,) or not np.isfinite(action).all():
             raise TransportError(
                 f"a command of shape {list(action.shape)} {action.tolist()} was to be sent; "
                 f"allowed: {self._dim} finite numbers"
             )
+        self._send({"t": float(command.time), "action": action, "target": "real"})
+
+    def tell(self, word: str, data: Mapping[str, Any]) -> None:
+        """Hand over the control word `word`: it stands where a command says its target, its fields beside it."""
+        taken = sorted({"t", "target", "action", "master", "seq"} & set(data))
+        if taken or word in ("real", "sim"):
+            raise TransportError(f"the control word {word!r} with {taken} would be taken for a command")
+        self._send({**data, "t": self._clock.now(), "target": word})
+
+    def _send(self, message: dict[str, Any]) -> None:
+        if self._socket is None:
+            raise TransportError(f"the link to {self._endpoint} is not connected; connect it before sending")
         self._sequence += 1
-        message = {
-            "t": float(command.time),
-            "action": action,
-            "target": "real",
-            "master": self.master,
-            "seq": self._sequence,
-        }
+        message |= {"master": self.master, "seq": self._sequence}
         with contextlib.suppress(zmq.Again):  # the newest command counts; the next one comes in a tick
             self._socket.send(codecs.pack(message), zmq.NOBLOCK)
 
@@ -361,6 +380,7 @@ def _observation(
         eef=frame.eef,
         reported_action=frame.action,
         reported_action_eef=frame.action_eef,
+        truth=frame.truth,
     )
 
 

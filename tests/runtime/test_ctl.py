@@ -49,8 +49,8 @@ class Script:
             raise found
         return found
 
-    def command(self, kind):
-        self.given.append(kind)
+    def command(self, kind, **arguments):
+        self.given.append((kind, arguments) if arguments else kind)
         if self.refusal:
             raise self.refusal
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from runtime.errors import RuntimeFault
-from runtime.messages import Order, PostedChunk, decode
+from runtime.messages import NodeRequest, Order, PostedChunk, decode
 from runtime.orders import Orders
 from runtime.page import Page, PageLayout
 
@@ -57,6 +57,13 @@ def test_chunks_keep_their_numbers_and_their_place_among_the_orders(page):
     orders.give("hold", run=1)
     assert [type(message) for message in read(page)] == [Order, PostedChunk, Order]
     assert orders.next_chunk() == 2
+
+
+def test_a_word_for_the_node_goes_the_way_of_the_orders(page):
+    orders = Orders(page)
+    orders.give("hold")
+    orders.ask_node("scene_reset", {"id": "r", "seed": 3})
+    assert read(page)[1] == NodeRequest("scene_reset", {"id": "r", "seed": 3})
 
 
 def test_a_control_that_does_not_read_is_a_fault_and_not_silence(page):

@@ -9,6 +9,7 @@ from runtime.clock import VirtualClock
 from runtime.errors import RuntimeFault
 from runtime.lease import Lease
 from runtime.messages import Ack, Command
+from runtime.requests import BenchRequest, RunRequest, SetUpRequest
 from runtime.session import COMMANDS, HAPPENINGS, STOPPING, Effects, Happening, Session, State
 
 S, H = State, Happening
@@ -46,14 +47,16 @@ class Recorded(Effects):
             raise RuntimeFault(f"cannot {name}")
         self.done.append((name, *details))
 
-    def begin_setup(self):
-        self._do("begin_setup")
+    def begin_setup(self, asked):
+        self._do("begin_setup", asked)
+        return {"bench": "bench-7"}
 
     def cancel_setup(self, reason):
         self._do("cancel_setup", reason)
 
-    def begin_run(self):
-        self._do("begin_run")
+    def begin_run(self, asked):
+        self._do("begin_run", asked)
+        return {"episode": "episode-7"}
 
     def hold(self, reason):
         self._do("hold", reason)
@@ -72,6 +75,7 @@ class Recorded(Effects):
 
     def start_recording(self):
         self._do("start_recording")
+        return {"episode": "episode-8"}
 
     def stop_recording(self):
         self._do("stop_recording")
@@ -149,6 +153,42 @@ def test_an_effect_that_refuses_is_the_reason_and_nothing_changes(kind, state):
     ack = bench.give(kind)
     assert (ack.status, ack.reason) == ("refused", f"cannot {name}")
     assert (bench.session.state, bench.session.sequence, bench.session.reason) == (state, sequence, reason)
+
+
+def test_the_arguments_of_a_command_reach_its_effect_checked():
+    bench = Bench(S.READY)
+    bench.give("run", args={"trial": {"scene": 3}, "operator": "anna", "duration_s": 20})
+    bench.session.state = S.READY
+    bench.give("setup", args={"task": "stack", "bench": {"seed": 4}})
+    run, setup = (asked for _, asked in bench.effects.done)
+    assert run == RunRequest(trial={"scene": 3}, operator="anna", duration_s=20.0)
+    assert setup == SetUpRequest(task="stack", bench=BenchRequest(seed=4))
+
+
+@pytest.mark.parametrize("kind", [kind for kind in COMMANDS if kind not in STOPPING])
+def test_an_argument_that_a_command_does_not_take_is_the_reason_and_nothing_is_done(kind):
+    state = COMMANDS[kind].allowed[0]
+    bench = Bench(state)
+    sequence = bench.session.sequence
+    ack = bench.give(kind, args={"colour": "blue"})
+    assert ack.status == "refused"
+    assert ack.reason.startswith((f"{kind}: colour = 'blue': unknown key", f"{kind} takes no arguments"))
+    assert (bench.session.state, bench.session.sequence, bench.effects.done) == (state, sequence, [])
+
+
+@pytest.mark.parametrize("kind", ["stop", "halt"])
+@pytest.mark.parametrize("state", [S.RUNNING, S.HOLDING, S.SETTING_UP])
+def test_a_stop_is_not_refused_for_a_word_too_many(kind, state):
+    assert Bench(state).give(kind, args={"colour": "blue"}).status == "accepted"
+
+
+def test_what_an_effect_tells_is_in_the_answer_beside_the_lease():
+    lease = {"epoch": 1, "holder": "anna"}
+    assert Bench(S.READY).give("run").data == {"episode": "episode-7"} | lease
+    assert Bench(S.READY).give("setup").data == {"bench": "bench-7"} | lease
+    assert Bench(S.READY).give("record_start").data == {"episode": "episode-8"} | lease
+    assert Bench(S.READY).give("stop").data == lease
+    assert Bench(S.IDLE).give("run").data == lease  # refused: nothing was told
 
 
 @pytest.mark.parametrize("state", State)

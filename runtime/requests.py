@@ -1,0 +1,96 @@
+"""What the commands of the session take with them: checked whole before anything is done about it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeVar
+
+from pydantic import AfterValidator, Field, JsonValue, ValidationError
+
+from runtime.errors import RuntimeFault
+from runtime.explanation import explanation
+from runtime.section import Section
+
+LARGEST = 64 * 1024  # characters of JSON that a command may carry into a manifest
+_HIGHEST_SEED = 2**53 - 1  # beyond it a browser counts no more
+
+
+def _small(given: dict[str, JsonValue]) -> dict[str, JsonValue]:
+    size = len(json.dumps(given))
+    if size > LARGEST:
+        raise ValueError(f"must be at most {LARGEST} characters of JSON, and is {size}")
+    return given
+
+
+Map = Annotated[dict[str, JsonValue], AfterValidator(_small)]
+Label = Annotated[str, Field(max_length=200)]
+
+
+class Nothing(Section):
+    """For commands that are one word."""
+
+
+class Checkpoint(Section):
+    """Which checkpoint is behind the policy, as the one who asks knows it."""
+
+    id: Annotated[str, Field(min_length=1, max_length=200)] | int
+    name: Label = ""
+
+
+class Positions(Section):
+    """Where things are wanted on the bench, in the world: x, y [m], yaw [degrees]; what is absent lies anywhere."""
+
+    block: list[float] | None = Field(default=None, min_length=3, max_length=3)
+    plate: list[float] | None = Field(default=None, min_length=2, max_length=2)
+
+
+class BenchRequest(Section):
+    """How a simulated bench is to be laid out; `id` names this reset, one is made up where none is given."""
+
+    id: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    seed: int = Field(ge=0, le=_HIGHEST_SEED)
+    positions: Positions | None = None
+
+
+class SetUpRequest(Section):
+    """`setup`: what differs from the deployment this time; what is absent is the deployment's own.
+
+    `policy` is merged into the deployment's own [policy] as a file over what it extends: a table of another
+    `kind` replaces it whole. `checkpoint` is only written down.
+    """
+
+    policy: Map | None = None
+    task: Annotated[str, Field(max_length=2000)] | None = None
+    checkpoint: Checkpoint | None = None
+    bench: BenchRequest | None = None
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """The tables that go on top of the deployment."""
+        wanted = {"policy": self.policy, "task": self.task}
+        return {key: value for key, value in wanted.items() if value is not None}
+
+
+class RunRequest(Section):
+    """`run`: `trial` is the asker's own and goes into the manifest as it is; `duration_s` ends this run [s].
+
+    Where operator or duration are absent, the deployment's own hold.
+    """
+
+    trial: Map | None = None
+    operator: Label | None = None
+    duration_s: float | None = Field(default=None, gt=0)
+
+
+Request = TypeVar("Request", bound=Section)
+
+
+def read(kind: str, model: type[Request], arguments: Mapping[str, Any]) -> Request:
+    """The arguments of a command `kind`; RuntimeFault names the key, what was given, what is allowed."""
+    if arguments and not model.model_fields:
+        raise RuntimeFault(f"{kind} takes no arguments; given: {', '.join(map(str, arguments))}")
+    try:
+        return model.model_validate(dict(arguments))
+    except ValidationError as invalid:
+        raise RuntimeFault(explanation(invalid, model, arguments, kind)) from None
