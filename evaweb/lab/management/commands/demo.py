@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from argparse import ArgumentParser
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,7 @@ class Command(BaseCommand):
             with a_lab(options["host"], options["port"]) as lab:
                 url, logins = self._up(lab, options["seed"])
                 if options["ready_file"]:
-                    _announce(options["ready_file"], url, logins)
+                    _announce(options["ready_file"], url, logins, lab.processes.pids())
                 if options["once"]:
                     self._once(url, logins[0], options)
                 else:
@@ -108,12 +109,12 @@ class Command(BaseCommand):
         self.stdout.write(text)
 
 
-def _announce(path: Path, url: str, logins: list[Login]) -> None:
+def _announce(path: Path, url: str, logins: list[Login], pids: Mapping[str, int]) -> None:
     """Whole or not at all, and readable by its user alone."""
     draft = path.with_name(f"{path.name}.{os.getpid()}")
     passwords = {login.username: login.password for login in logins}
     with os.fdopen(
         os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8"
     ) as file:
-        json.dump({"url": url, "passwords": passwords}, file)
+        json.dump({"url": url, "passwords": passwords, "pids": dict(pids)}, file)
     draft.replace(path)

@@ -1,0 +1,131 @@
+"""Twenty viewers of one running station: what they get, what they cost the control loop, what a stalled one costs.
+
+The whole demo runs: bench, policies, worker, web. The first trial has no viewer, the second twenty that draw,
+then ten that never read join a station that stands.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from benchmarks.report import Figure, Report
+from evaweb.lab.visitor import LivePage, Visitor
+
+_ROOT = Path(__file__).parents[1]
+_STATION = "bench-1"
+_VIEWERS, _STALLED = 20, 10
+_STREAMS = "state,joints,poses,camera/cam_high,camera/cam_left_wrist,camera/cam_right_wrist"
+
+
+def measure(seconds: float) -> Report:
+    """`viewer_p99_ms`, `stalled_viewer_mb`, `lateness_p99_ms` and the latter without viewers."""
+    with tempfile.TemporaryDirectory() as folder, _demo(Path(folder)) as (visitor, pids):
+        alone = _run(visitor, seconds, 0)
+        watched = _run(visitor, seconds, _VIEWERS)
+        stalled = _stalled(visitor, pids["web"], seconds)
+    ages = np.array(watched["ages_ms"])
+    figures = [
+        Figure("viewer_p50_ms", float(np.percentile(ages, 50)), "ms"),
+        Figure("viewer_p99_ms", float(np.percentile(ages, 99)), "ms", "<= 250"),
+        Figure("viewer_frames_per_s", float(np.mean(watched["frames"])) / seconds, "Hz"),
+        Figure("stalled_viewer_mb", stalled, "MB", "< 2"),
+        Figure("lateness_p99_ms", watched["control"]["lateness_p99_ms"], "ms", "<= 2"),
+        Figure("lateness_p99_ms.alone", alone["control"]["lateness_p99_ms"], "ms"),
+        Figure("missed_ticks", watched["control"]["missed"] - alone["control"]["missed"], "", "== 0"),
+    ]
+    rows = [{"viewers": n, **found["control"]} for n, found in ((0, alone), (_VIEWERS, watched))]
+    return Report("live", figures, rows)
+
+
+@contextmanager
+def _demo(folder: Path) -> Iterator[tuple[Visitor, dict[str, int]]]:
+    ready = folder / "ready.json"
+    environment = os.environ | {"EVA_DATA_DIR": str(folder / "data"), "EVA_LOG_LEVEL": "WARNING"}
+    child = subprocess.Popen(
+        [sys.executable, "manage.py", "demo", "--port", "0", "--ready-file", str(ready)],
+        cwd=_ROOT,
+        env=environment,
+        stdout=subprocess.DEVNULL,
+    )
+    try:
+        while not ready.exists():
+            if child.poll() is not None:
+                raise SystemExit(f"the demo ended with {child.returncode} before it was ready")
+            time.sleep(0.1)
+        found = json.loads(ready.read_text())
+        visitor = Visitor(found["url"])
+        visitor.login("operator", found["passwords"]["operator"])
+        yield visitor, found["pids"]
+    finally:
+        child.send_signal(signal.SIGINT)
+        child.wait(60)
+
+
+def _run(visitor: Visitor, seconds: float, viewers: int) -> Mapping[str, Any]:
+    """One trial of `seconds` while so many watch; it is voided afterwards."""
+    with closing(LivePage(visitor, _STATION)) as page:
+        page.wait(lambda state: state["state"] != "disconnected", 60, "waiting for the station")
+        page.claim()
+        choice = {"scene": "block-on-plate", "position": 1, "checkpoint": "pick-place-40k", "seed": 1}
+        trial = visitor.post(f"stations/{_STATION}/trials", choice)["id"]
+        page.wait(lambda state: state["lease"]["epoch"] == page.epoch, 10, "waiting for the lease")
+        page.command("setup", trial)
+        page.wait(lambda state: state["state"] == "ready", 60, "setting up")
+        page.command("run", trial)
+        page.wait(lambda state: state["state"] == "running", 10, "running")
+        found = _viewers(visitor, seconds, reading=viewers) if viewers else _wait(seconds)
+        state = page.wait(lambda state: True, 10, "looking")
+        page.command("stop")
+        page.wait(lambda state: state["state"] == "ready", 10, "stopping")
+        visitor.post(f"stations/{_STATION}/lease", {"action": "give_up", "page": page.page})
+    _void(visitor, trial)
+    return {**found, "control": state["control"]}
+
+
+def _wait(seconds: float) -> dict[str, Any]:
+    time.sleep(seconds)
+    return {}
+
+
+def _void(visitor: Visitor, trial: int) -> None:
+    while visitor.get(f"trials/{trial}")["status"] not in ("ended", "interrupted"):
+        time.sleep(0.1)
+    visitor.post(f"trials/{trial}/void", {"reason": "a benchmark"})
+
+
+def _viewers(visitor: Visitor, seconds: float, **counts: int) -> dict[str, Any]:
+    options = [part for name, count in counts.items() for part in (f"--{name}", str(count))]
+    command = [sys.executable, "-m", "benchmarks.viewers", visitor.url, _STATION, visitor.cookie("sessionid")]
+    command += ["--streams", _STREAMS, "--seconds", str(seconds), *options]
+    done = subprocess.run(command, cwd=_ROOT, stdout=subprocess.PIPE, text=True, check=True)
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def _stalled(visitor: Visitor, web: int, seconds: float) -> float:
+    """What the web has grown by per viewer that never reads [MB], at its largest."""
+    process = psutil.Process(web)
+    _viewers(visitor, 3.0, reading=1)  # what the first viewer costs once is no growth
+    before = process.memory_info().rss
+    largest = before
+    watching = threading.Thread(target=_viewers, args=(visitor, seconds), kwargs={"stalled": _STALLED})
+    watching.start()
+    while watching.is_alive():
+        largest = max(largest, process.memory_info().rss)
+        time.sleep(0.2)
+    watching.join()
+    return (largest - before) / _STALLED / 1e6
