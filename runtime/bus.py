@@ -22,6 +22,19 @@ from runtime.codecs import pack, unpack
 from runtime.errors import CodecError, TransportError
 from runtime.messages import Ack, Command, Event, decode, encode
 
+# What a client needs to talk to a station, with the errors that it may meet: this module is a door.
+__all__ = [
+    "CodecError",
+    "CommandClient",
+    "CommandServer",
+    "Endpoints",
+    "EventLog",
+    "Publisher",
+    "Subscriber",
+    "TransportError",
+    "bind",
+]
+
 log = logging.getLogger(__name__)
 RETRY_S = 1.0
 # What a publisher queues per reader that does not keep up, beyond which ZMQ drops the newest. It counts a

@@ -17,6 +17,8 @@ from runtime.config import Deployment
 from runtime.errors import ConfigurationError
 from runtime.explanation import Key, explanation
 
+__all__ = ["ConfigurationError", "Deployment", "Resolved", "changed", "load", "resolve"]
+
 
 @dataclass(frozen=True, slots=True)
 class Resolved:

@@ -15,8 +15,7 @@ from django.core.management import call_command
 from evaweb.lab import lifetime, programs
 from evaweb.lab.processes import LabError, Processes
 from evaweb.lab.seed import station_registered
-from runtime.deployment import load
-from runtime.errors import RuntimeFault
+from runtime.deployment import ConfigurationError, load
 
 _WATCH_S = 0.5
 
@@ -55,7 +54,7 @@ class Lab:
     def _register(self, bench: Bench) -> str:
         try:
             deployment = load(bench.deployment, bench.assignments).deployment
-        except RuntimeFault as fault:
+        except ConfigurationError as fault:
             raise LabError(str(fault)) from None
         station = station_registered(
             name=deployment.station,

@@ -12,6 +12,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 GROUND_FLOOR = {"types", "clock", "messages", "codecs", "errors", "section", "memory"}
+# By these alone the web comes in; to read a deployment file belongs to the configuration.
+DOORS = {"messages", "bus", "config", "deployment", "kinematics", "recording", "datasets"}
 FAMILY = {"control", "main", "media", "guard", "headless"}
 ROOF = FAMILY | {"lockstep", "supervisor", "ctl", "__main__"}
 
@@ -124,6 +126,71 @@ def test_no_import_goes_round_in_a_circle():
     except CycleError as error:
         pytest.fail(" -> ".join(error.args[1]))
     assert len(order) == len(MODULES)
+
+
+def behind_the_doors(path):
+    """Lines of a file of the web that enter the runtime where there is no door."""
+    tree = ast.parse(path.read_text("utf-8"))
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Import | ast.ImportFrom):
+            continue
+        names = [alias.name for alias in node.names]
+        if isinstance(node, ast.ImportFrom):
+            # `from runtime import bus` enters by bus; `from .runtime import x` is a module of the web's own.
+            names = [] if node.level else names if node.module == "runtime" else [node.module]
+            names = [f"runtime.{name}" for name in names] if node.module == "runtime" else names
+        for name in names:
+            package, _, rest = name.partition(".")
+            if package == "runtime" and rest.partition(".")[0] not in DOORS:
+                yield f"{path.name}:{node.lineno}: {name}"
+
+
+def test_the_web_enters_the_runtime_by_its_doors_alone():
+    found = [line for path in sorted((ROOT / "evaweb").rglob("*.py")) for line in behind_the_doors(path)]
+    assert found == []
+
+
+@pytest.mark.parametrize("door", sorted(DOORS))
+def test_every_door_is_there(door):
+    assert f"runtime.{door}" in MODULES
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ("import runtime.session", "runtime.session"),
+        ("import os, runtime.sim.node as node", "runtime.sim.node"),
+        ("import runtime", "runtime"),
+        ("from runtime import bus, client", "runtime.client"),
+        ("from runtime.client import StationClient", "runtime.client"),
+        ("from runtime.errors import RuntimeFault", "runtime.errors"),
+        ("from runtime.transports.zmq import Config", "runtime.transports.zmq"),
+        ("def view():\n    from runtime.busy import x", "runtime.busy"),
+        ("if TYPE_CHECKING:\n    from runtime.types import Observation", "runtime.types"),
+    ],
+)
+def test_who_comes_in_beside_the_doors_is_found(tmp_path, line, found):
+    path = tmp_path / "views.py"
+    path.write_text(f"{line}\n", "utf-8")
+    assert [one.rpartition(" ")[2] for one in behind_the_doors(path)] == [found]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from runtime import bus, messages",
+        "from runtime.bus import CommandClient",
+        "import runtime.datasets.catalog",
+        "from runtime.recording.reader import open_episode",
+        "from .runtime import anything",
+        "import runtimes",
+        "import robots",
+    ],
+)
+def test_who_comes_in_by_a_door_is_let_in(tmp_path, line):
+    path = tmp_path / "views.py"
+    path.write_text(f"{line}\n", "utf-8")
+    assert list(behind_the_doors(path)) == []
 
 
 ROBOTS = sorted(path.parent.name for path in (ROOT / "robots").glob("*/robot.toml"))
