@@ -130,6 +130,7 @@ class Command(models.Model):
     sequence = models.PositiveBigIntegerField(default=0)
     status = models.CharField(max_length=12, choices=CommandStatus, default=CommandStatus.PRESSED)
     reason = models.TextField(blank=True)
+    allowed = models.JSONField(default=list, blank=True, help_text="What would have been accepted then.")
     data = models.JSONField(default=dict, blank=True)
     issued_at = models.DateTimeField(auto_now_add=True)
     answered_at = models.DateTimeField(null=True, blank=True)

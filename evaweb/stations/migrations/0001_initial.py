@@ -206,6 +206,12 @@ class Migration(migrations.Migration):
                     ),
                 ),
                 ("reason", models.TextField(blank=True)),
+                (
+                    "allowed",
+                    models.JSONField(
+                        blank=True, default=list, help_text="What would have been accepted then."
+                    ),
+                ),
                 ("data", models.JSONField(blank=True, default=dict)),
                 ("issued_at", models.DateTimeField(auto_now_add=True)),
                 ("answered_at", models.DateTimeField(blank=True, null=True)),

@@ -1,0 +1,273 @@
+"""Commands: who gave which, and what became of it.
+
+A row first, then the wire, then the answer. The stopping commands go to the wire first and wait for no database.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import timedelta
+from typing import Any
+from uuid import UUID, uuid4
+
+from django.conf import settings
+from django.db import DatabaseError, IntegrityError, transaction
+from django.utils import timezone
+
+from evaweb.errors import Conflict, EvaError, StationGone
+from evaweb.roles import Role, require
+from evaweb.stations.models import Command, CommandStatus, Station
+from evaweb.stations.plain import plain
+from evaweb.stations.wire import NoAnswer, wire_to
+from runtime import messages
+
+log = logging.getLogger(__name__)
+STOPPING = ("stop", "halt", "estop")  # never stale; the runtime has the same list
+KINDS = ("setup", "run", "stop", "halt", "resume", "home", "release", "record_start", "record_stop", "estop")
+HARDWARE_STOP = "USE THE HARDWARE STOP"
+_ESTOP_S = 1.0  # what a person waits for before the page turns red
+_UNANSWERED = (CommandStatus.PRESSED, CommandStatus.UNKNOWN)
+_LONG_AGO = 0.0  # on the runtime's clock: a command that must not be carried out any more
+
+
+class NotSent(EvaError):
+    """The command was not sent, because it could not be written down."""
+
+    status = 503
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What became of a command; `allowed` names the commands that would be accepted now."""
+
+    status: CommandStatus
+    reason: str = ""
+    allowed: list[str] = field(default_factory=list)
+    data: dict[str, Any] = field(default_factory=dict)
+
+
+def holder_of(username: str, page: str) -> str:
+    """The name under which a page holds a lease."""
+    return f"web:{username}:{page}"
+
+
+def issue(
+    *,
+    user: Any,
+    station: Station,
+    kind: str,
+    args: Mapping[str, Any] | None = None,
+    page: str = "",
+    epoch: int = 0,
+    boot: str = "",
+    sequence: int = 0,
+    uuid: UUID | str | None = None,
+) -> Command:
+    """Give a command and return its row with the answer; the same uuid again returns the first one's.
+
+    `boot` and `sequence` are those of the snapshot that the page showed. Never call it within a transaction:
+    nobody else could write until the station has answered. Raises NotAllowed, Conflict for a uuid that is
+    another command's, NotSent where the database does not take the row.
+    """
+    row = Command(
+        uuid=_uuid(uuid),
+        station=station,
+        user=user,
+        kind=kind,
+        args=plain(dict(args or {})),
+        holder=holder_of(user.get_username(), page),
+        epoch=epoch,
+        boot=boot,
+        sequence=sequence,
+    )
+    if kind not in KINDS:
+        raise EvaError(f"command {kind!r:.40} is unknown; allowed: {', '.join(KINDS)}")
+    if kind != "estop":
+        require(user, Role.OPERATOR)
+    return _stop(row) if kind in STOPPING else _give(row)
+
+
+def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
+    """Press the e-stop of the station of that name; for any user, and without the database."""
+    command = messages.Command(str(uuid), "estop", {"why": why}, user=username, holder=username)
+    try:
+        answer = _answer_of(wire_to(station).urgent(command, "guard", "estop", _estop_s()))
+    except NoAnswer as fault:
+        answer = Answer(CommandStatus.UNKNOWN, f"{HARDWARE_STOP}: {fault}")
+    except StationGone as fault:
+        answer = Answer(CommandStatus.FAILED, f"{HARDWARE_STOP}: {fault}")
+    if answer.status is CommandStatus.REFUSED:
+        return Answer(CommandStatus.FAILED, f"{HARDWARE_STOP}: {answer.reason}", answer.allowed, answer.data)
+    return answer
+
+
+def estop_noted(*, user: Any, station: Station, why: str, uuid: UUID | str, answer: Answer) -> Command:
+    """The row of an e-stop that was pressed."""
+    row = Command(uuid=_uuid(uuid), station=station, user=user, kind="estop", args={"why": why})
+    return _noted(row, answer)
+
+
+def settle(*, row: Command) -> Command:
+    """Find out what became of a command whose answer was lost; leaves it as it is where nobody can know yet.
+
+    The runtime answers a uuid that it knows as it did the first time. One that it does not know comes too
+    late now, is refused, and is remembered as refused: it can never be carried out any more. A stopping
+    command never comes too late, and is therefore not asked about.
+    """
+    age = timezone.now() - row.issued_at
+    if row.kind in STOPPING or row.status not in _UNANSWERED or age < timedelta(seconds=_patience_s()):
+        return row
+    try:
+        answer = _answer_of(wire_to(row.station.name).request(_message(row, valid_until=_LONG_AGO)))
+    except StationGone:
+        return row
+    _put(row, answer)
+    _update(row)
+    return row
+
+
+def unsettled(*, station: Station) -> list[Command]:
+    """The commands of the last hour whose answers were lost."""
+    now = timezone.now()
+    return list(
+        station.commands.filter(
+            status__in=_UNANSWERED,
+            issued_at__lt=now - timedelta(seconds=_patience_s()),
+            issued_at__gt=now - timedelta(hours=1),
+        )
+        .exclude(kind__in=STOPPING)
+        .select_related("station", "user")
+    )
+
+
+def _give(row: Command) -> Command:
+    first = _first(row)
+    if first is not None:
+        return settle(row=first)
+    pressed = time.monotonic()
+    try:
+        with transaction.atomic(durable=True):
+            row.save(force_insert=True)
+    except IntegrityError:  # pressed twice in the same moment
+        first = _first(row)
+        if first is None:
+            raise
+        return first
+    except DatabaseError as error:
+        raise NotSent(
+            f"{row.kind} was not sent: the database does not take it now ({error}); stopping works"
+        ) from error
+    _put(row, _asked(row, waited=time.monotonic() - pressed))
+    _update(row)
+    return row
+
+
+def _asked(row: Command, waited: float) -> Answer:
+    """What the runtime says to a command whose row took `waited` seconds to be written."""
+    if waited > settings.EVA_COMMAND_TIMEOUT_S:
+        late = f"not sent: the database took {waited:.0f} s to write it down; look at the robot, press again"
+        return Answer(CommandStatus.FAILED, late)
+    try:
+        return _answer_of(wire_to(row.station.name).request(_message(row), expires=True))
+    except NoAnswer as fault:
+        return Answer(CommandStatus.UNKNOWN, str(fault))
+    except StationGone as fault:
+        return Answer(CommandStatus.FAILED, str(fault))
+
+
+def _stop(row: Command) -> Command:
+    if row.kind == "estop":
+        why, username = str(row.args.get("why", "pressed")), row.user.get_username()
+        return _noted(row, estop(station=row.station.name, username=username, why=why, uuid=row.uuid))
+    try:
+        ack = wire_to(row.station.name).urgent(
+            _message(row), "main", "commands", settings.EVA_COMMAND_TIMEOUT_S
+        )
+        answer = _answer_of(ack)
+    except NoAnswer as fault:
+        answer = Answer(CommandStatus.UNKNOWN, f"{fault}; the e-stop goes another way")
+    except StationGone as fault:
+        answer = Answer(CommandStatus.FAILED, str(fault))
+    return _noted(row, answer)
+
+
+def _noted(row: Command, answer: Answer) -> Command:
+    """Write down what has been done already; where the database refuses, the log has it."""
+    _put(row, answer)
+    try:
+        first = _first(row)
+        if first is None:
+            with transaction.atomic():
+                row.save(force_insert=True)
+        elif first.status in _UNANSWERED:
+            _update(row)
+        else:
+            return first
+    except IntegrityError:  # pressed twice in the same moment: the other one has written it
+        return row
+    except DatabaseError as error:
+        log.error("%s (%s) is not in the database: %s", row, row.uuid, error)
+    return row
+
+
+def _first(row: Command) -> Command | None:
+    """The row that has this uuid already; raises Conflict where it is another command."""
+    first = Command.objects.select_related("station", "user").filter(uuid=row.uuid).first()
+    if first and (first.station_id, first.user_id, first.kind) != (row.station_id, row.user_id, row.kind):
+        raise Conflict(f"uuid {row.uuid} is that of another command ({first}); each needs one of its own")
+    return first
+
+
+def _put(row: Command, answer: Answer) -> None:
+    row.status, row.reason = answer.status, answer.reason
+    row.allowed, row.data = answer.allowed, answer.data
+    row.answered_at = timezone.now()
+
+
+def _update(row: Command) -> None:
+    """Where the database refuses, `settle` asks the runtime again later."""
+    try:
+        row.save(update_fields=["status", "reason", "allowed", "data", "answered_at"])
+    except DatabaseError as error:
+        log.error(
+            "the answer to %s %s (%s) is not in the database: %s", row.kind, row.uuid, row.status, error
+        )
+
+
+def _message(row: Command, valid_until: float = float("inf")) -> messages.Command:
+    return messages.Command(
+        str(row.uuid),
+        row.kind,
+        row.args,
+        user=row.user.get_username() if row.user else "",
+        holder=row.holder,
+        epoch=row.epoch,
+        boot=row.boot,
+        sequence=row.sequence,
+        valid_until=valid_until,
+    )
+
+
+def _answer_of(ack: messages.Ack) -> Answer:
+    return Answer(CommandStatus(ack.status), ack.reason, list(ack.allowed), plain(ack.data))
+
+
+def _patience_s() -> float:
+    """After this time nobody waits for an answer any more [s]."""
+    return settings.EVA_COMMAND_TIMEOUT_S + 1.0
+
+
+def _estop_s() -> float:
+    return min(_ESTOP_S, settings.EVA_COMMAND_TIMEOUT_S)
+
+
+def _uuid(given: UUID | str | None) -> UUID:
+    if given is None:
+        return uuid4()
+    try:
+        return UUID(str(given))
+    except ValueError:
+        raise EvaError(f"uuid {given!r:.60}: must be a UUID such as {uuid4()}") from None

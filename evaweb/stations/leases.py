@@ -1,0 +1,225 @@
+"""Leases: the web says who may command a station, its runtime enforces it.
+
+A lease begins where the runtime has accepted it, and ends where the runtime says so; rows are the record of it.
+Renewing is a stream from the holder's page and touches no row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import timedelta
+from typing import Any
+from uuid import uuid4
+
+from django.contrib.auth import get_user_model
+from django.db import transaction
+from django.db.models import Max
+from django.utils import timezone
+
+from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
+from evaweb.roles import Role, require
+from evaweb.stations.commands import holder_of
+from evaweb.stations.models import Lease, LeaseRequest, Station
+from evaweb.stations.wire import wire_to
+from runtime import messages
+
+_ECHO = timedelta(seconds=3)  # for which an old snapshot may still be under way
+
+
+def claim(*, user: Any, station: Station, page: str) -> Lease:
+    """Take a station that nobody holds, or keep one's own; raises Conflict with who holds it."""
+    require(user, Role.OPERATOR)
+    _require_active(station)
+    holder = holder_of(user.get_username(), page)
+    held = _held(station)
+    if held["holder"] not in ("", holder):
+        raise Conflict(f"{who(held['holder'])} has {station}: ask for it, and it can be handed over")
+    epoch = held["epoch"] if held["holder"] else _next_epoch(station, held)
+    return _grant(station, holder, epoch, end_reason="expired")
+
+
+def renew(*, username: str, page: str, station: str, epoch: int) -> messages.Ack:
+    """Pass a page's sign of life on to the runtime, which alone decides; no row, no database."""
+    return _tell(station, "lease_renew", holder_of(username, page), epoch)
+
+
+def give_up(*, user: Any, station: Station, page: str) -> Lease:
+    """End one's own lease; a run that is going on is held then."""
+    lease = _own(user, station, page)
+    ack = _tell(station.name, "lease_give_up", lease.holder, lease.epoch)
+    if ack.status == "refused":
+        raise Conflict(ack.reason)
+    _end(lease, "given up")
+    return lease
+
+
+def request(*, user: Any, station: Station, page: str) -> LeaseRequest:
+    """Ask the holder to hand the station over; asking again moves the request to the page that asks."""
+    require(user, Role.OPERATOR)
+    _require_active(station)
+    holder, held = holder_of(user.get_username(), page), _held(station)["holder"]
+    if not held:
+        raise Conflict(f"nobody has {station}: take it")
+    if held == holder:
+        raise Conflict(f"this page has {station} already")
+    asked, _ = LeaseRequest.objects.update_or_create(
+        station=station, user=user, answer=LeaseRequest.Answer.OPEN, defaults={"holder": holder}
+    )
+    return asked
+
+
+def withdraw(*, user: Any, station: Station) -> LeaseRequest:
+    """Take one's request back."""
+    asked = LeaseRequest.objects.filter(station=station, user=user, answer=LeaseRequest.Answer.OPEN).first()
+    if asked is None:
+        raise NotFound(f"{user.get_username()} has not asked for {station}, or was answered already")
+    return _answered(asked, LeaseRequest.Answer.WITHDRAWN)
+
+
+def decline(*, user: Any, station: Station, page: str, request: int) -> LeaseRequest:
+    """The holder says no to a request."""
+    _own(user, station, page)
+    return _answered(_open_request(station, request), LeaseRequest.Answer.DECLINED)
+
+
+def hand_over(*, user: Any, station: Station, page: str, request: int) -> Lease:
+    """The holder gives the station to the page that asked; a run goes on without a pause."""
+    own = _own(user, station, page)
+    asked = _open_request(station, request)
+    held = _held(station)
+    if (held["holder"], held["epoch"]) != (own.holder, own.epoch):
+        raise Conflict(f"the lease has ended: {who(held['holder']) or 'nobody'} has {station} now")
+    lease = _grant(station, asked.holder, _next_epoch(station, held), f"handed over to {asked.user}")
+    _answered(asked, LeaseRequest.Answer.GRANTED)
+    return lease
+
+
+def take(*, user: Any, station: Station, page: str, reason: str) -> Lease:
+    """An administrator takes the station from whoever has it, and says why."""
+    require(user, Role.ADMIN)
+    if not reason.strip():
+        raise EvaError("taking a station from somebody needs a reason; it is written down and shown")
+    holder = holder_of(user.get_username(), page)
+    epoch = _next_epoch(station, _held(station))
+    return _grant(station, holder, epoch, f"taken by {user.get_username()}: {reason.strip()}"[:240])
+
+
+def notice(*, station: Station, boot: str, held: Mapping[str, Any]) -> bool:
+    """Write down what the runtime says of its lease (a snapshot's "lease"); True where rows had to change.
+
+    This is how a lease ends that expired, and how one comes into the records that a terminal or a script took.
+    A snapshot older than the newest row of the same boot says nothing new.
+    """
+    holder, epoch = str(held["holder"]), int(held["epoch"])
+    with transaction.atomic():
+        _lock(station)
+        last = station.leases.filter(ended_at=None).first()
+        if last and last.boot == boot and last.epoch > epoch:
+            return False
+        if not holder:
+            return last is not None and _end(last, _why_over(last, boot))
+        return _record(station, holder, epoch, boot, _why_over(last, boot) if last else "")[1]
+
+
+def who(holder: str) -> str:
+    """A holder's name as people know it."""
+    return holder.split(":")[1] if holder.startswith("web:") else holder
+
+
+def _why_over(lease: Lease, boot: str) -> str:
+    return "expired: it was not renewed" if lease.boot == boot else "the station was restarted"
+
+
+def _require_active(station: Station) -> None:
+    if not station.active:
+        raise NotAllowed(f"{station} is switched off: {station.message or 'ask an administrator'}")
+
+
+def _held(station: Station) -> dict[str, Any]:
+    """The lease as the runtime has it now: holder, epoch."""
+    held: dict[str, Any] = wire_to(station.name).status()["lease"]
+    return held
+
+
+def _next_epoch(station: Station, held: Mapping[str, Any]) -> int:
+    """Above all that runtime and rows have seen: a runtime whose folder was lost begins anew."""
+    return 1 + max(int(held["epoch"]), station.leases.aggregate(newest=Max("epoch"))["newest"] or 0)
+
+
+def _tell(station: str, kind: str, holder: str, epoch: int) -> messages.Ack:
+    """A lease command to the runtime."""
+    user = who(holder)
+    command = messages.Command(str(uuid4()), kind, user=user, holder=holder, epoch=epoch)
+    return wire_to(station).request(command)
+
+
+def _grant(station: Station, holder: str, epoch: int, end_reason: str) -> Lease:
+    """Have the runtime accept the lease, then write it down; raises Conflict where somebody was faster."""
+    ack = _tell(station.name, "lease_claim", holder, epoch)
+    if ack.status == "refused":
+        raise Conflict(f"{station} was not given: {ack.reason}")
+    with transaction.atomic():
+        _lock(station)
+        return _record(station, holder, epoch, ack.boot, end_reason)[0]
+
+
+def _record(station: Station, holder: str, epoch: int, boot: str, end_reason: str) -> tuple[Lease, bool]:
+    """The open row of this lease, all others ended; and whether anything had to change."""
+    others = station.leases.filter(ended_at=None).exclude(epoch=epoch)
+    changed = others.update(ended_at=timezone.now(), end_reason=end_reason) > 0
+    lease, created = Lease.objects.get_or_create(
+        station=station, epoch=epoch, defaults={"holder": holder, "boot": boot, "user": _user_of(holder)}
+    )
+    if created or _just_ended(lease) or (lease.ended_at, lease.holder, lease.boot) == (None, holder, boot):
+        return lease, changed or created
+    lease.ended_at, lease.end_reason, lease.holder, lease.boot = None, "", holder, boot
+    lease.user = _user_of(holder)
+    lease.save()
+    return lease, True
+
+
+def _just_ended(lease: Lease) -> bool:
+    """What is heard of it now was said before it ended."""
+    return lease.ended_at is not None and timezone.now() - lease.ended_at < _ECHO
+
+
+def _lock(station: Station) -> None:
+    """Others that write this station's leases wait until the transaction ends."""
+    Station.objects.select_for_update().get(pk=station.pk)
+
+
+def _user_of(holder: str) -> Any:
+    users = get_user_model().objects
+    return users.filter(username=who(holder)).first() if holder.startswith("web:") else None
+
+
+def _own(user: Any, station: Station, page: str) -> Lease:
+    holder = holder_of(user.get_username(), page)
+    lease = station.leases.filter(ended_at=None, holder=holder).first()
+    if lease is None:
+        raise Conflict(f"this page does not have {station}")
+    return lease
+
+
+def _open_request(station: Station, request: int) -> LeaseRequest:
+    found = LeaseRequest.objects.filter(pk=request, station=station).select_related("user").first()
+    if found is None:
+        raise NotFound(f"request {request} for {station} does not exist")
+    if found.answer != LeaseRequest.Answer.OPEN:
+        raise Conflict(f"the request of {found.user} was {found.get_answer_display()} already")
+    return found
+
+
+def _answered(asked: LeaseRequest, answer: LeaseRequest.Answer) -> LeaseRequest:
+    asked.answer, asked.answered_at = answer, timezone.now()
+    asked.save(update_fields=["answer", "answered_at"])
+    return asked
+
+
+def _end(lease: Lease, reason: str) -> bool:
+    """End the row unless it has ended; True where it had not."""
+    lease.ended_at, lease.end_reason = timezone.now(), reason
+    changed = Lease.objects.filter(pk=lease.pk, ended_at=None).update(
+        ended_at=lease.ended_at, end_reason=reason
+    )
+    return changed > 0

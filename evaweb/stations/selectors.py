@@ -1,0 +1,37 @@
+"""What is known of stations."""
+
+from __future__ import annotations
+
+from django.db.models import QuerySet
+
+from evaweb.errors import NotFound
+from evaweb.stations.models import Command, Lease, LeaseRequest, Station
+
+
+def station_list(*, all_of_them: bool = False) -> QuerySet[Station]:
+    """The stations that are offered to operators, or all."""
+    return Station.objects.all() if all_of_them else Station.objects.filter(active=True)
+
+
+def station_get(*, name: str) -> Station:
+    """The station of that name; NotFound lists those that there are."""
+    found = Station.objects.filter(name=name).first()
+    if found is None:
+        known = ", ".join(Station.objects.values_list("name", flat=True)) or "none yet"
+        raise NotFound(f"station {name!r:.80} does not exist; there are: {known}")
+    return found
+
+
+def lease_open(*, station: Station) -> Lease | None:
+    """Who has the station, as far as the database knows."""
+    return station.leases.filter(ended_at=None).select_related("user").first()
+
+
+def request_list(*, station: Station) -> QuerySet[LeaseRequest]:
+    """Who asks for the station and waits, the first who asked first."""
+    return station.lease_requests.filter(answer=LeaseRequest.Answer.OPEN).select_related("user")
+
+
+def command_list(*, station: Station, limit: int = 100) -> QuerySet[Command]:
+    """The newest commands first."""
+    return station.commands.select_related("user")[:limit]

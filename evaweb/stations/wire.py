@@ -1,0 +1,131 @@
+"""The connection of this process to a station's runtime: requests with a deadline, from any thread.
+
+Knows the bus and no rules: who may ask for what is decided in leases and commands. Nothing here touches the
+database, so that stopping works without it.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from dataclasses import replace
+from functools import cache
+from typing import Any
+from uuid import uuid4
+
+import zmq
+from django.conf import settings
+
+from evaweb.errors import NotFound, StationGone
+from evaweb.stations.models import STATION_NAME
+from evaweb.stations.plain import plain
+from runtime.bus import CodecError, CommandClient, Endpoints, TransportError
+from runtime.messages import Ack, Command
+
+_CLOCK_KNOWN_S = 60.0  # how long the difference of two computers' clocks is believed
+
+
+class NoAnswer(StationGone):
+    """The request may have arrived and may have been carried out: nobody knows."""
+
+    status = 504
+
+
+class StationWire:
+    """One station; its sockets are found anew where its runtime was restarted."""
+
+    def __init__(self, name: str) -> None:
+        if not re.fullmatch(STATION_NAME, name):
+            raise NotFound(f"station {name!r:.80}: letters, digits, '.', '_' and '-' make a name")
+        self.name = name
+        self.endpoints = Endpoints(settings.DATA_DIR / "stations" / name)
+        self._lock = threading.Lock()
+        self._client: CommandClient | None = None
+        self._endpoint = ""
+        self._ahead = 0.0  # its clock minus ours [s]
+        self._ahead_known = -float("inf")
+
+    def request(self, command: Command, *, timeout: float | None = None, expires: bool = False) -> Ack:
+        """The answer of main; one request at a time over a connection that is kept.
+
+        With `expires` the command is void once we have given up waiting for its answer: it can never be
+        carried out behind the back of somebody who was told that it was lost. Raises StationGone where it was
+        not sent, NoAnswer where nobody knows.
+        """
+        deadline = time.monotonic() + (timeout or settings.EVA_COMMAND_TIMEOUT_S)
+        if not self._lock.acquire(timeout=max(0.0, deadline - time.monotonic())):
+            raise StationGone(f"{self.name} does not answer: {command.kind} was not sent")
+        try:
+            client = self._connected()
+            if expires:
+                self._learn_clock(client, command.kind, deadline)
+                command = replace(command, valid_until=deadline + self._ahead)
+            return self._ask(client, command, deadline)
+        finally:
+            self._lock.release()
+
+    def urgent(self, command: Command, process: str, key: str, timeout: float) -> Ack:
+        """The answer over a connection of its own: nothing that hangs stands before it.
+
+        `process` and `key` name the socket: main's "commands", the guard's "estop".
+        """
+        client = CommandClient(zmq.Context.instance(), self.address(process, key))
+        try:
+            return self._ask(client, command, time.monotonic() + timeout)
+        finally:
+            client.close()
+
+    def status(self, timeout: float | None = None) -> dict[str, Any]:
+        """The newest snapshot, as JSON may carry it; raises StationGone."""
+        found: dict[str, Any] = plain(self.request(Command(str(uuid4()), "status"), timeout=timeout).data)
+        return found
+
+    def events_since(self, number: int, timeout: float | None = None) -> tuple[str, list[dict[str, Any]]]:
+        """The runtime's boot id and its events after `number`, as JSON may carry them; raises StationGone."""
+        ack = self.request(Command(str(uuid4()), "events_since", {"number": number}), timeout=timeout)
+        return ack.boot, plain(ack.data.get("events", []))
+
+    def address(self, process: str, key: str) -> str:
+        """Where a socket is, as its process last wrote it; raises StationGone where there is none."""
+        try:
+            return str(self.endpoints.read(process)[key])
+        except (TransportError, KeyError):
+            raise StationGone(f"{self.name} is not running: its runtime has to be started") from None
+
+    def _connected(self) -> CommandClient:
+        endpoint = self.address("main", "commands")
+        if self._client is None or endpoint != self._endpoint:
+            if self._client is not None:
+                self._client.close()
+            self._client, self._endpoint = CommandClient(zmq.Context.instance(), endpoint), endpoint
+            self._ahead_known = -float("inf")
+        return self._client
+
+    def _learn_clock(self, client: CommandClient, kind: str, deadline: float) -> None:
+        if time.monotonic() - self._ahead_known < _CLOCK_KNOWN_S:
+            return
+        try:
+            ack = self._ask(client, Command(str(uuid4()), "status"), deadline)
+            clock = float(ack.data["clock"])
+        except (NoAnswer, KeyError):
+            raise StationGone(f"{self.name} does not answer: {kind} was not sent") from None
+        self._ahead_known = time.monotonic()
+        self._ahead = clock - self._ahead_known
+
+    def _ask(self, client: CommandClient, command: Command, deadline: float) -> Ack:
+        try:
+            return client.request(command, max(0.0, deadline - time.monotonic()))
+        except TransportError:
+            unknown = "" if command.kind == "status" else ": outcome unknown, look at the robot"
+            raise NoAnswer(f"{self.name} has not answered {command.kind} in time{unknown}") from None
+        except CodecError as error:
+            raise NoAnswer(
+                f"{self.name} answered {command.kind} with what cannot be read: {error}"
+            ) from error
+
+
+@cache
+def wire_to(name: str) -> StationWire:
+    """This process's wire to the station; raises NotFound for what cannot be a station's name."""
+    return StationWire(name)
