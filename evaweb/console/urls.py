@@ -2,6 +2,15 @@
 
 from __future__ import annotations
 
-from django.urls import URLPattern
+from django.urls import path
 
-urlpatterns: list[URLPattern] = []
+from evaweb.console import views
+
+urlpatterns = [
+    path("", views.home, name="home"),
+    path("stations/<str:name>/", views.station, name="station"),
+    path("stations/<str:name>/debug/", views.debug, name="station-debug"),
+    path("stations/<str:name>/eval/", views.evaluate, name="station-eval"),
+    path("stations/<str:name>/eval/panel", views.panel, name="station-panel"),
+    path("stations/<str:name>/lease", views.lease, name="station-lease"),
+]

@@ -1,0 +1,40 @@
+"""The tab bar: which pages there are, and which one an address belongs to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from django.http import HttpRequest
+from django.urls import reverse
+
+from evaweb.console import selectors
+
+
+@dataclass(frozen=True, slots=True)
+class Tab:
+    """One tab; `current` where the page that is shown belongs to it."""
+
+    title: str
+    address: str
+    current: bool
+
+
+_STATION_TABS = (("Debug", "station-debug"), ("Eval", "station-eval"))
+_LAB_TABS = (("Replay", "/replay/"), ("Result", "/result/"))
+
+
+def of(request: HttpRequest) -> list[Tab]:
+    """The tabs in their order; those of a station lead to the one this browser last used."""
+    station = selectors.station_last_used(session=request.session)
+    match = request.resolver_match
+    name = match.url_name if match else ""
+    at_station = [
+        Tab(
+            title,
+            reverse(route, args=[station.name]) if station else reverse("home") + "#stations",
+            name == route,
+        )
+        for title, route in _STATION_TABS
+    ]
+    in_lab = [Tab(title, address, request.path.startswith(address)) for title, address in _LAB_TABS]
+    return at_station + in_lab

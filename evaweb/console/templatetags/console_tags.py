@@ -1,0 +1,24 @@
+"""What every page's bar shows: the tabs, and the role of who is logged in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django import template
+
+from evaweb.console import tabs
+from evaweb.roles import role_of
+
+register = template.Library()
+
+
+@register.inclusion_tag("console/tabs.html", takes_context=True)
+def tab_bar(context: template.Context) -> dict[str, Any]:
+    """The tabs that exist, with the one that this address belongs to."""
+    return {"tabs": tabs.of(context["request"])}
+
+
+@register.simple_tag
+def role_name(user: Any) -> str:
+    """The highest role of a user."""
+    return role_of(user).value

@@ -1,0 +1,103 @@
+"""The pages of the console and the fragments they fetch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django.http import Http404, HttpRequest, HttpResponse
+from django.shortcuts import redirect, render
+from django.templatetags.static import static
+from django.urls import reverse
+
+from evaweb.console import selectors
+from evaweb.errors import NotFound
+from evaweb.roles import role_of
+from evaweb.stations.models import Station
+
+
+def home(request: HttpRequest) -> HttpResponse:
+    """The stations of the lab."""
+    template = "console/stations.html" if request.htmx else "console/home.html"  # type: ignore[attr-defined]
+    return render(request, template, {"rows": selectors.station_rows()})
+
+
+def station(request: HttpRequest, name: str) -> HttpResponse:
+    """A station's address without a page."""
+    return redirect("station-eval", name=_station(name).name)
+
+
+def debug(request: HttpRequest, name: str) -> HttpResponse:
+    """A station by hand: every command, every figure."""
+    return _page(request, _station(name), "debug", {})
+
+
+def evaluate(request: HttpRequest, name: str) -> HttpResponse:
+    """A station with the trial that is being made there."""
+    found = _station(name)
+    return _page(request, found, "eval", _panel(request, found))
+
+
+def panel(request: HttpRequest, name: str) -> HttpResponse:
+    """The four steps of a trial, to be put into the page."""
+    return render(request, "console/panel.html", _panel(request, _station(name)))
+
+
+def lease(request: HttpRequest, name: str) -> HttpResponse:
+    """Who commands and who waits for it, to be put into the page."""
+    return render(request, "console/lease.html", _lease(request, _station(name)))
+
+
+def _station(name: str) -> Station:
+    try:
+        return selectors.station_get(name=name)
+    except NotFound as error:
+        raise Http404(str(error)) from None
+
+
+def _page(request: HttpRequest, station: Station, page: str, extra: dict[str, Any]) -> HttpResponse:
+    request.session[selectors.SESSION_KEY] = station.name
+    robot = selectors.joint_units(robot=station.robot)
+    context = {
+        "station": station,
+        "robot": robot,
+        "config": _config(request, station, page, robot),
+        **_lease(request, station),
+        **extra,
+    }
+    return render(request, f"console/{page}.html", context)
+
+
+def _config(request: HttpRequest, station: Station, page: str, robot: dict[str, Any]) -> dict[str, Any]:
+    """What the page's modules have to know before the socket is open."""
+    api = f"/api/v1/stations/{station.name}"
+    return {
+        "page": page,
+        "station": station.name,
+        "user": request.user.get_username(),
+        "role": role_of(request.user).value,
+        "simulated": station.simulated,
+        "joints": robot["names"],
+        "units": robot["units"],
+        "cameras": robot["cameras"],
+        "socket": f"/ws/stations/{station.name}",
+        "geometry": f"/stations/{station.name}/geometry",
+        "lease": reverse("station-lease", args=[station.name]),
+        "api": {"lease": f"{api}/lease", "commands": f"{api}/commands", "estop": f"{api}/estop"},
+        "trials": f"{api}/trials",
+        "trial": "/api/v1/trials",
+        "uplot": static("uplot/uPlot.esm.js"),
+    }
+
+
+def _panel(request: HttpRequest, station: Station) -> dict[str, Any]:
+    return {"panel": selectors.panel(station=station, scene=request.GET.get("scene", "")), "station": station}
+
+
+def _lease(request: HttpRequest, station: Station) -> dict[str, Any]:
+    waiting = list(selectors.lease_requests(station=station))
+    return {
+        "station": station,
+        "role": role_of(request.user).value,
+        "waiting": waiting,
+        "mine": next((one for one in waiting if one.user_id == request.user.pk), None),
+    }
