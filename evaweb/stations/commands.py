@@ -18,9 +18,9 @@ from django.db import DatabaseError, IntegrityError, transaction
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, StationGone
+from evaweb.frames import plain
 from evaweb.roles import Role, require
 from evaweb.stations.models import Command, CommandStatus, Station
-from evaweb.stations.plain import plain
 from evaweb.stations.wire import NoAnswer, wire_to
 from runtime import messages
 

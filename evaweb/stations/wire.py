@@ -18,8 +18,8 @@ import zmq
 from django.conf import settings
 
 from evaweb.errors import NotFound, StationGone
+from evaweb.frames import plain
 from evaweb.stations.models import STATION_NAME
-from evaweb.stations.plain import plain
 from runtime.bus import CodecError, CommandClient, Endpoints, TransportError
 from runtime.messages import Ack, Command
 
