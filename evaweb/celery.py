@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 
 os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
@@ -9,13 +10,17 @@ os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
 from celery import Celery
 from django.conf import settings
 
+log = logging.getLogger(__name__)
 app = Celery("evaweb")
 
 
 def _filesystem() -> dict[str, object]:
     folder = settings.DATA_DIR / "broker"
     for part in ("queue", "processed", "control"):
-        (folder / part).mkdir(parents=True, exist_ok=True)
+        try:
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        except OSError as error:  # no doorbell then; workers look for jobs all the same
+            log.warning("%s cannot be made: %s", folder / part, error.strerror)
     return {
         "data_folder_in": str(folder / "queue"),
         "data_folder_out": str(folder / "queue"),
@@ -27,12 +32,13 @@ def _filesystem() -> dict[str, object]:
 
 
 app.conf.update(
-    broker_url=settings.REDIS_URL or "filesystem://",
-    broker_transport_options={} if settings.REDIS_URL else _filesystem(),
+    broker_url=settings.REDIS_URL or "filesystem://localhost/",
+    broker_transport_options={"socket_connect_timeout": 2.0} if settings.REDIS_URL else _filesystem(),
     task_ignore_result=True,
     task_acks_late=True,
     worker_prefetch_multiplier=1,
     worker_hijack_root_logger=False,
+    worker_enable_remote_control=False,
     broker_connection_retry_on_startup=True,
 )
 app.autodiscover_tasks(["evaweb.jobs"])

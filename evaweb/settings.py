@@ -164,4 +164,7 @@ LOGGING = {
 
 # How long a request waits for a station's answer [s]; after it the outcome is unknown.
 EVA_COMMAND_TIMEOUT_S = environment.seconds("EVA_COMMAND_TIMEOUT_S", 2.0)
+# Without a sign of life for so long a worker's job is taken from it [s].
 EVA_JOB_STALE_S = environment.seconds("EVA_JOB_STALE_S", 60.0)
+# How long a worker that is told to end may finish its job [s]; then it puts it back.
+EVA_WORKER_GRACE_S = environment.seconds("EVA_WORKER_GRACE_S", 12.0)

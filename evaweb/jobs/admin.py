@@ -1,0 +1,36 @@
+"""Jobs in the admin pages: to look at, and to ask for anew."""
+
+from __future__ import annotations
+
+from django.contrib import admin, messages
+from django.db.models import QuerySet
+from django.http import HttpRequest
+
+from evaweb.jobs import services
+from evaweb.jobs.models import Job, JobStatus
+
+
+@admin.register(Job)
+class JobAdmin(admin.ModelAdmin):
+    """Rows are written by services alone."""
+
+    list_display = ("key", "status", "attempts", "queue", "created_at", "finished_at", "progress", "error")
+    list_filter = ("status", "kind", "queue")
+    search_fields = ("key", "error")
+    actions = ("try_again",)
+
+    @admin.action(description="Try failed jobs again", permissions=("view",))
+    def try_again(self, request: HttpRequest, jobs: QuerySet) -> None:
+        failed = list(jobs.filter(status=JobStatus.FAILED))
+        for job in failed:
+            services.try_again(job=job)
+        self.message_user(request, f"{len(failed)} asked for anew", messages.SUCCESS)
+
+    def has_add_permission(self, request: HttpRequest) -> bool:
+        return False
+
+    def has_change_permission(self, request: HttpRequest, obj: Job | None = None) -> bool:
+        return False
+
+    def has_delete_permission(self, request: HttpRequest, obj: Job | None = None) -> bool:
+        return False

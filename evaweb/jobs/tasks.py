@@ -1,0 +1,12 @@
+"""What celery calls; a task is one line."""
+
+from __future__ import annotations
+
+from evaweb.celery import app
+from evaweb.jobs import services
+
+
+@app.task(name="evaweb.jobs.work")
+def work(queue: str) -> None:
+    """The doorbell of a queue."""
+    services.work(queue)

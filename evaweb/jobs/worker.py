@@ -1,0 +1,112 @@
+"""The worker's process: celery for the doorbell, and a second look every few seconds for what it lost."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from functools import partial
+
+from celery.worker import state as celery_state
+from django.conf import settings
+from django.db import close_old_connections, connection
+
+from evaweb.celery import app
+from evaweb.jobs import services
+from evaweb.jobs.kinds import chores
+from evaweb.jobs.patience import patiently
+
+log = logging.getLogger(__name__)
+
+LOOK_EVERY_S = 3.0
+BROKER_AGAIN_S = 30.0
+
+
+def run(queues: Sequence[str], *, lifeline: bool) -> None:
+    """Work until SIGTERM, SIGINT or, with `lifeline`, the end of standard input.
+
+    What is being done then is finished, or put back after EVA_WORKER_GRACE_S seconds.
+    """
+    os.nice(19)
+    ending = _ending_by_signal()
+    if lifeline:
+        threading.Thread(target=_watch_input, name="lifeline", daemon=True).start()
+    looking = threading.Thread(target=_look, args=(queues, ending), name="looking")
+    looking.start()
+    log.info("working on %s in %s", ", ".join(queues), settings.DATA_DIR)
+    while not ending.is_set():
+        _answer_doorbell(queues)
+        if not ending.is_set():
+            log.error("no doorbell for %g s; jobs are looked for every %g s", BROKER_AGAIN_S, LOOK_EVERY_S)
+            ending.wait(BROKER_AGAIN_S)
+    looking.join()
+    log.info("the worker has ended")
+
+
+def _ending_by_signal() -> threading.Event:
+    ending = threading.Event()
+
+    def end(number: int, frame: object) -> None:
+        if ending.is_set():
+            return
+        ending.set()
+        services.end_work()
+        celery_state.should_stop = 0  # where its own handlers would put it
+        threading.Thread(target=_put_back_later, name="grace", daemon=True).start()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, end)
+    return ending
+
+
+def _put_back_later() -> None:
+    """End the process at the end of its grace; every kind of job can be ended at any moment and done again."""
+    threading.Event().wait(settings.EVA_WORKER_GRACE_S)
+    try:
+        count = patiently(lambda: services.put_back(worker_prefix=services.own_prefix()))
+        log.warning("not done within %g s of grace: %d put back", settings.EVA_WORKER_GRACE_S, count)
+    finally:
+        os._exit(0)  # the row tells the rest: a job that is not put back is swept
+
+
+def _watch_input() -> None:
+    while os.read(sys.stdin.fileno(), 4096):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _answer_doorbell(queues: Sequence[str]) -> None:
+    """Celery in this thread until it is told to stop; it returns where its broker does not work."""
+    worker = app.WorkController(
+        pool="solo",
+        concurrency=1,
+        queues=list(queues),
+        hostname=f"eva-{os.getpid()}@%h",
+        without_gossip=True,
+        without_mingle=True,
+        without_heartbeat=True,
+    )
+    worker.start()
+
+
+def _look(queues: Sequence[str], ending: threading.Event) -> None:
+    """Sweep, look after the chores, and do what waits, whether or not a doorbell has rung."""
+    while not ending.is_set():
+        close_old_connections()
+        for name, task in {"sweep": services.sweep, **chores()}.items():
+            _attempt(name, partial(patiently, task))
+        for queue in queues:
+            _attempt(f"queue {queue}", partial(services.work, queue))
+        ending.wait(LOOK_EVERY_S)
+    connection.close()
+
+
+def _attempt(name: str, action: Callable[[], object]) -> None:
+    try:
+        action()
+    except Exception:  # of whatever kind: the next look is a few seconds away, and this thread must see it
+        log.exception("%s failed, again in %g s", name, LOOK_EVERY_S)
+        connection.close()

@@ -1,0 +1,35 @@
+"""Signs of life go on through a locked database and stop with the work."""
+
+from __future__ import annotations
+
+import threading
+
+from django.db import OperationalError
+
+from evaweb.jobs.heartbeat import Heartbeat
+
+
+def test_it_beats_until_the_block_is_left_also_after_an_error() -> None:
+    beats: list[int] = []
+    enough = threading.Event()
+
+    def beat() -> bool:
+        beats.append(len(beats))
+        if len(beats) == 2:
+            raise OperationalError("database is locked")
+        if len(beats) == 4:
+            enough.set()
+        return True
+
+    with Heartbeat(beat, 0.001):
+        assert enough.wait(20)
+    counted = len(beats)
+    assert counted >= 4
+    assert not [thread for thread in threading.enumerate() if thread.name == "heartbeat"]
+
+
+def test_it_stops_where_the_job_is_not_ours_any_more() -> None:
+    beats: list[int] = []
+    with Heartbeat(lambda: bool(beats.append(1)), 0.001) as heart:
+        heart._thread.join(20)
+        assert beats == [1]

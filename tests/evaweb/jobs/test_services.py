@@ -1,0 +1,220 @@
+"""Jobs from being asked for to their end: one at a time, once, and nothing lost."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+
+import pytest
+from django.db import OperationalError
+from django.utils import timezone
+
+from evaweb.jobs import patience, services
+from evaweb.jobs.kinds import UnknownKind, Work
+from evaweb.jobs.models import Job, JobStatus
+from tests.evaweb.jobs.conftest import Toy
+
+pytestmark = [pytest.mark.django_db, pytest.mark.usefixtures("rung")]
+
+
+def enqueue(**args: object) -> Job:
+    return services.enqueue(kind="toy", key="toy:1", args=args)
+
+
+def silent(job: Job, seconds: float = 120.0) -> None:
+    """Make the job look as if its worker had last been seen so long ago."""
+    Job.objects.filter(pk=job.pk).update(seen_at=timezone.now() - timedelta(seconds=seconds))
+
+
+def due(job: Job) -> None:
+    Job.objects.filter(pk=job.pk).update(not_before=None)
+
+
+def test_a_job_is_done_and_keeps_its_result(toy: Toy) -> None:
+    job = enqueue(a=1)
+    assert services.work("lab") == 1
+    job.refresh_from_db()
+    assert (job.status, job.result, job.attempts) == (JobStatus.DONE, {"seen": {"a": 1}}, 1)
+    assert job.finished_at is not None
+    assert services.work("lab") == 0
+
+
+@pytest.mark.django_db(transaction=True)
+def test_the_doorbell_rings_when_the_row_can_be_seen(toy: Toy, rung: list[str]) -> None:
+    services.enqueue(kind="toy", key="k", args={}, queue="bench-1")
+    assert rung == ["bench-1"]
+
+
+def test_the_same_key_twice_is_one_job_with_the_newest_args(toy: Toy) -> None:
+    assert enqueue(a=1).pk == enqueue(a=2).pk
+    services.work("lab")
+    assert toy.asked == [{"a": 2}]
+
+
+def test_what_is_asked_for_while_the_same_is_being_done_is_done_once_more_afterwards(toy: Toy) -> None:
+    enqueue(a=1)
+
+    def ask_again(work: Work) -> dict[str, object]:
+        if work.args["a"] == 1:
+            enqueue(a=2)
+            assert services.claim(queue="lab", worker="other") is None, "two of one key at once"
+        return {}
+
+    toy.does = ask_again
+    assert services.work("lab") == 2
+    assert toy.asked == [{"a": 1}, {"a": 2}]
+
+
+def test_of_two_workers_one_gets_the_job(toy: Toy) -> None:
+    enqueue()
+    first = services.claim(queue="lab", worker="one")
+    assert first is not None
+    assert services.claim(queue="lab", worker="two") is None
+
+
+def test_another_queue_is_left_alone(toy: Toy) -> None:
+    enqueue()
+    assert services.work("bench-2") == 0
+
+
+def test_a_kind_that_nobody_knows_is_refused_when_it_is_asked_for(toy: Toy) -> None:
+    with pytest.raises(UnknownKind, match=r"no job of kind .paint. is known; there are .*toy"):
+        services.enqueue(kind="paint", key="p", args={})
+
+
+def test_an_error_is_kept_and_tried_again_later_until_the_last_attempt(toy: Toy) -> None:
+    def break_down(work: Work) -> dict[str, object]:
+        raise ValueError("rows.arrow is damaged")
+
+    toy.does = break_down
+    job = enqueue()
+    for attempt in range(1, services.MOST_ATTEMPTS):
+        assert services.work("lab") == 1
+        job.refresh_from_db()
+        assert (job.status, job.attempts) == (JobStatus.QUEUED, attempt)
+        assert job.error == "rows.arrow is damaged"
+        assert services.work("lab") == 0, "it waits before it is tried again"
+        due(job)
+    services.work("lab")
+    job.refresh_from_db()
+    assert (job.status, job.error) == (JobStatus.FAILED, "rows.arrow is damaged")
+    toy.does = lambda work: {}
+    services.try_again(job=job)
+    assert services.work("lab") == 1
+
+
+def test_a_killed_worker_is_swept_and_its_job_done_once_by_another(toy: Toy) -> None:
+    job = enqueue()
+    dead = services.claim(queue="lab", worker="dead")
+    assert services.sweep() == 0, "it was seen just now"
+    silent(job)
+    assert services.sweep() == 1
+    assert services.sweep() == 0
+    assert services.work("lab") == 1
+    job.refresh_from_db()
+    assert (job.status, job.attempts) == (JobStatus.DONE, 2)
+    assert dead is not None
+    assert services.job_done(job=dead, result={"late": True}) is False
+    job.refresh_from_db()
+    assert job.result == {"seen": {}}, "who was thought dead must not change what the other one found"
+
+
+def test_a_job_that_silences_every_worker_fails_in_the_end(toy: Toy) -> None:
+    job = enqueue()
+    for _ in range(services.MOST_ATTEMPTS):
+        assert services.claim(queue="lab", worker="dead") is not None
+        silent(job)
+        assert services.sweep() == 1
+    job.refresh_from_db()
+    assert job.status == JobStatus.FAILED
+    assert job.error == f"its worker dead went silent in attempt {services.MOST_ATTEMPTS}"
+
+
+def test_a_stale_job_gives_way_to_one_that_was_asked_for_anew(toy: Toy) -> None:
+    old = enqueue(a=1)
+    services.claim(queue="lab", worker="dead")
+    silent(old)
+    new = enqueue(a=2)
+    assert services.sweep() == 1
+    old.refresh_from_db()
+    assert old.status == JobStatus.FAILED
+    assert services.work("lab") == 1
+    new.refresh_from_db()
+    assert new.status == JobStatus.DONE
+
+
+def test_a_sign_of_life_is_one_only_from_who_has_the_job(toy: Toy) -> None:
+    job = enqueue()
+    claimed = services.claim(queue="lab", worker="one")
+    silent(job)
+    assert claimed is not None
+    assert services.seen(job=claimed) is True
+    assert services.sweep() == 0
+    claimed.claimed_by = "two"
+    assert services.seen(job=claimed) is False
+
+
+def test_what_an_ending_worker_puts_back_has_all_its_attempts(toy: Toy) -> None:
+    job = enqueue()
+    services.claim(queue="lab", worker="host:1:abc")
+    assert services.put_back(worker_prefix="host:2:") == 0
+    assert services.put_back(worker_prefix="host:1:") == 1
+    job.refresh_from_db()
+    assert (job.status, job.attempts) == (JobStatus.QUEUED, 0)
+    assert services.work("lab") == 1
+
+
+def test_progress_is_shown_while_it_works_and_gone_afterwards(toy: Toy) -> None:
+    job = enqueue()
+
+    def tell(work: Work) -> dict[str, object]:
+        work.tell("camera 1 of 3")
+        job.refresh_from_db()
+        assert (job.status, job.progress) == (JobStatus.RUNNING, "camera 1 of 3")
+        return {}
+
+    toy.does = tell
+    services.work("lab")
+    job.refresh_from_db()
+    assert (job.status, job.progress) == (JobStatus.DONE, "")
+
+
+@pytest.mark.django_db(transaction=True)
+def test_a_locked_database_is_waited_for_before_a_job_and_after_it(
+    toy: Toy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited: list[float] = []
+    monkeypatch.setattr(patience.time, "sleep", waited.append)
+    for name in ("claim", "job_done"):
+        monkeypatch.setattr(services, name, locked_twice(getattr(services, name)))
+    job = enqueue()
+    assert services.work("lab") == 1
+    job.refresh_from_db()
+    assert job.status == JobStatus.DONE
+    assert len(toy.asked) == 1
+    assert waited == [*patience.WAITS_S[:2], *patience.WAITS_S[:2]]
+
+
+def locked_twice(action):
+    left = [2]
+
+    def attempt(**given):
+        if left[0]:
+            left[0] -= 1
+            raise OperationalError("database is locked")
+        return action(**given)
+
+    return attempt
+
+
+@pytest.mark.django_db(transaction=True)
+def test_a_database_that_stays_away_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(patience.time, "sleep", lambda seconds: None)
+    attempts = []
+
+    def away() -> None:
+        attempts.append(1)
+        raise OperationalError("database is locked")
+
+    with pytest.raises(OperationalError, match="locked"):
+        patience.patiently(away)
+    assert len(attempts) == len(patience.WAITS_S) + 1
