@@ -1,4 +1,4 @@
-"""A stand-in for an openpi policy server: the real wire, a gesture for a policy, faults on demand."""
+"""A stand-in for an openpi policy server: the real wire, a script for a policy, faults on demand."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from websockets.sync.server import Server, ServerConnection, serve
 from runtime import codecs
 from runtime.errors import SetupError
 from runtime.sim.faults import NONE, Fault
-from runtime.sim.gestures import Gesture
+from runtime.sim.script import Answer, Script, Waving
+from runtime.types import UInt8
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
@@ -42,13 +43,15 @@ class Behaviour:
 
 
 class OpenpiServer:
-    """Serves on loopback in threads of its own; a chunk depends on nothing but the state in the request."""
+    """Serves on loopback in threads of its own; plays `script`, a gesture where none is given."""
 
-    def __init__(self, robot: Robot, behaviour: Behaviour, port: int = 0) -> None:
+    def __init__(
+        self, robot: Robot, behaviour: Behaviour, port: int = 0, script: Script | None = None
+    ) -> None:
         self._robot = robot
         self._behaviour = behaviour
         self._port = port
-        self._gesture = Gesture(robot, behaviour.seed)
+        self._script = script or Waving(robot, behaviour.horizon, behaviour.rate, behaviour.seed)
         self._device = threading.Lock()  # one inference at a time, as on one GPU
         self._asked = 0
         self._server: Server | None = None
@@ -96,28 +99,30 @@ class OpenpiServer:
                 connection.send("the checkpoint could not be loaded")
             elif fault != "mute_on_connect":
                 connection.send(codecs.pack(self._metadata()))
-            previous = None
+            answer, previous = self._script.begin(), None
             while True:
                 request = connection.recv()
                 started = time.monotonic()
-                if not self._answer(connection, request, previous):
+                if not self._answer(connection, answer, request, previous):
                     return
                 previous = 1e3 * (time.monotonic() - started)
 
     def _metadata(self) -> dict[str, object]:
-        metadata: dict[str, object] = {"name": "stand-in", "action_horizon": self._behaviour.horizon}
+        metadata = dict(self._script.metadata)
         if self._behaviour.fault.name == "action_mode":
             metadata["action_mode"] = self._behaviour.fault.argument
         return metadata
 
-    def _answer(self, connection: ServerConnection, request: str | bytes, previous: float | None) -> bool:
+    def _answer(
+        self, connection: ServerConnection, answer: Answer, request: str | bytes, previous: float | None
+    ) -> bool:
         """Answer one request, rightly or as the fault has it; False where the conversation is over."""
         with self._device:
             number, self._asked = self._asked, self._asked + 1
             try:
                 if self._behaviour.fault.name == "exception":
                     raise RuntimeError("CUDA out of memory (on purpose)")
-                reply = self._reply(request, previous)
+                reply = self._reply(answer, request, previous)
             except Exception:  # whatever goes wrong in a policy is told to the client, as openpi does it
                 connection.send(traceback.format_exc())
                 connection.close(1011, "Internal server error. Traceback included in previous frame.")
@@ -139,12 +144,13 @@ class OpenpiServer:
         connection.send(payload)
         return True
 
-    def _reply(self, request: str | bytes, previous: float | None) -> dict[str, object]:
+    def _reply(self, answer: Answer, request: str | bytes, previous: float | None) -> dict[str, object]:
         if isinstance(request, str):
             raise TypeError("the request is a text frame; expected a binary one")
         started = time.monotonic()
-        state = self._state(codecs.unpack(request))
-        actions = self._gesture.chunk(state, self._behaviour.horizon, self._behaviour.rate)
+        observation = codecs.unpack(request)
+        state, pictures = self._state(observation), self._pictures(observation)
+        actions = answer(state, pictures, str(observation.get("prompt", "")))
         time.sleep(max(0.0, self._behaviour.latency - (time.monotonic() - started)))
         took = 1e3 * (time.monotonic() - started)
         timing = {"infer_ms": took} | ({} if previous is None else {"prev_total_ms": previous})
@@ -158,12 +164,16 @@ class OpenpiServer:
         state = np.asarray(observation["state"], dtype=np.float64)
         if state.shape != (self._robot.dim,):
             raise ValueError(f"state has shape {state.shape}, expected ({self._robot.dim},)")
-        for key, picture in observation.get("images", {}).items():
+        return state
+
+    def _pictures(self, observation: Any) -> dict[str, UInt8]:
+        pictures: dict[str, UInt8] = observation.get("images", {})
+        for key, picture in pictures.items():
             if picture.dtype != np.uint8 or picture.ndim != 3:
                 raise ValueError(
                     f"images[{key!r}] is {picture.dtype} {picture.shape}, expected uint8, 3 axes"
                 )
-        return state
+        return pictures
 
     def _spoilt(self, actions: np.ndarray[Any, Any]) -> object:
         """The actions, or what the fault makes of them."""

@@ -6,9 +6,14 @@ import argparse
 import contextlib
 import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from runtime.errors import RuntimeFault
+from runtime.errors import RuntimeFault, SetupError
 from runtime.sim import faults, standin
+from runtime.sim.script import Script, Waving
+
+if TYPE_CHECKING:
+    from robots import Robot
 
 
 def parser() -> argparse.ArgumentParser:
@@ -23,8 +28,19 @@ def parser() -> argparse.ArgumentParser:
     line.add_argument("--port", type=int, default=8000, help="0 takes a free one")
     line.add_argument("--horizon", type=int, default=50, help="rows per chunk")
     line.add_argument("--rate", type=float, help="rows per second; the robot's control rate if not given")
-    line.add_argument("--latency-ms", type=float, default=0.0, help="time that an inference takes")
-    line.add_argument("--seed", type=int, default=0, help="which gesture")
+    line.add_argument(
+        "--latency-ms", "--delay-ms", type=float, default=0.0, help="time that an inference takes"
+    )
+    line.add_argument("--behaviour", choices=["gesture", "pick_place"], default="gesture")
+    line.add_argument("--name", help="what the server calls its policy; the behaviour's own if not given")
+    line.add_argument("--seed", type=int, default=0, help="which gesture; the chances of pick_place")
+    skill = line.add_argument_group("how good pick_place is")
+    skill.add_argument(
+        "--noise", type=_length, default=0.0, metavar="MM", help="one sigma on where it takes the block to be"
+    )
+    skill.add_argument(
+        "--failure-rate", type=_share, default=0.0, metavar="P", help="share of episodes that it spoils"
+    )
     line.add_argument("--fault", type=faults.parse, default=faults.NONE, metavar="NAME[:ARG]")
     standin.add_arguments(line)
     return line
@@ -39,20 +55,46 @@ def main(arguments: Sequence[str] | None = None) -> int:
     told = standin.ending(options.lifeline)
     try:
         robot = robots.load(options.robot)
-        behaviour = Behaviour(
-            horizon=options.horizon,
-            rate=options.rate or robot.control_rate,
-            latency=options.latency_ms / 1e3,
-            fault=options.fault,
-            seed=options.seed,
-        )
-        with contextlib.closing(OpenpiServer(robot, behaviour, options.port)) as server:
+        rate = options.rate or robot.control_rate
+        behaviour = Behaviour(options.horizon, rate, options.latency_ms / 1e3, options.fault, options.seed)
+        played = _script(robot, rate, options)
+        with contextlib.closing(OpenpiServer(robot, behaviour, options.port, played)) as server:
             standin.announce(server.start(), options.ready_file)
             told.wait()
     except (RuntimeFault, robots.RobotError) as error:
         print(error, file=sys.stderr)
         return 2
     return 0
+
+
+def _script(robot: Robot, rate: float, options: argparse.Namespace) -> Script:
+    from runtime.sim.pick_place import PickPlace, Skill
+
+    if options.behaviour == "gesture":
+        if options.noise or options.failure_rate:
+            raise SetupError(
+                "--noise and --failure-rate are for --behaviour pick_place; a gesture cannot fail"
+            )
+        return Waving(robot, options.horizon, rate, options.seed, options.name)
+    skill = Skill(options.noise / 1e3, options.failure_rate, options.seed)
+    return PickPlace(robot, options.horizon, rate, skill, options.name)
+
+
+def _length(text: str) -> float:
+    """Millimetres from 0 to 100."""
+    return _number(text, 100.0)
+
+
+def _share(text: str) -> float:
+    """A probability."""
+    return _number(text, 1.0)
+
+
+def _number(text: str, highest: float) -> float:
+    number = float(text)
+    if not 0 <= number <= highest:
+        raise argparse.ArgumentTypeError(f"{text} was given; allowed: 0 to {highest:g}")
+    return number
 
 
 if __name__ == "__main__":
