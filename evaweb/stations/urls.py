@@ -1,7 +1,12 @@
-"""Addresses of the pages of stations."""
+"""Addresses of what pages draw of stations."""
 
 from __future__ import annotations
 
-from django.urls import URLPattern
+from django.urls import path
 
-urlpatterns: list[URLPattern] = []
+from evaweb.stations import views
+
+urlpatterns = [
+    path("stations/<str:name>/geometry", views.station_geometry, name="station-geometry"),
+    path("robots/<str:robot>/geometry", views.robot_geometry, name="robot-geometry"),
+]

@@ -1,0 +1,107 @@
+"""Live streams encoded once for all viewers: a frame for one of them is nothing but a concatenation.
+
+The layout is that of evaweb.frames, which also reads it.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaweb.frames import plain
+
+_ALIGNMENT = 8
+_AGE = "age"  # stands where a part's age is to be put in
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """The newest of one stream.
+
+    `entry` is its entry in the header in pieces of text; a number between them is an offset into `body`, and
+    _AGE the time since it was `received` (our monotonic clock). `body` is a multiple of 8 bytes long.
+    """
+
+    stream: str
+    entry: tuple[str | int, ...]
+    body: bytes
+    received: float
+
+    def at(self, offset: int, now: float) -> str:
+        """The entry of a part whose body begins at `offset`."""
+        return "".join(
+            str(offset + piece)
+            if isinstance(piece, int)
+            else f"{max(0.0, now - self.received):.3f}"
+            if piece is _AGE
+            else piece
+            for piece in self.entry
+        )
+
+
+def facts(stream: str, content: Mapping[str, Any], received: float) -> Part:
+    """A map, such as the state."""
+    return Part(stream, (f'{_key(stream)}:{{"json":{_json(content)}}}',), b"", received)
+
+
+def numbers(
+    stream: str, content: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], received: float
+) -> Part:
+    """Small facts and float32 arrays beside them, such as the joints."""
+    entry: list[str | int] = [f'{_key(stream)}:{{"json":{_json(content)},"arrays":{{']
+    body = b""
+    for count, (name, array) in enumerate(arrays.items()):
+        entry += [f'{"," if count else ""}{_key(name)}:{{"offset":', len(body), f",{_shape(array)}}}"]
+        body += _bytes(array)
+    return Part(stream, (*entry, "}}"), body, received)
+
+
+def array(stream: str, content: NDArray[Any], received: float) -> Part:
+    """One float32 array, such as the poses."""
+    return Part(
+        stream, (f'{_key(stream)}:{{"offset":', 0, f",{_shape(content)}}}"), _bytes(content), received
+    )
+
+
+def picture(stream: str, jpeg: bytes, received: float) -> Part:
+    """One picture; its entry says how old it is when the frame leaves."""
+    entry = (f'{_key(stream)}:{{"mime":"image/jpeg","length":{len(jpeg)},"offset":', 0, ',"age":', _AGE, "}")
+    return Part(stream, entry, _padded(jpeg), received)
+
+
+def frame(parts: Iterable[Part], number: int, now: float) -> bytes:
+    """The message with these parts, as it leaves at `now`."""
+    entries, bodies, offset = [], [], 0
+    for part in parts:
+        entries.append(part.at(offset, now))
+        bodies.append(part.body)
+        offset += len(part.body)
+    header = f'{{"frame":{number},"t":{now:.4f},"streams":{{{",".join(entries)}}}}}'.encode()
+    start = 4 + len(header)
+    return b"".join([struct.pack("<I", len(header)), header, bytes(-start % _ALIGNMENT), *bodies])
+
+
+def _key(name: str) -> str:
+    return json.dumps(name)
+
+
+def _json(content: Mapping[str, Any]) -> str:
+    return json.dumps(plain(content), separators=(",", ":"), allow_nan=False)
+
+
+def _shape(content: NDArray[Any]) -> str:
+    return f'"dtype":"f4","shape":{json.dumps(list(content.shape), separators=(",", ":"))}'
+
+
+def _bytes(content: NDArray[Any]) -> bytes:
+    return _padded(np.ascontiguousarray(content, "<f4").tobytes())
+
+
+def _padded(data: bytes) -> bytes:
+    return data + bytes(-len(data) % _ALIGNMENT)
