@@ -1,0 +1,63 @@
+"""Which of two solids hides the other: the order in which a painter has to draw them.
+
+Two convex solids that a plane separates hide each other only one way: the one on the camera's side of the
+plane hides the other. The planes tried are the sides of the boxes around the solids; where the boxes of two
+solids overlap, as at a joint, the side that separates them best decides.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.sim.render.solids import Placed
+from runtime.types import Float32
+
+Bool = NDArray[np.bool_]
+
+
+class Order:
+    """The separating sides of solids as they stand; `hides` and `painted` for as many cameras as wanted."""
+
+    def __init__(self, placed: Placed, halves: Float32) -> None:
+        count = len(halves)
+        self._placed = placed
+        self._halves = halves
+        normals = placed.axes.reshape(-1, 3)  # [3 S, 3]
+        reach = np.abs(normals @ normals.T).reshape(-1, count, 3)  # of every axis along every normal
+        radius = (reach * halves).sum(-1).reshape(count, 3, count)
+        along = (normals @ placed.centres.T).reshape(count, 3, count)
+        offset = along - along[np.arange(count), :, np.arange(count)][..., None]  # of the others' centres
+        gap = np.abs(offset) - halves[..., None] - radius  # [S, 3, S] between side and other
+        self._side = gap.argmax(1)  # [S, S]
+        take = np.ogrid[:count, :count]
+        self._gap = gap[take[0], self._side, take[1]]
+        self._sign = offset[take[0], self._side, take[1]] > 0
+
+    def hides(self, eye: Float32) -> Bool:
+        """[S, S]: whether the second, as seen from `eye` [3], lies in front of the first."""
+        across = np.einsum("skd,sd->sk", self._placed.axes, eye - self._placed.centres)
+        beyond = np.stack([-across > self._halves, across > self._halves], -1)  # [S, 3, 2]
+        rows = np.arange(len(beyond))[:, None]
+        mine: Bool = beyond[rows, self._side, self._sign.astype(np.intp)]
+        better = self._gap >= self._gap.T
+        return np.asarray(np.where(better, mine, ~mine.T))
+
+
+def painted(hides: Bool, overlap: Bool, distance: Float32) -> list[int]:
+    """The solids from back to front: what is hidden by another comes before it, else the farther first.
+
+    `hides` and `overlap` are [S, S], the latter whether two overlap in the picture; a circle is broken at its
+    farthest solid.
+    """
+    below = np.packbits((hides & overlap).T, axis=1, bitorder="little")
+    waits = [int.from_bytes(row.tobytes(), "little") & ~(1 << solid) for solid, row in enumerate(below)]
+    queue = np.argsort(-distance, kind="stable").tolist()
+    left = (1 << len(queue)) - 1
+    order: list[int] = []
+    while queue:
+        solid = next((solid for solid in queue if not waits[solid] & left), queue[0])
+        queue.remove(solid)
+        left ^= 1 << solid
+        order.append(solid)
+    return order

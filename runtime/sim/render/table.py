@@ -1,0 +1,150 @@
+"""The table and the plate on it, drawn where a camera sees them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.sim.bench import Bench, PinholeCamera
+from runtime.sim.render.painter import ahead
+from runtime.sim.render.room import draw_room
+from runtime.sim.render.solids import circle
+from runtime.types import Float32, Float64, UInt8
+
+X, Y = (-0.80, 0.80), (-0.42, 0.86)  # m, the table's edges
+_TEXEL = 0.0008  # m
+_BOARD = 0.16  # m, width of a board
+CORNERS = np.array([[X[0], Y[0], 0.0], [X[1], Y[0], 0.0], [X[1], Y[1], 0.0], [X[0], Y[1], 0.0]])
+_PLATE_POINTS = 64
+
+
+class Table:
+    """Boards of pale wood with the work area marked; `seed` makes their grain."""
+
+    def __init__(self, bench: Bench, seed: int) -> None:
+        self._bench = bench
+        self._texture = _boards(bench, seed)
+
+    def draw(self, camera: PinholeCamera) -> UInt8:
+        """The bare table in its room, BGR [H, W, 3]."""
+        picture = np.empty((camera.height, camera.width, 3), np.uint8)
+        outline = outline_of(camera)
+        whole = covers(outline, camera)
+        if not whole:
+            draw_room(picture, camera)
+        if len(outline) > 2:
+            self._draw_boards(picture, camera, None if whole else outline)
+        return picture
+
+    def _draw_boards(self, picture: UInt8, camera: PinholeCamera, outline: Float32 | None) -> None:
+        matrix = texels_to_pixels(camera, _TEXEL)
+        size = (camera.width, camera.height)
+        if outline is None:
+            cv2.warpPerspective(self._texture, matrix, size, picture, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+            return
+        boards = cv2.warpPerspective(
+            self._texture, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        mask = np.zeros((camera.height, camera.width), np.uint8)
+        cv2.fillConvexPoly(mask, (outline * 16).round().astype(np.int32), 255, cv2.LINE_8, 4)
+        cv2.copyTo(boards, mask, picture)
+        edge = [part * 0.42 for part in self._bench.table_colour[::-1]]
+        cv2.polylines(picture, [(outline * 16).round().astype(np.int32)], True, edge, 2, cv2.LINE_AA, 4)
+
+    def draw_plate(self, picture: UInt8, camera: PinholeCamera, plate: tuple[float, float]) -> None:
+        """A round dish: its outer side, its coloured rim, the slope inwards and the flat middle."""
+        bench = self._bench
+        radius, height = bench.plate_radius, bench.plate_height
+        side = [part * 0.55 for part in bench.plate_rim_colour[::-1]]
+        ring = _ring(plate, radius, height)
+        self._fill(picture, camera, np.concatenate([_ring(plate, radius * 0.92, 0.0), ring]), side)
+        self._fill(picture, camera, ring, list(bench.plate_rim_colour[::-1]))
+        white = np.array(bench.plate_colour[::-1], np.float64)
+        for share, level, tone in (
+            (0.93, 0.95, 0.97),
+            (0.90, 0.9, 0.86),
+            (0.72, 0.35, 0.93),
+            (0.70, 0.33, 1.0),
+        ):
+            self._fill(picture, camera, _ring(plate, radius * share, height * level), (white * tone).tolist())
+
+    def _fill(self, picture: UInt8, camera: PinholeCamera, points: Float64, colour: list[float]) -> None:
+        inside = (points - camera.pose[:3, 3]) @ camera.pose[:3, :3]
+        if inside[:, 2].min() > 0.02:
+            pixels = inside[:, :2] / inside[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+            if (pixels.max(0) < 0).any() or (pixels.min(0) > (camera.width, camera.height)).any():
+                return
+            hull = cv2.convexHull((np.clip(pixels, -9000, 9000) * 16).round().astype(np.int32))
+            cv2.fillConvexPoly(picture, hull, colour, cv2.LINE_AA, 4)
+
+
+def texels_to_pixels(camera: PinholeCamera, texel: float) -> Float64:
+    """The homography [3, 3] from a map of the table, `texel` m per point, to the camera's picture."""
+    to_world = np.array([[texel, 0, X[0]], [0, texel, Y[0]], [0, 0, 0], [0, 0, 1.0]])
+    lens = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    turn = camera.pose[:3, :3].T
+    return np.asarray(lens @ np.column_stack([turn, -turn @ camera.pose[:3, 3]]) @ to_world)
+
+
+def _ring(centre: tuple[float, float], radius: float, height: float) -> Float64:
+    return np.column_stack([circle(radius, _PLATE_POINTS) + centre, np.full(_PLATE_POINTS, height)])
+
+
+def outline_of(camera: PinholeCamera) -> Float32:
+    """Pixels [n, 2] around the part of the table that lies before the camera; empty if there is none."""
+    inside = ahead(((CORNERS - camera.pose[:3, 3]) @ camera.pose[:3, :3]).astype(np.float32))
+    if len(inside) < 3:
+        return np.empty((0, 2), np.float32)
+    pixels = inside[:, :2] / inside[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    return np.asarray(np.clip(pixels, -12000, 12000), np.float32)
+
+
+def covers(outline: Float32, camera: PinholeCamera) -> bool:
+    """Whether every corner of the picture lies inside the outline."""
+    if len(outline) < 3:
+        return False
+    right, low = float(camera.width), float(camera.height)
+    corners = ((-1.0, -1.0), (right, -1.0), (right, low), (-1.0, low))
+    return all(cv2.pointPolygonTest(outline, corner, False) > 0 for corner in corners)
+
+
+def _boards(bench: Bench, seed: int) -> UInt8:
+    """Boards along x with grain, joints between them, and the corners of the work area taped."""
+    chance = np.random.default_rng(seed)
+    height, width = round((Y[1] - Y[0]) / _TEXEL), round((X[1] - X[0]) / _TEXEL)
+    grain = _streaks(chance, height, width, 60, 0.0) * 3.5 + _streaks(chance, height, width, 260, 2.0) * 3.0
+    grain += _streaks(chance, height, width, 700, 14.0) * 3.0
+    board = (np.arange(height) * _TEXEL / _BOARD).astype(int)
+    tone = chance.uniform(-5.0, 5.0, board[-1] + 1)[board][:, None]
+    wood = np.array(bench.table_colour[::-1], np.float32) + (grain + tone)[..., None].astype(np.float32)
+    joints = np.flatnonzero(np.diff(board))
+    for row in joints.tolist():
+        wood[row : row + 2] *= 0.80
+        wood[row + 2 : row + 3] *= 1.05
+    texture: UInt8 = np.clip(wood, 0, 255).astype(np.uint8)
+    _tape(texture, bench)
+    return texture
+
+
+def _streaks(
+    chance: np.random.Generator, height: int, width: int, along: int, across: float
+) -> NDArray[np.float32]:
+    """Noise of deviation 1, smeared over so many texels along x and, where `across` is not 0, along y."""
+    noise = chance.standard_normal((height, width // 4)).astype(np.float32)
+    smeared = cv2.GaussianBlur(noise, (0, 0), along / 16, sigmaY=across or 0.3)
+    wide = cv2.resize(smeared, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(wide / wide.std(), np.float32)
+
+
+def _tape(texture: UInt8, bench: Bench) -> None:
+    """White angles at the corners of the work area, a little outside of it."""
+    x_from, x_to, y_from, y_to = bench.area
+    margin, arm, thick = 0.045, 0.045, 0.005
+    for x, inwards_x in ((x_from - margin, 1), (x_to + margin, -1)):
+        for y, inwards_y in ((y_from - margin, 1), (y_to + margin, -1)):
+            for size in ((arm * inwards_x, thick * inwards_y), (thick * inwards_x, arm * inwards_y)):
+                ends = np.array([[x, y], [x + size[0], y + size[1]]]) - (X[0], Y[0])
+                (left, low), (right, high) = np.sort((ends / _TEXEL).round().astype(int), axis=0).tolist()
+                patch = texture[low:high, left:right]
+                patch[:] = (patch * 0.25 + 0.75 * 236).astype(np.uint8)
