@@ -78,12 +78,13 @@ class SetUp:
             return None
         if not self._plan.capabilities.resets_bench:
             raise SetupError(
-                "setup: bench cannot be reset here: the transport is not declared simulated "
-                "(transport.simulated = true, for a node that simulates a bench); set up without bench"
+                f"setup: bench with seed {bench.seed}: the transport is not declared simulated; allowed: no "
+                "bench, or a node that simulates one, with transport.simulated = true in the deployment"
             )
         if bench.id is not None and bench.id == self._media().truth.get("reset"):
             raise SetupError(
-                f"setup: bench.id = {bench.id!r} was reset already; give each reset an id of its own"
+                f"setup: bench.id = {bench.id!r}: the bench was reset under this id already; allowed: an id "
+                "of its own for each reset, or none"
             )
         return bench.model_dump(exclude_none=True) | {"id": bench.id or str(uuid.uuid4())}
 

@@ -205,7 +205,7 @@ def _truth(name: str, given: object) -> Mapping[str, Any]:
         truth: dict[str, Any] = _JSON.validate_python(given)
     except ValidationError as invalid:
         error = invalid.errors()[0]
-        where = ".".join(map(str, (name, *error["loc"])))
+        where = ".".join(map(str, (name, *error["loc"][:1])))
         raise MessageRefused("malformed", f"{where}: {error['msg']}") from None
     size = len(codecs.pack(truth))
     if size > TRUTH_LIMIT:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from runtime import deployment, family
-from runtime.errors import PolicyError
+from runtime.errors import ConfigurationError, PolicyError
 from runtime.family import Plan
 from runtime.lockstep import Lockstep
 from runtime.policies.base import Policy, PolicyInfo
@@ -46,6 +46,10 @@ class StubRobot(Source, Sink):
         self.cameras = [camera.key for camera in plan.robot.cameras]
         self.picture = numbered
         self.bias: Float64 = np.zeros(DIM)  # it stands beside where it is told to go
+        self.told: list[tuple[str, dict[str, Any]]] = []
+        self.wordless = not plan.simulated
+        self.deaf = 0  # control words that are lost on their way to it
+        self.truth: dict[str, Any] | None = None
         self._sequence = 0
 
     def connect(self) -> None:
@@ -62,12 +66,20 @@ class StubRobot(Source, Sink):
             captured=dict.fromkeys(("joints", *self.cameras), now),
             qpos=self.position.astype(np.float32),
             pictures=dict.fromkeys(self.cameras, self.picture(self._sequence)),
+            truth=self.truth,
         )
 
     def send(self, command: RobotCommand) -> None:
         self.commands.append(command)
         if not self.blocked:
             self.position = command.action.astype(np.float64) + self.bias
+
+    def tell(self, word: str, data: Mapping[str, Any]) -> None:
+        if self.wordless:
+            super().tell(word, data)
+        self.told.append((word, dict(data)))
+        if len(self.told) > self.deaf:
+            self.truth = {"reset": data["id"], "seed": data["seed"], "milestones": {}, "success": False}
 
     def close(self) -> None:
         pass
@@ -124,6 +136,7 @@ class StubPlan(Plan):
     space: Space
     absent: str
     moves_robot: bool
+    simulated: bool
 
     @property
     def transport(self) -> Any:
@@ -135,7 +148,7 @@ class StubPlan(Plan):
 
     @property
     def capabilities(self) -> Capabilities:
-        return Capabilities(moves_robot=self.moves_robot)
+        return Capabilities(moves_robot=self.moves_robot, resets_bench=self.simulated)
 
     def _robot(self, config: object, robot: object, clock: object) -> StubRobot:
         if "robot" not in self.built:
@@ -143,7 +156,10 @@ class StubPlan(Plan):
         return self.built["robot"]
 
     def _policy(self, config: object, robot: object, clock: object, rate: float) -> StubPolicy:
+        if "unfit" in self.built:
+            raise ConfigurationError(self.built["unfit"])
         self.built["policy"] = StubPolicy(self)
+        self.built.setdefault("policies", []).append(self.built["policy"])
         return self.built["policy"]
 
 
@@ -156,6 +172,7 @@ def plan(
     space: Space = "joint",
     absent: str = "",
     moves_robot: bool = True,
+    simulated: bool = False,
     **settings: Any,
 ) -> StubPlan:
     """A station on the bundled robot's description; `settings` are tables of the deployment."""
@@ -174,7 +191,7 @@ def plan(
     for table, values in settings.items():
         tree[table] = {**tree.get(table, {}), **values} if isinstance(values, dict) else values
     made = family.plan(deployment.resolve(tree, {}, "test"))
-    return StubPlan(made.resolved, made.robot, {}, start, rows, space, absent, moves_robot)
+    return StubPlan(made.resolved, made.robot, {}, start, rows, space, absent, moves_robot, simulated)
 
 
 class Station(Lockstep):
@@ -184,7 +201,8 @@ class Station(Lockstep):
         made.built.clear()
         super().__init__(made)
         self.robot: StubRobot = made.built["robot"]
-        self.policy: StubPolicy = made.built["policy"]
+        self.policy: StubPolicy = made.built["policy"]  # the deployment's own
+        self.policies: list[StubPolicy] = made.built["policies"]  # all that were built since
         self.connect()
 
     @property
@@ -203,8 +221,8 @@ class Station(Lockstep):
     def reach(self, state: State, seconds: float = 30.0) -> None:
         self.until(lambda: self.state is state, seconds, f"{state}")
 
-    def ready(self) -> Station:
-        self.prepare()
+    def ready(self, **arguments: Any) -> Station:
+        self.prepare(**arguments)
         assert self.state is State.READY, self.reason
         return self
 
@@ -223,10 +241,10 @@ class Station(Lockstep):
     def episode(self) -> Episode:
         return open_episode(Path(self.main.runs.last_episode["path"]))
 
-    def prepare(self) -> None:
+    def prepare(self, **arguments: Any) -> None:
         """Set up, to whatever end."""
-        self.reach(State.IDLE)
-        self.command("setup")
+        self.until(lambda: self.state in (State.IDLE, State.READY), 30.0, "a state to set up from")
+        self.command("setup", **arguments)
         self.until(lambda: self.state is not State.SETTING_UP, 60.0, "set-up")
 
     def events(self, kind: str) -> list[str]:

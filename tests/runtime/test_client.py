@@ -8,6 +8,7 @@ from runtime.client import Refused, StationClient
 from runtime.errors import TransportError
 from runtime.lease import Lease
 from runtime.messages import Ack, Command
+from runtime.requests import RunRequest
 from runtime.session import Session, State
 from tests.runtime.test_session import Recorded
 
@@ -242,3 +243,10 @@ def test_an_estop_that_cannot_be_delivered_says_what_to_do(client):
 def test_without_a_name_a_terminal_is_named_after_its_user_and_machine(tmp_path):
     assert StationClient(tmp_path).holder.startswith("terminal:")
     assert "@" in StationClient(tmp_path).holder
+
+
+def test_arguments_travel_with_their_command(client, station):
+    ack = client.command("run", trial={"id": 7}, duration_s=20)
+    assert ack.data["episode"] == "episode-7"
+    assert station.received[-1].args == {"trial": {"id": 7}, "duration_s": 20}
+    assert station.effects.done == [("begin_run", RunRequest(trial={"id": 7}, duration_s=20.0))]

@@ -112,3 +112,21 @@ def test_a_disk_that_fails_is_told_and_leaves_no_half_line(tmp_path, journal, pa
     assert path.read_bytes() == before
     assert journal.append(Command("u-3", "stop"), Ack("u-3", "accepted")) == ""
     assert list(reopened(tmp_path)) == ["u-1", "u-3"]
+
+
+def nested(depth):
+    inner = {}
+    for _ in range(depth):
+        inner = {"a": inner}
+    return inner
+
+
+@pytest.mark.parametrize(
+    "args", [{b"key": 1}, {"a": {(1, 2): 3}}, nested(100_000)], ids=["bytes", "tuple", "deep"]
+)
+def test_arguments_that_are_no_json_do_not_end_who_refused_them(tmp_path, journal, path, args):
+    refused = Ack("u-3", "refused", "no JSON")
+    assert journal.append(Command("u-3", "run", args), refused) == ""
+    (row,) = lines(path)
+    assert row["args"].startswith("no JSON: ")
+    assert reopened(tmp_path) == {"u-3": refused}

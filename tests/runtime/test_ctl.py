@@ -239,3 +239,34 @@ def test_watching_goes_on_after_a_restart_with_the_events_of_the_new_start(run, 
     assert script.subscribed == 2
     shown = [json.loads(row) for row in capsys.readouterr().out.splitlines()]
     assert [row["text"] for row in shown if "text" in row] == ["event 1"]
+
+
+@pytest.mark.parametrize(
+    ("words", "given"),
+    [
+        (["setup", "--policy-url", "ws://a:1"], ("setup", {"policy": {"url": "ws://a:1"}})),
+        (["setup", "--task", "fold"], ("setup", {"task": "fold"})),
+        (["run", "--duration", "2.5"], ("run", {"duration_s": 2.5})),
+        (["run"], "run"),
+    ],
+)
+def test_what_a_command_is_given_with_goes_along(run, words, given):
+    script = Script([status()])
+    assert run(script, *words) == 0
+    assert script.given[0] == given
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["run", "--task", "fold"], "--task goes with setup, not with run"),
+        (["stop", "--policy-url", "ws://a:1"], "--policy-url goes with setup, not with stop"),
+        (["setup", "--duration", "3"], "--duration goes with run, not with setup"),
+    ],
+)
+def test_an_option_of_another_command_is_an_error_before_anything_is_sent(run, capsys, words, says):
+    script = Script([status()])
+    with pytest.raises(SystemExit):
+        run(script, *words)
+    assert says in capsys.readouterr().err
+    assert script.given == []

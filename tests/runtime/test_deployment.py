@@ -461,3 +461,27 @@ def test_the_loopback_rule_knows_no_other_address():
     assert config._loopback("localhost") == "localhost"
     with pytest.raises(ValueError, match="the bus has no keys of its own yet"):
         config._loopback("192.168.0.2")
+
+
+def test_changes_go_on_top_like_a_file_over_what_it_extends(write):
+    own = load(write())
+    changed = deployment.changed(own, {"task": "fold", "policy": {"amplitude": 0.1}}, "setup")
+    assert (changed.deployment.task, changed.deployment.policy.amplitude) == ("fold", 0.1)
+    assert changed.deployment.transport == own.deployment.transport
+    assert changed.digest != own.digest
+    assert deployment.changed(own, {}, "setup") == own
+    assert own == load(write())
+
+
+def test_a_change_of_kind_replaces_the_table_whole(write):
+    own = load(write(SMALL + "amplitude = 0.1\n"))
+    changed = deployment.changed(own, {"policy": {"kind": "openpi", "url": "ws://a:1"}}, "setup")
+    assert (changed.deployment.policy.kind, changed.deployment.policy.url) == ("openpi", "ws://a:1")
+
+
+def test_a_wrong_change_names_where_it_came_from(write):
+    own = load(write())
+    with pytest.raises(ConfigurationError, match=r"^setup: policy\.amplitud = 1: unknown key"):
+        deployment.changed(own, {"policy": {"amplitud": 1}}, "setup")
+    with pytest.raises(ConfigurationError, match=r"^setup: policy\.kind = \[\]: must be one of 'mock'"):
+        deployment.changed(own, {"policy": {"kind": []}}, "setup")

@@ -3,6 +3,7 @@ from __future__ import annotations
 import mmap
 import threading
 import weakref
+from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ class FakePolicy(Policy):
         self.answer: Any = None
         self.open = threading.Event()
         self.open.set()
+        self.reached, self.answered = threading.Event(), threading.Event()
 
     def connect(self) -> PolicyInfo:
         return PolicyInfo("fake")
@@ -39,7 +41,9 @@ class FakePolicy(Policy):
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
         self.calls.append("infer")
         self.seen.append(observation)
+        self.reached.set()
         self.open.wait(10)
+        self.answered.set()
         if isinstance(self.answer, Exception):
             raise self.answer
         return self.answer or ActionChunk(np.full((4, 2), observation.step, np.float32))
@@ -395,3 +399,76 @@ def test_an_error_in_the_thread_is_told_as_a_policy_error() -> None:
     with pytest.raises(PolicyError, match="ZeroDivisionError"):
         future.result(10)
     runner.close()
+
+
+def test_an_answer_that_the_former_policy_gives_late_is_never_used() -> None:
+    desk = Desk(ThreadRunner()).going()
+    former, other = desk.policy, FakePolicy()
+    former.open.clear()
+    desk.inference.pump()
+    former.reached.wait(10)
+    desk.inference.exchange(other, "place")
+    connected = desk.runner.submit(other.connect)
+    assert former.calls == ["reset", "infer", "close"]
+    assert not desk.runner.ready(connected)  # never two: the last call of the former one is not over
+    former.open.set()
+    connected.result(10)
+    desk.inference.begin(2, fresh=True)
+    assert desk.inference.pump() is None
+    other.answered.wait(10)
+    answer = None
+    while answer is None:
+        answer = desk.inference.pump()
+    assert (answer.run, len(desk.posted())) == (2, 1)
+    assert former.calls == ["reset", "infer", "close"]
+    assert other.calls == ["reset", "infer"]
+    assert other.seen[0].prompt == "place"
+    desk.runner.close()
+
+
+def test_a_call_whose_turn_comes_after_the_exchange_is_still_the_former_policys(desk: Desk) -> None:
+    calls: list[Any] = []
+
+    def submit(call: Any) -> Future[Any]:
+        calls.append(call)
+        return Future()
+
+    desk.runner.submit = submit  # type: ignore[method-assign]
+    former, other = desk.policy, FakePolicy()
+    desk.inference.ask()
+    desk.inference.exchange(other, "place")
+    calls[0]()
+    assert former.calls == ["close", "reset", "infer"]
+    assert other.calls == []
+
+
+def test_the_same_policy_is_neither_closed_nor_told_to_forget_by_a_new_task(desk: Desk) -> None:
+    desk.inference.pump()
+    assert desk.inference.latencies
+    desk.inference.exchange(desk.policy, "place")
+    assert desk.policy.calls == ["reset", "infer"]
+    assert (len(desk.inference.latencies), len(desk.inference.delays)) == (0, 0)
+    desk.inference.ask()
+    assert desk.policy.calls == ["reset", "infer", "infer"]
+    assert desk.policy.seen[-1].prompt == "place"
+
+
+def test_what_the_newest_merged_chunk_wants_for_a_step_is_known(desk: Desk) -> None:
+    desk.policy.answer = ActionChunk(np.arange(8, dtype=np.float32).reshape(4, 2))
+    desk.inference.pump()
+    assert desk.inference.raw(10) is None  # posted, not merged
+    targets = np.array([-1, 10, 11, 12])
+    desk.inference.merged(ChunkMerged(1, 1, 10, 1, targets, 0, ""))
+    assert [desk.inference.raw(step) for step in (9, 13)] == [None, None]
+    assert np.array_equal(desk.inference.raw(10), [2.0, 3.0])  # type: ignore[arg-type]
+    assert np.array_equal(desk.inference.raw(12), [6.0, 7.0])  # type: ignore[arg-type]
+
+
+def test_a_chunk_that_was_dropped_leaves_what_the_one_before_it_wants(desk: Desk) -> None:
+    desk.inference.pump()
+    desk.inference.merged(ChunkMerged(1, 1, 10, 0, np.arange(10, 14), 0, ""))
+    desk.inference.pump()
+    desk.inference.merged(ChunkMerged(2, 1, 12, 9, np.full(4, -1), 0, "all in the past"))
+    assert desk.inference.raw(10) is not None
+    desk.inference.pause()
+    assert desk.inference.raw(10) is None

@@ -494,3 +494,49 @@ def test_a_leftover_that_cannot_be_repaired_keeps_no_other_from_it(
 def test_ending_without_an_episode_says_nothing(desk: Desk) -> None:
     desk.media.end("interrupted", "nobody home")
     assert desk.told(EpisodeClosed) == []
+
+
+TRUTH = {"reset": "r", "milestones": {"placed": True}, "success": True}
+
+
+def test_the_truth_of_a_simulated_bench_is_reported_and_forgotten_with_its_node(desk: Desk) -> None:
+    desk.source.waiting.append(desk.observation(1, truth=TRUTH))
+    desk.media.pump(0.0)
+    assert desk.told(MediaReport)[-1].truth == TRUTH
+    desk.clock.advance(1.0)
+    desk.receive(2)  # another node, or the same without its bench
+    assert desk.told(MediaReport)[-1].truth == {}
+
+
+def test_an_episode_ends_with_the_newest_truth(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.source.waiting.append(desk.observation(2, truth=TRUTH))
+    desk.media.pump(0.0)
+    desk.post(EndEpisode("finished", "stopped"))
+    desk.media.pump(0.0)
+    said = [event for event in desk.told(Event) if event.kind == "truth"]
+    assert [event.data for event in said] == [TRUTH | {"episode": "one"}]
+    assert [event["data"] for event in desk.journal.events if event["kind"] == "truth"] == [said[0].data]
+    assert desk.journal.outcome is not None
+
+
+def test_without_truth_nothing_is_said_of_it(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.post(EndEpisode("finished", "stopped"))
+    desk.media.pump(0.0)
+    assert [event for event in desk.told(Event) if event.kind == "truth"] == []
+
+
+def test_a_log_that_cannot_take_the_truth_ends_the_episode_once(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.source.waiting.append(desk.observation(2, truth=TRUTH))
+    desk.media.pump(0.0)
+
+    desk.journal.failing = {"mark"}
+    desk.post(EndEpisode("finished", "stopped"))
+    desk.media.pump(0.0)
+    closed = desk.told(EpisodeClosed)
+    assert [(message.status, message.reason) for message in closed] == [("failed", "disk full while mark")]

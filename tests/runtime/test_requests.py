@@ -120,5 +120,5 @@ def test_whatever_comes_it_is_taken_or_refused_with_a_sentence(arguments):
         if set(arguments) <= set(model.model_fields):
             assert read("say", model, arguments) == model()
         else:
-            with pytest.raises(RuntimeFault, match="^say"):
+            with pytest.raises(RuntimeFault, match=r"^say"):
                 read("say", model, arguments)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from runtime.clock import VirtualClock
-from runtime.messages import ChunkMerged, Event, Order, PostedChunk, TickDone, decode, encode
+from runtime.messages import ChunkMerged, Event, NodeRequest, Order, PostedChunk, TickDone, decode, encode
 from runtime.page import EStop, Page, PageLayout
 from runtime.safety import Limits, SafetyFilter, SafetySettings
 from runtime.strategies import overlap, sync
@@ -17,13 +17,18 @@ DIM, PERIOD = 2, 1 / 30
 
 class RecordingSink(Sink):
     def __init__(self):
-        self.sent = []
+        self.sent, self.told, self.takes_words = [], [], True
 
     def connect(self):
         pass
 
     def send(self, command):
         self.sent.append(command.action.copy())
+
+    def tell(self, word, data):
+        if not self.takes_words:
+            super().tell(word, data)
+        self.told.append((word, dict(data)))
 
     def close(self):
         pass
@@ -600,3 +605,57 @@ def test_a_motion_refused_again_after_it_stopped_never_jumps_back(bench):
         bench.run(1)
     sent = np.array(bench.sink.sent)[:, 0]
     assert np.diff(sent).min() >= -1e-6
+
+
+def ask_node(bench, word="scene_reset", **data):
+    bench.page.rings["orders"].push(encode(NodeRequest(word, data)))
+
+
+def test_a_word_for_the_node_goes_to_the_sink_and_moves_nothing(bench):
+    ask_node(bench, id="r", seed=3)
+    bench.run()
+    assert bench.sink.told == [("scene_reset", {"id": "r", "seed": 3})]
+    assert bench.sink.sent == []
+    assert bench.behaviour == "silent"
+
+
+def test_a_sink_that_takes_no_words_is_an_event_and_not_the_end_of_control(bench):
+    bench.sink.takes_words = False
+    ask_node(bench)
+    bench.run(2)
+    said = bench.said("word_refused")
+    assert [event.text for event in said] == [
+        "this transport takes no control words; 'scene_reset' was to be sent"
+    ]
+
+
+@pytest.mark.parametrize("state", [EStop.LATCHED, EStop.UNKNOWN])
+def test_no_word_reaches_the_node_while_the_e_stop_is_not_clear(bench, state):
+    bench.page.set_estop(state)
+    ask_node(bench)
+    bench.run()
+    assert bench.sink.told == []
+    assert "scene_reset is not passed on to the node while the e-stop" in bench.said("word_refused")[0].text
+
+
+def smoothed(bench):
+    return bench.page.control.read()["smoothed"].tolist()
+
+
+def test_the_status_says_what_was_wanted_before_safety_and_nan_where_nothing_was(bench):
+    bench.say("hold")
+    bench.run()
+    assert np.isnan(smoothed(bench)).all()
+    bench.say("follow", run=1)
+    bench.run()
+    bench.chunk(1, np.full((3, 2), 0.4))  # farther than one tick may go
+    bench.run()
+    assert smoothed(bench) == pytest.approx([0.4, 0.4], abs=0.4)
+    assert smoothed(bench) == bench.records()[-1].smoothed.tolist()
+    bench.run(2)
+    wanted, sent = smoothed(bench), bench.sink.sent[-1].tolist()
+    assert wanted == pytest.approx([0.4, 0.4])
+    assert sent[0] < 0.39
+    bench.say("hold")
+    bench.run()
+    assert np.isnan(smoothed(bench)).all()

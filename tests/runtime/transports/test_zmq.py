@@ -596,3 +596,91 @@ def test_sending_needs_a_connection() -> None:
     sink.close()
     with pytest.raises(TransportError, match="not connected"):
         sink.send(RobotCommand(np.zeros(14, np.float32), 0, 0.0))
+
+
+# --- a simulated bench -------------------------------------------------------------------------------------
+
+TRUTH = {
+    "reset": "r-1",
+    "seed": 3,
+    "blocks": [[0.1, 0.3, 0.02, 0.5]],
+    "plate": [0.0, 0.3],
+    "held": [""],
+    "milestones": {"grasped": True, "placed": False},
+    "success": False,
+}
+
+
+def test_the_truth_of_a_node_that_is_declared_simulated_is_passed_on(node: Node) -> None:
+    with listening(node, simulated=True) as source:
+        seen = until_heard(node, source, lambda: frame(time.monotonic(), truth=TRUTH))
+        assert seen.truth == TRUTH
+        assert source.faults() == {}
+        assert until_heard(node, source, lambda: frame(time.monotonic())).truth is None
+
+
+def test_the_truth_of_any_other_node_is_ignored_and_that_is_said_once(node: Node) -> None:
+    with listening(node) as source:
+        for _ in range(3):
+            assert until_heard(node, source, lambda: frame(time.monotonic(), truth=TRUTH)).truth is None
+        assert source.faults() == {"truth_ignored": 1}
+        assert "transport.simulated is false" in source.last_fault
+
+
+@pytest.mark.parametrize(
+    ("truth", "says"),
+    [
+        (7, "truth: Input should be a valid dictionary"),
+        (TRUTH | {"blocks": np.zeros((1, 4))}, "truth.blocks: input was not a valid JSON value"),
+        (TRUTH | {"plate": [float("nan"), 0.0]}, "truth.plate: Input should be a finite number"),
+        (TRUTH | {"reset": None}, "truth.reset is None; expected the id of a reset or ''"),
+        (TRUTH | {"success": 1}, "truth.success is 1; expected true or false"),
+        (TRUTH | {"milestones": {"placed": 1}}, "truth.milestones is {'placed': 1}; expected a map of bools"),
+        (TRUTH | {"blocks": "x" * 20_000}, "bytes; expected at most 16384"),
+    ],
+)
+def test_a_truth_that_cannot_be_used_is_left_out_and_named(node: Node, truth: object, says: str) -> None:
+    with listening(node, simulated=True) as source:
+        seen = until_heard(node, source, lambda: frame(time.monotonic(), truth=truth))
+        assert seen.truth is None
+        assert set(source.faults()) == {"truth_unusable"}
+        assert says in source.last_fault
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_only_a_node_that_is_declared_simulated_is_told_to_reset_its_bench(simulated: bool) -> None:
+    assert link.capabilities(Config(simulated=simulated)).resets_bench is simulated
+
+
+def test_a_control_word_says_who_sends_it_and_stands_where_a_command_says_its_target(node: Node) -> None:
+    with commanding(node) as sink:
+        data = {"id": "r-1", "seed": 3, "positions": {"block": [0.1, 0.3, 45.0]}}
+        heard = None
+        while heard is None:  # until the link is up
+            sink.tell("scene_reset", data)
+            heard = node.hear(0.1)
+        assert {key: heard[key] for key in data} == data
+        assert (heard["target"], heard["master"]) == ("scene_reset", sink.master)
+        assert isinstance(heard["t"], float)
+        before = heard["seq"]
+        sink.send(RobotCommand(np.zeros(ROBOT.dim, np.float32), 1, 2.0))
+        command = node.hear()
+        while command is not None and command["target"] != "real":
+            command = node.hear()
+        assert command is not None
+        assert (command["master"], command["seq"] > before) == (sink.master, True)
+
+
+@pytest.mark.parametrize(
+    ("word", "data"),
+    [("real", {}), ("sim", {}), ("scene_reset", {"action": [0.0]}), ("scene_reset", {"master": "x"})],
+)
+def test_a_control_word_cannot_be_taken_for_a_command(node: Node, word: str, data: dict[str, Any]) -> None:
+    with commanding(node) as sink, pytest.raises(TransportError, match="would be taken for a command"):
+        sink.tell(word, data)
+
+
+def test_a_control_word_over_no_link_is_a_fault() -> None:
+    sink = link.sink(Config(), ROBOT, VirtualClock())
+    with pytest.raises(TransportError, match="is not connected"):
+        sink.tell("scene_reset", {"id": "r"})
