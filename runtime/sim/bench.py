@@ -30,7 +30,7 @@ _SIDES = ((-0.25, 0.0), (0.25, 0.0))  # where arms stand, and how far they reach
 _REACH = 0.42
 _OVERHEAD_EYE, _OVERHEAD_AIM = (0.0, 0.36, 0.85), (0.0, 0.27, 0.0)
 _OVERHEAD_FOCAL = 1.0  # per picture width
-_WRIST_EYE, _WRIST_AIM = (-0.08, 0.0, -0.13), (0.0, 0.0, 0.01)  # in the tip's frame
+_WRIST_EYE, _WRIST_AIM = (-0.095, 0.0, -0.125), (-0.005, 0.0, 0.03)  # in the tip's frame
 _WRIST_FOCAL = 0.75
 _OVERHEAD_CAMERA = "front"
 

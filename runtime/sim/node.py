@@ -138,7 +138,7 @@ class Node:
         try:
             self._surroundings.reset(wish)
         except BenchError:
-            self._gate.refused["layout"] += 1
+            self._gate.refused["bench_layout"] += 1
 
     def _move(self, seconds: float) -> None:
         silent = self._gate.silent(self._clock.now())

@@ -8,6 +8,7 @@ import pytest
 import robots
 from runtime import codecs
 from runtime.sim.gate import Gate
+from runtime.sim.tabletop import Reset
 
 ROBOT = robots.load("agilex_piper")
 HOME = ROBOT.poses["home"].astype(np.float32)
@@ -129,4 +130,54 @@ def test_a_client_without_a_name_is_a_master_like_any_other(gate: Gate) -> None:
 def test_control_words_of_another_client_are_refused(gate: Gate) -> None:
     gate.judge(command(master="a"), 0.0)
     assert gate.judge(command(target="collect_start", master="b"), 0.1) is None
+    assert gate.refused == {"other_master": 1}
+
+
+WISH = {"target": "scene_reset", "id": "one", "seed": 7}
+
+
+def test_a_wish_to_lay_the_bench_passes_where_there_is_one() -> None:
+    gate = Gate(ROBOT, deadline=0.3, bench=True)
+    positions = {"block": [0.1, 0.2, 30.0], "plate": [0.1, 0.37]}
+    for arrival, wish, expected in (
+        (0.0, WISH, Reset("one", 7, None)),
+        (2.0, WISH | {"positions": None, "master": "first", "t": 1.0, "seq": 3}, Reset("one", 7, None)),
+        (4.0, WISH | {"positions": positions}, Reset("one", 7, positions)),
+    ):
+        accepted = gate.judge(codecs.pack(wish), arrival)
+        assert accepted is not None
+        assert accepted.reset == expected
+        assert accepted.target is accepted.control is None
+    assert gate.refused == {}
+    assert gate.silent(0.0)
+
+
+def test_a_node_without_a_bench_refuses_the_wish(gate: Gate) -> None:
+    assert gate.judge(codecs.pack(WISH), 0.0) is None
+    assert gate.refused == {"no_bench": 1}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"id": ""},
+        {"id": 3},
+        {"id": "x" * 129},
+        {"seed": -1},
+        {"seed": True},
+        {"seed": 1.0},
+        {"seed": None},
+        {"positions": [1, 2]},
+    ],
+)
+def test_a_wish_of_the_wrong_shape_is_refused(wrong: dict[str, Any]) -> None:
+    gate = Gate(ROBOT, deadline=0.3, bench=True)
+    assert gate.judge(codecs.pack(WISH | wrong), 0.0) is None
+    assert gate.refused == {"malformed": 1}
+
+
+def test_the_bench_is_not_laid_for_a_second_client_while_the_first_commands() -> None:
+    gate = Gate(ROBOT, deadline=0.3, bench=True)
+    gate.judge(command(master="first"), 0.0)
+    assert gate.judge(codecs.pack(WISH | {"master": "second"}), 0.5) is None
     assert gate.refused == {"other_master": 1}

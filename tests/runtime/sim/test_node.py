@@ -19,9 +19,11 @@ from runtime import codecs
 from runtime.clock import MonotonicClock, VirtualClock
 from runtime.errors import CodecError, SetupError
 from runtime.sim import node as module
+from runtime.sim.bench import layout_of, overhead_camera
 from runtime.sim.node import Node, parser
 from runtime.sim.pictures import frame_number
 from runtime.transports import zmq as link
+from runtime.transports.node_messages import NodeMessages
 from runtime.transports.zmq import Config, NodeSink, NodeSource
 from runtime.types import Float64, Observation, RobotCommand
 
@@ -278,6 +280,89 @@ def test_its_clock_can_be_set_off() -> None:
         assert bench.tick()["t"] == pytest.approx(bench.clock.now() - 400)
 
 
+POSITIONS = {"block": [0.15, 0.2, 30.0], "plate": [0.15, 0.37]}
+
+
+@pytest.fixture
+def tabletop() -> Iterator[Bench]:
+    with contextlib.closing(Bench("--bench", "tabletop", "--start-pose", "ready", "--seed", "5")) as made:
+        yield made
+
+
+def test_without_a_bench_there_is_no_truth_and_nothing_to_lay(bench: Bench) -> None:
+    bench.send(target="scene_reset", id="one", seed=3)
+    said = bench.tick()
+    assert "truth" not in said
+    assert said["refused"] == {"no_bench": 1}
+
+
+def test_a_tabletop_says_how_it_really_is(tabletop: Bench) -> None:
+    said = tabletop.tick()
+    np.testing.assert_allclose(joints(said), ROBOT.poses["ready"], atol=1e-6)
+    layout = layout_of(5)
+    truth = said["truth"]
+    assert truth["reset"] == ""
+    assert truth["seed"] == 5
+    assert truth["blocks"] == [pytest.approx([*layout.blocks[0][:2], 0.02, layout.blocks[0][2]])]
+    assert truth["plate"] == pytest.approx(layout.plate)
+    assert truth["held"] == [""]
+    assert truth["milestones"] == {"grasped": False, "lifted": False, "over_plate": False, "placed": False}
+    assert truth["success"] is False
+
+
+def test_a_scene_reset_lays_the_bench_once_and_the_pictures_show_it(tabletop: Bench) -> None:
+    before = tabletop.tick()
+    for _ in range(3):
+        tabletop.send(target="scene_reset", id="one", seed=3, positions=POSITIONS)
+    said = tabletop.tick()
+    layout = layout_of(3, POSITIONS)
+    assert said["truth"]["reset"] == "one"
+    assert said["truth"]["seed"] == 3
+    assert said["truth"]["blocks"][0][:2] == pytest.approx(layout.blocks[0][:2])
+    assert said["refused"] == {}
+    camera = overhead_camera(96, 60)
+    u, v = camera.project(np.array([*layout.blocks[0][:2], 0.04])).round().astype(int)
+    blue, _, red = said["images"]["cam_high"][v, u].astype(int)
+    assert red > blue + 80
+    assert not np.array_equal(before["images"]["cam_high"], said["images"]["cam_high"])
+    np.testing.assert_array_equal(said["images"]["cam_high"], tabletop.tick()["images"]["cam_high"])
+    tabletop.send(target="scene_reset", id="two", seed=3)
+    assert tabletop.tick()["truth"]["reset"] == "two"
+
+
+def test_a_layout_that_cannot_be_is_refused_and_changes_nothing(tabletop: Bench) -> None:
+    before = tabletop.tick()["truth"]
+    tabletop.send(target="scene_reset", id="one", seed=3, positions={"plate": [3.0, 0.3]})
+    said = tabletop.tick()
+    assert said["refused"] == {"bench_layout": 1}
+    assert said["truth"] == before
+
+
+def test_the_arms_over_a_bench_obey_as_without_one(tabletop: Bench) -> None:
+    target = ROBOT.poses["ready"].copy()
+    target[0] += 0.2
+    for _ in range(40):
+        tabletop.send(target)
+        said = tabletop.tick()
+    np.testing.assert_allclose(joints(said), target, atol=1e-4)
+    tabletop.clock.advance(0.3)
+    assert tabletop.tick()["holding"] is True
+
+
+def test_a_bench_can_have_more_blocks() -> None:
+    with contextlib.closing(Bench("--bench", "tabletop", "--blocks", "3")) as bench:
+        assert len(bench.tick()["truth"]["blocks"]) == 3
+
+
+def test_the_node_with_a_bench_is_one_that_the_link_understands(tabletop: Bench) -> None:
+    tabletop.clock.advance(PERIOD)
+    tabletop.node.tick(PERIOD)
+    assert tabletop.frames.poll(int(PATIENCE * 1e3))
+    frame = NodeMessages(ROBOT, "bgr", frozenset(), 2**24).read(tabletop.frames.recv())
+    assert frame.truth is not None
+    assert frame.truth["success"] is False
+
+
 @pytest.mark.parametrize("name", robots.names())
 def test_every_robot_can_be_simulated(name: str) -> None:
     robot = robots.load(name)
@@ -423,6 +508,8 @@ def test_it_ends_when_its_lifeline_ends(start: Any) -> None:
         (["--robot", "no_such_robot"], "no_such_robot"),
         (["--robot", "agilex_piper", *FREE, "--drop-camera", "x"], "has no camera 'x'"),
         (["--robot", "agilex_piper", *FREE, "--rate", "0"], "0 is not above zero"),
+        (["--robot", "agilex_piper", *FREE, "--start-pose", "x"], "has no pose 'x'; it has home, ready"),
+        (["--robot", "agilex_piper", *FREE, "--bench", "tabletop", "--blocks", "0"], "0 blocks by seed 0"),
     ],
 )
 def test_a_wrong_option_ends_it_with_a_sentence(arguments: list[str], says: str) -> None:
