@@ -10,6 +10,7 @@ from robots import scene_of
 from runtime.sim import bench as benches
 from runtime.sim.bench import Bench, BenchState, PinholeCamera
 from runtime.sim.render.painter import Painter
+from runtime.sim.render.plate import Plate
 from runtime.sim.render.shadows import Shadows, darken
 from runtime.sim.render.solids import Solid, Solids
 from runtime.sim.render.table import Table
@@ -32,6 +33,7 @@ class Renderer:
         self._size = width, height
         self._scene = scene_of(robot)
         self._table = Table(bench, seed)
+        self._plate = Plate(bench)
         self._shadows = Shadows(bench)
         self._solids: dict[int, Solids] = {}  # by the number of blocks
         q = robot.poses["home"]
@@ -52,7 +54,7 @@ class Renderer:
         for key, camera in self._cameras(q).items():
             still = self._still.get(key)
             picture = self._table.draw(camera) if still is None else still.copy()
-            self._table.draw_plate(picture, camera, state.plate)
+            self._plate.draw(picture, camera, state.plate)
             darken(picture, camera, light)
             painter.paint(picture, camera)
             pictures[key] = picture

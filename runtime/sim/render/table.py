@@ -1,4 +1,4 @@
-"""The table and the plate on it, drawn where a camera sees them."""
+"""The table, drawn where a camera sees it."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from numpy.typing import NDArray
 from runtime.sim.bench import Bench, PinholeCamera
 from runtime.sim.render.painter import ahead
 from runtime.sim.render.room import draw_room
-from runtime.sim.render.solids import circle
 from runtime.types import Float32, Float64, UInt8
 
 X, Y = (-0.80, 0.80), (-0.42, 0.86)  # m, the table's edges
-_TEXEL = 0.0008  # m
+_TEXEL = 0.001  # m
 _BOARD = 0.16  # m, width of a board
 CORNERS = np.array([[X[0], Y[0], 0.0], [X[1], Y[0], 0.0], [X[1], Y[1], 0.0], [X[0], Y[1], 0.0]])
-_PLATE_POINTS = 64
 
 
 class Table:
@@ -52,32 +50,6 @@ class Table:
         edge = [part * 0.42 for part in self._bench.table_colour[::-1]]
         cv2.polylines(picture, [(outline * 16).round().astype(np.int32)], True, edge, 2, cv2.LINE_AA, 4)
 
-    def draw_plate(self, picture: UInt8, camera: PinholeCamera, plate: tuple[float, float]) -> None:
-        """A round dish: its outer side, its coloured rim, the slope inwards and the flat middle."""
-        bench = self._bench
-        radius, height = bench.plate_radius, bench.plate_height
-        side = [part * 0.55 for part in bench.plate_rim_colour[::-1]]
-        ring = _ring(plate, radius, height)
-        self._fill(picture, camera, np.concatenate([_ring(plate, radius * 0.92, 0.0), ring]), side)
-        self._fill(picture, camera, ring, list(bench.plate_rim_colour[::-1]))
-        white = np.array(bench.plate_colour[::-1], np.float64)
-        for share, level, tone in (
-            (0.93, 0.95, 0.97),
-            (0.90, 0.9, 0.86),
-            (0.72, 0.35, 0.93),
-            (0.70, 0.33, 1.0),
-        ):
-            self._fill(picture, camera, _ring(plate, radius * share, height * level), (white * tone).tolist())
-
-    def _fill(self, picture: UInt8, camera: PinholeCamera, points: Float64, colour: list[float]) -> None:
-        inside = (points - camera.pose[:3, 3]) @ camera.pose[:3, :3]
-        if inside[:, 2].min() > 0.02:
-            pixels = inside[:, :2] / inside[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-            if (pixels.max(0) < 0).any() or (pixels.min(0) > (camera.width, camera.height)).any():
-                return
-            hull = cv2.convexHull((np.clip(pixels, -9000, 9000) * 16).round().astype(np.int32))
-            cv2.fillConvexPoly(picture, hull, colour, cv2.LINE_AA, 4)
-
 
 def texels_to_pixels(camera: PinholeCamera, texel: float) -> Float64:
     """The homography [3, 3] from a map of the table, `texel` m per point, to the camera's picture."""
@@ -85,10 +57,6 @@ def texels_to_pixels(camera: PinholeCamera, texel: float) -> Float64:
     lens = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     turn = camera.pose[:3, :3].T
     return np.asarray(lens @ np.column_stack([turn, -turn @ camera.pose[:3, 3]]) @ to_world)
-
-
-def _ring(centre: tuple[float, float], radius: float, height: float) -> Float64:
-    return np.column_stack([circle(radius, _PLATE_POINTS) + centre, np.full(_PLATE_POINTS, height)])
 
 
 def outline_of(camera: PinholeCamera) -> Float32:
