@@ -73,8 +73,8 @@ def test_in_a_run_the_curves_are_those_of_one_step(watched: Watched) -> None:
     assert np.allclose(seen["commanded"], seen["planned"], atol=0.02)
     assert not np.allclose(seen["measured"], seen["raw"], atol=1e-4)  # it was measured before it was told
     episode = station.stop()
-    row = episode.ticks["step"].to_pylist().index(seen["step"])
-    assert np.allclose(seen["planned"], episode.ticks["smoothed"][row].as_py())
+    row = episode.smoothed["step"].to_pylist().index(seen["step"])
+    assert np.allclose(seen["planned"], episode.smoothed["smoothed"][row].as_py())
 
 
 def test_after_a_run_nothing_is_planned_any_more(watched: Watched) -> None:
