@@ -194,7 +194,10 @@ class Node:
 
 
 def run(node: Node, clock: Clock, rate: float, told: Event) -> None:
-    """Tick on absolute deadlines until told to end; missed ticks are skipped, not made up for."""
+    """Tick on absolute deadlines until told to end; missed ticks are skipped, not made up for.
+
+    One that is late by less than half a period is done at once: the next one is on time again.
+    """
     period = 1.0 / rate
     due = last = clock.now()
     while not told.is_set():
@@ -202,7 +205,7 @@ def run(node: Node, clock: Clock, rate: float, told: Event) -> None:
         now = clock.now()
         node.tick(min(now - last, _LONGEST_STEP))
         last = now
-        due += period * (1 + max(0, int((clock.now() - due) / period)))
+        due += period * max(1, int((clock.now() - due) / period + 0.5))
 
 
 def parser() -> argparse.ArgumentParser:

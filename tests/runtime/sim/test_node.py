@@ -388,7 +388,7 @@ def test_it_does_not_listen_beyond_this_machine_unasked() -> None:
         Node(ROBOT, options, VirtualClock()).open()
 
 
-def test_missed_ticks_are_skipped_and_the_others_keep_their_times() -> None:
+def test_missed_ticks_are_skipped_and_the_others_keep_their_times_or_are_a_little_late() -> None:
     clock = VirtualClock(0.0)
     told = _Told()
     starts: list[float] = []
@@ -396,11 +396,11 @@ def test_missed_ticks_are_skipped_and_the_others_keep_their_times() -> None:
     class Slow:
         def tick(self, seconds: float) -> None:
             starts.append(clock.now())
-            clock.advance(0.35 if len(starts) == 2 else 0.01)
-            told.done = len(starts) == 5
+            clock.advance({2: 0.37, 4: 0.13}.get(len(starts), 0.01))
+            told.done = len(starts) == 6
 
     module.run(Slow(), clock, 10.0, told)  # type: ignore[arg-type]
-    assert starts == pytest.approx([0.0, 0.1, 0.5, 0.6, 0.7])
+    assert starts == pytest.approx([0.0, 0.1, 0.5, 0.6, 0.73, 0.8])
 
 
 class _Told:
