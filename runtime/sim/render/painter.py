@@ -108,13 +108,20 @@ class Painter:
 
 
 def fill_ahead(
-    picture: UInt8, camera: PinholeCamera, inside: Float32, colour: tuple[float, ...] | list[float]
+    picture: UInt8,
+    camera: PinholeCamera,
+    inside: Float32,
+    colour: tuple[float, ...] | list[float],
+    edges: int = cv2.LINE_AA,
 ) -> None:
     """Fill the part that lies ahead of a flat polygon given in the camera's axes, [n, 3]."""
     corners = ahead(inside)
-    if len(corners) > 2:
-        pixels = (_pixels(camera, corners) * (1 << _SHIFT)).round().astype(np.int32)
-        cv2.fillConvexPoly(picture, pixels, colour, cv2.LINE_AA, _SHIFT)
+    if len(corners) < 3:
+        return
+    pixels = _pixels(camera, corners)
+    if (pixels.max(0) > -1).all() and (pixels.min(0) < (camera.width, camera.height)).all():
+        fixed = (pixels * (1 << _SHIFT)).round().astype(np.int32)
+        cv2.fillConvexPoly(picture, fixed, colour, edges, _SHIFT)
 
 
 def ahead(inside: Float32) -> Float32:

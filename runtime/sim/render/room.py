@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from runtime.sim.bench import PinholeCamera
@@ -33,6 +34,7 @@ _ROOM = _room()
 def draw_room(picture: UInt8, camera: PinholeCamera) -> None:
     """Fill the picture with what of the room the camera sees."""
     eye, turn = camera.pose[:3, 3].astype(np.float32), camera.pose[:3, :3].astype(np.float32)
-    picture[:] = (120, 118, 114)
+    picture.fill(118)  # of a seam that no wall covers
     for corners, colour in _ROOM:
-        fill_ahead(picture, camera, np.asarray((corners - eye) @ turn, np.float32), colour)
+        inside = np.asarray((corners - eye) @ turn, np.float32)
+        fill_ahead(picture, camera, inside, colour, cv2.LINE_8)

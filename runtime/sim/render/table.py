@@ -41,14 +41,21 @@ class Table:
         if outline is None:
             cv2.warpPerspective(self._texture, matrix, size, picture, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
             return
+        top = int(np.clip(outline[:, 1].min(), 0, camera.height))
+        rows = picture[top : int(np.clip(outline[:, 1].max() + 2, top, camera.height))]
+        if len(rows) == 0:
+            return
+        matrix[:2] -= np.outer((0, top), matrix[2])
+        size = (camera.width, len(rows))
         boards = cv2.warpPerspective(
             self._texture, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
-        mask = np.zeros((camera.height, camera.width), np.uint8)
-        cv2.fillConvexPoly(mask, (outline * 16).round().astype(np.int32), 255, cv2.LINE_8, 4)
-        cv2.copyTo(boards, mask, picture)
+        corners = ((outline - np.array([0, top], np.float32)) * 16).round().astype(np.int32)
+        mask = np.zeros(rows.shape[:2], np.uint8)
+        cv2.fillConvexPoly(mask, corners, 255, cv2.LINE_8, 4)
+        cv2.copyTo(boards, mask, rows)
         edge = [part * 0.42 for part in self._bench.table_colour[::-1]]
-        cv2.polylines(picture, [(outline * 16).round().astype(np.int32)], True, edge, 2, cv2.LINE_AA, 4)
+        cv2.polylines(rows, [corners], True, edge, 2, cv2.LINE_AA, 4)
 
 
 def texels_to_pixels(camera: PinholeCamera, texel: float) -> Float64:
