@@ -136,3 +136,51 @@ def test_a_joint_without_a_limit_needs_an_override(edited: Edit) -> None:
     file.write_text(text.replace(limit, ""))
     with pytest.raises(RobotError, match="'joint5': the URDF gives no lower for joint6; needed: an override"):
         load(folder)
+
+
+def test_fingertips_lie_between_the_fingers_of_the_urdf() -> None:
+    for arm in load("agilex_piper").arms:
+        assert arm.tip is not None
+        np.testing.assert_allclose(arm.tip[:3, 3], [0.0, 0.0, 0.1358], atol=1e-12)
+        np.testing.assert_allclose(arm.tip[:3, :3], np.eye(3), atol=1e-5)
+        assert not arm.tip.flags.writeable
+
+
+def test_the_way_in_which_the_fingers_slide_is_the_tips_y(edited: Edit) -> None:
+    folder = edited()
+    file = folder / "agilex_piper.urdf"
+    text = file.read_text()
+    finger = '<origin xyz="0.0 0.0 0.1358" rpy="1.5708 0.0 0.0"/>'
+    assert finger in text
+    file.write_text(text.replace(finger, '<origin xyz="0.02 0.0 0.1" rpy="1.5707963267949 0.0 0.7"/>'))
+    tip = load(folder).arms[0].tip
+    assert tip is not None
+    np.testing.assert_allclose(tip[:3, 3], [0.01, 0.0, 0.1179], atol=1e-9)
+    np.testing.assert_allclose(tip[:3, 1], [-np.sin(0.7), np.cos(0.7), 0.0], atol=1e-9)
+    np.testing.assert_allclose(tip[:3, 2], [0.0, 0.0, 1.0], atol=1e-9)
+    assert np.linalg.det(tip[:3, :3]) == pytest.approx(1.0)
+
+
+def test_without_sliding_fingers_the_end_effector_is_the_fingertip(edited: Edit) -> None:
+    folder = edited()
+    file = folder / "agilex_piper.urdf"
+    file.write_text(file.read_text().replace('type="prismatic"', 'type="revolute"'))
+    tip = load(folder).arms[0].tip
+    assert tip is not None
+    np.testing.assert_array_equal(tip, np.eye(4))
+
+
+def test_fingertips_that_are_declared_count(edited: Edit) -> None:
+    declared = "[groups.gripper.tip]\nxyz = [0.0, 0.01, 0.2]\nwxyz = [0.0, 0.0, 0.0, 1.0]\n\n[groups.mount]"
+    left, right = load(edited(("[groups.mount]", declared))).arms
+    assert left.tip is not None
+    assert right.tip is not None
+    np.testing.assert_allclose(left.tip[:3, 3], [0.0, 0.01, 0.2])
+    np.testing.assert_allclose(left.tip[:3, :3], np.diag([-1.0, -1.0, 1.0]), atol=1e-12)
+    np.testing.assert_allclose(right.tip[:3, 3], [0.0, 0.0, 0.1358])
+
+
+def test_a_declared_fingertip_needs_a_unit_quaternion(edited: Edit) -> None:
+    declared = "[groups.gripper.tip]\nxyz = [0.0, 0.0, 0.2]\nwxyz = [1.0, 1.0, 0.0, 0.0]\n\n[groups.mount]"
+    with pytest.raises(RobotError, match=r"left_arm\.gripper\.tip\.wxyz has length 1\.41.*allowed: 1"):
+        load(edited(("[groups.mount]", declared)))
