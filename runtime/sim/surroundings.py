@@ -65,8 +65,11 @@ class Workbench(Surroundings):
     """The tabletop, and its pictures."""
 
     def __init__(self, robot: Robot, options: argparse.Namespace) -> None:
-        from runtime.sim.render import Renderer  # takes OpenCV along, which no other node needs
+        import cv2  # which no other node needs
 
+        from runtime.sim.render import Renderer
+
+        cv2.setNumThreads(1)  # the other cores belong to the station
         self._tabletop = Tabletop(robot, options.seed, options.blocks)
         self._renderer = Renderer(robot, self._tabletop.bench, options.width, options.height)
 
