@@ -8,3 +8,7 @@ class ConsoleConfig(AppConfig):
 
     name = "evaweb.console"
     default_auto_field = "django.db.models.BigAutoField"
+
+    def ready(self) -> None:
+        """Register the checks."""
+        from evaweb.console import checks  # noqa: F401

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
-from django.urls import URLPattern
+from django.urls import path
 
-websocket_urlpatterns: list[URLPattern] = []
+from evaweb.console.consumers import StationConsumer
+
+websocket_urlpatterns = [path("ws/stations/<str:name>", StationConsumer.as_asgi())]

@@ -59,6 +59,14 @@ class Looks:
         }
 
 
+def facts_of(robot: str) -> dict[str, Any]:
+    """The facts of a robot; where its description cannot be read, none but why: stopping must work all the same."""
+    try:
+        return looks_of(robot).facts()
+    except (NotFound, robots.RobotError) as error:
+        return {"robot": robot, "title": robot, "joint_names": [], "cameras": [], "error": str(error)}
+
+
 @cache
 def looks_of(robot: str) -> Looks:
     """The looks of a robot that comes with the program; NotFound lists them."""

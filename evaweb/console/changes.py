@@ -1,0 +1,65 @@
+"""Whether something of a station has changed in the database, whoever changed it.
+
+Each web process looks once a second while somebody watches: the worker and other processes are heard this way
+without anything between them but the database.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from channels.db import database_sync_to_async
+from django.db import DatabaseError
+from django.db.models import Count, Max, Q
+
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.jobs.models import Job, JobStatus
+from evaweb.stations.models import Lease, LeaseRequest
+from evaweb.trials.models import Score, Trial
+
+log = logging.getLogger(__name__)
+Marks = dict[str, Any]
+
+
+async def look(station: str) -> Marks | None:
+    """The marks of the station now; None where the database does not answer: nothing live depends on it."""
+    try:
+        return await database_sync_to_async(marks, thread_sensitive=False)(station)
+    except DatabaseError as error:
+        log.warning("the database does not say what has changed: %s", error)
+        return None
+
+
+def difference(before: Marks, now: Marks) -> list[str]:
+    """The names of what has another mark."""
+    return sorted(name for name in now if now[name] != before.get(name))
+
+
+def marks(station: str) -> Marks:
+    """What is different after every change, by what it is about."""
+    here = Q(station__name=station)
+    return {
+        "lease": (
+            Lease.objects.filter(here).aggregate(
+                Max("id"), Max("ended_at"), open=Count("id", Q(ended_at=None))
+            ),
+            LeaseRequest.objects.filter(here).aggregate(Max("id"), Max("answered_at")),
+        ),
+        "trial": (
+            Trial.objects.filter(here).aggregate(Max("id"), Max("changed_at")),
+            Score.objects.filter(trial__station__name=station).aggregate(Max("id")),
+        ),
+        "episode": Episode.objects.filter(here).aggregate(
+            Max("created_at"),
+            Max("previewed_at"),
+            Max("published_at"),
+            open=Count("pk", Q(status=EpisodeStatus.RECORDING)),
+        ),
+        "job": Job.objects.aggregate(
+            Max("id"),
+            Max("finished_at"),
+            waiting=Count("id", Q(status=JobStatus.QUEUED)),
+            running=Count("id", Q(status=JobStatus.RUNNING)),
+        ),
+    }

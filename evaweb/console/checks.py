@@ -1,0 +1,24 @@
+"""What the pages need beside Python, looked for when a process starts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django.contrib.staticfiles import finders
+from django.core.checks import CheckMessage, Warning, register
+
+_WANTED = {"uplot/uPlot.esm.js": "curves", "meshcat/main.min.js": "the 3D scene"}
+
+
+@register()
+def third_party_scripts(**options: Any) -> list[CheckMessage]:
+    """The scripts of others are where they are served from."""
+    return [
+        Warning(
+            f"{script} is absent: pages are shown without {what}",
+            hint="make setup brings it",
+            id=f"console.W{number:03}",
+        )
+        for number, (script, what) in enumerate(_WANTED.items(), 1)
+        if finders.find(script) is None
+    ]

@@ -1,0 +1,211 @@
+"""Writes down what happens at the stations, whether somebody watches or not.
+
+A thread per station hears its feed and hands events to the services, in order, each at least once: the number
+of the last one is in the station's row, services take an event twice without harm, and so any number of web
+processes may do the same. A database that is busy or gone is tried again; nothing live waits for it.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from django.db import DatabaseError, InterfaceError, close_old_connections
+from django.db.models import Q
+
+from evaweb.console.feed import Feeds, History, feeds
+from evaweb.episodes import services as episodes
+from evaweb.stations import commands, leases
+from evaweb.stations.models import Station
+from evaweb.trials import services as trials
+
+log = logging.getLogger(__name__)
+# The kinds of events that change rows; all others are only shown.
+NOTED = ("state", "command", "truth", "episode_closed")
+_TURN_S = 1.0
+_SWEEP_S = 5.0  # how often what was lost on the way is looked for
+
+
+class Scribe:
+    """One station's thread."""
+
+    def __init__(self, station: str, heard: Feeds) -> None:
+        self._station = station
+        self._feed = heard.of(station)
+        self._ended = threading.Event()
+        self._news = threading.Event()
+        self._written = ("", 0)  # boot and number of the last event
+        self._lease: tuple[Any, ...] = ()
+        self._swept = 0.0
+        self._failing = False
+        self._thread = threading.Thread(target=self._run, name=f"{station} chronicle", daemon=True)
+
+    def start(self) -> None:
+        """Begin to listen."""
+        self._feed.join(self._hear, pictures=False)
+        self._thread.start()
+
+    def end(self) -> None:
+        """Listen no more; the thread ends after what it is writing."""
+        self._feed.leave(self._hear)
+        self._ended.set()
+        self._news.set()
+
+    def _hear(self, stream: str, content: Any) -> None:
+        if stream == "events" or (stream == "state" and self._lease_of(content) != self._lease):
+            self._news.set()
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            self._news.wait(_TURN_S)
+            self._news.clear()
+            close_old_connections()
+            try:
+                self._write()
+                self._failing = False
+            except (DatabaseError, InterfaceError) as error:
+                self._again(error)
+            except Exception:  # a station of another version must not silence the thread for good
+                log.exception("what happens at %s cannot be written down", self._station)
+                self._ended.wait(_TURN_S)
+            finally:
+                close_old_connections()
+
+    def _again(self, error: Exception) -> None:
+        if not self._failing:
+            log.warning("what happens at %s is written down later: %s", self._station, error)
+        self._failing = True
+        self._ended.wait(_TURN_S)
+        self._news.set()
+
+    def _write(self) -> None:
+        """Lease first, then events, then what was lost; a station without a row is left alone."""
+        sweep = time.monotonic() - self._swept > _SWEEP_S
+        state, history = self._feed.state, self._feed.history
+        lease = self._lease_of(state)
+        behind = bool(history.boot) and self._written != (history.boot, history.newest)
+        if not (sweep or behind or lease != self._lease):
+            return
+        station = Station.objects.filter(name=self._station).first()
+        if station is None:
+            return
+        if lease:
+            leases.notice(station=station, boot=state["boot"], held=state["lease"])
+            self._lease = lease
+        if behind:
+            self._written = events_written(
+                station=station, history=history, state=str(state.get("state", ""))
+            )
+        if sweep and self._feed.link.ok:
+            for row in commands.unsettled(station=station):
+                commands.settle(row=row)
+        if sweep:
+            self._swept = time.monotonic()
+
+    @staticmethod
+    def _lease_of(state: Mapping[str, Any]) -> tuple[Any, ...]:
+        return (state["boot"], state["lease"]["holder"], state["lease"]["epoch"]) if state else ()
+
+
+def events_written(*, station: Station, history: History, state: str = "") -> tuple[str, int]:
+    """Hand all events to the services that are not in the database yet; boot and number of the last one.
+
+    A boot that is new begins with an event of ours that says in which state the station is: it may have
+    nothing to say of itself for long.
+    """
+    if station.boot != history.boot:
+        if station.boot and state:
+            _hand_on(station, history.boot, _restarted(history, state))
+        station.boot, station.last_event = history.boot, 0
+        station.save(update_fields=["boot", "last_event"])
+    first = history.rows[0]["number"] if history.rows else 0
+    if first > station.last_event + 1:
+        log.error(
+            "events %d to %d of %s are lost: `manage.py reconcile` finds the episodes",
+            station.last_event + 1,
+            first - 1,
+            station,
+        )
+    for event in history.after(station.last_event):
+        if event["kind"] in NOTED:
+            _hand_on(station, history.boot, event)
+            _advance(station, history.boot, event["number"])
+    _advance(station, history.boot, history.newest)
+    return history.boot, history.newest
+
+
+def _restarted(history: History, state: str) -> dict[str, Any]:
+    text = f"restarted -> {state}: the station was restarted"
+    return {
+        "number": 0,
+        "kind": "state",
+        "text": text,
+        "time": None,
+        "data": {"state": state},
+        "boot": history.boot,
+    }
+
+
+def _advance(station: Station, boot: str, number: int) -> None:
+    """Note how far we are, unless another process is further."""
+    if number > station.last_event:
+        Station.objects.filter(Q(pk=station.pk, boot=boot, last_event__lt=number)).update(last_event=number)
+        station.last_event = number
+
+
+def _hand_on(station: Station, boot: str, event: Mapping[str, Any]) -> None:
+    """An event that a service cannot take must not keep those after it out of the database."""
+    try:
+        if event["kind"] == "episode_closed":
+            episodes.episode_closed(station=station, data=event["data"])
+        trials.run_changed(station=station, event=event, boot=boot)
+    except (DatabaseError, InterfaceError):
+        raise
+    except Exception:
+        log.exception("event %s of %s (%s) is not in the database", event["number"], station, event["text"])
+
+
+class Chronicle:
+    """The scribes of all stations, those that are added later included."""
+
+    def __init__(self, heard: Feeds = feeds) -> None:
+        self._feeds = heard
+        self._scribes: dict[str, Scribe] = {}
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="chronicle", daemon=True)
+
+    def start(self) -> None:
+        """Begin; returns at once."""
+        self._thread.start()
+
+    def end(self) -> None:
+        """End all scribes."""
+        self._ended.set()
+        for scribe in self._scribes.values():
+            scribe.end()
+
+    def _run(self) -> None:
+        failing = False
+        while not self._ended.is_set():
+            try:
+                self._look()
+                failing = False
+            except (DatabaseError, InterfaceError) as error:
+                if not failing:
+                    log.warning("the database does not say which stations there are: %s", error)
+                failing = True
+            self._ended.wait(2 * _TURN_S)
+
+    def _look(self) -> None:
+        close_old_connections()
+        try:
+            names = list(Station.objects.values_list("name", flat=True))
+        finally:
+            close_old_connections()
+        for name in names:
+            if name not in self._scribes and not self._ended.is_set():
+                self._scribes[name] = Scribe(name, self._feeds)
+                self._scribes[name].start()

@@ -1,0 +1,256 @@
+"""What a station publishes, followed by threads of this process: found anew where its runtime was restarted.
+
+Knows neither pages nor database. Listeners are told in the feed's own threads and must not wait for anything.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any
+
+import zmq
+
+from evaweb.errors import StationGone
+from evaweb.frames import plain
+from evaweb.stations.wire import StationWire, wire_to
+from runtime.bus import CodecError, Subscriber
+
+log = logging.getLogger(__name__)
+EVENTS_KEPT = 2000
+_SILENCE_S = 1.5  # ten snapshots come in a second
+_TURN_S = 0.2
+_EVENTS_S = 1.0
+Listener = Callable[[str, Any], None]  # told of a stream ("link", "events" among them) and its newest content
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """Whether the station's runtime is heard, and if not, what is known."""
+
+    ok: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """The last events of one boot of the runtime, numbered without gaps."""
+
+    boot: str = ""
+    rows: tuple[dict[str, Any], ...] = ()
+
+    @property
+    def newest(self) -> int:
+        return int(self.rows[-1]["number"]) if self.rows else 0
+
+    def after(self, number: int) -> tuple[dict[str, Any], ...]:
+        """The events after `number`."""
+        behind = self.newest - number
+        return self.rows[-behind:] if behind > 0 else ()
+
+    def extended(self, boot: str, rows: list[dict[str, Any]]) -> History:
+        """With what came after; another boot begins anew."""
+        known = self.rows if boot == self.boot else ()
+        last = known[-1]["number"] if known else 0
+        fresh = tuple(row for row in rows if row["number"] > last)
+        return History(boot, (*known, *fresh)[-EVENTS_KEPT:])
+
+
+class _Reader:
+    """A thread that follows one socket of a station, from runtime to runtime."""
+
+    def __init__(self, wire: StationWire, process: str, key: str, streams: tuple[str, ...]) -> None:
+        self._wire, self._process, self._key, self._streams = wire, process, key, streams
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"{wire.name} {key}", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def end(self) -> None:
+        """It ends by itself within a fraction of a second."""
+        self._ended.set()
+
+    def heard(self, found: Mapping[str, Any]) -> None:
+        """The newest of each stream that had something."""
+        raise NotImplementedError
+
+    def lost(self, reason: str) -> None:
+        """Nothing has come for a while."""
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            try:
+                self._follow(self._wire.address(self._process, self._key))
+            except StationGone as gone:
+                self.lost(str(gone))
+            except zmq.ZMQError as error:  # the file names no address
+                self.lost(f"the address of {self._wire.name} cannot be used: {error.strerror}")
+            except Exception:  # whatever a runtime of another version publishes: the next one may be better
+                log.exception("%s published what this web cannot use", self._wire.name)
+                self.lost(f"{self._wire.name} publishes what this web cannot use: see the log of the web")
+            self._ended.wait(_TURN_S)
+
+    def _follow(self, endpoint: str) -> None:
+        """Read until the runtime has another address."""
+        heard = looked = time.monotonic()
+        with closing(Subscriber(zmq.Context.instance(), endpoint, *self._streams)) as subscriber:
+            while not self._ended.is_set():
+                found = self._receive(subscriber)
+                now = time.monotonic()
+                if found:
+                    heard = now
+                    self.heard(found)
+                elif now - heard > _SILENCE_S:
+                    self.lost(
+                        f"no sign of life from {self._wire.name}: was its runtime ended, or does it hang?"
+                    )
+                if now - looked > 2 * _TURN_S:
+                    looked = now
+                    if self._wire.address(self._process, self._key) != endpoint:
+                        return
+
+    def _receive(self, subscriber: Subscriber) -> Mapping[str, Any]:
+        try:
+            return subscriber.receive(_TURN_S)
+        except CodecError as error:
+            log.error("%s published what cannot be read: %s", self._wire.name, error)
+            return {}
+
+
+class _Numbers(_Reader):
+    """State, joints and events, from main."""
+
+    def __init__(self, feed: Feed, wire: StationWire) -> None:
+        super().__init__(wire, "main", "state", ("state", "joints", "event"))
+        self._feed = feed
+
+    def heard(self, found: Mapping[str, Any]) -> None:
+        feed = self._feed
+        if feed.link != Link(True):
+            feed.tell("link", Link(True))
+        if "joints" in found:
+            feed.tell("joints", found["joints"])
+        if "state" in found:
+            feed.tell("state", plain(found["state"]))
+        if "event" in found or self._behind():
+            self._catch_up()
+
+    def lost(self, reason: str) -> None:
+        if self._feed.link != Link(False, reason):
+            log.warning("%s", reason)
+            self._feed.tell("link", Link(False, reason))
+
+    def _behind(self) -> bool:
+        state, history = self._feed.state, self._feed.history
+        return bool(state) and (state["boot"], state["newest_event"]) != (history.boot, history.newest)
+
+    def _catch_up(self) -> None:
+        """Fetch the events that there are; what is published is only the doorbell, and may be missed."""
+        history = self._feed.history
+        try:
+            boot, rows = self._wire.events_since(history.newest, timeout=_EVENTS_S)
+            if boot != history.boot and history.newest:
+                boot, rows = self._wire.events_since(0, timeout=_EVENTS_S)
+        except StationGone as gone:
+            log.warning("events of %s are late: %s", self._wire.name, gone)
+            return
+        if rows or boot != history.boot:
+            self._feed.tell("events", history.extended(boot, rows))
+
+
+class _Pictures(_Reader):
+    """Previews of the cameras, from media."""
+
+    def __init__(self, feed: Feed, wire: StationWire) -> None:
+        super().__init__(wire, "media", "cameras", ("camera/",))
+        self._feed = feed
+
+    def heard(self, found: Mapping[str, Any]) -> None:
+        for stream, jpeg in found.items():
+            self._feed.tell(stream, jpeg)
+
+
+class Feed:
+    """One station; `link`, `state` and `history` are the newest that was heard, for any thread to read."""
+
+    def __init__(self, station: str) -> None:
+        self.station = station
+        self.link = self._unheard()
+        self.state: dict[str, Any] = {}
+        self.history = History()
+        self._wire = wire_to(station)
+        self._listeners: dict[Listener, bool] = {}  # and whether it wants pictures
+        self._lock = threading.Lock()
+        self._numbers: _Reader | None = None
+        self._pictures: _Reader | None = None
+
+    def join(self, listener: Listener, *, pictures: bool) -> None:
+        """Tell `listener` what is known, then all that comes; the first one starts the threads."""
+        with self._lock:
+            self._listeners[listener] = pictures
+            listener("link", self.link)
+            if self.state:
+                listener("state", self.state)
+            listener("events", self.history)
+        self._adjust()
+
+    def leave(self, listener: Listener) -> None:
+        """The last one ends the threads."""
+        with self._lock:
+            self._listeners.pop(listener, None)
+            if not self._listeners:  # nobody hears what becomes of it now
+                self.link, self.state = self._unheard(), {}
+        self._adjust()
+
+    def _unheard(self) -> Link:
+        return Link(False, f"{self.station} has not been heard yet")
+
+    def tell(self, stream: str, content: Any) -> None:
+        """Pass on what a reader has heard."""
+        with self._lock:
+            if stream == "link":
+                self.link = content
+            elif stream == "state":
+                self.state = content
+            elif stream == "events":
+                self.history = content
+            for listener in self._listeners:
+                listener(stream, content)
+
+    def _adjust(self) -> None:
+        with self._lock:
+            wanted, pictures = bool(self._listeners), any(self._listeners.values())
+            self._numbers = self._switched(self._numbers, wanted, _Numbers)
+            self._pictures = self._switched(self._pictures, pictures, _Pictures)
+
+    def _switched(
+        self, reader: _Reader | None, wanted: bool, kind: Callable[[Feed, StationWire], _Reader]
+    ) -> _Reader | None:
+        if wanted and reader is None:
+            reader = kind(self, self._wire)
+            reader.start()
+        elif not wanted and reader is not None:
+            reader.end()
+            reader = None
+        return reader
+
+
+class Feeds:
+    """The feeds of a process, one per station, shared by its pages and its chronicle."""
+
+    def __init__(self) -> None:
+        self._feeds: dict[str, Feed] = {}
+        self._lock = threading.Lock()
+
+    def of(self, station: str) -> Feed:
+        """The station's feed."""
+        with self._lock:
+            return self._feeds.setdefault(station, Feed(station))
+
+
+feeds = Feeds()

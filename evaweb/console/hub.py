@@ -1,0 +1,192 @@
+"""The live pages of this process: each station is heard once, encoded once, and shown to all who watch it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Iterable
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from evaweb.console import changes, parts
+from evaweb.console.feed import Feeds, History, Link, feeds
+from evaweb.console.mailbox import Deliver, Mailbox
+from evaweb.console.parts import Part
+from evaweb.errors import NotFound
+from evaweb.stations.geometry import Looks, looks_of
+from robots import RobotError
+
+log = logging.getLogger(__name__)
+_FLUSH_S = 1 / 40  # frames leave at most so often
+_CHANGES_S = 1.0
+
+
+class Encoder:
+    """Makes parts of what a feed tells, in the feed's own threads."""
+
+    def __init__(self, robot: str) -> None:
+        self._looks = _looks(robot)
+
+    def encode(self, stream: str, content: Any) -> list[Part]:
+        """The parts that `content` of a stream is shown as."""
+        now = time.monotonic()
+        if stream == "state":
+            return [parts.facts(stream, content, now)]
+        if stream == "joints":
+            return self._joints(content, now)
+        if stream.startswith("camera/"):
+            return [parts.picture(stream, content, now)]
+        return []
+
+    def _joints(self, content: dict[str, Any], now: float) -> list[Part]:
+        measured, commanded = np.asarray(content["measured"]), np.asarray(content["commanded"])
+        words = {key: content[key] for key in content if key not in ("measured", "commanded")}
+        made = [parts.numbers("joints", words, {"measured": measured, "commanded": commanded}, now)]
+        rows = (
+            [measured, commanded] if content.get("engaged") and np.isfinite(commanded).all() else [measured]
+        )
+        if self._looks and np.isfinite(measured).all() and measured.shape == (self._looks.robot.dim,):
+            poses = self._looks.poses(np.stack(rows))
+            made.append(parts.array("poses", poses if len(rows) > 1 else poses[0], now))
+        return made
+
+
+class Room:
+    """The pages that watch one station; all but `hear` belongs to the event loop."""
+
+    def __init__(self, station: str, robot: str, loop: asyncio.AbstractEventLoop, heard: Feeds) -> None:
+        self.station = station
+        self._loop = loop
+        self._feed = heard.of(station)
+        self._encoder = Encoder(robot)
+        self._viewers: set[Mailbox] = set()
+        self._newest: dict[str, Part] = {}
+        self._link: Link | None = None
+        self._history = History()
+        self._frames = 0
+        self._flushed = 0.0
+        self._timer: asyncio.TimerHandle | None = None
+        self._changes: asyncio.Task[None] | None = None
+
+    @property
+    def empty(self) -> bool:
+        return not self._viewers
+
+    def join(self, deliver: Deliver) -> Mailbox:
+        """A mailbox for one more page."""
+        first = not self._viewers
+        mailbox = Mailbox(deliver)
+        self._viewers.add(mailbox)
+        if first:
+            self._feed.join(self.hear, pictures=True)
+            self._changes = self._loop.create_task(self._follow_changes())
+        elif self._link is not None:
+            mailbox.put_link(self._link)
+        self.ring()
+        return mailbox
+
+    def leave(self, mailbox: Mailbox) -> None:
+        """The page is gone; with the last one nothing is heard any more."""
+        self._viewers.discard(mailbox)
+        if self._viewers:
+            return
+        self._feed.leave(self.hear)
+        for pending in (self._timer, self._changes):
+            if pending is not None:
+                pending.cancel()
+        self._timer = self._changes = None
+
+    def watch(self, mailbox: Mailbox, streams: Iterable[str]) -> None:
+        """Show a page these streams, at once with what there is."""
+        mailbox.watch(streams, self._newest.values())
+        self.ring()
+
+    def hear(self, stream: str, content: Any) -> None:
+        """What the feed has to tell, in its thread."""
+        encoded = self._encoder.encode(stream, content)
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._take, stream, content, encoded)
+
+    def ring(self) -> None:
+        """Something is waiting: send it soon, together with what comes until then."""
+        if self._timer is None:
+            self._timer = self._loop.call_at(self._flushed + _FLUSH_S, self._flush)
+
+    def _take(self, stream: str, content: Any, encoded: list[Part]) -> None:
+        if stream == "link":
+            self._link = content
+            for viewer in self._viewers:
+                viewer.put_link(content)
+        elif stream == "events":
+            self._history = content
+        for part in encoded:
+            self._newest[part.stream] = part
+            for viewer in self._viewers:
+                viewer.put(part)
+        if self._viewers:
+            self.ring()
+
+    def _flush(self) -> None:
+        """Send to all; pages that wait for the same are sent the same bytes."""
+        self._timer, self._flushed = None, self._loop.time()
+        self._frames += 1
+        now, made = time.monotonic(), {}
+
+        def make_frame(wanted: Iterable[Part]) -> bytes:
+            chosen = tuple(sorted(wanted, key=lambda part: part.stream))
+            if chosen not in made:
+                made[chosen] = parts.frame(chosen, self._frames, now)
+            return made[chosen]
+
+        for viewer in self._viewers:
+            viewer.flush(self._history, make_frame)
+
+    async def _follow_changes(self) -> None:
+        """Tell the pages what has changed in the database, whoever changed it."""
+        known = None
+        while True:
+            found = await changes.look(self.station)
+            if known is not None and found is not None and found != known:
+                what = changes.difference(known, found)
+                for viewer in self._viewers:
+                    viewer.put_changed(what)
+                self.ring()
+            known = found or known
+            await asyncio.sleep(_CHANGES_S)
+
+
+class LiveHub:
+    """The rooms of one event loop."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, heard: Feeds = feeds) -> None:
+        self._loop = loop
+        self._feeds = heard
+        self._rooms: dict[str, Room] = {}
+
+    def room(self, station: str, robot: str) -> Room:
+        """The station's room, made for its first page: join it at once, or the next one makes another."""
+        found = self._rooms.get(station)
+        if found is None or found.empty:
+            found = self._rooms[station] = Room(station, robot, self._loop, self._feeds)
+        return found
+
+
+_hubs: WeakKeyDictionary[asyncio.AbstractEventLoop, LiveHub] = WeakKeyDictionary()
+
+
+def hub() -> LiveHub:
+    """The hub of the running event loop."""
+    loop = asyncio.get_running_loop()
+    return _hubs.setdefault(loop, LiveHub(loop))
+
+
+def _looks(robot: str) -> Looks | None:
+    """None: the robot is not drawn, and the log says why."""
+    try:
+        return looks_of(robot)
+    except (NotFound, RobotError) as error:
+        log.error("no 3D scene: %s", error)
+        return None

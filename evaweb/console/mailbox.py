@@ -1,0 +1,100 @@
+"""What one page has not been sent yet: the newest of each stream, events, a few words.
+
+A page pays for each frame with a credit and gets the credit back when it has drawn; at most two frames are
+ever under way to it. A page that does not answer is sent nothing more, and costs what it has not read.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+
+from evaweb.console.feed import History, Link
+from evaweb.console.parts import Part
+
+CREDITS = 2
+EVENTS_AT_ONCE = 200
+_TEXTS_UNHEARD = 30  # texts to a page that has said nothing since
+Deliver = Callable[[str | bytes], None]
+MakeFrame = Callable[[Iterable[Part]], bytes]
+
+
+class Mailbox:
+    """One page at one station; belongs to the event loop, where alone it may be used."""
+
+    def __init__(self, deliver: Deliver) -> None:
+        self._deliver = deliver
+        self._watched: frozenset[str] = frozenset()
+        self._pending: dict[str, Part] = {}
+        self._credits = CREDITS
+        self._unheard = 0
+        self._link: Link | None = None
+        self._changed: set[str] = set()
+        self._events_of = ""  # the boot that the page has events of
+        self._events_after: int | None = None  # None: it has not asked for any
+
+    @property
+    def watched(self) -> frozenset[str]:
+        return self._watched
+
+    def watch(self, streams: Iterable[str], newest: Iterable[Part]) -> None:
+        """What the page shows from now on, and what there is of it already."""
+        self._watched = frozenset(streams)
+        self._pending = {part.stream: part for part in newest if part.stream in self._watched}
+
+    def put(self, part: Part) -> None:
+        """A newer one of a stream replaces the one that is still waiting."""
+        if part.stream in self._watched:
+            self._pending[part.stream] = part
+
+    def put_link(self, link: Link) -> None:
+        self._link = link
+
+    def put_changed(self, what: Iterable[str]) -> None:
+        self._changed.update(what)
+
+    def want_events(self, after: int, boot: str) -> None:
+        """The page has the events of `boot` up to `after`, and wants what follows."""
+        self._events_after, self._events_of = after, boot
+
+    def credit(self) -> None:
+        """The page has drawn a frame."""
+        self._credits = min(CREDITS, self._credits + 1)
+
+    def heard(self) -> None:
+        """The page has said something: it reads what it is sent."""
+        self._unheard = 0
+
+    def flush(self, history: History, make_frame: MakeFrame) -> None:
+        """Send what may be sent now."""
+        if self._link is not None and self._say(
+            {"type": "link", "ok": self._link.ok, "reason": self._link.reason}
+        ):
+            self._link = None
+        if self._changed and self._say({"type": "changed", "what": sorted(self._changed)}):
+            self._changed.clear()
+        self._flush_events(history)
+        if self._pending and self._credits:
+            self._credits -= 1
+            pending, self._pending = self._pending, {}
+            self._deliver(make_frame(pending.values()))
+
+    def _flush_events(self, history: History) -> None:
+        if self._events_after is None or not history.boot:
+            return
+        if self._events_of != history.boot or self._events_after > history.newest:
+            self._events_of, self._events_after = history.boot, 0
+        rows = history.after(self._events_after)
+        for start in range(0, len(rows), EVENTS_AT_ONCE):
+            some = rows[start : start + EVENTS_AT_ONCE]
+            if not self._say({"type": "events", "boot": history.boot, "events": some}):
+                return
+            self._events_after = some[-1]["number"]
+
+    def _say(self, message: dict[str, object]) -> bool:
+        """Send a text, unless the page has not been heard for many of them."""
+        if self._unheard >= _TEXTS_UNHEARD:
+            return False
+        self._unheard += 1
+        self._deliver(json.dumps(message, separators=(",", ":"), allow_nan=False))
+        return True

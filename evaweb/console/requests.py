@@ -1,0 +1,113 @@
+"""What a page may say over the live socket, checked before anything is done with it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+from uuid import UUID, uuid4
+
+from evaweb.errors import EvaError
+
+STREAMS = ("state", "joints", "poses")
+PAGE = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_LONGEST_WHY = 240
+
+
+class BadRequest(EvaError):
+    """The page said something that has no meaning; the message says what and what is allowed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """Send these streams."""
+
+    streams: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Credit:
+    """A frame has been drawn."""
+
+
+@dataclass(frozen=True, slots=True)
+class Renew:
+    """The page is there and visible, and holds the lease of this epoch."""
+
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class EStop:
+    """Press it."""
+
+    uuid: UUID
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Events:
+    """Send the events of `boot` (the newest one's where it is another, or "") after a number."""
+
+    after: int
+    boot: str
+
+
+Request = Watch | Credit | Renew | EStop | Events
+
+
+def parse(text: str, cameras: Collection[str]) -> Request:
+    """The request in a text message; raises BadRequest."""
+    try:
+        said = json.loads(text)
+    except ValueError:
+        raise BadRequest(f"{text!r:.60} is no JSON") from None
+    kind = said.get("type") if isinstance(said, dict) else None
+    if kind == "watch":
+        return Watch(_streams(said, cameras))
+    read = _READ.get(kind) if isinstance(kind, str) else None
+    if read is None:
+        raise BadRequest(f"type {kind!r:.40} is unknown; allowed: watch, {', '.join(_READ)}")
+    return read(said)
+
+
+def _streams(said: Mapping[str, Any], cameras: Collection[str]) -> tuple[str, ...]:
+    allowed = (*STREAMS, *(f"camera/{camera}" for camera in cameras))
+    streams = said.get("streams")
+    if not isinstance(streams, list) or any(stream not in allowed for stream in streams):
+        raise BadRequest(f"streams = {streams!r:.200}; allowed: a list of {', '.join(allowed)}")
+    return tuple(streams)
+
+
+def _whole(said: Mapping[str, Any], key: str) -> int:
+    value = said.get(key)
+    if type(value) is not int or not 0 <= value <= 2**53:
+        raise BadRequest(f"{key} = {value!r:.40}; allowed: a whole number from 0 on")
+    return value
+
+
+def _text(said: Mapping[str, Any], key: str, default: str) -> str:
+    value = said.get(key) or default
+    if not isinstance(value, str):
+        raise BadRequest(f"{key} = {value!r:.40}; allowed: a text")
+    return value
+
+
+def _estop(said: Mapping[str, Any]) -> EStop:
+    """Pressing is never refused for what else the message says."""
+    why, uuid = said.get("why"), said.get("uuid")
+    try:
+        identity = UUID(str(uuid))
+    except ValueError:
+        identity = uuid4()
+    return EStop(identity, why[:_LONGEST_WHY] if isinstance(why, str) and why else "pressed")
+
+
+_READ: dict[str, Callable[[Mapping[str, Any]], Request]] = {
+    "credit": lambda said: Credit(),
+    "renew": lambda said: Renew(_whole(said, "epoch")),
+    "estop": _estop,
+    "events": lambda said: Events(_whole(said, "after"), _text(said, "boot", "")),
+}
