@@ -1,7 +1,18 @@
-"""Addresses of the pages of episodes."""
+"""Addresses of the pages of episodes, and of the files they play."""
 
 from __future__ import annotations
 
-from django.urls import URLPattern
+from django.urls import path
 
-urlpatterns: list[URLPattern] = []
+from evaweb.episodes import views
+
+urlpatterns = [
+    path("replay/", views.replay_list, name="replay-list"),
+    path("replay/<uuid:uuid>/", views.replay, name="replay"),
+    path("replay/<uuid:uuid>/stage", views.stage, name="replay-stage"),
+    path("replay/<uuid:uuid>/preview", views.preview, name="replay-preview"),
+    path("episodes/<uuid:uuid>/video/<str:camera>", views.video, name="episode-video"),
+    path("episodes/<uuid:uuid>/thumbnail", views.thumbnail, name="episode-thumbnail"),
+    path("episodes/<uuid:uuid>/curves", views.episode_curves, name="episode-curves"),
+    path("episodes/<uuid:uuid>/poses", views.episode_poses, name="episode-poses"),
+]

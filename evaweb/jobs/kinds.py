@@ -24,6 +24,7 @@ Chore = Callable[[], object]
 
 _kinds: dict[str, Kind] = {}
 _chores: dict[str, Chore] = {}
+_starts: dict[str, Chore] = {}
 
 
 class UnknownKind(EvaError):
@@ -54,6 +55,16 @@ def chore(name: str) -> Callable[[Chore], Chore]:
     return declare
 
 
+def at_start(name: str) -> Callable[[Chore], Chore]:
+    """Declare what every worker does once, when it starts."""
+
+    def declare(function: Chore) -> Chore:
+        _starts[name] = function
+        return function
+
+    return declare
+
+
 def kind_named(name: str) -> Kind:
     """The function that does jobs of that kind; UnknownKind lists those there are."""
     if name not in _kinds:
@@ -66,3 +77,8 @@ def kind_named(name: str) -> Kind:
 def chores() -> Mapping[str, Chore]:
     """All chores by name."""
     return dict(_chores)
+
+
+def starts() -> Mapping[str, Chore]:
+    """All that is done once, by name."""
+    return dict(_starts)

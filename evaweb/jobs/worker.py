@@ -16,7 +16,7 @@ from django.db import close_old_connections, connection
 
 from evaweb.celery import app
 from evaweb.jobs import services
-from evaweb.jobs.kinds import chores
+from evaweb.jobs.kinds import chores, starts
 from evaweb.jobs.patience import patiently
 
 log = logging.getLogger(__name__)
@@ -94,6 +94,8 @@ def _answer_doorbell(queues: Sequence[str]) -> None:
 
 def _look(queues: Sequence[str], ending: threading.Event) -> None:
     """Sweep, look after the chores, and do what waits, whether or not a doorbell has rung."""
+    for name, task in starts().items():
+        _attempt(name, partial(patiently, task))
     while not ending.is_set():
         close_old_connections()
         for name, task in {"sweep": services.sweep, **chores()}.items():

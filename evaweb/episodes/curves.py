@@ -1,0 +1,141 @@
+"""The curves of an episode on the clock of its videos: what was measured, asked for, smoothed and sent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaweb.frames import Stream, encode
+from runtime.recording.reader import Episode, open_episode
+from runtime.recording.summary import HELD
+
+Array = NDArray[Any]
+
+
+def curves(folder: Path) -> bytes:
+    """One message of evaweb.frames; RecordingError names the file that is absent or damaged.
+
+    Times are seconds of the video: row k is at k / fps. Streams, vectors joint by joint (a row per joint):
+    rows: time f8 [N], measured and sent f4 [D, N]. ticks, at the control rate: time f8 [M], smoothed and
+    executed f4 [D, M] (NaN where nothing was asked for or sent), safety u1 [M] (1 changed, 2 refused). raw,
+    where the policy speaks in joints: time f8 [R], values f4 [D, R], chunk i4 [R].
+    """
+    episode = open_episode(folder)
+    start = _start(episode)
+    streams = {"rows": _rows(episode), "ticks": _ticks(episode, start), "raw": _raw(episode, start)}
+    robot = episode.manifest.get("robot")
+    names = robot.get("joint_names") if isinstance(robot, dict) else None
+    return encode(
+        streams,
+        joints=names if isinstance(names, list) else [f"joint {k}" for k in range(episode.layout.dim)],
+        frames=episode.frames,
+        fps=episode.layout.fps,
+        held=held_spans(episode.rows.column("control_source").to_pylist(), episode.layout.fps),
+        marks=_marks(episode, start),
+    )
+
+
+def _start(episode: Episode) -> float:
+    """The clock of the tables at which the videos begin."""
+    for table, name in ((episode.ticks, "planned"), (episode.rows, "tick_time")):
+        if table.num_rows:
+            return float(table.column(name)[0].as_py())
+    return 0.0
+
+
+def vectors(table: Any, name: str, width: int) -> Array:
+    """A column of vectors, joint by joint: float32 [W, N], NaN where it is null."""
+    column = table.column(name).combine_chunks()
+    values = np.full((table.num_rows, width), np.nan, np.float32)
+    known = np.asarray(column.is_valid().to_numpy(zero_copy_only=False), bool)
+    values[known] = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
+    return np.ascontiguousarray(values.T)
+
+
+def _rows(episode: Episode) -> Stream:
+    dim = episode.layout.dim
+    return Stream(
+        arrays={
+            "time": np.arange(episode.rows.num_rows) / episode.layout.fps,
+            "measured": vectors(episode.rows, "qpos", dim),
+            "sent": vectors(episode.rows, "action", dim),
+        }
+    )
+
+
+def _ticks(episode: Episode, start: float) -> Stream:
+    ticks, dim = episode.ticks, episode.layout.dim
+    steps = ticks.column("step").to_numpy()
+    smoothed = np.full((dim, ticks.num_rows), np.nan, np.float32)
+    asked = episode.smoothed.column("step").to_numpy()
+    places = np.searchsorted(steps, asked)
+    known = places < len(steps)
+    known[known] = steps[places[known]] == asked[known]
+    smoothed[:, places[known]] = vectors(episode.smoothed, "smoothed", dim)[:, known]
+    changed = np.asarray([bool(changes) for changes in ticks.column("changes").to_pylist()], np.uint8)
+    refused = ticks.column("refused").to_numpy(zero_copy_only=False).astype(np.uint8)
+    return Stream(
+        arrays={
+            "time": ticks.column("planned").to_numpy() - start,
+            "smoothed": smoothed,
+            "executed": vectors(ticks, "executed", dim),
+            "safety": np.maximum(changed, 2 * refused).astype(np.uint8),
+        }
+    )
+
+
+def _raw(episode: Episode, start: float) -> Stream:
+    """What the policy meant for each step; dropped rows and chunks in another space have no place here."""
+    raw, dim = episode.raw, episode.layout.dim
+    spaces = sorted(set(raw.column("space").to_pylist()))
+    lengths = raw.column("action").combine_chunks().value_lengths().to_numpy(zero_copy_only=False)
+    joints = np.asarray([space == "joint" for space in raw.column("space").to_pylist()], bool)
+    used = (raw.column("target_step").to_numpy() >= 0) & joints & (lengths == dim)
+    table = raw.filter(used)
+    values = table.column("action").combine_chunks().flatten().to_numpy(zero_copy_only=False)
+    time = _times_of(episode, table.column("target_step").to_numpy()) - start
+    return Stream(
+        json={"spaces": spaces, "rows": raw.num_rows},
+        arrays={
+            "time": time,
+            "values": np.ascontiguousarray(values.reshape(-1, dim).T.astype(np.float32)),
+            "chunk": table.column("chunk_id").to_numpy().astype(np.int32),
+        },
+    )
+
+
+def _times_of(episode: Episode, steps: Array) -> Array:
+    """When each control step was, on the clock of the tables; steps that never came by the rate."""
+    ticks = episode.ticks
+    if not ticks.num_rows:
+        return np.zeros(len(steps))
+    known, planned = ticks.column("step").to_numpy(), ticks.column("planned").to_numpy()
+    rate = episode.manifest.get("control_rate")
+    period = 1.0 / rate if isinstance(rate, int | float) and rate > 0 else 1.0 / episode.layout.fps
+    beyond = np.clip(steps - known[-1], 0, None) * period - np.clip(known[0] - steps, 0, None) * period
+    times: Array = np.interp(steps, known, planned) + beyond
+    return times
+
+
+def held_spans(sources: Sequence[str], fps: float) -> list[list[float]]:
+    """From when to when [s] nobody asked the robot for anything."""
+    held = np.asarray([source in HELD for source in sources], np.int8)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], held, [0]])))
+    return [
+        [float(first) / fps, float(end) / fps] for first, end in zip(edges[::2], edges[1::2], strict=True)
+    ]
+
+
+def _marks(episode: Episode, start: float) -> list[dict[str, Any]]:
+    """The events of the episode; one without a time has no place on the axis."""
+    marks = []
+    for event in episode.events:
+        time = event.get("time")
+        if isinstance(time, int | float) and not isinstance(time, bool):
+            at = max(0.0, float(time) - episode.layout.started - start)
+            marks.append({"time": at, "kind": str(event.get("kind", "")), "text": str(event.get("text", ""))})
+    return marks

@@ -1,0 +1,45 @@
+"""Where what belongs to an episode lies in the data folder; names come from the database, never from a client."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from uuid import UUID
+
+from django.conf import settings
+
+THUMBNAIL = "thumbnail.jpg"
+
+
+def data_dir() -> Path:
+    """The folder of this lab."""
+    return Path(settings.DATA_DIR)
+
+
+def episodes_dir() -> Path:
+    """The journals of all episodes."""
+    return data_dir() / "episodes"
+
+
+def journal_folder(uuid: UUID) -> Path:
+    """The journal of one episode."""
+    return episodes_dir() / str(uuid)
+
+
+def preview_folder(uuid: UUID) -> Path:
+    """What a browser plays of an episode."""
+    return data_dir() / "previews" / str(uuid)
+
+
+def preview_video(uuid: UUID, camera: str) -> Path:
+    """The video of one of the episode's cameras."""
+    return preview_folder(uuid) / f"{camera}.mp4"
+
+
+def datasets_dir() -> Path:
+    """All datasets that are published here."""
+    return data_dir() / "datasets"
+
+
+def scores_file(uuid: UUID) -> Path:
+    """What raters said of an episode, a line each."""
+    return data_dir() / "scores" / f"{uuid}.jsonl"

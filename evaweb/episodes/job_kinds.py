@@ -1,0 +1,83 @@
+"""The jobs of episodes: preview, publish, reconcile; and what every worker looks after."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+from uuid import UUID
+
+from django.utils import timezone
+
+from evaweb.episodes import services
+from evaweb.episodes.folders import data_dir, datasets_dir, journal_folder, preview_folder, scores_file
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.preview import make_preview
+from evaweb.episodes.publishing import dataset_name, success_of
+from evaweb.episodes.reconcile import reconcile
+from evaweb.episodes.recorded import recorded_in
+from evaweb.jobs.kinds import Work, at_start, chore, job_kind
+from evaweb.jobs.services import enqueue
+from runtime.datasets.published import publish
+
+
+@job_kind("preview")
+def preview(work: Work) -> Mapping[str, Any]:
+    """Make the episode playable; args: uuid."""
+    episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
+    frames = make_preview(journal_folder(episode.uuid), preview_folder(episode.uuid), work.tell)
+    Episode.objects.filter(uuid=episode.uuid).update(previewed_at=timezone.now())
+    return {"frames": frames}
+
+
+@job_kind("publish")
+def publish_episode(work: Work) -> Mapping[str, Any]:
+    """Write the episode into its dataset with the success of its newest score; args: uuid.
+
+    An interrupted one goes there only where somebody has scored it.
+    """
+    episode = Episode.objects.select_related("station").get(uuid=UUID(work.args["uuid"]))
+    folder = journal_folder(episode.uuid)
+    recorded = recorded_in(folder)
+    success = success_of(scores_file(episode.uuid))
+    if success is None and recorded.facts["status"] in (EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED):
+        return {"published": False, "why": f"it is {recorded.facts['status']} and nobody has scored it"}
+    name = dataset_name(recorded, scored=success is not None, simulated=episode.station.simulated)
+    work.tell(f"into {name}")
+    placed = publish(folder, datasets_dir() / name, success=success, include_interrupted=success is not None)
+    dataset = str(placed.dataset.relative_to(data_dir()))
+    Episode.objects.filter(uuid=episode.uuid).update(
+        dataset=dataset, dataset_index=placed.episode_index, published_at=timezone.now()
+    )
+    return {
+        "published": True,
+        "dataset": dataset,
+        "index": placed.episode_index,
+        "frames": placed.frames,
+        "success": success,
+        "created": placed.created,
+    }
+
+
+@job_kind("reconcile")
+def reconcile_all(work: Work) -> Mapping[str, Any]:
+    """Read the data folder into the database."""
+    report = reconcile()
+    return {
+        "episodes": report.episodes,
+        "made": report.made,
+        "missing": report.missing,
+        "published": report.published,
+        "problems": list(report.problems),
+    }
+
+
+@at_start("reconcile")
+def reconcile_at_start() -> None:
+    """What happened on the disk while no worker was there."""
+    enqueue(kind="reconcile", key="reconcile", args={})
+
+
+@chore("closed recordings")
+def look_for_closed() -> int:
+    """Episodes that a station has repaired, or closed while the web was away."""
+    return services.catch_up()

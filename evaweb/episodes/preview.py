@@ -1,0 +1,85 @@
+"""Makes what a browser can play of an episode: the same coded pictures with the index at the front, a thumbnail."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import simplejpeg
+from PIL import Image
+
+from evaweb.episodes.folders import THUMBNAIL
+from runtime.datasets.pictures import Pictures
+from runtime.datasets.remux import remux
+from runtime.recording.files import RecordingError, disk_fault, sync_folder, write_whole
+from runtime.recording.reader import Episode, open_episode
+
+WIDTH = 320  # of the thumbnail
+QUALITY = 82
+
+
+def make_preview(journal: Path, target: Path, tell: Callable[[str], None]) -> int:
+    """Put <camera>.mp4 of every camera and thumbnail.jpg of the middle row into `target`; the number of rows.
+
+    The folder appears whole or not at all, in the place of an older one. RecordingError names the file that
+    is absent, damaged or cannot be written.
+    """
+    episode = open_episode(journal)
+    if episode.outcome is None:
+        raise RecordingError(f"{journal} has no outcome.json: it is being recorded, or wants repair")
+    if not episode.frames:
+        raise RecordingError(f"{journal} has no rows: there is nothing to play")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _remove_drafts(target)
+        with tempfile.TemporaryDirectory(prefix=_draft_prefix(target), dir=target.parent) as folder:
+            draft = Path(folder) / "new"
+            draft.mkdir()
+            _fill(episode, draft, tell)
+            if target.is_dir():
+                os.replace(target, draft.with_name("old"))
+            os.replace(draft, target)
+        sync_folder(target.parent)
+    except OSError as error:
+        raise disk_fault("making a preview in", target, error) from error
+    return episode.frames
+
+
+def _draft_prefix(target: Path) -> str:
+    return f".{target.name}."
+
+
+def _remove_drafts(target: Path) -> None:
+    """What a killed worker left."""
+    for left in target.parent.glob(f"{_draft_prefix(target)}*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _fill(episode: Episode, draft: Path, tell: Callable[[str], None]) -> None:
+    for number, (camera, source) in enumerate(episode.videos.items(), 1):
+        tell(f"camera {number} of {len(episode.videos)}")
+        video = draft / f"{camera}.mp4"
+        remux(source, video, episode.frames, episode.layout.fps)
+        _sync(video)
+    if episode.videos:
+        write_whole(draft / THUMBNAIL, thumbnail(next(iter(episode.videos.values())), episode.frames // 2))
+    sync_folder(draft)
+
+
+def thumbnail(video: Path, frame: int) -> bytes:
+    """Frame `frame` of the video as a JPEG of WIDTH pixels; RecordingError where it cannot be decoded."""
+    with Pictures(video) as pictures:
+        picture = Image.fromarray(pictures[min(frame, len(pictures) - 1)])
+    height = max(1, round(picture.height * WIDTH / picture.width))
+    small = picture.resize((WIDTH, height), Image.Resampling.LANCZOS)
+    jpeg: bytes = simplejpeg.encode_jpeg(np.ascontiguousarray(small), quality=QUALITY)
+    return jpeg
+
+
+def _sync(path: Path) -> None:
+    with path.open("rb") as file:
+        os.fsync(file.fileno())

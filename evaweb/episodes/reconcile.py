@@ -1,0 +1,97 @@
+"""Disk to database: makes the rows say what the folders say. Running it again changes nothing."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from uuid import UUID
+
+from evaweb.episodes import services
+from evaweb.episodes.folders import data_dir, datasets_dir, episodes_dir
+from evaweb.episodes.models import Episode
+from runtime.datasets.catalog import Catalog
+from runtime.datasets.layout import EVA_EPISODES
+from runtime.recording.files import RecordingError
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What was found. `problems` are sentences about folders that could not be read; nothing is done to those."""
+
+    episodes: int  # folders that were read
+    made: int  # rows that were not there
+    missing: int  # rows whose folder is not on this disk
+    published: int  # rows that are in a dataset
+    problems: tuple[str, ...]
+
+
+def reconcile() -> Report:
+    """Read every episode and every dataset of the data folder into the database."""
+    before = set(Episode.objects.values_list("uuid", flat=True))
+    found, problems = _folders()
+    read = []
+    for uuid in found:
+        problem = services.problem_of(uuid)
+        if problem:
+            problems.append(problem)
+        else:
+            read.append(uuid)
+    missing = services.missing_marked()
+    problems += _datasets()
+    for problem in problems:
+        log.warning("%s", problem)
+    return Report(
+        episodes=len(read),
+        made=len(set(read) - before),
+        missing=missing,
+        published=Episode.objects.exclude(dataset_index=None).count(),
+        problems=tuple(problems),
+    )
+
+
+def _folders() -> tuple[list[UUID], list[str]]:
+    """The episodes that there are, and what else lies there."""
+    root = episodes_dir()
+    folders = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
+    found, problems = [], []
+    for folder in folders:
+        try:
+            uuid = UUID(folder.name)
+        except ValueError:
+            uuid = None
+        if uuid is None or str(uuid) != folder.name:
+            problems.append(f"{folder} is no episode: its name is no uuid")
+        else:
+            found.append(uuid)
+    return found, problems
+
+
+def _datasets() -> list[str]:
+    root = datasets_dir()
+    folders = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
+    # Where an episode is in two, the one that knows its success counts.
+    folders.sort(key=lambda folder: not folder.name.endswith("-unscored"))
+    problems = []
+    for folder in folders:
+        try:
+            _places(folder)
+        except RecordingError as error:
+            problems.append(str(error))
+    return problems
+
+
+def _places(folder: Path) -> None:
+    lines = Catalog.read(folder).eva
+    if not lines:
+        return
+    published_at = datetime.fromtimestamp((folder / EVA_EPISODES).stat().st_mtime, UTC)
+    name = str(folder.relative_to(data_dir()))
+    for line in lines:
+        place = {"dataset": name, "dataset_index": line["episode_index"]}
+        row = Episode.objects.filter(uuid=line["uuid"])
+        if not row.filter(**place).exists():
+            row.update(**place, published_at=published_at)

@@ -1,0 +1,90 @@
+"""What an episode's folder says about it: manifest and outcome, in the words of the database."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from evaweb.episodes.models import EpisodeStatus
+from runtime.recording.files import RecordingError, read_document
+from runtime.recording.layout import Layout
+
+CLOSED = (EpisodeStatus.FINISHED, EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED)
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """One folder; `facts` are fields of models.Episode, without those that the folder does not know."""
+
+    uuid: str
+    station: str
+    facts: Mapping[str, Any]
+
+    @property
+    def closed(self) -> bool:
+        """Whether the recorder, or repair, has finished it."""
+        return self.facts["status"] in CLOSED
+
+
+def recorded_in(folder: Path) -> Recorded:
+    """Read it; RecordingError names the file that is absent, damaged, or says what cannot be."""
+    manifest = read_document(folder / "manifest.json")
+    layout = Layout.of(manifest)
+    if folder.name != layout.uuid:
+        raise RecordingError(f"{folder / 'manifest.json'} is of episode {layout.uuid}, not of {folder.name}")
+    told = {
+        "kind": _text(manifest, "kind", 16) or "rollout",
+        "task": _text(manifest, "task"),
+        "robot": _text(_table(manifest, "robot"), "name", 63),
+        "checkpoint": _text(_table(manifest, "checkpoint"), "name", 120),
+        "operator": _text(manifest, "operator", 150),
+        "configuration_hash": _text(manifest, "configuration_hash", 64),
+    }
+    facts = {name: value for name, value in told.items() if value} | {
+        "cameras": list(layout.cameras),
+        "fps": layout.fps,
+        "started_at": _time(manifest.get("started_wall")),
+    }
+    return Recorded(layout.uuid, _text(manifest, "station", 63), facts | _outcome(folder))
+
+
+def _outcome(folder: Path) -> dict[str, Any]:
+    path = folder / "outcome.json"
+    if not path.exists():
+        return {"status": EpisodeStatus.RECORDING}
+    outcome = read_document(path)
+    if outcome.get("status") not in CLOSED:
+        allowed = ", ".join(CLOSED)
+        raise RecordingError(f"{path}: status is {outcome.get('status')!r}, must be one of {allowed}")
+    frames, duration = outcome.get("frames"), outcome.get("duration_s")
+    if isinstance(frames, bool) or not isinstance(frames, int) or frames < 0:
+        raise RecordingError(f"{path}: frames is {frames!r}, must be a whole number from 0")
+    return {
+        "status": EpisodeStatus(outcome["status"]),
+        "reason": _text(outcome, "reason"),
+        "frames": frames,
+        "duration_s": duration if isinstance(duration, int | float) else None,
+        "control": _table(outcome, "control"),
+    }
+
+
+def _text(table: Mapping[str, Any], key: str, longest: int | None = None) -> str:
+    value = table.get(key)
+    return value.replace("\x00", "")[:longest] if isinstance(value, str) else ""
+
+
+def _table(table: Mapping[str, Any], key: str) -> dict[str, Any]:
+    value = table.get(key)
+    return dict(value) if isinstance(value, Mapping) else {}
+
+
+def _time(value: object) -> datetime | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return datetime.fromtimestamp(value, UTC)
+    except (OverflowError, OSError, ValueError):
+        return None

@@ -1,0 +1,97 @@
+"""Reads of episodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+from uuid import UUID
+
+from django.db.models import Q, QuerySet
+
+from evaweb.episodes.folders import journal_folder, preview_folder
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.errors import NotFound
+from evaweb.jobs.models import Job, JobStatus
+from evaweb.jobs.selectors import job_newest
+
+# What a page says of an episode beside its own facts; a trial is bound to it from above.
+_WITH = ("station", "trial__scene", "trial__position", "trial__checkpoint", "trial__verdict")
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """How far an episode is on its way to be played: recording, preparing, ready, failed, empty or missing."""
+
+    name: str
+    sentence: str = ""
+
+    @property
+    def passing(self) -> bool:
+        """Whether it changes by itself, so that a page looks again."""
+        return self.name in ("recording", "preparing")
+
+
+def episode_get(*, uuid: UUID) -> Episode:
+    """The episode with what a page says of it; NotFound where it is not in the database."""
+    found = Episode.objects.select_related(*_WITH).filter(uuid=uuid).first()
+    if found is None:
+        raise NotFound(f"episode {uuid} does not exist in this lab")
+    return found
+
+
+def episode_list(*, station: str = "", status: str = "", words: str = "") -> QuerySet[Episode]:
+    """The newest first; `words` are looked for in task, checkpoint, operator, scene and uuid."""
+    found = Episode.objects.select_related(*_WITH)
+    if station:
+        found = found.filter(station__name=station)
+    if status:
+        found = found.filter(status=status)
+    for word in words.split():
+        found = found.filter(
+            Q(task__icontains=word)
+            | Q(checkpoint__icontains=word)
+            | Q(operator__icontains=word)
+            | Q(trial__scene__title__icontains=word)
+            | Q(uuid__icontains=word)
+        )
+    return found
+
+
+def stage_of(*, episode: Episode) -> Stage:
+    """Where the episode stands, from its row, the disk and its newest job."""
+    if preview_folder(episode.uuid).is_dir() and episode.status != EpisodeStatus.RECORDING:
+        return Stage("ready")
+    if episode.status == EpisodeStatus.RECORDING:
+        return Stage(
+            "recording",
+            f"{episode.station} is still writing it. If the station was cut off meanwhile, it completes the "
+            "episode when it starts again.",
+        )
+    if episode.status == EpisodeStatus.MISSING or not journal_folder(episode.uuid).is_dir():
+        return Stage(
+            "missing",
+            "Its folder is not on this machine: it was moved, or recorded elsewhere. Bring it back and run "
+            "`manage.py reconcile`.",
+        )
+    if not episode.frames:
+        return Stage("empty", f"Nothing was recorded: {episode.reason or 'it has no rows'}.")
+    return _preparing(job_newest(key=f"preview:{episode.uuid}"))
+
+
+def _preparing(job: Job | None) -> Stage:
+    if job is None or job.status == JobStatus.DONE:
+        return Stage("failed", "There is no preview of it yet, and nobody is making one.")
+    if job.status == JobStatus.FAILED:
+        return Stage("failed", job.error)
+    if job.status == JobStatus.RUNNING:
+        return Stage(
+            "preparing", f"The videos are being prepared{': ' if job.progress else ''}{job.progress}."
+        )
+    if job.error:
+        return Stage("preparing", f"It is tried again in a moment: {job.error}")
+    return Stage("preparing", "The videos wait for the worker to prepare them.")
+
+
+def trial_of(*, episode: Episode) -> Any:
+    """The trial that was recorded in it, None where there is none."""
+    return getattr(episode, "trial", None)

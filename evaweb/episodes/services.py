@@ -1,0 +1,156 @@
+"""What happens to the rows of episodes; their folders are the authority, and reconcile makes rows of them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from datetime import UTC, datetime, timedelta
+from typing import Any
+from uuid import UUID
+
+from django.db import transaction
+from django.utils import timezone
+
+from evaweb.episodes.folders import journal_folder, preview_folder
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.recorded import CLOSED, Recorded, recorded_in
+from evaweb.errors import EvaError
+from evaweb.jobs.models import Job
+from evaweb.jobs.services import enqueue
+from evaweb.stations.models import Station
+from runtime.recording.files import RecordingError
+
+log = logging.getLogger(__name__)
+
+APPEARS_WITHIN = timedelta(seconds=60)  # the folder of an episode that was announced
+
+
+@transaction.atomic
+def episode_opened(
+    *,
+    station: Station,
+    uuid: UUID | str,
+    kind: str = "rollout",
+    task: str = "",
+    checkpoint: str = "",
+    operator: str = "",
+) -> Episode:
+    """The station has begun to record; the row that is there already stays as it is."""
+    episode, _ = Episode.objects.get_or_create(
+        uuid=_uuid(uuid),
+        defaults={
+            "station": station,
+            "kind": kind,
+            "task": task,
+            "robot": station.robot,
+            "checkpoint": checkpoint,
+            "operator": operator,
+            "started_at": timezone.now(),
+        },
+    )
+    return episode
+
+
+def episode_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
+    """The station says that an episode is on disk: read it there, and ask for its preview.
+
+    `data` is that of the runtime's event: uuid, status, reason, rows, error. Where the folder is not on this
+    machine, or damaged, the event's own words are kept. EvaError where it names no episode.
+    """
+    uuid = _uuid(data.get("uuid"))
+    try:
+        return episode_read(uuid=uuid, station=station)
+    except RecordingError as error:
+        log.warning("episode %s: %s", uuid, error)
+        status = data.get("status")
+        facts = {
+            "status": EpisodeStatus(status) if status in CLOSED else EpisodeStatus.FAILED,
+            "reason": f"{data.get('reason') or 'no reason was given'} ({error})",
+        }
+    with transaction.atomic():
+        episode, _ = Episode.objects.update_or_create(
+            uuid=uuid, defaults=facts, create_defaults={"station": station, "robot": station.robot, **facts}
+        )
+    return episode
+
+
+@transaction.atomic
+def episode_read(*, uuid: UUID, station: Station | None = None) -> Episode:
+    """Make the row say what the folder says, and ask for a preview where there is something to play.
+
+    RecordingError where the folder is absent or damaged.
+    """
+    recorded = recorded_in(journal_folder(uuid))
+    facts = dict(recorded.facts) | {"previewed_at": _previewed_at(uuid)}
+    episode, _ = Episode.objects.update_or_create(
+        uuid=uuid,
+        defaults=facts,
+        create_defaults={"station": station or _station_of(recorded), **facts},
+    )
+    if episode.status in CLOSED and episode.frames and episode.cameras and episode.previewed_at is None:
+        preview_asked(episode=episode)
+    return episode
+
+
+def preview_asked(*, episode: Episode) -> Job:
+    """Have the worker make what a browser can play."""
+    return enqueue(kind="preview", key=f"preview:{episode.uuid}", args={"uuid": str(episode.uuid)})
+
+
+def publish_asked(*, episode: Episode) -> Job:
+    """Have the worker write the episode into its dataset, or write it anew with the score that counts now."""
+    return enqueue(kind="publish", key=f"publish:{episode.uuid}", args={"uuid": str(episode.uuid)})
+
+
+def catch_up() -> int:
+    """Close rows of recordings that were closed while nobody listened, as repair does; how many."""
+    closed = 0
+    for uuid in Episode.objects.filter(status=EpisodeStatus.RECORDING).values_list("uuid", flat=True):
+        if (journal_folder(uuid) / "outcome.json").exists():
+            closed += not problem_of(uuid)
+    return closed
+
+
+def missing_marked() -> int:
+    """Say of every row whose folder is gone that it is missing; how many there are now."""
+    rows = Episode.objects.values_list("uuid", "status", "created_at")
+    for uuid, status, created_at in rows:
+        fresh = status == EpisodeStatus.RECORDING and timezone.now() - created_at < APPEARS_WITHIN
+        if status != EpisodeStatus.MISSING and not fresh and not journal_folder(uuid).is_dir():
+            Episode.objects.filter(uuid=uuid).update(status=EpisodeStatus.MISSING)
+    return Episode.objects.filter(status=EpisodeStatus.MISSING).count()
+
+
+def problem_of(uuid: UUID) -> str:
+    """Read one folder into its row; the sentence that says why that cannot be, "" where it could."""
+    try:
+        episode_read(uuid=uuid)
+    except RecordingError as error:
+        open_rows = Episode.objects.filter(uuid=uuid, status=EpisodeStatus.RECORDING)
+        if (journal_folder(uuid) / "outcome.json").exists():
+            open_rows.update(status=EpisodeStatus.FAILED, reason=str(error))
+        return str(error)
+    return ""
+
+
+def _previewed_at(uuid: UUID) -> datetime | None:
+    folder = preview_folder(uuid)
+    return datetime.fromtimestamp(folder.stat().st_mtime, UTC) if folder.is_dir() else None
+
+
+def _station_of(recorded: Recorded) -> Station:
+    """The station it was recorded at; one that is not known any more is known from it again."""
+    name = recorded.station or "unknown"
+    station, made = Station.objects.get_or_create(
+        name=name, defaults={"robot": recorded.facts.get("robot", ""), "title": name}
+    )
+    if made:
+        log.warning("station %s was not in the database: made from episode %s", name, recorded.uuid)
+    return station
+
+
+def _uuid(given: object) -> UUID:
+    try:
+        return given if isinstance(given, UUID) else UUID(str(given))
+    except ValueError:
+        raise EvaError(f"{given!r} is no episode: expected its uuid") from None

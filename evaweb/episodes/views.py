@@ -1,0 +1,148 @@
+"""Pages that play episodes, and the files they play."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+from uuid import UUID
+
+from django.core.paginator import Paginator
+from django.http import HttpRequest, HttpResponse
+from django.http.response import HttpResponseBase
+from django.shortcuts import redirect, render
+from django.templatetags.static import static
+from django.urls import reverse
+from django.views.decorators.http import require_GET, require_POST
+
+from evaweb.episodes import selectors, services
+from evaweb.episodes.curves import curves
+from evaweb.episodes.folders import THUMBNAIL, journal_folder, preview_folder, preview_video
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.poses import poses
+from evaweb.episodes.selectors import episode_get, stage_of
+from evaweb.episodes.streaming import file_answer
+from evaweb.errors import Conflict, EvaError, NotFound
+from evaweb.roles import Role, require
+from evaweb.stations.models import Station
+from runtime.recording.files import RecordingError
+
+PER_PAGE = 50
+
+
+# --- pages ---------------------------------------------------------------------------------------------------
+
+
+@require_GET
+def replay_list(request: HttpRequest) -> HttpResponse:
+    """All episodes, the newest first."""
+    chosen = {name: request.GET.get(name, "").strip() for name in ("station", "status", "words")}
+    page = Paginator(selectors.episode_list(**chosen), PER_PAGE).get_page(request.GET.get("page"))
+    rows = [(episode, stage_of(episode=episode)) for episode in page]
+    context = {
+        "page": page,
+        "rows": rows,
+        "chosen": chosen,
+        "stations": Station.objects.all(),
+        "statuses": EpisodeStatus.choices,
+        "passing": any(stage.passing for _, stage in rows),
+    }
+    template = "episodes/rows.html" if request.headers.get("HX-Request") else "episodes/list.html"
+    return render(request, template, context)
+
+
+@require_GET
+def replay(request: HttpRequest, uuid: UUID) -> HttpResponse:
+    """One episode: cameras, robot and curves on one clock."""
+    episode = episode_get(uuid=uuid)
+    stage = stage_of(episode=episode)
+    context = {
+        "episode": episode,
+        "trial": selectors.trial_of(episode=episode),
+        "stage": stage,
+        "config": _config(episode) if stage.name == "ready" else None,
+    }
+    return render(request, "episodes/replay.html", context)
+
+
+@require_GET
+def stage(request: HttpRequest, uuid: UUID) -> HttpResponse:
+    """How far an episode is; tells a page that it can be played now."""
+    episode = episode_get(uuid=uuid)
+    found = stage_of(episode=episode)
+    answer = render(request, "episodes/stage.html", {"episode": episode, "stage": found})
+    if found.name == "ready":
+        answer["HX-Refresh"] = "true"
+    return answer
+
+
+@require_POST
+def preview(request: HttpRequest, uuid: UUID) -> HttpResponse:
+    """Ask for the videos anew."""
+    require(request.user, Role.OPERATOR)
+    services.preview_asked(episode=episode_get(uuid=uuid))
+    return redirect("replay", uuid=uuid)
+
+
+def _config(episode: Episode) -> dict[str, Any]:
+    """What the page's modules have to know."""
+    address = {name: reverse(f"episode-{name}", args=[episode.uuid]) for name in ("curves", "poses")}
+    return {
+        **address,
+        "videos": [reverse("episode-video", args=[episode.uuid, camera]) for camera in episode.cameras],
+        "geometry": reverse("robot-geometry", args=[episode.robot]) if episode.robot else "",
+        "viewer": static("meshcat/main.min.js"),
+        "uplot": static("uplot/uPlot.esm.js"),
+        "fps": episode.fps,
+        "frames": episode.frames,
+    }
+
+
+# --- files ---------------------------------------------------------------------------------------------------
+
+
+async def video(request: HttpRequest, uuid: UUID, camera: str) -> HttpResponseBase:
+    """The video of one camera, also in parts."""
+    episode = await _known(uuid)
+    if camera not in episode.cameras:
+        raise NotFound(f"episode {uuid} has no camera {camera!r:.80}; it has {', '.join(episode.cameras)}")
+    return await file_answer(request, preview_video(uuid, camera), "video/mp4")
+
+
+async def thumbnail(request: HttpRequest, uuid: UUID) -> HttpResponseBase:
+    """A picture from the middle of the episode."""
+    await _known(uuid)
+    return await file_answer(request, preview_folder(uuid) / THUMBNAIL, "image/jpeg")
+
+
+async def _known(uuid: UUID) -> Episode:
+    episode = await Episode.objects.filter(uuid=uuid).afirst()
+    if episode is None:
+        raise NotFound(f"episode {uuid} does not exist in this lab")
+    return episode
+
+
+@require_GET
+def episode_curves(request: HttpRequest, uuid: UUID) -> HttpResponse:
+    """Joint curves and events, as one message of evaweb.frames."""
+    episode_get(uuid=uuid)
+    return _message(lambda: curves(journal_folder(uuid)))
+
+
+@require_GET
+def episode_poses(request: HttpRequest, uuid: UUID) -> HttpResponse:
+    """Where the robot's parts were from row ?first= on, as one message of evaweb.frames."""
+    episode = episode_get(uuid=uuid)
+    first = request.GET.get("first", "0")
+    if not first.isdecimal() or len(first) > 9:
+        raise EvaError(f"first = {first!r:.40}; allowed: a whole number from 0")
+    return _message(lambda: poses(journal_folder(uuid), episode.robot, int(first)))
+
+
+def _message(make: Callable[[], bytes]) -> HttpResponse:
+    try:
+        content = make()
+    except RecordingError as error:
+        raise Conflict(str(error)) from None
+    answer = HttpResponse(content, content_type="application/octet-stream")
+    answer["Cache-Control"] = "private, no-cache"
+    return answer
