@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from runtime.sim.bench import Bench, BenchState, Layout, layout_of, on_table, yaw_of
+from runtime.sim.bench import Bench, BenchState, Layout, on_table, yaw_of
 from runtime.sim.block import Block
 from runtime.sim.grasp import RELEASE, push, squeeze
 from runtime.sim.hands import Hand, Jaws
+from runtime.sim.layout import layout_of
 from runtime.sim.plant import Plant
 from runtime.types import Float64
 

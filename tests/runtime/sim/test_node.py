@@ -19,7 +19,8 @@ from runtime import codecs
 from runtime.clock import MonotonicClock, VirtualClock
 from runtime.errors import CodecError, SetupError
 from runtime.sim import node as module
-from runtime.sim.bench import layout_of, overhead_camera
+from runtime.sim.bench import overhead_camera
+from runtime.sim.layout import layout_of
 from runtime.sim.node import Node, parser
 from runtime.sim.pictures import frame_number
 from runtime.transports import zmq as link
