@@ -1,0 +1,116 @@
+"""Episodes from the first word about them to rows that say what their folders say."""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections.abc import Callable
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+from django.utils import timezone
+
+from evaweb.episodes import services
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.errors import EvaError
+from evaweb.jobs.models import Job
+from evaweb.stations.models import Station
+from runtime.recording.repair import repair
+
+pytestmark = pytest.mark.django_db
+
+
+def opened(station: Station, identity: str) -> Episode:
+    return services.episode_opened(
+        station=station, uuid=identity, task="stack", checkpoint="good", operator="ann"
+    )
+
+
+def test_an_episode_is_known_from_the_moment_it_opens(station: Station) -> None:
+    identity = str(uuid.uuid4())
+    episode = opened(station, identity)
+    assert (episode.status, episode.robot, episode.checkpoint) == ("recording", "agilex_piper", "good")
+    assert opened(station, identity).uuid == episode.uuid
+    assert Episode.objects.count() == 1
+
+
+def test_closing_reads_the_folder_and_asks_for_one_preview(
+    put: Callable[..., Path], station: Station
+) -> None:
+    folder = put()
+    opened(station, folder.name)
+    for _ in range(2):
+        services.episode_closed(station=station, data={"uuid": folder.name, "status": "finished"})
+    episode = Episode.objects.get()
+    assert episode.status == EpisodeStatus.FINISHED
+    assert episode.reason == "stopped by the operator"
+    assert (episode.frames, episode.fps, episode.cameras[0]) == (24, 30.0, "cam_high")
+    assert episode.duration_s == pytest.approx(18 / 30, abs=3 / 30)
+    assert episode.checkpoint == "good", "what the folder does not know stays"
+    assert [job.key for job in Job.objects.all()] == [f"preview:{folder.name}"]
+
+
+def test_an_episode_that_opens_after_it_was_closed_stays_closed(
+    put: Callable[..., Path], station: Station
+) -> None:
+    folder = put()
+    services.episode_closed(station=station, data={"uuid": folder.name})
+    assert opened(station, folder.name).status == EpisodeStatus.FINISHED
+
+
+def test_a_folder_on_another_machine_leaves_the_words_of_the_event(data: Path, station: Station) -> None:
+    told = {"uuid": str(uuid.uuid4()), "status": "interrupted", "reason": "e-stop", "path": "/etc/passwd"}
+    episode = services.episode_closed(station=station, data=told)
+    assert episode.status == EpisodeStatus.INTERRUPTED
+    assert episode.reason.startswith("e-stop (")
+    assert "manifest.json cannot be read" in episode.reason
+    assert not Job.objects.exists()
+
+
+def test_a_damaged_manifest_is_named(put: Callable[..., Path], station: Station) -> None:
+    folder = put()
+    (folder / "manifest.json").write_text('{"format": 1, "uuid"')
+    episode = services.episode_closed(station=station, data={"uuid": folder.name, "status": "made up"})
+    assert episode.status == EpisodeStatus.FAILED
+    assert f"{folder}/manifest.json is not a whole JSON document" in episode.reason
+
+
+@pytest.mark.parametrize("given", [None, "", "../../etc", 7])
+def test_an_event_that_names_no_episode_is_refused(station: Station, given: object) -> None:
+    with pytest.raises(EvaError, match="is no episode"):
+        services.episode_closed(station=station, data={"uuid": given})
+    assert not Episode.objects.exists()
+
+
+def test_a_repaired_recording_is_closed_without_an_event(put: Callable[..., Path], station: Station) -> None:
+    folder = put()
+    (folder / "outcome.json").unlink()
+    opened(station, folder.name)
+    assert services.catch_up() == 0
+    repair(folder)
+    assert services.catch_up() == 1
+    assert Episode.objects.get().status == EpisodeStatus.INTERRUPTED
+    assert services.catch_up() == 0
+
+
+def test_a_recording_closed_with_an_unusable_outcome_fails_with_the_file_named(
+    put: Callable[..., Path], station: Station
+) -> None:
+    folder = put()
+    opened(station, folder.name)
+    (folder / "outcome.json").write_text(json.dumps({"status": "fine", "frames": 2}))
+    assert services.catch_up() == 0
+    episode = Episode.objects.get()
+    assert episode.status == EpisodeStatus.FAILED
+    assert "outcome.json: status is 'fine', must be one of finished, interrupted, failed" in episode.reason
+
+
+def test_folders_that_are_gone_are_missing_but_one_just_announced_is_not(
+    data: Path, station: Station
+) -> None:
+    old, fresh = opened(station, str(uuid.uuid4())), opened(station, str(uuid.uuid4()))
+    Episode.objects.filter(uuid=old.uuid).update(created_at=timezone.now() - timedelta(hours=1))
+    assert services.missing_marked() == 1
+    assert Episode.objects.get(uuid=old.uuid).status == EpisodeStatus.MISSING
+    assert Episode.objects.get(uuid=fresh.uuid).status == EpisodeStatus.RECORDING
