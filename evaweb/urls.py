@@ -8,6 +8,8 @@ from django.contrib.auth.decorators import login_not_required
 from django.http import HttpRequest, HttpResponse
 from django.urls import include, path
 
+from evaweb.api.urls import urls as rest
+
 
 @login_not_required
 async def healthz(request: HttpRequest) -> HttpResponse:
@@ -20,6 +22,7 @@ urlpatterns = [
     path("login/", auth_views.LoginView.as_view(redirect_authenticated_user=True), name="login"),
     path("logout/", auth_views.LogoutView.as_view(), name="logout"),
     path("admin/", admin.site.urls),
+    path("api/v1/", rest),
     path("", include("evaweb.console.urls")),
     path("", include("evaweb.stations.urls")),
     path("", include("evaweb.episodes.urls")),

@@ -7,6 +7,7 @@ import uuid
 from django.conf import settings
 from django.core.validators import MaxValueValidator, MinValueValidator
 from django.db import models
+from django.utils import timezone
 
 from evaweb.episodes.models import Episode
 from evaweb.stations.models import Station
@@ -199,7 +200,9 @@ class Trial(models.Model):
     setup = models.UUIDField(null=True, blank=True, editable=False, help_text="Of its newest set-up.")
     run = models.UUIDField(null=True, blank=True, editable=False, help_text="Of the command that ran it.")
     run_boot = models.CharField(max_length=64, blank=True, editable=False)
-    run_event = models.PositiveBigIntegerField(null=True, blank=True, editable=False)
+    run_event = models.PositiveBigIntegerField(
+        null=True, blank=True, editable=False, help_text="The newest of the station's events that it knows."
+    )
     run_since = models.FloatField(
         null=True, blank=True, editable=False, help_text="Since when it goes on, on the runtime's clock [s]."
     )
@@ -207,6 +210,10 @@ class Trial(models.Model):
     started_at = models.DateTimeField(null=True, blank=True)
     ended_at = models.DateTimeField(null=True, blank=True)
     duration_s = models.FloatField(null=True, blank=True, help_text="Without the time it was paused.")
+    voided_at = models.DateTimeField(null=True, blank=True)
+    voided_by = models.ForeignKey(
+        settings.AUTH_USER_MODEL, null=True, blank=True, on_delete=models.PROTECT, related_name="+"
+    )
     changed_at = models.DateTimeField(auto_now=True)
 
     class Meta:
@@ -255,8 +262,9 @@ class Score(models.Model):
     )
     note = models.TextField(blank=True)
     failure = models.CharField(max_length=60, blank=True, help_text="What went wrong, in a word or two.")
+    reason = models.TextField(blank=True, help_text="Of a correction: why the one before does not stand.")
     source = models.CharField(max_length=16, choices=Source, default=Source.HUMAN)
-    scored_at = models.DateTimeField(auto_now_add=True)
+    scored_at = models.DateTimeField(default=timezone.now)
 
     class Meta:
         ordering = ("trial", "id")

@@ -15,3 +15,7 @@ os.environ.setdefault("EVA_SECRET_KEY", "for tests alone")
 from evaweb.settings import *
 
 PASSWORD_HASHERS = ["django.contrib.auth.hashers.MD5PasswordHasher"]
+
+if DATABASES["default"]["ENGINE"].endswith("sqlite3"):
+    # A file, as in a lab: threads that share a database in memory never wait for each other's locks.
+    DATABASES["default"]["TEST"] = {"NAME": DATA_DIR / f"test-{os.getpid()}.sqlite3"}

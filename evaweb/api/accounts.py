@@ -1,0 +1,28 @@
+"""Who am I."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django.http import HttpRequest
+from ninja import Router, Schema
+
+from evaweb.api.answers import FAILURES
+from evaweb.roles import Role, role_of
+
+router = Router(tags=["accounts"])
+
+
+class Me(Schema):
+    """The user that asks."""
+
+    username: str
+    name: str
+    role: Role
+
+
+@router.get("/me", response={200: Me, **FAILURES}, summary="The user that asks", url_name="me")
+def me(request: HttpRequest) -> Any:
+    """Who is logged in, or whose token it is, and what they may do."""
+    user = request.auth
+    return {"username": user.get_username(), "name": user.get_full_name(), "role": role_of(user)}

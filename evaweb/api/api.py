@@ -1,0 +1,84 @@
+"""REST under /api/v1: every entity, every statistic, every command; errors become answers here and nowhere else."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from django.db import OperationalError
+from django.http import Http404, HttpRequest, HttpResponse
+from ninja import NinjaAPI
+from ninja.errors import AuthenticationError, HttpError, ValidationError
+
+from evaweb.api import accounts, checkpoints, episodes, jobs, scenes, stations, statistics, trials
+from evaweb.api.auth import Bearer, Session
+from evaweb.errors import EvaError
+
+log = logging.getLogger(__name__)
+
+api = NinjaAPI(
+    title="EVA Web",
+    version="1",
+    urls_namespace="api",
+    description="Every entity and every statistic of the lab. Log in, or send `Authorization: Bearer TOKEN`.",
+    auth=[Bearer(), Session()],
+    openapi_url=None,  # served below, to those who are logged in
+    docs_url=None,  # its pages fetch scripts from elsewhere
+)
+api.add_router("", accounts.router)
+api.add_router("/stations", stations.router)
+api.add_router("/trials", trials.router)
+api.add_router("/statistics", statistics.router)
+api.add_router("/episodes", episodes.router)
+api.add_router("/scenes", scenes.router)
+api.add_router("/checkpoints", checkpoints.router)
+api.add_router("/jobs", jobs.router)
+
+
+@api.get("/openapi.json", include_in_schema=False, url_name="openapi")
+def openapi(request: HttpRequest) -> Any:
+    """This interface, as OpenAPI describes it."""
+    return api.get_openapi_schema()
+
+
+@api.exception_handler(EvaError)
+def _refused(request: HttpRequest, fault: EvaError) -> HttpResponse:
+    return _failure(request, str(fault), fault.status)
+
+
+@api.exception_handler(AuthenticationError)
+def _not_logged_in(request: HttpRequest, fault: AuthenticationError) -> HttpResponse:
+    return _failure(request, "not logged in: log in, or send Authorization: Bearer TOKEN", 401)
+
+
+@api.exception_handler(ValidationError)
+def _malformed(request: HttpRequest, fault: ValidationError) -> HttpResponse:
+    said = "; ".join(_sentence(error) for error in fault.errors)
+    return _failure(request, said, 422)
+
+
+@api.exception_handler(HttpError)
+def _http(request: HttpRequest, fault: HttpError) -> HttpResponse:
+    return _failure(request, str(fault), fault.status_code)
+
+
+@api.exception_handler(Http404)
+def _nowhere(request: HttpRequest, fault: Http404) -> HttpResponse:
+    return _failure(request, str(fault) or "there is nothing here", 404)
+
+
+@api.exception_handler(OperationalError)
+def _database(request: HttpRequest, fault: OperationalError) -> HttpResponse:
+    log.error("the database did not take %s %s: %s", request.method, request.path, fault)
+    return _failure(request, f"the database is busy or gone ({fault}): nothing was changed, try again", 503)
+
+
+def _failure(request: HttpRequest, sentence: str, status: int) -> HttpResponse:
+    return api.create_response(request, {"error": sentence}, status=status)
+
+
+def _sentence(error: Any) -> str:
+    place = ".".join(str(part) for part in error["loc"][1:] if part != "given") or "body"
+    given = error.get("input")
+    shown = "" if given is None or isinstance(given, dict) else f" = {given!r:.80}"
+    return f"{place}{shown}: {error['msg']}"

@@ -1,0 +1,37 @@
+"""Who asks: a logged-in browser, or a program with a token."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django.http import HttpRequest
+from ninja.security import HttpBearer, SessionAuth
+
+from evaweb.api.tokens import token_user
+from evaweb.errors import EvaError
+
+
+class NotLoggedIn(EvaError):
+    """Nobody that we know."""
+
+    status = 401
+
+
+class Bearer(HttpBearer):
+    """`Authorization: Bearer TOKEN`, as `manage.py api_token` prints it."""
+
+    def authenticate(self, request: HttpRequest, token: str) -> Any:
+        """The token's user; a wrong token is an error, even where a session would do."""
+        user = token_user(secret=token)
+        if user is None:
+            raise NotLoggedIn("the token is not known: make one with manage.py api_token USER NAME")
+        return user
+
+
+class Session(SessionAuth):
+    """The session cookie of a logged-in browser; what changes anything needs the X-CSRFToken header as well."""
+
+    def _get_key(self, request: HttpRequest) -> str | None:
+        if not request.user.is_authenticated:  # 401 before CSRF's 403: log in first
+            return None
+        return super()._get_key(request)

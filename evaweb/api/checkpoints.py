@@ -1,0 +1,46 @@
+"""Checkpoints."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from django.http import HttpRequest
+from ninja import Query, Router, Schema
+
+from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.trials import selectors
+from evaweb.trials.models import Checkpoint
+
+router = Router(tags=["checkpoints"])
+
+
+class CheckpointOut(Schema):
+    """A trained policy; how it is reached is an administrator's business."""
+
+    id: int
+    name: str
+    description: str
+    active: bool
+    created_at: datetime
+
+    @staticmethod
+    def of(checkpoint: Checkpoint) -> Checkpoint:
+        """As it is."""
+        return checkpoint
+
+
+@router.get(
+    "", response={200: Page[CheckpointOut], **FAILURES}, summary="Checkpoints", url_name="checkpoints"
+)
+def checkpoints(request: HttpRequest, paging: Query[Paging], inactive: bool = False) -> Any:
+    """Those offered to operators; with `inactive` also the ones that are switched off."""
+    return paging.of(selectors.checkpoint_list(all_of_them=inactive), CheckpointOut)
+
+
+@router.get(
+    "/{path:name}", response={200: CheckpointOut, **FAILURES}, summary="One checkpoint", url_name="checkpoint"
+)
+def checkpoint(request: HttpRequest, name: str) -> Any:
+    """By its name, which may contain slashes, or by its id."""
+    return selectors.checkpoint_get(name=name)

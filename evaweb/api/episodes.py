@@ -1,0 +1,97 @@
+"""Episodes: what the database knows of the recordings."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any
+from uuid import UUID
+
+from django.http import HttpRequest
+from ninja import Field, Query, Router, Schema
+
+from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.errors import NotFound
+from evaweb.stations.selectors import station_get
+
+router = Router(tags=["episodes"])
+
+
+class EpisodeOut(Schema):
+    """One recorded run or demonstration; `trial` is the id of the trial that it was recorded for."""
+
+    uuid: UUID
+    station: str
+    trial: int | None
+    status: EpisodeStatus
+    reason: str
+    kind: str
+    task: str
+    robot: str
+    checkpoint: str
+    operator: str
+    cameras: list[str]
+    fps: float | None
+    frames: int
+    duration_s: float | None
+    started_at: datetime | None
+    previewed_at: datetime | None
+    dataset: str
+    dataset_index: int | None
+    published_at: datetime | None
+
+    @staticmethod
+    def of(episode: Episode) -> dict[str, Any]:
+        """With the names of its station and its trial."""
+        own = [name for name in EpisodeOut.model_fields if name not in ("station", "trial")]
+        trial = getattr(episode, "trial", None)
+        return {
+            **{name: getattr(episode, name) for name in own},
+            "station": episode.station.name,
+            "trial": trial.pk if trial else None,
+        }
+
+
+class EpisodeDetail(EpisodeOut):
+    """With the figures of the control loop at its end."""
+
+    configuration_hash: str
+    control: dict[str, Any]
+
+    @staticmethod
+    def of(episode: Episode) -> dict[str, Any]:
+        """With all that is known of it."""
+        return {
+            **EpisodeOut.of(episode),
+            "configuration_hash": episode.configuration_hash,
+            "control": episode.control,
+        }
+
+
+class Filters(Schema):
+    """Which episodes are meant."""
+
+    station: str = ""
+    status: EpisodeStatus | None = None
+    dataset: Annotated[str, Field(description="Relative to the data folder")] = ""
+
+
+@router.get("", response={200: Page[EpisodeOut], **FAILURES}, summary="Episodes", url_name="episodes")
+def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging]) -> Any:
+    """The newest first."""
+    rows = Episode.objects.select_related("station", "trial").order_by("-started_at", "-created_at", "pk")
+    if filters.station:
+        rows = rows.filter(station=station_get(name=filters.station))
+    wanted = {"status": filters.status and filters.status.value, "dataset": filters.dataset}
+    return paging.of(rows.filter(**{name: value for name, value in wanted.items() if value}), EpisodeOut)
+
+
+@router.get(
+    "/{uuid:uuid}", response={200: EpisodeDetail, **FAILURES}, summary="One episode", url_name="episode"
+)
+def episode(request: HttpRequest, uuid: UUID) -> Any:
+    """By its uuid."""
+    found = Episode.objects.select_related("station", "trial").filter(pk=uuid).first()
+    if found is None:
+        raise NotFound(f"episode {uuid} does not exist")
+    return EpisodeDetail.of(found)

@@ -1,0 +1,33 @@
+"""Makes a token with which a program uses the REST interface."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django.contrib.auth.models import User
+from django.core.management.base import BaseCommand, CommandError, CommandParser
+
+from evaweb.api.tokens import token_create
+from evaweb.errors import EvaError
+
+
+class Command(BaseCommand):
+    """`manage.py api_token USER NAME` prints the token, once."""
+
+    help = "Make a token for the REST interface and print it; it cannot be shown again."
+
+    def add_arguments(self, parser: CommandParser) -> None:
+        """Whose, and what for."""
+        parser.add_argument("user", help="the username whose rights the token has")
+        parser.add_argument("name", help="what uses it, e.g. nightly-export")
+
+    def handle(self, *args: Any, **options: Any) -> None:
+        """Print the token and nothing else."""
+        user = User.objects.filter(username=options["user"]).first()
+        if user is None:
+            known = ", ".join(User.objects.values_list("username", flat=True)) or "none yet"
+            raise CommandError(f"user {options['user']!r} does not exist; there are: {known}")
+        try:
+            self.stdout.write(token_create(user=user, name=options["name"]))
+        except EvaError as fault:
+            raise CommandError(str(fault)) from None

@@ -1,0 +1,24 @@
+"""Writes docs/openapi.json, which a test compares with what the interface is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from django.conf import settings
+from django.core.management.base import BaseCommand
+
+from evaweb.api.snapshot import snapshot
+
+PLACE = Path(settings.BASE_DIR) / "docs" / "openapi.json"
+
+
+class Command(BaseCommand):
+    """`manage.py openapi_snapshot` after a change of the interface."""
+
+    help = f"Write {PLACE.name} anew."
+
+    def handle(self, *args: Any, **options: Any) -> None:
+        """Write the file and say where."""
+        PLACE.write_text(snapshot(), encoding="utf-8")
+        self.stdout.write(f"wrote {PLACE}")

@@ -1,0 +1,67 @@
+"""Scenes with their positions and milestones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django.http import HttpRequest
+from ninja import Query, Router, Schema
+
+from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.trials import selectors
+from evaweb.trials.models import Scene
+
+router = Router(tags=["scenes"])
+
+
+class PositionOut(Schema):
+    """One initial condition."""
+
+    id: int
+    number: int
+    label: str
+    description: str
+    bench: dict[str, Any] | None
+
+
+class MilestoneOut(Schema):
+    """One step on the way to success; `truth` is the name that a simulated bench has for it."""
+
+    id: int
+    order: int
+    text: str
+    points: int
+    required: bool
+    truth: str
+
+
+class SceneOut(Schema):
+    """A task on a bench."""
+
+    id: int
+    name: str
+    title: str
+    instruction: str
+    criterion: str
+    layout: str
+    time_limit_s: float | None
+    active: bool
+    positions: list[PositionOut]
+    milestones: list[MilestoneOut]
+
+    @staticmethod
+    def of(scene: Scene) -> Scene:
+        """As it is."""
+        return scene
+
+
+@router.get("", response={200: Page[SceneOut], **FAILURES}, summary="Scenes", url_name="scenes")
+def scenes(request: HttpRequest, paging: Query[Paging], inactive: bool = False) -> Any:
+    """Those offered to operators; with `inactive` also the ones that are switched off."""
+    return paging.of(selectors.scene_list(all_of_them=inactive), SceneOut)
+
+
+@router.get("/{name}", response={200: SceneOut, **FAILURES}, summary="One scene", url_name="scene")
+def scene(request: HttpRequest, name: str) -> Any:
+    """By its name, or by its id."""
+    return selectors.scene_get(name=name)

@@ -1,0 +1,263 @@
+"""Stations: how they stand, who has them, commands, the e-stop, new trials."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Literal
+from uuid import UUID, uuid4
+
+from django.db import DatabaseError
+from django.http import HttpRequest
+from ninja import Field, Router, Schema
+
+from evaweb.api.answers import FAILURES, Failure
+from evaweb.api.trials import TrialDetail
+from evaweb.errors import EvaError, StationGone
+from evaweb.stations import commands, leases, selectors
+from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
+from evaweb.stations.wire import wire_to
+from evaweb.trials import selectors as trial_selectors
+from evaweb.trials import services
+from evaweb.trials.bench import trial_command
+
+router = Router(tags=["stations"])
+PageId = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$", description="Made by the page at random")]
+_HTTP = {
+    CommandStatus.ACCEPTED: 200,
+    CommandStatus.DONE: 200,
+    CommandStatus.REFUSED: 409,
+    CommandStatus.FAILED: 409,
+    CommandStatus.PRESSED: 504,
+    CommandStatus.UNKNOWN: 504,
+}
+
+
+class RequestOut(Schema):
+    """Somebody asks for the station."""
+
+    id: int
+    user: str
+    asked_at: datetime
+
+    @staticmethod
+    def of(asked: LeaseRequest) -> dict[str, Any]:
+        """With the name of who asks."""
+        return {"id": asked.pk, "user": asked.user.get_username(), "asked_at": asked.asked_at}
+
+
+class LeaseOut(Schema):
+    """Who has a station, "" for nobody, and who waits for it."""
+
+    holder: str
+    user: str
+    epoch: int
+    granted_at: datetime | None
+    requests: list[RequestOut]
+
+    @staticmethod
+    def of(station: Station) -> dict[str, Any]:
+        """As the database knows it now."""
+        lease = selectors.lease_open(station=station)
+        return {
+            "holder": lease.holder if lease else "",
+            "user": leases.who(lease.holder) if lease else "",
+            "epoch": lease.epoch if lease else 0,
+            "granted_at": lease.granted_at if lease else None,
+            "requests": [RequestOut.of(asked) for asked in selectors.request_list(station=station)],
+        }
+
+
+class StationOut(Schema):
+    """A robot on a bench."""
+
+    name: str
+    title: str
+    robot: str
+    simulated: bool
+    active: bool
+    message: str
+    lease: LeaseOut
+
+    @staticmethod
+    def of(station: Station) -> dict[str, Any]:
+        """With who has it."""
+        plain = ("name", "title", "robot", "simulated", "active", "message")
+        return {**{name: getattr(station, name) for name in plain}, "lease": LeaseOut.of(station)}
+
+
+class StationDetail(StationOut):
+    """With the runtime's newest snapshot, or why there is none, and the trial that is not finished."""
+
+    snapshot: dict[str, Any] | None
+    gone: str
+    trial: TrialDetail | None
+
+
+class LeaseIn(Schema):
+    """What is wanted; `request` is the id of somebody's request, `reason` why an administrator takes it."""
+
+    action: Literal["claim", "give_up", "request", "withdraw", "hand_over", "decline", "take"]
+    page: PageId
+    request: int | None = None
+    reason: str = ""
+
+
+class CommandIn(Schema):
+    """A discrete verb; boot and sequence are those of the snapshot that it was decided by.
+
+    With `trial`, set-up and run get their arguments from the trial.
+    """
+
+    uuid: UUID
+    kind: str
+    args: Annotated[dict[str, Any], Field(default_factory=dict)]
+    page: PageId
+    epoch: Annotated[int, Field(ge=0, le=2**53)] = 0
+    boot: Annotated[str, Field(max_length=64)] = ""
+    sequence: Annotated[int, Field(ge=0, le=2**53)] = 0
+    trial: int | None = None
+
+
+class CommandOut(Schema):
+    """What became of a command: 200 accepted or done, 409 refused or failed, 504 nobody knows."""
+
+    uuid: UUID
+    status: CommandStatus
+    reason: str
+    allowed: list[str]
+    data: dict[str, Any]
+
+
+class EStopIn(Schema):
+    """Why; the same uuid again is the same press."""
+
+    uuid: UUID | None = None
+    why: Annotated[str, Field(max_length=200)] = "pressed"
+
+
+class TrialIn(Schema):
+    """What is tried next; scene and checkpoint by name or id, the position by its number."""
+
+    scene: str | int
+    position: int
+    checkpoint: str | int
+    seed: int | None = None
+
+
+ANSWERS = {200: CommandOut, 504: CommandOut, frozenset({400, 401, 403, 404, 422, 503}): Failure}
+
+
+@router.get("", response={200: list[StationOut], **FAILURES}, summary="Stations", url_name="stations")
+def stations(request: HttpRequest, inactive: bool = False) -> Any:
+    """Those offered to operators; with `inactive` also the ones that are switched off."""
+    return [StationOut.of(row) for row in selectors.station_list(all_of_them=inactive)]
+
+
+@router.get("/{name}", response={200: StationDetail, **FAILURES}, summary="One station", url_name="station")
+def station(request: HttpRequest, name: str) -> Any:
+    """With its newest snapshot; `gone` says why there is none."""
+    found = selectors.station_get(name=name)
+    snapshot, gone = None, ""
+    try:
+        snapshot = wire_to(name).status()
+    except StationGone as fault:
+        gone = str(fault)
+    unfinished = trial_selectors.trial_open(found)
+    trial = TrialDetail.of(trial_selectors.trial_get(id=unfinished.pk)) if unfinished else None
+    return {**StationOut.of(found), "snapshot": snapshot, "gone": gone, "trial": trial}
+
+
+@router.post(
+    "/{name}/lease", response={200: LeaseOut, **FAILURES}, summary="Take, give, ask", url_name="lease"
+)
+def lease(request: HttpRequest, name: str, given: LeaseIn) -> Any:
+    """Who commands the station; answers with how it stands afterwards."""
+    found, user, page = selectors.station_get(name=name), request.auth, given.page
+    if given.action == "claim":
+        leases.claim(user=user, station=found, page=page)
+    elif given.action == "give_up":
+        leases.give_up(user=user, station=found, page=page)
+    elif given.action == "request":
+        leases.request(user=user, station=found, page=page)
+    elif given.action == "withdraw":
+        leases.withdraw(user=user, station=found)
+    elif given.action == "take":
+        leases.take(user=user, station=found, page=page, reason=given.reason)
+    else:
+        answer = leases.hand_over if given.action == "hand_over" else leases.decline
+        answer(user=user, station=found, page=page, request=_request_of(given))
+    return LeaseOut.of(found)
+
+
+@router.post(
+    "/{name}/commands",
+    response={**ANSWERS, 409: CommandOut | Failure},
+    summary="Give a command",
+    url_name="commands",
+)
+def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
+    """Setup, run, stop, halt, resume and so on; the same uuid again gets the first answer."""
+    found = selectors.station_get(name=name)
+    order = given.model_dump(exclude={"trial"})
+    if given.trial is None:
+        row = commands.issue(user=request.auth, station=found, **order)
+    else:
+        trial = trial_selectors.trial_get(id=given.trial)
+        if trial.station_id != found.pk:
+            raise EvaError(f"trial {trial.pk} is one of {trial.station.name}, not of {found.name}")
+        row = trial_command(user=request.auth, trial=trial, **order)
+    return _HTTP[CommandStatus(row.status)], _command_out(row)
+
+
+@router.post(
+    "/{name}/estop", response={**ANSWERS, 409: CommandOut | Failure}, summary="E-stop", url_name="estop"
+)
+def estop(request: HttpRequest, name: str, given: EStopIn) -> Any:
+    """Stop the robot now; anybody who is logged in. To the wire first; the row waits for nobody."""
+    identity = given.uuid or uuid4()
+    answer = commands.estop(station=name, username=request.auth.get_username(), why=given.why, uuid=identity)
+    _note_estop(request, name, given.why, identity, answer)
+    return _HTTP[answer.status], {
+        "uuid": identity,
+        "status": answer.status,
+        "reason": answer.reason,
+        "allowed": answer.allowed,
+        "data": answer.data,
+    }
+
+
+@router.post(
+    "/{name}/trials", response={201: TrialDetail, **FAILURES}, summary="Prepare a trial", url_name="prepare"
+)
+def prepare(request: HttpRequest, name: str, given: TrialIn) -> Any:
+    """The next trial of this checkpoint at this position, or the repetition of one that does not count."""
+    scene = trial_selectors.scene_get(name=given.scene)
+    made = services.trial_prepare(
+        user=request.auth,
+        station=selectors.station_get(name=name),
+        scene=scene,
+        position=trial_selectors.position_get(scene=scene, number=given.position),
+        checkpoint=trial_selectors.checkpoint_get(name=given.checkpoint),
+        seed=given.seed,
+    )
+    return 201, TrialDetail.of(trial_selectors.trial_get(id=made.pk))
+
+
+def _request_of(given: LeaseIn) -> int:
+    if given.request is None:
+        raise EvaError(f"request is missing: {given.action} answers somebody's request, name its id")
+    return given.request
+
+
+def _command_out(row: Command) -> dict[str, Any]:
+    return {"uuid": row.pk, **{name: getattr(row, name) for name in ("status", "reason", "allowed", "data")}}
+
+
+def _note_estop(request: HttpRequest, name: str, why: str, uuid: UUID, answer: commands.Answer) -> None:
+    """Write the press down where the database has the station; it is done already, whatever comes of this."""
+    try:
+        found = Station.objects.filter(name=name).first()
+        if found is not None:
+            commands.estop_noted(user=request.auth, station=found, why=why, uuid=uuid, answer=answer)
+    except (DatabaseError, EvaError) as fault:
+        commands.log.error("the e-stop of %s (%s) is not in the database: %s", name, uuid, fault)

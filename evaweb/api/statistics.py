@@ -1,0 +1,83 @@
+"""What the scored trials say, per scene and checkpoint."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django.http import HttpRequest, HttpResponse
+from ninja import Query, Router, Schema
+
+from evaweb.api.answers import FAILURES
+from evaweb.api.tables import Format, csv_answer
+from evaweb.api.trials import Filters
+from evaweb.trials import selectors
+from evaweb.trials.selectors import StatisticsRow
+
+router = Router(tags=["statistics"])
+
+
+class StatisticsOut(Schema):
+    """One checkpoint at one scene. Rates never stand without n and interval; null where n is 0."""
+
+    scene: str
+    scene_title: str
+    checkpoint: str
+    n: int
+    successes: int
+    rate: float | None
+    low: float | None
+    high: float | None
+    level: float | None
+    mean_score: float | None
+    median_duration_s: float | None
+    to_score: int
+    interrupted: int
+    voided: int
+
+    @staticmethod
+    def of(row: StatisticsRow) -> dict[str, Any]:
+        """Flat, the same for JSON and CSV."""
+        success, interval = row.summary.success, row.summary.success.interval
+        return {
+            "scene": row.scene.name,
+            "scene_title": row.scene.title,
+            "checkpoint": row.checkpoint.name,
+            "n": success.n,
+            "successes": success.successes,
+            "rate": success.rate,
+            "low": interval and interval.low,
+            "high": interval and interval.high,
+            "level": interval and interval.level,
+            "mean_score": row.summary.mean_score,
+            "median_duration_s": row.summary.median_duration_s,
+            "to_score": row.to_score,
+            "interrupted": row.interrupted,
+            "voided": row.voided,
+        }
+
+
+class Statistics(Schema):
+    """All rows, by scene and checkpoint name: their order is no ranking."""
+
+    method: str
+    items: list[StatisticsOut]
+
+
+METHOD = (
+    "success rate with Wilson 95 % interval over scored trials; voided and interrupted trials do not count"
+)
+
+
+@router.get(
+    "",
+    response={200: Statistics, **FAILURES},
+    summary="Success per scene and checkpoint",
+    url_name="statistics",
+)
+def statistics(request: HttpRequest, filters: Query[Filters], format: Format = "json") -> Any:
+    """Counts, success rate with its Wilson 95 % interval, mean score, median duration; CSV with `format=csv`."""
+    rows = [StatisticsOut.of(row) for row in selectors.statistics(filters.chosen())]
+    if format == "csv":
+        answer: HttpResponse = csv_answer(request, "statistics", list(StatisticsOut.model_fields), [rows])
+        return answer
+    return {"method": METHOD, "items": rows}

@@ -1,0 +1,161 @@
+"""The commands of a trial: what its set-up and its run take with them, and what their answers do to it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+from uuid import UUID, uuid4
+
+from django.contrib.auth.models import User
+from django.db import transaction
+
+from evaweb.errors import Conflict, EvaError
+from evaweb.roles import Role, require
+from evaweb.stations.commands import issue
+from evaweb.stations.models import Command, CommandStatus
+from evaweb.trials import lifecycle
+from evaweb.trials.facts import trial_facts
+from evaweb.trials.following import run_begun
+from evaweb.trials.models import Trial, TrialStatus
+
+_CARRIED_OUT = (CommandStatus.ACCEPTED, CommandStatus.DONE)
+_NOT_CARRIED_OUT = (CommandStatus.REFUSED, CommandStatus.FAILED)
+
+
+def trial_command(
+    *,
+    user: User,
+    trial: Trial,
+    kind: str,
+    page: str,
+    epoch: int,
+    boot: str,
+    sequence: int,
+    uuid: UUID | str | None = None,
+    args: Mapping[str, Any] | None = None,
+) -> Command:
+    """Give a command for a trial; `setup` and `run` get their arguments from it, others keep `args`.
+
+    Never within a transaction. An accepted run has begun: its episode has a row. Raises Conflict where the
+    trial is not prepared, or the station was last set up for something else.
+    """
+    require(user, Role.OPERATOR)
+    identity = _identity(uuid)
+    given = {
+        "user": user,
+        "station": trial.station,
+        "kind": kind,
+        "page": page,
+        "epoch": epoch,
+        "boot": boot,
+        "sequence": sequence,
+        "uuid": identity,
+    }
+    if kind == "setup":
+        return _set_up(trial, given)
+    if kind == "run":
+        return _run(trial, given)
+    return issue(**given, args=dict(args or {}))
+
+
+def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
+    """What the station needs to know for this trial; `reset` names this laying out of a simulated bench."""
+    args: dict[str, Any] = {
+        "policy": trial.checkpoint.policy,
+        "task": trial.instruction,
+        "checkpoint": {"id": trial.checkpoint_id, "name": trial.checkpoint.name},
+    }
+    if trial.station.simulated and trial.seed is not None:
+        args["bench"] = {"id": str(reset), "seed": trial.seed, "positions": trial.position.bench}
+    return args
+
+
+def run_args(trial: Trial, user: User) -> dict[str, Any]:
+    """What goes into the manifest of the episode, and when the run ends by itself."""
+    args: dict[str, Any] = {"trial": trial_facts(trial), "operator": user.get_username()}
+    if trial.time_limit_s is not None:
+        args["duration_s"] = trial.time_limit_s
+    return args
+
+
+def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
+    first = Command.objects.filter(pk=given["uuid"]).first()
+    if first is None:
+        _require_prepared(trial, "set up")
+    args = first.args if first else setup_args(trial, given["uuid"])
+    row = issue(**given, args=args)
+    if row.status not in _NOT_CARRIED_OUT:
+        with transaction.atomic():
+            held = _held(trial)
+            if held.status == TrialStatus.PREPARED:
+                held.setup = row.pk
+                held.save()
+    trial.refresh_from_db()
+    return row
+
+
+def _run(trial: Trial, given: Mapping[str, Any]) -> Command:
+    first = Command.objects.filter(pk=given["uuid"]).first()
+    if first is None:
+        _require_prepared(trial, "run")
+        _require_set_up(trial)
+    args = first.args if first else run_args(trial, given["user"])
+    row = issue(**given, args=args)
+    if row.status in _CARRIED_OUT and _is_about(row, trial):
+        with transaction.atomic():
+            run_begun(_held(trial), command=row, episode=_episode_of(row))
+    trial.refresh_from_db()
+    return row
+
+
+def _require_prepared(trial: Trial, what: str) -> None:
+    status = TrialStatus(_held_status(trial))
+    if status is not TrialStatus.PREPARED:
+        raise Conflict(
+            f"trial {trial.pk} is {status.label} and cannot be {what}: {lifecycle.advice(status)}; "
+            "a repetition is another trial"
+        )
+
+
+def _require_set_up(trial: Trial) -> None:
+    """Whatever the page thinks: the last set-up of the station that may have been carried out was for this trial."""
+    last = (
+        Command.objects.filter(station=trial.station, kind="setup")
+        .exclude(status__in=_NOT_CARRIED_OUT)
+        .order_by("-issued_at")
+        .values_list("pk", flat=True)
+        .first()
+    )
+    mine = Trial.objects.values_list("setup", flat=True).get(pk=trial.pk)
+    if mine is None:
+        raise Conflict(f"trial {trial.pk} is not set up: press Set up, then Run")
+    if last != mine:
+        raise Conflict(
+            f"{trial.station.name} was set up for something else since trial {trial.pk} was: press Set up again"
+        )
+
+
+def _is_about(row: Command, trial: Trial) -> bool:
+    return (row.args.get("trial") or {}).get("uuid") == str(trial.uuid)
+
+
+def _episode_of(row: Command) -> UUID | None:
+    episode = row.data.get("episode")
+    return UUID(episode) if episode else None
+
+
+def _held(trial: Trial) -> Trial:
+    return Trial.objects.select_for_update().get(pk=trial.pk)
+
+
+def _held_status(trial: Trial) -> str:
+    return Trial.objects.values_list("status", flat=True).get(pk=trial.pk)
+
+
+def _identity(given: UUID | str | None) -> UUID:
+    if given is None:
+        return uuid4()
+    try:
+        return UUID(str(given))
+    except ValueError:
+        raise EvaError(f"uuid {given!r:.60}: must be a UUID such as {uuid4()}") from None

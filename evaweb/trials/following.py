@@ -1,0 +1,219 @@
+"""What a station's events do to its trial: begun, paused, resumed, ended, interrupted, its recording closed.
+
+Every event may come more than once, from several web processes, and after a gap: a trial knows the number of
+the newest event that it has taken, and takes none before that again.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+from uuid import UUID
+
+from django.db import transaction
+from django.utils import timezone
+
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.services import episode_opened, publish_asked
+from evaweb.stations.commands import settle
+from evaweb.stations.models import Command, Station
+from evaweb.trials import lifecycle
+from evaweb.trials.lifecycle import Move
+from evaweb.trials.models import Trial, TrialStatus
+
+log = logging.getLogger(__name__)
+
+# The session's state -> what that means for a trial that is under way. Any other state interrupts it.
+_MEANING = {"running": Move.RESUME, "holding": Move.PAUSE, "ready": Move.END}
+
+
+def run_changed(*, station: Station, event: Mapping[str, Any], boot: str | None = None) -> Trial | None:
+    """Take one row of a station's event log; the trial that it changed, or None.
+
+    `event`: number, kind, text, time [s, the runtime's clock], data. `boot`: of the runtime that numbered it.
+    """
+    boot = boot if boot is not None else station.boot
+    kind, data = event.get("kind"), event.get("data") or {}
+    if kind in ("truth", "episode_closed"):
+        _find_trial_of(station, _uuid(data.get("episode") or data.get("uuid")))
+    with transaction.atomic():
+        if kind == "command":
+            return _begun(station, event, boot) or _state_entered(station, event, boot)
+        if kind == "state":
+            return _state_entered(station, event, boot)
+        if kind == "truth":
+            return _truth_told(event)
+        if kind == "episode_closed":
+            return _episode_closed(event)
+    return None
+
+
+def run_begun(trial: Trial, *, command: Command, episode: UUID | None) -> None:
+    """The station has accepted the command to run: at the answer, or where that was lost, at the event.
+
+    The caller holds the trial's row. Taken twice it changes nothing.
+    """
+    if trial.run is None and _may_begin(trial):
+        lifecycle.apply(trial, Move.RUN)
+        trial.run, trial.run_boot, trial.reason = command.pk, command.boot, ""
+        trial.started_at = timezone.now()
+        trial.operator = command.user or trial.operator
+    if trial.run == command.pk and trial.episode_id is None and episode is not None:
+        trial.episode = _episode(trial, episode)
+    trial.save()
+
+
+def _may_begin(trial: Trial) -> bool:
+    others = Trial.objects.filter(station=trial.station, status__in=lifecycle.OPEN).exclude(pk=trial.pk)
+    if lifecycle.allows(trial, Move.RUN) and not others.exists():
+        return True
+    log.error("trial %s is %s, but %s accepted its run", trial.pk, trial.status, trial.station.name)
+    return False
+
+
+def _episode(trial: Trial, uuid: UUID) -> Episode:
+    return episode_opened(
+        station=trial.station,
+        uuid=uuid,
+        task=trial.instruction,
+        checkpoint=trial.checkpoint.name,
+        operator=trial.operator.get_username(),
+        kind="rollout",
+    )
+
+
+def _find_trial_of(station: Station, episode: UUID | None) -> None:
+    """Bind an episode to its trial where the answer that named it was lost: the runtime is asked once more."""
+    if episode is None or Trial.objects.filter(episode_id=episode).exists():
+        return
+    trial = Trial.objects.filter(station=station, episode=None, run__isnull=False).order_by("-pk").first()
+    command = (
+        Command.objects.select_related("station", "user").filter(pk=trial.run).first() if trial else None
+    )
+    if trial is None or command is None:
+        return
+    if _uuid(settle(row=command).data.get("episode")) == episode:
+        with transaction.atomic():
+            run_begun(Trial.objects.select_for_update().get(pk=trial.pk), command=command, episode=episode)
+
+
+def _begun(station: Station, event: Mapping[str, Any], boot: str) -> Trial | None:
+    """The event of an accepted `run`: from its number on the station's events are about this trial."""
+    data = event.get("data") or {}
+    if data.get("to") != "running" or data.get("from") == "running":
+        return None
+    command = Command.objects.filter(pk=_uuid(data.get("uuid")), station=station, kind="run").first()
+    asked = (command.args.get("trial") or {}) if command else {}
+    trial = _held(uuid=_uuid(asked.get("uuid")), station=station) if asked else None
+    if command is None or trial is None or trial.run_event is not None:
+        return None
+    run_begun(trial, command=command, episode=_uuid(command.data.get("episode")))
+    if trial.run != command.pk:
+        return None
+    trial.run_boot, trial.run_event = boot, event["number"]
+    trial.run_since = _time(event) if trial.status == TrialStatus.RUNNING else None
+    trial.save()
+    return trial
+
+
+def _state_entered(station: Station, event: Mapping[str, Any], boot: str) -> Trial | None:
+    data = event.get("data") or {}
+    state = data.get("state") or data.get("to")
+    trial = _held(station=station, status__in=lifecycle.UNDER_WAY)
+    if trial is None or not state:
+        return None
+    if trial.run_boot != boot:
+        return _runtime_restarted(trial)
+    if trial.run_event is None or event["number"] <= trial.run_event:
+        return None
+    move = _MEANING.get(state, Move.INTERRUPT)
+    if not lifecycle.allows(trial, move):  # it is there already
+        return None
+    _moved(trial, move, _reason(event), _time(event))
+    trial.run_event = event["number"]
+    trial.save()
+    return trial
+
+
+def _runtime_restarted(trial: Trial) -> Trial:
+    """Its events are lost: what the recording says counts."""
+    episode = trial.episode
+    if episode is not None and episode.status == EpisodeStatus.FINISHED:
+        _moved(trial, Move.END, episode.reason or "ended while the web was away", None)
+        trial.duration_s = episode.duration_s
+    else:
+        _moved(trial, Move.INTERRUPT, "the station was restarted during the run", None)
+    trial.save()
+    return trial
+
+
+def _moved(trial: Trial, move: Move, reason: str, time: float | None) -> None:
+    """Apply the move; the clock stands while the trial is paused. `time` [s] None: not known."""
+    if trial.run_since is not None and time is not None:
+        trial.duration_s = (trial.duration_s or 0.0) + max(0.0, time - trial.run_since)
+    lifecycle.apply(trial, move)
+    trial.run_since = time if trial.status == TrialStatus.RUNNING else None
+    trial.reason = "" if move is Move.RESUME else reason
+    if move in (Move.END, Move.INTERRUPT):
+        trial.ended_at = timezone.now()
+
+
+def _truth_told(event: Mapping[str, Any]) -> Trial | None:
+    """How the simulated bench was left at the end of an episode."""
+    data = dict(event.get("data") or {})
+    trial = _held(episode_id=_uuid(data.get("episode")))
+    if trial is None or trial.truth == data:
+        return None
+    trial.truth = data
+    trial.save()
+    return trial
+
+
+def _episode_closed(event: Mapping[str, Any]) -> Trial | None:
+    """The recording is on disk: its duration is the exact one, and what is not whole is interrupted."""
+    data = event.get("data") or {}
+    uuid = _uuid(data.get("uuid"))
+    trial = _held(episode_id=uuid)
+    if trial is None:
+        return None
+    _closed_as(trial, str(data.get("status")), str(data.get("reason") or ""), _time(event))
+    if trial.episode is not None and trial.episode.duration_s is not None:
+        trial.duration_s = trial.episode.duration_s
+    trial.save()
+    if trial.episode is not None and trial.status in (TrialStatus.SCORED, TrialStatus.VOIDED):
+        publish_asked(episode=trial.episode)  # it was judged before its recording was on disk
+    return trial
+
+
+def _closed_as(trial: Trial, status: str, reason: str, time: float | None) -> None:
+    if status == EpisodeStatus.FINISHED:
+        if trial.status in lifecycle.UNDER_WAY:
+            _moved(trial, Move.END, reason, time)
+    elif lifecycle.allows(trial, Move.INTERRUPT):
+        _moved(trial, Move.INTERRUPT, f"its recording is {status}: {reason}", time)
+
+
+def _held(**key: Any) -> Trial | None:
+    """The newest such trial, its row kept from others until the transaction ends."""
+    if any(value is None for name, value in key.items() if name in ("uuid", "episode_id")):
+        return None
+    return Trial.objects.select_for_update().filter(**key).order_by("-pk").first()
+
+
+def _uuid(given: object) -> UUID | None:
+    try:
+        return UUID(str(given))
+    except ValueError:
+        return None
+
+
+def _time(event: Mapping[str, Any]) -> float | None:
+    time = event.get("time")
+    return float(time) if isinstance(time, int | float) else None
+
+
+def _reason(event: Mapping[str, Any]) -> str:
+    """Of a command "stop by ann: accepted" the part before the colon, of a state "a -> b: why" the part after."""
+    before, _, after = str(event.get("text") or "").partition(": ")
+    return before if event.get("kind") == "command" else after or before

@@ -1,0 +1,253 @@
+"""What is known of scenes, checkpoints, evaluations, trials and their scores."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime, time
+from typing import TypeVar
+
+from django.db.models import Count, Model, Prefetch, Q, QuerySet
+from django.utils import timezone
+from django.utils.dateparse import parse_date, parse_datetime
+
+from evaweb.errors import EvaError, NotFound
+from evaweb.stations.models import Command, Station
+from evaweb.trials import lifecycle
+from evaweb.trials.models import Checkpoint, Evaluation, Position, Scene, Score, Trial, TrialStatus
+from evaweb.trials.statistics import Summary, summary
+
+UNFINISHED = (*lifecycle.OPEN, TrialStatus.ENDED)
+_Named = TypeVar("_Named", bound=Model)
+
+
+# --- by name -----------------------------------------------------------------------------------------------
+
+
+def scene_get(*, name: str | int) -> Scene:
+    """The scene of that name or id; NotFound lists those that there are."""
+    return _by_name(Scene.objects.all(), "scene", name)
+
+
+def checkpoint_get(*, name: str | int) -> Checkpoint:
+    """The checkpoint of that name or id; NotFound lists those that there are."""
+    return _by_name(Checkpoint.objects.all(), "checkpoint", name)
+
+
+def evaluation_get(*, name: str | int) -> Evaluation:
+    """The newest version of the evaluation of that name, or the one of that id."""
+    return _by_name(Evaluation.objects.order_by("-version"), "evaluation", name)
+
+
+def position_get(*, scene: Scene, number: int) -> Position:
+    """The position of that number; NotFound lists those of the scene."""
+    found = scene.positions.filter(number=number).first()
+    if found is None:
+        known = ", ".join(map(str, scene.positions.values_list("number", flat=True))) or "none yet"
+        raise NotFound(f"position {number} of scene {scene.name} does not exist; there are: {known}")
+    return found
+
+
+def _by_name(rows: QuerySet[_Named], kind: str, name: str | int) -> _Named:
+    found = rows.filter(name=str(name)).first()
+    if found is None and re.fullmatch(r"[0-9]{1,18}", str(name)):
+        found = rows.filter(pk=int(name)).first()
+    if found is None:
+        known = ", ".join(dict.fromkeys(rows.values_list("name", flat=True))) or "none yet"
+        raise NotFound(f"{kind} {str(name)!r:.80} does not exist; there are: {known}")
+    return found
+
+
+# --- lists -------------------------------------------------------------------------------------------------
+
+
+def scene_list(*, all_of_them: bool = False) -> QuerySet[Scene]:
+    """Scenes with their positions and milestones: those offered to operators, or all."""
+    rows = Scene.objects.prefetch_related("positions", "milestones")
+    return rows if all_of_them else rows.filter(active=True)
+
+
+def checkpoint_list(*, all_of_them: bool = False) -> QuerySet[Checkpoint]:
+    """Checkpoints: those offered to operators, or all."""
+    return Checkpoint.objects.all() if all_of_them else Checkpoint.objects.filter(active=True)
+
+
+def evaluation_list() -> QuerySet[Evaluation]:
+    """All evaluations by name and version."""
+    return Evaluation.objects.select_related("station")
+
+
+def trial_open(station: Station) -> Trial | None:
+    """The trial of a station that is not finished: prepared, running, paused, or ended and not yet scored."""
+    unfinished = Trial.objects.filter(station=station, status__in=UNFINISHED).order_by("-pk")
+    return unfinished.select_related(*_NAMED).first()
+
+
+def trial_get(*, id: int) -> Trial:
+    """The trial with all that is known of it."""
+    scores = Score.objects.select_related("rater").prefetch_related("outcomes").order_by("-pk")
+    rows = Trial.objects.select_related(*_NAMED, "episode", "voided_by")
+    found = (
+        rows.prefetch_related(Prefetch("scores", scores)).filter(pk=id).first() if 0 < id < 2**63 else None
+    )
+    if found is None:
+        raise NotFound(f"trial {id} does not exist")
+    return found
+
+
+_NAMED = ("evaluation", "checkpoint", "scene", "position", "station", "operator", "verdict")
+
+
+@dataclass(frozen=True, slots=True)
+class TrialFilters:
+    """Which trials are meant, each by name; "" where it does not matter. `since`: a day or an ISO time."""
+
+    evaluation: str = ""
+    checkpoint: str = ""
+    scene: str = ""
+    station: str = ""
+    status: str = ""
+    since: str = ""
+
+    def apply(self, trials: QuerySet[Trial]) -> QuerySet[Trial]:
+        """The trials that fit; raises NotFound or EvaError that names what is allowed."""
+        if self.evaluation:
+            trials = trials.filter(evaluation=evaluation_get(name=self.evaluation))
+        if self.checkpoint:
+            trials = trials.filter(checkpoint=checkpoint_get(name=self.checkpoint))
+        if self.scene:
+            trials = trials.filter(scene=scene_get(name=self.scene))
+        if self.station:
+            trials = trials.filter(station=_by_name(Station.objects.all(), "station", self.station))
+        if self.status:
+            trials = trials.filter(status=_status(self.status))
+        if self.since:
+            trials = trials.filter(prepared_at__gte=_since(self.since))
+        return trials
+
+
+def trial_list(filters: TrialFilters | None = None) -> QuerySet[Trial]:
+    """Trials that fit, the newest first, with what names them."""
+    rows = Trial.objects.select_related(*_NAMED, "verdict__rater").order_by("-prepared_at", "-pk")
+    return (filters or TrialFilters()).apply(rows)
+
+
+def trials_in_pages(filters: TrialFilters, *, size: int = 1000) -> Iterator[list[Trial]]:
+    """All trials that fit, the oldest first, a page at a time: for exports of any length."""
+    rows = trial_list(filters).order_by("pk").prefetch_related("verdict__outcomes")
+    last = 0
+    while page := list(rows.filter(pk__gt=last)[:size]):
+        yield page
+        last = page[-1].pk
+
+
+def attempts_of(*, trial: Trial) -> QuerySet[Trial]:
+    """All attempts of the same number, this one included, in their order."""
+    key = {
+        name: getattr(trial, name)
+        for name in ("evaluation_id", "checkpoint_id", "scene_id", "position_id", "number")
+    }
+    same = Trial.objects.filter(**key, evaluation_version=trial.evaluation_version)
+    return same.order_by("attempt")
+
+
+def commands_of(*, trial: Trial) -> QuerySet[Command]:
+    """The commands given to its station from its preparation until its end, the first one first."""
+    until = trial.ended_at or (None if trial.status in UNFINISHED else trial.changed_at)
+    asked = Command.objects.filter(station=trial.station, issued_at__gte=trial.prepared_at)
+    asked = asked.filter(issued_at__lte=until) if until else asked
+    mine = Q(pk__in=[key for key in (trial.setup, trial.run) if key])
+    return (asked | Command.objects.filter(mine)).select_related("user").order_by("issued_at").distinct()
+
+
+# --- statistics --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class StatisticsRow:
+    """One checkpoint at one scene: what its scored trials say, and how many others there are beside them."""
+
+    scene: Scene
+    checkpoint: Checkpoint
+    summary: Summary
+    to_score: int
+    interrupted: int
+    voided: int
+
+
+def statistics(filters: TrialFilters | None = None) -> list[StatisticsRow]:
+    """Per scene and checkpoint, both by name: only scored trials count, what else was run is beside them."""
+    trials = (filters or TrialFilters()).apply(Trial.objects.order_by())
+    cells = _scored_cells(trials)
+    others = _other_counts(trials)
+    keys = {*cells, *others}
+    scenes = Scene.objects.in_bulk({scene for scene, _ in keys})
+    checkpoints = Checkpoint.objects.in_bulk({checkpoint for _, checkpoint in keys})
+    rows = [
+        StatisticsRow(
+            scenes[scene],
+            checkpoints[checkpoint],
+            _summary(cells.get((scene, checkpoint), [])),
+            others[scene, checkpoint][TrialStatus.ENDED],
+            others[scene, checkpoint][TrialStatus.INTERRUPTED],
+            others[scene, checkpoint][TrialStatus.VOIDED],
+        )
+        for scene, checkpoint in keys
+    ]
+    return sorted(rows, key=lambda row: (row.scene.title, row.scene.pk, row.checkpoint.name))
+
+
+_Cell = tuple[int, int]  # scene, checkpoint
+
+
+def _scored_cells(trials: QuerySet[Trial]) -> dict[_Cell, list[tuple[bool, float, float | None]]]:
+    cells: dict[_Cell, list[tuple[bool, float, float | None]]] = defaultdict(list)
+    scored = trials.filter(status=TrialStatus.SCORED)
+    for scene, checkpoint, *outcome in scored.values_list(
+        "scene_id", "checkpoint_id", "verdict__success", "verdict__score", "duration_s"
+    ):
+        cells[scene, checkpoint].append((outcome[0], outcome[1], outcome[2]))
+    return cells
+
+
+def _other_counts(trials: QuerySet[Trial]) -> dict[_Cell, dict[str, int]]:
+    counted = (TrialStatus.ENDED, TrialStatus.INTERRUPTED, TrialStatus.VOIDED)
+    found: dict[_Cell, dict[str, int]] = defaultdict(lambda: dict.fromkeys(counted, 0))
+    grouped = trials.filter(status__in=counted).values("scene_id", "checkpoint_id", "status")
+    for row in grouped.annotate(n=Count("pk")):
+        found[row["scene_id"], row["checkpoint_id"]][row["status"]] = row["n"]
+    return found
+
+
+def _summary(outcomes: Sequence[tuple[bool, float, float | None]]) -> Summary:
+    return summary(
+        [success for success, _, _ in outcomes],
+        [score for _, score, _ in outcomes],
+        [seconds for _, _, seconds in outcomes if seconds is not None],
+    )
+
+
+# --- parsing -----------------------------------------------------------------------------------------------
+
+
+def _status(given: str) -> str:
+    if given not in TrialStatus.values:
+        raise EvaError(f"status = {given!r:.80}; allowed: {', '.join(TrialStatus.values)}")
+    return given
+
+
+def _since(given: str) -> datetime:
+    try:
+        moment = parse_datetime(given)
+        day = parse_date(given) if moment is None else None
+    except ValueError:  # well formed, but no such day
+        moment = day = None
+    if day is not None:
+        moment = datetime.combine(day, time.min)
+    if moment is None:
+        raise EvaError(
+            f"since = {given!r:.80}; allowed: a day such as 2026-01-31, or a time such as 2026-01-31T08:00:00Z"
+        )
+    return moment if timezone.is_aware(moment) else timezone.make_aware(moment)

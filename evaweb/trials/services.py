@@ -1,0 +1,316 @@
+"""What is done with trials: prepared, scored, voided, abandoned; what their runs do to them is in `following`."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+from django.contrib.auth.models import User
+from django.db import IntegrityError, transaction
+from django.db.models import Max
+from django.utils import timezone
+
+from evaweb.episodes.services import publish_asked
+from evaweb.errors import Conflict, EvaError, NotFound
+from evaweb.roles import Role, require
+from evaweb.stations.models import Station
+from evaweb.trials import journal, lifecycle
+from evaweb.trials.facts import trial_facts
+from evaweb.trials.following import run_changed
+from evaweb.trials.lifecycle import Move
+from evaweb.trials.models import (
+    Checkpoint,
+    Evaluation,
+    MilestoneOutcome,
+    Position,
+    Scene,
+    Score,
+    Trial,
+    TrialStatus,
+)
+from evaweb.trials.selectors import trial_open
+from evaweb.trials.verdicts import LONGEST_FAILURE, LONGEST_NOTE, Verdict, text, verdict
+
+__all__ = [
+    "open_bench",
+    "run_changed",
+    "trial_abandon",
+    "trial_prepare",
+    "trial_score",
+    "trial_void",
+]
+
+HIGHEST_SEED = 2**31 - 1
+_TRIES = 5  # to get a number that nobody else takes at the same moment
+
+
+# --- preparing ---------------------------------------------------------------------------------------------
+
+
+def trial_prepare(
+    *,
+    user: User,
+    station: Station,
+    scene: Scene,
+    position: Position,
+    checkpoint: Checkpoint,
+    seed: int | None = None,
+) -> Trial:
+    """The next trial of this checkpoint at this position, on the station's open bench.
+
+    It repeats the lowest number whose newest attempt does not count, as a new attempt; else it is the next
+    number. Conflict where the station has a trial that is not finished, and says what to do about it.
+    """
+    require(user, Role.OPERATOR)
+    _check_choice(station, scene, position, checkpoint, seed)
+    for _ in range(_TRIES):
+        try:
+            with transaction.atomic():
+                return _prepared(user, station, scene, position, checkpoint, seed)
+        except IntegrityError:
+            continue  # somebody took the number, or the station: both are looked at anew
+    raise Conflict(f"others prepare trials of {checkpoint} at {scene} at the same moment: try again")
+
+
+def open_bench(station: Station) -> Evaluation:
+    """The evaluation of the station's trials outside any plan; made when it is first needed."""
+    name = f"open bench {station.name}"
+    found, _ = Evaluation.objects.get_or_create(
+        station=station, kind=Evaluation.Kind.OPEN_BENCH, defaults={"name": name}
+    )
+    return found
+
+
+def _check_choice(
+    station: Station, scene: Scene, position: Position, checkpoint: Checkpoint, seed: int | None
+) -> None:
+    named = (("station", station.name, station), ("scene", scene.name, scene))
+    for kind, name, chosen in (*named, ("checkpoint", checkpoint.name, checkpoint)):
+        if not chosen.active:
+            why = f" ({station.message})" if chosen is station and station.message else ""
+            raise Conflict(f"{kind} {name} is switched off{why}: choose another, or ask an administrator")
+    if position.scene_id != scene.pk:
+        raise NotFound(f"position {position.pk} is not one of scene {scene.name}")
+    if seed is not None and not 0 <= seed <= HIGHEST_SEED:
+        raise EvaError(f"seed = {seed}; allowed: 0 to {HIGHEST_SEED}")
+
+
+def _prepared(
+    user: User,
+    station: Station,
+    scene: Scene,
+    position: Position,
+    checkpoint: Checkpoint,
+    seed: int | None,
+) -> Trial:
+    Station.objects.select_for_update().get(pk=station.pk)  # one at a time
+    unfinished = trial_open(station)
+    if unfinished is not None:
+        status = TrialStatus(unfinished.status)
+        raise Conflict(
+            f"trial {unfinished.pk} of {station.name} is {status.label}: {lifecycle.advice(status)}, "
+            "then prepare the next one"
+        )
+    evaluation = open_bench(station)
+    key = {
+        "evaluation": evaluation,
+        "evaluation_version": evaluation.version,
+        "checkpoint": checkpoint,
+        "scene": scene,
+        "position": position,
+    }
+    number, attempt = _next_attempt(key)
+    if seed is None and station.simulated:
+        seed = seed_of(scene, position, number)
+    return Trial.objects.create(
+        **key,
+        number=number,
+        attempt=attempt,
+        station=station,
+        operator=user,
+        instruction=scene.instruction,
+        time_limit_s=scene.time_limit_s,
+        seed=seed,
+    )
+
+
+def _next_attempt(key: Mapping[str, Any]) -> tuple[int, int]:
+    newest: dict[int, tuple[int, str]] = {}
+    attempts = Trial.objects.filter(**key).order_by("number", "attempt")
+    for number, attempt, status in attempts.values_list("number", "attempt", "status"):
+        newest[number] = (attempt, status)
+    for number, (attempt, status) in newest.items():
+        if status in lifecycle.REPEATED:
+            return number, attempt + 1
+    return max(newest, default=0) + 1, 1
+
+
+def seed_of(scene: Scene, position: Position, number: int) -> int:
+    """The seed of a simulated bench: the same for every checkpoint, so that they meet the same conditions."""
+    return zlib.crc32(f"{scene.name}/{position.number}/{number}".encode()) & HIGHEST_SEED
+
+
+# --- judging -----------------------------------------------------------------------------------------------
+
+
+def trial_score(
+    *,
+    user: User,
+    trial: Trial,
+    milestones: Mapping[object, object],
+    success: bool | None = None,
+    note: str = "",
+    failure: str = "",
+    source: str = Score.Source.HUMAN,
+    reason: str = "",
+) -> Score:
+    """Add a score; of a trial that has one it is a correction, needs a reason, and counts from then on.
+
+    `milestones`: id -> reached, for every milestone of the scene. Disk first, then the row, then publication.
+    """
+    require(user, Role.OPERATOR)
+    if source not in Score.Source.values:
+        raise EvaError(f"source = {source!r}; allowed: {', '.join(Score.Source.values)}")
+    words = {
+        "note": text("note", note, LONGEST_NOTE),
+        "failure": text("failure", failure, LONGEST_FAILURE),
+        "reason": text("reason", reason, LONGEST_NOTE),
+    }
+    with transaction.atomic():
+        held = _held(trial)
+        _check_scorable(held, words["reason"])
+        found = verdict(list(held.scene.milestones.order_by("order")), milestones, success)
+        if found.success and words["failure"]:
+            raise EvaError(f"failure = {words['failure']!r} but the trial is a success: leave failure empty")
+        score = Score(
+            trial=held, rater=user, success=found.success, score=found.score, source=source, **words
+        )
+        _keep(held, score, found)
+        _publish(held)
+    trial.refresh_from_db()
+    return score
+
+
+def trial_void(*, user: User, trial: Trial, reason: str) -> Trial:
+    """Take a trial out of the count: void is not fail. It stays in the record with its reason."""
+    require(user, Role.OPERATOR)
+    why = _reason_given(reason, "a trial is voided")
+    with transaction.atomic():
+        held = _held(trial)
+        lifecycle.apply(held, Move.VOID)
+        held.reason, held.voided_by, held.voided_at = why, user, timezone.now()
+        journal.append(
+            held.episode_id or held.uuid,
+            {
+                "kind": "void",
+                "trial": trial_facts(held),
+                "by": user.get_username(),
+                "reason": why,
+                "at": held.voided_at.isoformat(),
+            },
+        )
+        held.save()
+        _publish(held)
+    trial.refresh_from_db()
+    return trial
+
+
+def trial_abandon(*, user: User, trial: Trial, reason: str = "") -> Trial:
+    """Give up a trial that never ran; its number is given out again as another attempt."""
+    require(user, Role.OPERATOR)
+    why = text("reason", reason, LONGEST_NOTE) or "abandoned"
+    with transaction.atomic():
+        held = _held(trial)
+        lifecycle.apply(held, Move.ABANDON)
+        held.reason = f"{why} ({user.get_username()})"
+        held.save()
+    trial.refresh_from_db()
+    return trial
+
+
+def _publish(trial: Trial) -> None:
+    """Have its episode written into the dataset with what counts now."""
+    if trial.episode is not None:
+        publish_asked(episode=trial.episode)
+
+
+def _held(trial: Trial) -> Trial:
+    """The trial's row as it is now, kept from others until the transaction ends."""
+    return Trial.objects.select_for_update().get(pk=trial.pk)
+
+
+def _check_scorable(trial: Trial, reason: str) -> None:
+    lifecycle.require(trial, Move.SCORE)
+    if trial.status == TrialStatus.SCORED and not reason:
+        raise EvaError(
+            f"trial {trial.pk} has a score already: to correct it, give a reason; both stay in the record"
+        )
+    if trial.status == TrialStatus.INTERRUPTED and _repeated(trial):
+        raise Conflict(
+            f"trial {trial.pk} was interrupted and has been repeated since: its repetition counts; "
+            "score that one"
+        )
+
+
+def _repeated(trial: Trial) -> bool:
+    same = {
+        name: getattr(trial, name)
+        for name in (
+            "evaluation_id",
+            "evaluation_version",
+            "checkpoint_id",
+            "scene_id",
+            "position_id",
+            "number",
+        )
+    }
+    newest = Trial.objects.filter(**same).aggregate(newest=Max("attempt"))["newest"]
+    return bool(newest > trial.attempt)
+
+
+def _keep(trial: Trial, score: Score, found: Verdict) -> None:
+    outcomes = [
+        MilestoneOutcome(
+            score=score,
+            milestone=milestone,
+            order=milestone.order,
+            text=milestone.text,
+            points=milestone.points,
+            required=milestone.required,
+            reached=reached,
+        )
+        for milestone, reached in found.reached
+    ]
+    journal.append(trial.episode_id or trial.uuid, _line(trial, score, outcomes))
+    score.save()
+    MilestoneOutcome.objects.bulk_create(outcomes)
+    lifecycle.apply(trial, Move.SCORE)
+    trial.verdict = score
+    trial.save()
+
+
+def _line(trial: Trial, score: Score, outcomes: list[MilestoneOutcome]) -> dict[str, Any]:
+    milestones = [
+        {name: getattr(outcome, name) for name in ("order", "text", "points", "required", "reached")}
+        for outcome in outcomes
+    ]
+    words = {
+        name: getattr(score, name) for name in ("success", "score", "note", "failure", "reason", "source")
+    }
+    return {
+        "kind": "score",
+        "uuid": str(score.uuid),
+        "trial": trial_facts(trial),
+        "rater": score.rater.get_username(),
+        "at": score.scored_at.isoformat(),
+        **words,
+        "milestones": milestones,
+    }
+
+
+def _reason_given(reason: str, when: str) -> str:
+    why = text("reason", reason, LONGEST_NOTE)
+    if not why:
+        raise EvaError(f"reason is empty: {when} only with a reason that others can read")
+    return why
