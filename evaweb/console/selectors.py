@@ -5,19 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import robots
 from django.contrib.sessions.backends.base import SessionBase
-from django.db.models import QuerySet
 
 from evaweb.errors import NotFound
-from evaweb.stations.models import Command, CommandStatus, Lease, LeaseRequest, Station
-from evaweb.trials.models import Checkpoint, Position, Scene, Score, Trial, TrialStatus
+from evaweb.stations.geometry import looks_of
+from evaweb.stations.models import Command, CommandStatus, Lease, Station
+from evaweb.stations.selectors import station_list
+from evaweb.trials.models import Checkpoint, Milestone, Position, Scene, Score, Trial, TrialStatus
+from evaweb.trials.selectors import UNFINISHED, checkpoint_list, scene_list, trial_list, trial_open
+from robots import RobotError
 
 SESSION_KEY = "station"
 FAILURES_OFFERED = 12
 
-_OPEN = (TrialStatus.PREPARED, TrialStatus.RUNNING, TrialStatus.PAUSED, TrialStatus.ENDED)
-_ANSWERED = (CommandStatus.ACCEPTED, CommandStatus.DONE)
+_NOT_CARRIED_OUT = (CommandStatus.REFUSED, CommandStatus.FAILED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,30 +34,33 @@ class StationRow:
 class Panel:
     """What the four steps of an evaluation show.
 
-    `trial` is the open one; `last` the newest closed one, from which the choice is prefilled where there is no
-    open one. `set_up` says whether the station was set up for `trial`.
+    `trial` is the unfinished one, with the `milestones` of its scene; `implied` says whether they decide on
+    success, `set_up` whether the station was last set up for it. Without one, `scene`, `position` and
+    `checkpoint` are the choice to begin with, after `last`, the newest finished one.
     """
 
     station: Station
     trial: Trial | None
     last: Trial | None
+    scenes: tuple[Scene, ...]
+    checkpoints: tuple[Checkpoint, ...]
     scene: Scene | None
     positions: tuple[Position, ...]
     position: Position | None
     checkpoint: Checkpoint | None
-    scenes: tuple[Scene, ...]
-    checkpoints: tuple[Checkpoint, ...]
+    milestones: tuple[Milestone, ...]
     set_up: bool
     failures: tuple[str, ...]
 
+    @property
+    def implied(self) -> bool:
+        """Whether the milestones decide on success: at least one of them is required."""
+        return any(milestone.required for milestone in self.milestones)
 
-def station_get(*, name: str) -> Station:
-    """The station of this name; NotFound names those that exist."""
-    found = Station.objects.filter(name=name).first()
-    if found is None:
-        known = ", ".join(Station.objects.values_list("name", flat=True)) or "none yet"
-        raise NotFound(f"there is no station {name!r}; stations: {known}")
-    return found
+    @property
+    def last_address(self) -> str:
+        """Where the last trial is shown."""
+        return f"/result/trials/{self.last.pk}/" if self.last else ""
 
 
 def station_last_used(*, session: SessionBase) -> Station | None:
@@ -65,33 +69,27 @@ def station_last_used(*, session: SessionBase) -> Station | None:
     found = Station.objects.filter(name=used).first() if used else None
     if found is not None:
         return found
-    first_two = list(Station.objects.filter(active=True)[:2])
+    first_two = list(station_list()[:2])
     return first_two[0] if len(first_two) == 1 else None
 
 
 def station_rows() -> list[StationRow]:
     """Every station, the active ones first, with its open lease and trial."""
     leases = {lease.station_id: lease for lease in Lease.objects.filter(ended_at=None).select_related("user")}
-    trials = {trial.station_id: trial for trial in _trials().filter(status__in=_OPEN).order_by("pk")}
-    stations = Station.objects.order_by("-active", "name")
+    unfinished = trial_list().filter(status__in=UNFINISHED).order_by("pk")
+    trials = {trial.station_id: trial for trial in unfinished}
+    stations = station_list(all_of_them=True).order_by("-active", "name")
     return [StationRow(station, leases.get(station.pk), trials.get(station.pk)) for station in stations]
 
 
-def lease_requests(*, station: Station) -> QuerySet[LeaseRequest]:
-    """Who waits for the station, the longest first."""
-    return station.lease_requests.filter(answer=LeaseRequest.Answer.OPEN).select_related("user")
+def robot_facts(*, robot: str) -> dict[str, Any]:
+    """Names and units of the robot's vector, and its cameras; empty where its description cannot be read.
 
-
-def lease_open(*, station: Station) -> Lease | None:
-    """The lease that the database holds for given; the station's own word is in its snapshot."""
-    return station.leases.filter(ended_at=None).select_related("user").first()
-
-
-def joint_units(*, robot: str) -> dict[str, Any]:
-    """Names and units of the robot's vector; empty with the reason where its description cannot be read."""
+    "error" says why; the page goes on without them.
+    """
     try:
-        described = robots.load(robot)
-    except robots.RobotError as error:
+        described = looks_of(robot).robot
+    except (NotFound, RobotError) as error:
         return {"names": [], "units": [], "cameras": [], "title": robot, "error": str(error)}
     units = ["rad"] * described.dim
     for group in described.groups:
@@ -107,39 +105,34 @@ def joint_units(*, robot: str) -> dict[str, Any]:
 
 
 def panel(*, station: Station, scene: str = "") -> Panel:
-    """The evaluation panel of a station; `scene` is the name of the one being chosen, where one is."""
-    trial = _trials().filter(station=station, status__in=_OPEN).first()
-    last = None if trial else _trials().filter(station=station).first()
-    scenes = tuple(Scene.objects.filter(active=True))
-    checkpoints = tuple(Checkpoint.objects.filter(active=True))
-    chosen = _chosen_scene(scenes, scene, trial or last)
+    """The evaluation panel of a station; `scene` is the name of the one being chosen, "" for the last one."""
+    trial = trial_open(station)
+    last = None if trial else trial_list().filter(station=station).first()
+    scenes, checkpoints = tuple(scene_list()), tuple(checkpoint_list())
+    chosen = _chosen_scene(scenes, scene or (last.scene.name if last else ""))
     positions = tuple(chosen.positions.all()) if chosen else ()
     return Panel(
         station=station,
         trial=trial,
         last=last,
+        scenes=scenes,
+        checkpoints=checkpoints,
         scene=chosen,
         positions=positions,
         position=_next_position(positions, last),
-        checkpoint=last.checkpoint if last and last.checkpoint in checkpoints else None,
-        scenes=scenes,
-        checkpoints=checkpoints,
-        set_up=trial is not None and _set_up_since(trial),
-        failures=_failures(),
+        checkpoint=last.checkpoint if last else None,
+        milestones=tuple(trial.scene.milestones.order_by("order")) if trial else (),
+        set_up=trial is not None and _is_set_up(trial),
+        failures=_failures() if trial else (),
     )
 
 
-def _trials() -> QuerySet[Trial]:
-    return Trial.objects.select_related("scene", "position", "checkpoint", "operator", "episode")
-
-
-def _chosen_scene(scenes: tuple[Scene, ...], name: str, trial: Trial | None) -> Scene | None:
-    wanted = name or (trial.scene.name if trial else "")
-    return next((scene for scene in scenes if scene.name == wanted), scenes[0] if scenes else None)
+def _chosen_scene(scenes: tuple[Scene, ...], name: str) -> Scene | None:
+    return next((scene for scene in scenes if scene.name == name), scenes[0] if scenes else None)
 
 
 def _next_position(positions: tuple[Position, ...], last: Trial | None) -> Position | None:
-    """The one after the last trial's; the same again where that trial gave no score."""
+    """The one after the last trial's; the same again where that trial has no score."""
     if not positions:
         return None
     if last is None or last.position not in positions:
@@ -148,10 +141,11 @@ def _next_position(positions: tuple[Position, ...], last: Trial | None) -> Posit
     return positions[(at + 1) % len(positions)] if last.status == TrialStatus.SCORED else positions[at]
 
 
-def _set_up_since(trial: Trial) -> bool:
-    return Command.objects.filter(
-        station=trial.station_id, kind="setup", status__in=_ANSWERED, issued_at__gte=trial.prepared_at
-    ).exists()
+def _is_set_up(trial: Trial) -> bool:
+    """Whether the last set-up of the station that may have been carried out was for this trial."""
+    asked = Command.objects.filter(station=trial.station, kind="setup").exclude(status__in=_NOT_CARRIED_OUT)
+    last = asked.order_by("-issued_at").values_list("pk", flat=True).first()
+    return last is not None and last == trial.setup
 
 
 def _failures() -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from evaweb.console import selectors
 from evaweb.errors import NotFound
 from evaweb.roles import role_of
 from evaweb.stations.models import Station
+from evaweb.stations.selectors import request_list, station_get
 
 
 def home(request: HttpRequest) -> HttpResponse:
@@ -49,14 +50,14 @@ def lease(request: HttpRequest, name: str) -> HttpResponse:
 
 def _station(name: str) -> Station:
     try:
-        return selectors.station_get(name=name)
+        return station_get(name=name)
     except NotFound as error:
         raise Http404(str(error)) from None
 
 
 def _page(request: HttpRequest, station: Station, page: str, extra: dict[str, Any]) -> HttpResponse:
     request.session[selectors.SESSION_KEY] = station.name
-    robot = selectors.joint_units(robot=station.robot)
+    robot = selectors.robot_facts(robot=station.robot)
     context = {
         "station": station,
         "robot": robot,
@@ -94,7 +95,7 @@ def _panel(request: HttpRequest, station: Station) -> dict[str, Any]:
 
 
 def _lease(request: HttpRequest, station: Station) -> dict[str, Any]:
-    waiting = list(selectors.lease_requests(station=station))
+    waiting = list(request_list(station=station))
     return {
         "station": station,
         "role": role_of(request.user).value,

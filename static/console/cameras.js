@@ -1,0 +1,104 @@
+// Pictures of the cameras, drawn from one JPEG each; what is old goes grey and says how old it is.
+
+import { age } from "./words.js";
+
+const STALE_S = 0.5; // as the runtime's own bound on pictures
+const SLOW = 0.8; // of the fastest camera's rate
+const WINDOW_MS = 2000;
+
+class Camera {
+  constructor(figure) {
+    this.figure = figure;
+    this.name = figure.dataset.camera;
+    this.canvas = figure.querySelector("canvas");
+    this.context = this.canvas.getContext("2d");
+    this.rateText = figure.querySelector(".camera-rate");
+    this.ageText = figure.querySelector(".camera-age");
+    this.capturedAt = -Infinity; // on this page's clock [ms]
+    this.drawn = []; // when the last pictures were drawn
+  }
+
+  draw(picture, seconds) {
+    if (this.canvas.width !== picture.width || this.canvas.height !== picture.height) {
+      this.canvas.width = picture.width;
+      this.canvas.height = picture.height;
+    }
+    this.context.drawImage(picture, 0, 0);
+    picture.close();
+    const now = performance.now();
+    this.capturedAt = now - seconds * 1000;
+    this.drawn.push(now);
+    this.tell(now);
+  }
+
+  /** Age and staleness at `now`, without news. */
+  tell(now) {
+    const seconds = (now - this.capturedAt) / 1000;
+    const stale = !(seconds < STALE_S);
+    this.figure.toggleAttribute("data-stale", stale);
+    const text = Number.isFinite(seconds) && stale ? `${age(seconds)} old` : "";
+    if (this.ageText.textContent !== text) this.ageText.textContent = text;
+  }
+
+  /** Pictures that this page drew per second. */
+  shownRate(now) {
+    while (this.drawn.length && now - this.drawn[0] > WINDOW_MS) this.drawn.shift();
+    return (this.drawn.length * 1000) / WINDOW_MS;
+  }
+
+  rate(measured, fastest, now) {
+    const shown = this.shownRate(now);
+    const known = Number.isFinite(measured);
+    const slow = known && measured < SLOW * fastest;
+    const text = known ? `${measured.toFixed(1)} Hz${slow ? " !" : ""}` : "no picture yet";
+    if (this.rateText.textContent !== text) this.rateText.textContent = text;
+    this.rateText.toggleAttribute("data-slow", slow);
+    this.rateText.title = `The camera delivers ${known ? measured.toFixed(1) : "no"} pictures per second; this page shows ${shown.toFixed(1)}.`;
+  }
+}
+
+export class Cameras {
+  #cameras = new Map();
+
+  constructor(store) {
+    for (const figure of document.querySelectorAll("[data-camera]")) {
+      const camera = new Camera(figure);
+      this.#cameras.set(camera.name, camera);
+    }
+    store.on("snapshot", (snapshot) => this.#rates(snapshot.link.rates));
+    setInterval(() => this.#tell(), 100);
+  }
+
+  get streams() {
+    return [...this.#cameras.keys()].map((name) => `camera/${name}`);
+  }
+
+  /** Decode the pictures of a frame; resolves to a function that puts them on the screen. */
+  async prepare(frame) {
+    const ready = [];
+    for (const [stream, place] of Object.entries(frame.header.streams)) {
+      const camera = this.#cameras.get(stream.slice("camera/".length));
+      if (!stream.startsWith("camera/") || !camera) continue;
+      const blob = new Blob([frame.bytes(place)], { type: place.mime });
+      ready.push(
+        createImageBitmap(blob).then(
+          (picture) => () => camera.draw(picture, place.age ?? 0),
+          () => () => camera.tell(performance.now()), // not a picture: the one before grows old
+        ),
+      );
+    }
+    const draws = await Promise.all(ready);
+    return () => draws.forEach((draw) => draw());
+  }
+
+  #rates(rates) {
+    const now = performance.now();
+    const fastest = Math.max(0, ...[...this.#cameras.keys()].map((name) => rates[name] ?? 0));
+    for (const camera of this.#cameras.values()) camera.rate(rates[camera.name] ?? NaN, fastest, now);
+  }
+
+  #tell() {
+    const now = performance.now();
+    for (const camera of this.#cameras.values()) camera.tell(now);
+  }
+}

@@ -1,0 +1,113 @@
+// Commands: pressed at once, then accepted or done, refused with the reason, or outcome unknown.
+
+import { post, RequestFailed } from "../site/api.js";
+import { uuid } from "../site/identity.js";
+import { config } from "./config.js";
+import { verb, words } from "./words.js";
+
+const STOPPING = ["stop", "halt"]; // pressed again while the first one is under way, they are sent again
+
+/** Gives commands, says what became of them, and shows which can be given now. */
+export class Commands {
+  #store;
+  #pending = new Set();
+
+  constructor(store) {
+    this.#store = store;
+    document.addEventListener("click", (event) => this.#clicked(event));
+    store.on(["snapshot", "link", "open", "second"], () => this.gate());
+    document.body.addEventListener("htmx:afterSettle", () => this.gate());
+    this.gate();
+  }
+
+  /** Send one command; resolves to the answer, or null where it was not accepted (and says why on the page). */
+  async give(kind, args = {}, trial = null) {
+    const name = verb(kind);
+    this.say(`${name}: pressed …`, "pressed");
+    const command = { uuid: uuid(), kind, args, page: this.#store.page, epoch: this.#store.epoch };
+    Object.assign(command, { boot: this.#store.snapshot?.boot ?? "", sequence: this.#store.snapshot?.sequence ?? 0 });
+    if (trial) command.trial = Number(trial);
+    try {
+      const answer = await post(config.api.commands, command);
+      this.say(`${name}: ${answer.status}`, "accepted");
+      return answer;
+    } catch (error) {
+      this.fail(name, error);
+      return null;
+    }
+  }
+
+  /** Say what went wrong with `name`. */
+  fail(name, error) {
+    if (!(error instanceof RequestFailed)) throw error;
+    if (error.unknown) this.say(`${name}: outcome unknown. ${error.message}. Look at the state before you repeat it.`, "unknown");
+    else this.say(`${name} refused: ${error.message}`, "refused");
+  }
+
+  /** The one line in which answers stand. */
+  say(text, kind) {
+    const line = document.getElementById("outcome");
+    line.textContent = text;
+    line.dataset.kind = kind;
+  }
+
+  /** Why `kind` cannot be given now, "" where it can. */
+  reason(kind) {
+    const store = this.#store;
+    if (!store.fresh) return "nothing is known of the station at the moment";
+    if (store.role === "viewer") return "a viewer watches; an administrator can make you an operator";
+    if (store.lease === "free") return "take the station first";
+    if (store.lease !== "mine") return "somebody else commands the station; ask for it";
+    const { allowed, state } = store.snapshot;
+    if (kind && !allowed.includes(kind)) {
+      const possible = allowed.filter((one) => one !== "estop").map(verb).join(", ") || "nothing";
+      return `not while ${words(state)}; possible now: ${possible}`;
+    }
+    return "";
+  }
+
+  /** Enable and disable every button that gives a command; a disabled one says why. */
+  gate() {
+    for (const button of document.querySelectorAll("[data-command], [data-gate]")) {
+      const kind = button.dataset.command ?? button.dataset.gate;
+      const own = button.dataset.blocked ?? "";
+      setReason(button, own || this.reason(kind === "score" ? "" : kind));
+      if (button.dataset.onlyState) button.hidden = this.#store.snapshot?.state !== button.dataset.onlyState;
+    }
+  }
+
+  async #clicked(event) {
+    const button = event.target.closest("[data-command]");
+    if (!button) return;
+    const { command: kind, trial } = button.dataset;
+    if (button.getAttribute("aria-disabled") === "true") {
+      this.say(`${verb(kind)}: ${button.title}`, "refused");
+      return;
+    }
+    if (this.#pending.has(kind) && !STOPPING.includes(kind)) return;
+    this.#pending.add(kind);
+    button.dataset.pressed = "";
+    await this.give(kind, argsOf(button), trial || null);
+    delete button.dataset.pressed;
+    this.#pending.delete(kind);
+  }
+}
+
+/** Give a button its reason for being disabled, or none. */
+export function setReason(button, reason) {
+  const disabled = String(Boolean(reason));
+  if (button.getAttribute("aria-disabled") !== disabled) button.setAttribute("aria-disabled", disabled);
+  if (button.title !== reason) button.title = reason;
+}
+
+/** Arguments that a button takes from fields: data-arg-NAME="selector"; an empty field is left out. */
+function argsOf(button) {
+  const args = {};
+  for (const { name, value } of button.attributes) {
+    if (!name.startsWith("data-arg-")) continue;
+    const field = document.querySelector(value);
+    if (field.value.trim() === "") continue;
+    args[name.slice("data-arg-".length)] = field.type === "number" ? field.valueAsNumber : field.value.trim();
+  }
+  return args;
+}

@@ -1,0 +1,56 @@
+// Which joint is drawn, and whether it stands still; a sentence in its place where uPlot is not installed.
+
+import { config } from "./config.js";
+import { Curves, legend } from "./curves.js";
+
+const KEY = `eva-joint-${config.station}`;
+
+/** The pane of the curves; resolves to {add(t, vectors), joints(names, units)}. */
+export async function curvePane() {
+  const note = document.getElementById("curves-note");
+  let library;
+  try {
+    library = (await import(config.uplot)).default;
+  } catch {
+    note.hidden = false;
+    note.textContent = "Curves are drawn by uPlot, which is not installed: run npm install in the project's folder and start the web server again.";
+    return { add() {}, joints() {} };
+  }
+  legend(document.getElementById("curves-legend"));
+  const curves = new Curves({ element: document.getElementById("curves"), library, names: config.joints, units: config.units });
+  const select = joints(curves, config.joints);
+  document.getElementById("joint-next").addEventListener("click", () => {
+    select.selectedIndex = (select.selectedIndex + 1) % Math.max(1, select.options.length);
+    select.dispatchEvent(new Event("change"));
+  });
+  pauseButton(curves);
+  return {
+    add: (t, vectors) => curves.add(t, vectors),
+    joints: (names, units) => {
+      curves.joints(names, units);
+      if (names.join() !== [...select.options].map((option) => option.text).join()) joints(curves, names);
+    },
+  };
+}
+
+function joints(curves, names) {
+  const select = document.getElementById("joint");
+  select.replaceChildren(...names.map((name, index) => new Option(name, String(index))));
+  const wanted = names.indexOf(localStorage.getItem(KEY));
+  select.selectedIndex = names.length ? Math.max(0, wanted) : -1;
+  select.onchange = () => {
+    localStorage.setItem(KEY, names[select.selectedIndex]);
+    curves.show(select.selectedIndex);
+  };
+  if (names.length) curves.show(select.selectedIndex);
+  return select;
+}
+
+function pauseButton(curves) {
+  const button = document.getElementById("curves-pause");
+  button.addEventListener("click", () => {
+    curves.pause(!curves.paused);
+    button.setAttribute("aria-pressed", String(curves.paused));
+    button.textContent = curves.paused ? "Go on" : "Pause";
+  });
+}

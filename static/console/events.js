@@ -1,0 +1,83 @@
+// The station's events, newest first: the sentences of its log, without gaps, filtered by words.
+
+const KEPT = 400;
+
+function clock(wall) {
+  return new Date(wall * 1000).toLocaleTimeString("en-GB", { hour12: false });
+}
+
+export class Events {
+  #list = document.getElementById("events");
+  #filter = document.getElementById("events-filter");
+  #count = document.getElementById("events-count");
+  #boot = "";
+  #newest = 0;
+
+  constructor() {
+    this.#filter.addEventListener("input", () => this.#show());
+    this.#show();
+  }
+
+  /** The number of the newest event there is here, to ask for what comes after it. */
+  get newest() {
+    return this.#newest;
+  }
+
+  /** The boot of the runtime that they are of. */
+  get boot() {
+    return this.#boot;
+  }
+
+  add({ boot, events }) {
+    if (boot && boot !== this.#boot) {
+      if (this.#boot && this.#newest) this.#divide("The station was started anew");
+      this.#boot = boot;
+      this.#newest = 0;
+    }
+    const fresh = events.filter((event) => event.number > this.#newest);
+    if (!fresh.length) return;
+    const expected = this.#newest + 1;
+    if (this.#newest && fresh[0].number > expected) this.#divide(`Events ${expected} to ${fresh[0].number - 1} are no longer kept`);
+    for (const event of fresh) this.#list.prepend(this.#row(event));
+    this.#newest = fresh.at(-1).number;
+    while (this.#list.children.length > KEPT) this.#list.lastElementChild.remove();
+    this.#show();
+  }
+
+  #row({ number, kind, text, wall }) {
+    const row = document.createElement("li");
+    row.className = "event";
+    row.dataset.kind = kind;
+    row.dataset.words = `${kind} ${text}`.toLowerCase();
+    const time = document.createElement("time");
+    time.textContent = clock(wall);
+    time.title = `event ${number}`;
+    const name = document.createElement("span");
+    name.className = "event-kind mono";
+    name.textContent = kind;
+    const words = document.createElement("span");
+    words.textContent = text;
+    row.append(time, name, words);
+    return row;
+  }
+
+  #divide(text) {
+    const row = document.createElement("li");
+    row.className = "event event-divider";
+    row.dataset.words = text.toLowerCase();
+    row.textContent = text;
+    this.#list.prepend(row);
+  }
+
+  #show() {
+    const wanted = this.#filter.value.trim().toLowerCase().split(/\s+/).filter(Boolean);
+    let shown = 0;
+    for (const row of this.#list.querySelectorAll(".event")) {
+      row.hidden = !wanted.every((word) => row.dataset.words.includes(word));
+      if (!row.hidden) shown += 1;
+    }
+    this.#list.toggleAttribute("data-empty", shown === 0);
+    this.#list.dataset.note = wanted.length ? "No event has these words." : "What happens at the station is written here.";
+    this.#count.textContent = wanted.length ? `${shown} shown` : "";
+  }
+}

@@ -1,0 +1,64 @@
+// Keys: whatever has data-key can be pressed with it; `?` shows them all. The stopping keys are in estop.js.
+
+const FIXED = [
+  ["Esc", "E-stop"],
+  ["Space", "E-stop, outside text fields"],
+  ["?", "These keys"],
+];
+const TYPING = 'input:not([type="checkbox"]):not([type="radio"]), textarea, select, [contenteditable="true"]';
+
+function usable(element) {
+  return element.checkVisibility();
+}
+
+function keyOf(event) {
+  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key.toLowerCase();
+  return event.ctrlKey ? `ctrl+${key}` : key;
+}
+
+function text(element) {
+  if (element.dataset.keyText) return element.dataset.keyText;
+  const words = element.cloneNode(true);
+  for (const key of words.querySelectorAll("kbd")) key.remove();
+  return words.textContent.trim();
+}
+
+function show(dialog) {
+  const rows = [...FIXED];
+  for (const element of document.querySelectorAll("[data-key]")) {
+    if (usable(element)) rows.push([element.dataset.key, text(element)]);
+  }
+  const list = dialog.querySelector("#keys-list");
+  list.replaceChildren();
+  for (const [key, what] of rows) {
+    const name = document.createElement("dt");
+    const cap = document.createElement("kbd");
+    cap.textContent = key.length === 1 ? key.toUpperCase() : key;
+    name.append(cap);
+    const meaning = document.createElement("dd");
+    meaning.textContent = what;
+    list.append(name, meaning);
+  }
+  dialog.showModal();
+}
+
+/** Listen for keys; text fields keep theirs, but for those with Ctrl. */
+export function keyboard() {
+  const dialog = document.getElementById("keys");
+  document.querySelector("[data-open-keys]")?.addEventListener("click", () => show(dialog));
+  window.addEventListener("keydown", (event) => {
+    if (event.altKey || event.metaKey || event.repeat || dialog.open) return;
+    if (event.target.closest?.(TYPING) && !event.ctrlKey) return;
+    const key = keyOf(event);
+    if (key === "?") {
+      show(dialog);
+      return;
+    }
+    const candidates = [...document.querySelectorAll(`[data-key="${CSS.escape(key)}"]`)];
+    const element = candidates.find(usable);
+    if (!element) return;
+    event.preventDefault();
+    if (element.matches('input[type="search"], input[type="text"]')) element.focus();
+    else element.click();
+  });
+}

@@ -1,0 +1,115 @@
+// A page bound to a station: everything it shows and asks, put together.
+
+import { drafts } from "../site/drafts.js";
+import { quietFragments } from "../site/fragments.js";
+import { pageId } from "../site/identity.js";
+import { Cameras } from "./cameras.js";
+import { Commands } from "./commands.js";
+import { config } from "./config.js";
+import { curvePane } from "./curve_controls.js";
+import { figures } from "./debug.js";
+import { EStop } from "./estop.js";
+import { Events } from "./events.js";
+import { keyboard } from "./keys.js";
+import { LeaseControls } from "./lease.js";
+import { scenePane } from "./scene_pane.js";
+import { LiveSocket } from "./socket.js";
+import { statusBar } from "./status.js";
+import { current, mark } from "./steps.js";
+import { Store } from "./store.js";
+import { TrialPanel } from "./trial.js";
+
+const nothing = { poses() {}, bench() {}, add() {}, joints() {} };
+
+/** The panes that need time to load; until then their data goes nowhere. */
+const panes = { scene: nothing, curves: nothing };
+
+function onScreen() {
+  return new Promise((resolve) => requestAnimationFrame(resolve));
+}
+
+/** Draw one frame; resolves when it is on the screen, which earns the next one. */
+async function draw(frame, store, cameras) {
+  const { streams, t } = frame.header;
+  const showPictures = await cameras.prepare(frame);
+  await onScreen();
+  showPictures();
+  if (streams.state) store.setSnapshot(streams.state.json);
+  if (streams.joints) panes.curves.add(t, vectors(frame, streams.joints));
+  if (streams.poses) panes.scene.poses(frame.numbers(streams.poses), streams.poses.shape.length > 2 ? streams.poses.shape[0] : 1);
+}
+
+function vectors(frame, { json, arrays }) {
+  const found = {};
+  for (const [kind, place] of Object.entries(arrays)) found[kind] = frame.numbers(place);
+  if (json?.engaged === false) delete found.commanded; // nothing is being sent
+  return found;
+}
+
+function listen(store, { events, estop, lease, trial }) {
+  const answers = {
+    hello: ({ facts, role }) => {
+      store.facts = facts;
+      store.role = role ?? store.role;
+      if (facts.joint_names?.length) panes.curves.joints(facts.joint_names, config.units);
+      store.tell("hello");
+    },
+    link: (link) => {
+      store.link = link;
+      store.tell("link");
+    },
+    events: (news) => events.add(news),
+    ack: (ack) => estop().acknowledged(ack),
+    renewed: (answer) => lease().renewed(answer),
+    changed: ({ what }) => {
+      if (what.includes("lease")) window.htmx.trigger("#lease", "eva:lease");
+      if (what.includes("trial") || what.includes("episode")) trial()?.refresh();
+    },
+    error: ({ reason }) => console.error(`the server did not understand this page: ${reason}`),
+  };
+  return (message) => answers[message.type]?.(message);
+}
+
+async function start() {
+  quietFragments(); // before anything changes what the server rendered
+  drafts();
+  const store = new Store({ user: config.user, role: config.role, page: await pageId() });
+  const events = new Events();
+  const cameras = new Cameras(store);
+  const parts = {};
+  const socket = new LiveSocket(`${config.socket}?page=${store.page}`, {
+    told: listen(store, { events, estop: () => parts.estop, lease: () => parts.lease, trial: () => parts.trial }),
+    draw: (frame) => draw(frame, store, cameras),
+    changed: (open) => {
+      store.open = open;
+      if (!open) store.link = { ok: false, reason: "" };
+      store.tell("open");
+    },
+    greet: ({ again = false } = {}) => {
+      if (!again) socket.send({ type: "watch", streams: ["state", "joints", "poses", ...cameras.streams] });
+      socket.send({ type: "events", after: events.newest, boot: events.boot });
+    },
+    expected: () => store.link.ok,
+  });
+  parts.estop = new EStop(store, socket); // first of all that can be pressed
+  keyboard();
+  statusBar(store);
+  const commands = new Commands(store);
+  parts.lease = new LeaseControls(store, socket, commands);
+  if (config.page === "eval") parts.trial = new TrialPanel(store, commands);
+  figures(store);
+  store.on(["snapshot", "second"], () => steps(store));
+  document.body.addEventListener("htmx:afterSettle", () => steps(store));
+  steps(store);
+  setInterval(() => store.tell("second"), 500);
+  store.on("snapshot", (snapshot) => snapshot.truth && panes.scene.bench(snapshot.truth));
+  scenePane().then((pane) => Object.assign(panes, { scene: pane }));
+  curvePane().then((pane) => Object.assign(panes, { curves: pane }));
+}
+
+function steps(store) {
+  const element = document.getElementById("steps");
+  mark(element, current(element.dataset, store.snapshot));
+}
+
+start();

@@ -1,0 +1,98 @@
+// The status bar and the box that says what a person has to do: state by place, not by pop-up.
+
+import { holderName } from "./store.js";
+import { ADVICE, age, duration, figure, words } from "./words.js";
+
+const shown = (name) => document.querySelectorAll(`[data-show="${name}"]`);
+
+function write(name, text) {
+  for (const element of shown(name)) if (element.textContent !== text) element.textContent = text;
+}
+
+/** Keeps the bar true: as news come, and each second for what grows old without news. */
+export function statusBar(store) {
+  const draw = () => {
+    drawState(store);
+    drawSituation(store);
+    if (store.snapshot) drawFigures(store, store.snapshot);
+  };
+  store.on(["snapshot", "link", "open", "second"], draw);
+  draw();
+}
+
+function drawState(store) {
+  const snapshot = store.snapshot;
+  for (const element of shown("state")) {
+    element.toggleAttribute("data-stale", !store.fresh);
+    if (snapshot && store.fresh) element.dataset.state = snapshot.state;
+    else delete element.dataset.state;
+    const text = store.fresh ? words(snapshot.state) : trouble(store).word;
+    if (element.textContent !== text) element.textContent = text;
+    element.title = store.fresh ? snapshot.reason : trouble(store).reason;
+  }
+  const running = store.fresh && snapshot.run.number > 0;
+  write("clock", running ? duration(snapshot.run.elapsed) : "");
+}
+
+/** Why nothing is known, in a word and in a sentence. */
+function trouble(store) {
+  if (!store.open) return { word: "no connection", reason: "The web server does not answer; this page tries again by itself." };
+  if (!store.link.ok) return { word: "no station", reason: store.link.reason || "The station's runtime does not answer." };
+  if (!store.snapshot) return { word: "waiting", reason: "No state has come yet." };
+  return { word: `silent ${age(store.age)}`, reason: "The station has said nothing for a while; what is shown is old." };
+}
+
+function drawSituation(store) {
+  const box = document.getElementById("situation");
+  const advice = store.fresh ? ADVICE[store.snapshot.state] : null;
+  const lost = !store.fresh && store.snapshotAt !== -Infinity;
+  const dead = !store.fresh && store.open && !store.link.ok;
+  box.hidden = !(advice || lost || dead);
+  if (box.hidden) return;
+  const { word, reason } = store.fresh ? { word: "", reason: store.snapshot.reason } : trouble(store);
+  box.dataset.kind = store.fresh ? store.snapshot.state : "lost";
+  part(box, "title").textContent = advice ? advice.title : `Nothing is known: ${word}`;
+  part(box, "reason").textContent = reason;
+  part(box, "advice").textContent = advice ? advice.advice : "The robot goes on as its runtime decides; the hardware stop is yours.";
+  const busy = document.querySelectorAll("#steps [data-command]:not([hidden])");
+  const elsewhere = new Set([...busy].map((button) => button.dataset.command));
+  for (const button of part(box, "buttons").children) {
+    const kind = button.dataset.command;
+    button.hidden = !advice?.buttons.includes(kind) || elsewhere.has(kind);
+  }
+}
+
+function part(box, name) {
+  return box.querySelector(`[data-situation="${name}"]`);
+}
+
+function drawFigures(store, snapshot) {
+  const joints = snapshot.link.ages.joints;
+  write("transport", `${snapshot.transport} ${joints !== null && joints < 1 ? "ok" : `silent ${age(joints ?? Infinity)}`}`);
+  drawPolicy(snapshot.policy);
+  const held = { mine: "you", free: "free", other: holderName(snapshot.lease.holder) }[store.lease];
+  write("lease", `lease: ${held}`);
+  for (const element of shown("lease")) element.dataset.lease = store.lease;
+  const stage = snapshot.state === "setting_up" && store.fresh ? `${words(snapshot.stage)} …` : "";
+  write("stage", stage);
+  for (const element of shown("stage")) element.hidden = !stage;
+  const { uuid, rows, repeated } = snapshot.recording;
+  write("recording", uuid ? `recording ${rows} rows, ${repeated} with a repeated picture` : "not recording");
+}
+
+/** The latency as a small distribution: a bar to the 90th percentile with a mark at the median. */
+function drawPolicy(policy) {
+  const { latency_p50_ms: p50, latency_p90_ms: p90, answers } = policy;
+  if (!answers || p50 === null) {
+    write("policy", `${policy.kind}: no answer yet`);
+    return;
+  }
+  const title = `Inference latency of the last ${answers} answers: median ${figure(p50, 0, "ms")}, 90 % within ${figure(p90, 0, "ms")}`;
+  for (const element of shown("policy")) {
+    if (!element.querySelector(".latency")) element.innerHTML = '<span class="latency"><i></i></span><span></span>';
+    element.title = title;
+    element.style.setProperty("--p50", Math.min(1, p50 / 400));
+    element.style.setProperty("--p90", Math.min(1, p90 / 400));
+    element.lastElementChild.textContent = `${p50.toFixed(0)}–${p90.toFixed(0)} ms`;
+  }
+}

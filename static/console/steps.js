@@ -1,0 +1,27 @@
+// Which of the numbered steps is the one to do now; its button alone is the primary one.
+
+/** The step that `panel` (data of the fragment) and the live state ask for. */
+export function current({ panel, status, setUp }, snapshot) {
+  const state = snapshot?.state ?? "disconnected";
+  if (panel === "debug") {
+    if (state === "running" || state === "holding" || state === "ready") return "run";
+    return "setup";
+  }
+  if (status === "ended") return "score";
+  if (status === "running" || status === "paused") return "run";
+  if (status === "prepared") return setUp === "yes" && state === "ready" ? "run" : "setup";
+  return state === "setting_up" ? "setup" : "choose";
+}
+
+/** Show it: the steps before it are done, those after it wait. */
+export function mark(steps, now) {
+  let done = true;
+  for (const step of steps.querySelectorAll("[data-step]")) {
+    const here = step.dataset.step === now;
+    if (here) done = false;
+    const place = here ? "now" : done ? "done" : "later";
+    if (step.dataset.place !== place) step.dataset.place = place;
+    if (here) step.setAttribute("aria-current", "step");
+    else step.removeAttribute("aria-current");
+  }
+}

@@ -1,0 +1,62 @@
+// What this page knows of its station: the newest of everything, and who wants to hear of it.
+
+/** Names told: "snapshot", "joints", "poses", "camera", "link", "events", "open", "hello", "second". */
+export class Store {
+  #listeners = new Map();
+
+  constructor({ user, page, role }) {
+    this.user = user;
+    this.role = role;
+    this.holder = `web:${user}:${page}`;
+    this.page = page;
+    this.snapshot = null; // the station's state as it last came
+    this.snapshotAt = -Infinity; // when, on this page's clock [ms]
+    this.facts = {}; // of the robot
+    this.link = { ok: false, reason: "connecting" }; // between web and runtime
+    this.open = false; // the socket to the web
+  }
+
+  on(names, listener) {
+    for (const name of [names].flat()) {
+      if (!this.#listeners.has(name)) this.#listeners.set(name, []);
+      this.#listeners.get(name).push(listener);
+    }
+  }
+
+  tell(name, content) {
+    for (const listener of this.#listeners.get(name) ?? []) listener(content);
+  }
+
+  setSnapshot(snapshot) {
+    this.snapshot = snapshot;
+    this.snapshotAt = performance.now();
+    this.tell("snapshot", snapshot);
+  }
+
+  /** Seconds since the state came; a state older than this page can bear is not the state. */
+  get age() {
+    return (performance.now() - this.snapshotAt) / 1000;
+  }
+
+  get fresh() {
+    return this.open && this.link.ok && this.snapshot !== null && this.age < 1.5;
+  }
+
+  /** "mine", "other", "free", or "unknown" where nothing is known. */
+  get lease() {
+    if (!this.snapshot) return "unknown";
+    const { holder } = this.snapshot.lease;
+    if (!holder) return "free";
+    return holder === this.holder ? "mine" : "other";
+  }
+
+  get epoch() {
+    return this.snapshot?.lease.epoch ?? 0;
+  }
+}
+
+/** A holder of a lease as people know it. */
+export function holderName(holder) {
+  const [kind, name] = holder.split(":");
+  return kind === "web" ? name : holder;
+}

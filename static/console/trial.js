@@ -1,0 +1,146 @@
+// The Eval page: a trial chosen, prepared and set up with one press, run, and scored.
+
+import { post, RequestFailed } from "../site/api.js";
+import { config } from "./config.js";
+import { duration } from "./words.js";
+
+export class TrialPanel {
+  #store;
+  #commands;
+  #panel = document.getElementById("panel");
+  #busy = false;
+
+  constructor(store, commands) {
+    this.#store = store;
+    this.#commands = commands;
+    document.addEventListener("click", (event) => this.#clicked(event));
+    document.addEventListener("submit", (event) => this.#submitted(event));
+    document.addEventListener("input", (event) => event.target.closest("#score") && scoreRule());
+    store.on(["snapshot", "second"], () => this.draw());
+    document.body.addEventListener("htmx:afterSettle", () => this.draw());
+    this.draw();
+  }
+
+  get #data() {
+    return this.#panel.querySelector("#steps").dataset;
+  }
+
+  /** Fetch the fragment anew. */
+  refresh() {
+    window.htmx.trigger(this.#panel, "eva:trial");
+  }
+
+  /** What depends on the live state: which button is blocked and why, the run's clock, the bench's own word. */
+  draw() {
+    const { setUp, status, limit } = this.#data;
+    const { snapshot } = this.#store;
+    const prepare = this.#panel.querySelector("[data-prepare]");
+    if (prepare) prepare.dataset.blocked = this.#panel.querySelector("#choose") ? "" : "nothing can be chosen yet: see step 1";
+    for (const run of this.#panel.querySelectorAll("[data-needs-setup]")) {
+      run.dataset.blocked = status !== "prepared" ? "choose and set up first" : setUp === "yes" ? "" : "set up first";
+    }
+    this.#commands.gate();
+    if (!snapshot) return;
+    this.#clock(snapshot, Number(limit));
+    for (const word of this.#panel.querySelectorAll("[data-truth]")) {
+      const reached = snapshot.truth?.milestones?.[word.dataset.truth];
+      word.textContent = reached === undefined ? "" : `bench says ${reached ? "reached" : "not reached"}`;
+    }
+    scoreRule();
+  }
+
+  #clock({ run }, limit) {
+    const clock = this.#panel.querySelector("[data-run-clock]");
+    if (!clock) return;
+    clock.hidden = run.number === 0;
+    clock.querySelector('[data-show="run-time"]').textContent = duration(run.elapsed);
+    if (limit) clock.querySelector("progress").value = Math.min(run.elapsed, limit);
+  }
+
+  #clicked(event) {
+    const button = event.target.closest("[data-prepare], [data-abandon], [data-void]");
+    if (!button) return;
+    if (button.getAttribute("aria-disabled") === "true") {
+      this.#commands.say(button.title, "refused");
+    } else if ("prepare" in button.dataset) {
+      this.#do("Set up", () => this.#prepare());
+    } else if (button.dataset.abandon) {
+      this.#do("Choose again", () => post(`${config.trial}/${button.dataset.abandon}/abandon`, { reason: "chosen again" }));
+    } else {
+      this.#do("Void", () => this.#void(button));
+    }
+  }
+
+  #submitted(event) {
+    if (event.target.closest("#choose")) event.preventDefault();
+    const form = event.target.closest("#score");
+    if (!form) return;
+    event.preventDefault();
+    const save = form.querySelector('[type="submit"]');
+    if (save.getAttribute("aria-disabled") === "true") this.#commands.say(save.title, "refused");
+    else this.#do("Save score", () => this.#score(form));
+  }
+
+  /** One thing at a time, with its outcome on the page. */
+  async #do(name, act) {
+    if (this.#busy) return;
+    this.#busy = true;
+    this.#commands.say(`${name}: pressed …`, "pressed");
+    try {
+      const said = await act();
+      if (said !== null) this.#commands.say(`${name}: done`, "accepted");
+    } catch (error) {
+      if (!(error instanceof RequestFailed)) throw error;
+      this.#commands.fail(name, error);
+    } finally {
+      this.#busy = false;
+      this.refresh();
+    }
+  }
+
+  async #prepare() {
+    const form = this.#panel.querySelector("#choose");
+    const { scene, position, checkpoint, seed } = form.elements;
+    if (!position?.value) throw new RequestFailed("choose a position", { status: 400 });
+    const choice = { scene: scene.value, position: Number(position.value), checkpoint: checkpoint.value };
+    if (seed?.value) choice.seed = Number(seed.value);
+    const trial = await post(config.trials, choice);
+    saved(form);
+    await this.#commands.give("setup", {}, trial.id);
+    return null; // the command has said what became of it
+  }
+
+  async #score(form) {
+    const milestones = {};
+    for (const box of form.querySelectorAll('[name="milestone"]')) milestones[box.value] = box.checked;
+    const { note, failure, success } = form.elements;
+    const score = { milestones, note: note.value, failure: failure.disabled ? "" : failure.value };
+    if (success) score.success = success.value === "yes";
+    await post(`${config.trial}/${form.dataset.score}/score`, score);
+    saved(form);
+  }
+
+  async #void(button) {
+    const form = button.closest("form");
+    await post(`${config.trial}/${button.dataset.void}/void`, { reason: form.elements.void_reason.value });
+    saved(form);
+  }
+}
+
+function saved(form) {
+  form.dispatchEvent(new Event("eva:saved", { bubbles: true }));
+}
+
+/** Say what the ticks come to, and why they cannot be saved yet; a success has nothing that went wrong. */
+function scoreRule() {
+  const form = document.getElementById("score");
+  if (!form) return;
+  const required = [...form.querySelectorAll('[data-required="yes"]')];
+  const choice = form.elements.success;
+  const success = required.length ? required.every((box) => box.checked) : choice.value === "" ? null : choice.value === "yes";
+  const verdict = form.querySelector('[data-show="verdict"]');
+  verdict.textContent = success === null ? "Success? Say yes or no." : success ? "Success" : "No success";
+  verdict.dataset.verdict = String(success);
+  form.elements.failure.disabled = success === true;
+  form.querySelector('[type="submit"]').dataset.blocked = success === null ? "say whether it was a success" : "";
+}

@@ -1,0 +1,57 @@
+// Words for what the station says; the states themselves, and what is allowed in them, are the runtime's.
+
+/** What a state asks of the person at the bench; nothing where the station can be left alone. */
+export const ADVICE = {
+  disconnected: {
+    title: "No complete picture of the robot",
+    advice: "Start the execution node; check the cameras that are grey.",
+    buttons: [],
+  },
+  holding: {
+    title: "The robot holds",
+    advice: "Look at the bench, then resume or stop.",
+    buttons: ["resume", "stop"],
+  },
+  faulted: {
+    title: "E-stop is latched",
+    advice: "Make the bench safe, then release and set up again.",
+    buttons: ["release"],
+  },
+};
+
+export const VERBS = {
+  setup: "Set up",
+  run: "Run",
+  stop: "Stop",
+  halt: "Pause",
+  resume: "Resume",
+  home: "Home",
+  release: "Release",
+  record_start: "Start recording",
+  record_stop: "End recording",
+  estop: "E-stop",
+};
+
+export function words(state) {
+  return state.replaceAll("_", " ");
+}
+
+export function verb(kind) {
+  return VERBS[kind] ?? words(kind);
+}
+
+export function duration(seconds) {
+  const whole = Math.max(0, Math.floor(seconds));
+  return `${Math.floor(whole / 60)}:${String(whole % 60).padStart(2, "0")}`;
+}
+
+export function age(seconds) {
+  if (!Number.isFinite(seconds)) return "never seen";
+  if (seconds < 1) return `${Math.round(seconds * 1000)} ms`;
+  return seconds < 100 ? `${seconds.toFixed(1)} s` : `${Math.round(seconds / 60)} min`;
+}
+
+/** A figure with its unit, or a dash where there is none. */
+export function figure(value, digits, unit) {
+  return Number.isFinite(value) ? `${value.toFixed(digits)} ${unit}` : `– ${unit}`;
+}

@@ -1,0 +1,75 @@
+// Requests to our own server: the session's cookie, the CSRF token, and one sentence for whatever goes wrong.
+
+const TIMEOUT_MS = 8000;
+
+/** What the server refused, or that it did not answer; `unknown` where nobody knows whether it was done. */
+export class RequestFailed extends Error {
+  constructor(message, { status = 0, body = {}, unknown = false } = {}) {
+    super(message);
+    this.status = status;
+    this.body = body;
+    this.unknown = unknown;
+  }
+}
+
+function token() {
+  const field = document.querySelector('input[name="csrfmiddlewaretoken"]');
+  return field ? field.value : "";
+}
+
+function sentence(status, body) {
+  const words = body.reason || body.error || body.detail || body.message;
+  if (typeof words === "string" && words) return words;
+  if (Array.isArray(words)) return words.map((one) => one.msg || String(one)).join("; ");
+  if (status === 401) return "your session has ended: log in again";
+  return `the server answered with HTTP ${status}`;
+}
+
+async function bodyOf(response) {
+  const text = await response.text();
+  try {
+    return JSON.parse(text);
+  } catch {
+    return {};
+  }
+}
+
+/** Send `content` as JSON; resolves to the answer's JSON, throws RequestFailed. */
+export async function post(address, content, { timeout = TIMEOUT_MS } = {}) {
+  let response;
+  try {
+    response = await fetch(address, {
+      method: "POST",
+      headers: { "Content-Type": "application/json", "X-CSRFToken": token() },
+      body: JSON.stringify(content),
+      credentials: "same-origin",
+      redirect: "manual",
+      signal: AbortSignal.timeout(timeout),
+    });
+  } catch (error) {
+    const why = error.name === "TimeoutError" ? `no answer within ${timeout / 1000} s` : "the server cannot be reached";
+    throw new RequestFailed(`${why}: outcome unknown`, { unknown: true });
+  }
+  if (response.type === "opaqueredirect") {
+    throw new RequestFailed("your session has ended: log in again", { status: 401 });
+  }
+  const body = await bodyOf(response);
+  if (!response.ok) {
+    const unknown = body.status === "unknown" || response.status === 504;
+    throw new RequestFailed(sentence(response.status, body), { status: response.status, body, unknown });
+  }
+  return body;
+}
+
+/** The JSON at `address`; throws RequestFailed. */
+export async function get(address) {
+  let response;
+  try {
+    response = await fetch(address, { credentials: "same-origin", signal: AbortSignal.timeout(TIMEOUT_MS) });
+  } catch {
+    throw new RequestFailed("the server cannot be reached");
+  }
+  const body = await bodyOf(response);
+  if (!response.ok) throw new RequestFailed(sentence(response.status, body), { status: response.status, body });
+  return body;
+}

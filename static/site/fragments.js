@@ -1,0 +1,26 @@
+// Fragments of the page that the server renders: put in only where they differ from what it rendered before, so
+// that nobody's cursor jumps and nothing flickers.
+
+const rendered = new Map(); // element -> what the server last rendered into it
+
+function normal(html) {
+  const template = document.createElement("template");
+  template.innerHTML = html;
+  return template.innerHTML.trim();
+}
+
+/** Watch htmx. To be called before any module changes what the server rendered. */
+export function quietFragments() {
+  for (const element of document.querySelectorAll("[hx-get]:not(select)")) rendered.set(element, normal(element.innerHTML));
+  document.body.addEventListener("htmx:beforeSwap", (event) => {
+    const { target, serverResponse, xhr, shouldSwap } = event.detail;
+    if (xhr.responseURL.includes("/login/")) {
+      event.detail.shouldSwap = false; // the session has ended: the login page, not its form inside ours
+      window.location.reload();
+      return;
+    }
+    const html = normal(serverResponse);
+    if (rendered.get(target) === html) event.detail.shouldSwap = false;
+    else if (shouldSwap) rendered.set(target, html);
+  });
+}
