@@ -93,9 +93,23 @@ def geometry(robot: str, *, simulated: bool) -> dict[str, Any]:
             for visual in looks.scene.visuals
         ],
         "home": looks.poses(np.asarray(looks.robot.poses["home"])).tolist() if _has_home(looks) else None,
+        "tips": _tips(looks),
         "table": TABLE,
         "bench": BENCH if simulated else None,
     }
+
+
+def _tips(looks: Looks) -> list[dict[str, Any]]:
+    """For each arm the point between its fingertips, z the way they point, in the part that carries it."""
+    return [
+        {
+            "group": arm.name,
+            "part": looks.scene.part(f"{arm.name}/{arm.eef_link}"),
+            "pose": arm.tip.T.ravel().tolist(),
+        }
+        for arm in looks.robot.arms
+        if arm.tip is not None
+    ]
 
 
 def _has_home(looks: Looks) -> bool:
