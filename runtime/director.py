@@ -27,7 +27,6 @@ from runtime.messages import (
 )
 from runtime.orders import Orders
 from runtime.page import Page
-from runtime.policies.base import Policy
 from runtime.requests import RunRequest, SetUpRequest
 from runtime.run import Provenance, Run
 from runtime.runs import Runs
@@ -55,11 +54,16 @@ class Director(Effects):
         self.session = Session(self, self.lease, self.boot, clock.now)
         self._orders = Orders(page)
         self.media_report = MediaReport(0.0, {}, {}, 0, "", 0)
-        policy = _policy_of(plan, clock)
-        query = plan.strategy.query(settings.strategy)
         self.spaces = plan.spaces()
         self.inference = Inference(
-            policy, query, self.spaces, page, self._orders, runner, clock, _inference_settings(plan)
+            plan.new_policy(clock),
+            plan.strategy.query(settings.strategy),
+            self.spaces,
+            page,
+            self._orders,
+            runner,
+            clock,
+            _inference_settings(plan),
         )
         self.setup = SetUp(plan, self.inference, self._orders, page, clock, lambda: self.media_report)
         self._watch = Watch(plan, page, self.lease, clock)
@@ -119,11 +123,12 @@ class Director(Effects):
         plan, reset = self._changed(asked), self.setup.reset_of(asked.bench)
         policy = self.inference.policy
         if plan.deployment.policy != self.plan.deployment.policy:
-            policy = _policy_of(plan, self.clock)
+            policy = plan.new_policy(self.clock)
         # Nothing is refused from here on.
         checkpoint = asked.checkpoint.model_dump() if asked.checkpoint else {}
         self.plan = plan
-        self.runs.provenance = replace(self.runs.provenance, plan=plan, checkpoint=checkpoint)
+        told = replace(self.runs.provenance, plan=plan, checkpoint=checkpoint, bench=reset or {})
+        self.runs.provenance = told
         self.inference.exchange(policy, plan.deployment.task)
         self.setup.begin(reset)
         return {"bench": reset["id"]} if reset else {}
@@ -291,12 +296,6 @@ class Director(Effects):
         """Let go of the policy."""
         self.inference.policy.close()
         self.inference.runner.close()
-
-
-def _policy_of(plan: Plan, clock: Clock) -> Policy:
-    """The policy of a plan, not yet connected; raises ConfigurationError where it does not fit the robot."""
-    made: Policy = plan.policy.build(plan.deployment.policy, plan.robot, clock, plan.rate)
-    return made
 
 
 def _inference_settings(plan: Plan) -> InferenceSettings:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import os
 import select
 from dataclasses import dataclass
@@ -15,12 +16,14 @@ import numpy as np
 import robots
 from robots import Robot
 from runtime import deployment, log
+from runtime.clock import Clock
 from runtime.config import Deployment
 from runtime.deployment import Resolved
-from runtime.errors import ConfigurationError, SetupError
+from runtime.errors import ConfigurationError, RuntimeFault, SetupError
 from runtime.kinematics import numeric
 from runtime.page import Page, PageLayout
 from runtime.plugins import variants
+from runtime.policies.base import Policy
 from runtime.safety import Limits
 from runtime.spaces import Spaces
 from runtime.transports.base import Capabilities
@@ -58,6 +61,20 @@ class Plan:
     @property
     def policy(self) -> ModuleType:
         return variants("runtime.policies")[self.deployment.policy.kind]
+
+    def new_policy(self, clock: Clock) -> Policy:
+        """The policy, not yet connected; raises RuntimeFault where it does not fit the robot, or cannot be made."""
+        settings = self.deployment.policy
+        try:
+            made: Policy = self.policy.build(settings, self.robot, clock, self.rate)
+        except RuntimeFault:
+            raise
+        except Exception as error:  # of a policy's own code: it must not end main
+            logging.getLogger(__name__).exception("the policy's own code failed")
+            raise ConfigurationError(
+                f"policy {settings.kind!r} cannot be made: {type(error).__name__}: {error}"
+            ) from error
+        return made
 
     @property
     def capabilities(self) -> Capabilities:

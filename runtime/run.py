@@ -61,6 +61,7 @@ class Provenance:
     checkpoint: Mapping[str, Any] = field(
         default_factory=dict
     )  # as the one who asked for the set-up named it
+    bench: Mapping[str, Any] = field(default_factory=dict)  # how a simulated one was asked to be laid out
     versions: dict[str, str] = field(
         default_factory=lambda: {"python": platform.python_version()} | {p: version(p) for p in _PACKAGES}
     )
@@ -76,6 +77,7 @@ class Provenance:
             "operator": settings.operator,
             "trial": {},
             "checkpoint": dict(self.checkpoint),
+            "bench": dict(self.bench),
             "duration_s": None,
             "kind": settings.recording.kind,
             "mode": mode,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from runtime import deployment, family
-from runtime.errors import ConfigurationError, PolicyError
+from runtime.errors import PolicyError
 from runtime.family import Plan
 from runtime.lockstep import Lockstep
 from runtime.policies.base import Policy, PolicyInfo
@@ -157,7 +157,7 @@ class StubPlan(Plan):
 
     def _policy(self, config: object, robot: object, clock: object, rate: float) -> StubPolicy:
         if "unfit" in self.built:
-            raise ConfigurationError(self.built["unfit"])
+            raise self.built["unfit"]
         self.built["policy"] = StubPolicy(self)
         self.built.setdefault("policies", []).append(self.built["policy"])
         return self.built["policy"]

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from runtime import deployment
-from runtime.errors import SetupError
+from runtime.errors import ConfigurationError, SetupError
 from runtime.session import State
 from tests.runtime.station import Station, on_time, plan
 
@@ -105,11 +105,20 @@ def test_a_refused_set_up_leaves_everything_as_it_was(
 
 def test_a_policy_that_does_not_fit_the_robot_is_refused_before_the_former_is_closed(tmp_path: Path) -> None:
     station = Station(plan(tmp_path)).ready()
-    station.plan.built["unfit"] = "policy.cameras names nose"
+    station.plan.built["unfit"] = ConfigurationError("policy.cameras names nose")
     with pytest.raises(SetupError, match=r"policy\.cameras names nose"):
         station.command("setup", policy=OTHER)
     assert station.main.inference.policy is station.policy
     assert "close" not in station.policy.calls
+    station.close()
+
+
+def test_a_policy_whose_own_code_fails_is_refused_and_ends_nothing(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path)).ready()
+    station.plan.built["unfit"] = ZeroDivisionError("0 / 0")
+    with pytest.raises(SetupError, match="policy 'mock' cannot be made: ZeroDivisionError: 0 / 0"):
+        station.command("setup", policy=OTHER)
+    assert (station.state, station.main.inference.policy) == (State.READY, station.policy)
     station.close()
 
 
@@ -356,6 +365,7 @@ def test_what_the_bench_says_at_the_end_of_a_run_is_in_the_episode_and_among_the
     assert told[0]["data"]["episode"] == episode.manifest["uuid"]
     assert told[0]["text"] == "the simulated bench says: success"
     assert station.events("truth") == ["the simulated bench says: success"]
+    assert episode.manifest["bench"] == BENCH
     station.close()
 
 
