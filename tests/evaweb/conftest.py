@@ -1,0 +1,69 @@
+"""People, stations, and runtimes without robots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from uuid import uuid4
+
+import pytest
+from django.conf import settings
+from django.contrib.auth.models import Group, User
+
+from evaweb.stations.models import Station
+from tests.evaweb.stand_in import StandIn
+
+
+def person(name: str, *groups: str) -> User:
+    user = User.objects.create_user(name)
+    user.groups.add(*(Group.objects.get_or_create(name=group)[0] for group in groups))
+    return user
+
+
+@pytest.fixture
+def ann(db: None) -> User:
+    """An operator."""
+    return person("ann", "operator")
+
+
+@pytest.fixture
+def bob(db: None) -> User:
+    """Another operator."""
+    return person("bob", "operator")
+
+
+@pytest.fixture
+def vera(db: None) -> User:
+    """A viewer."""
+    return person("vera")
+
+
+@pytest.fixture
+def alma(db: None) -> User:
+    """An administrator."""
+    return person("alma", "admin")
+
+
+@pytest.fixture
+def make_stand_in() -> Iterator[Callable[..., StandIn]]:
+    """Starts runtimes; they end with the test. Each has a name of its own: wires and feeds are kept by name."""
+    made: list[StandIn] = []
+
+    def make(ttl: float = 5.0) -> StandIn:
+        made.append(StandIn(settings.DATA_DIR, f"bench-{uuid4().hex[:12]}", ttl))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.end()
+
+
+@pytest.fixture
+def runtime(make_stand_in: Callable[..., StandIn]) -> StandIn:
+    """A runtime that waits for its first observation."""
+    return make_stand_in()
+
+
+@pytest.fixture
+def live(runtime: StandIn, db: None) -> Station:
+    """The station whose runtime is `runtime`."""
+    return Station.objects.create(name=runtime.name, robot="agilex_piper", title="Bench 1")

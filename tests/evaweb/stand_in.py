@@ -1,0 +1,171 @@
+"""A runtime without a robot: the real session, lease and sockets in a thread, under the test's hand."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+import zmq
+
+from runtime.bus import CommandServer, Endpoints, EventLog, Publisher
+from runtime.lease import Lease
+from runtime.messages import Ack, Command, Event
+from runtime.session import LEASE_COMMANDS, Effects, Happening, Session, State
+
+DIM = 14
+
+
+class Effortless(Effects):
+    """Everything succeeds at once and moves nothing."""
+
+    def _nothing(self, *arguments: Any) -> Mapping[str, Any]:
+        return {}
+
+    begin_setup = cancel_setup = begin_run = hold = resume_run = end_run = _nothing
+    go_home = release_estop = start_recording = stop_recording = _nothing
+
+
+Effortless.__abstractmethods__ = frozenset()
+
+
+class StandIn:
+    """A station `name` whose folder is below `data`; `mute` says nothing at all; commands of the kinds in `swallows`
+    never arrive."""
+
+    def __init__(self, data: Path, name: str, ttl: float = 5.0) -> None:
+        self.name = name
+        self.ttl = ttl
+        self.mute = False
+        self.swallows: set[str] = set()
+        self.commands: list[Command] = []
+        self.pressed: list[Command] = []
+        self.guard_says = "done"
+        self._folder = data / "stations" / name
+        self._ended = threading.Event()
+        self._do: list[Any] = []
+        self.boot_up()
+
+    def boot_up(self) -> None:
+        """Begin as a runtime that was just started: new boot id, new addresses."""
+        context = zmq.Context.instance()
+        self.boot = str(uuid4())
+        self.events = EventLog()
+        self.lease = Lease(self.ttl)
+        self.session = Session(Effortless(), self.lease, self.boot, time.monotonic)
+        self._ended = threading.Event()
+        self._main = CommandServer(context, "127.0.0.1", 0)
+        self._guard = CommandServer(context, "127.0.0.1", 0)
+        self._streams = Publisher(context, "127.0.0.1", 0, 64)
+        self._cameras = Publisher(context, "127.0.0.1", 0, 16)
+        endpoints = Endpoints(self._folder)
+        endpoints.write("main", {"commands": self._main.endpoint, "state": self._streams.endpoint})
+        endpoints.write("media", {"cameras": self._cameras.endpoint})
+        endpoints.write("guard", {"estop": self._guard.endpoint})
+        self._thread = threading.Thread(target=self._run, args=(self._ended,), daemon=True)
+        self._thread.start()
+
+    def end(self, *, tidy: bool = False) -> None:
+        """End as by a kill; `tidy`: nothing is left that says where it was."""
+        self._ended.set()
+        self._thread.join()
+        for socket in (self._main, self._guard, self._streams, self._cameras):
+            socket.close()
+        if tidy:
+            Endpoints(self._folder).clear()
+
+    def enter(self, happening: Happening, reason: str = "") -> None:
+        """Let something happen to the session; returns when it has."""
+        self.do(lambda: self._happen(happening, reason))
+
+    def say(self, kind: str, text: str = "", **data: Any) -> None:
+        """An event; returns when it is in the log."""
+        self.do(lambda: self.events.append(Event(kind, text, time.monotonic(), data=data)))
+
+    def ready(self) -> None:
+        """As after a set-up."""
+        self.enter(Happening.CONNECTED)
+        self.do(lambda: self.session._enter(State.READY, "set up"))
+
+    def do(self, work: Any) -> None:
+        """Work in the thread of the runtime."""
+        done = threading.Event()
+        self._do.append((work, done))
+        assert done.wait(10)
+
+    def snapshot(self) -> dict[str, Any]:
+        held = self.lease.current(time.monotonic())
+        return {
+            "boot": self.boot,
+            "sequence": self.session.sequence,
+            "clock": time.monotonic(),
+            "station": self.name,
+            "robot": "agilex_piper",
+            "state": str(self.session.state),
+            "reason": self.session.reason,
+            "allowed": self.session.allowed(),
+            "lease": {
+                "holder": held.holder if held else "",
+                "epoch": held.epoch if held else self.lease.epoch,
+                "expires_in": held.until - time.monotonic() if held else 0.0,
+            },
+            "latency": float("nan"),
+            "newest_event": self.events.newest,
+        }
+
+    def _happen(self, happening: Happening, reason: str) -> None:
+        before = self.session.state
+        if self.session.observe(happening, reason):
+            text = f"{before} -> {self.session.state}: {reason}"
+            data = {"state": str(self.session.state)}
+            self.events.append(Event("state", text, time.monotonic(), data=data))
+
+    def _run(self, ended: threading.Event) -> None:
+        due = 0.0
+        while not ended.is_set():
+            self._main.socket.poll(5)
+            while self._do:
+                work, done = self._do.pop(0)
+                work()
+                done.set()
+            self._serve(self._main, self._answer)
+            self._serve(self._guard, self._press)
+            if time.monotonic() >= due and not self.mute:
+                due = time.monotonic() + 0.03
+                self._publish()
+
+    def _serve(self, server: CommandServer, answer: Any) -> None:
+        while (received := server.receive()) is not None:
+            address, command = received
+            if not self.mute and command.kind not in self.swallows:
+                server.answer(address, answer(command))
+
+    def _answer(self, command: Command) -> Ack:
+        if command.kind == "status":
+            return Ack(command.uuid, "done", boot=self.boot, data=self.snapshot())
+        if command.kind == "events_since":
+            rows = self.events.since(command.args["number"])
+            return Ack(command.uuid, "done", boot=self.boot, data={"events": rows})
+        if command.kind not in LEASE_COMMANDS:
+            self.commands.append(command)
+        before = self.session.state
+        ack = self.session.handle(command)
+        if command.kind not in LEASE_COMMANDS:
+            data = {"uuid": command.uuid, "from": str(before), "to": str(self.session.state)}
+            text = f"{command.kind} by {command.user}: {ack.status}"
+            self.events.append(Event("command", text, time.monotonic(), data=data))
+        return ack
+
+    def _press(self, command: Command) -> Ack:
+        self.pressed.append(command)
+        return Ack(command.uuid, self.guard_says, "every tick now sends the measured position")
+
+    def _publish(self) -> None:
+        self._streams.publish("state", self.snapshot())
+        joints = np.full(DIM, 0.1, np.float32)
+        self._streams.publish("joints", {"step": 1, "measured": joints, "commanded": joints, "engaged": True})
+        self._cameras.publish("camera/cam_high", b"\xff\xd8 a picture")

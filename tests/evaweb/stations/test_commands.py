@@ -1,0 +1,246 @@
+"""Commands: one row each, with what became of it."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from uuid import uuid4
+
+import pytest
+from django.db import OperationalError
+
+from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.stations import commands, leases
+from evaweb.stations.commands import HARDWARE_STOP, NotSent, issue, settle
+from evaweb.stations.models import Command, CommandStatus, Station
+from runtime.session import COMMANDS, STOPPING
+
+pytestmark = pytest.mark.django_db
+
+
+@pytest.fixture(autouse=True)
+def _short(settings):
+    settings.EVA_COMMAND_TIMEOUT_S = 0.5
+
+
+@pytest.fixture
+def held(live, runtime, ann):
+    """The station is ready and ann's page has it; what her page sends along with each command."""
+    runtime.ready()
+    lease = leases.claim(user=ann, station=live, page="p1")
+    return {"user": ann, "station": live, "page": "p1", "epoch": lease.epoch}
+
+
+def seen(runtime):
+    return {"boot": runtime.boot, "sequence": runtime.session.sequence}
+
+
+def test_the_kinds_are_those_of_the_runtime():
+    assert set(commands.KINDS) == {*COMMANDS, "estop"}
+    assert commands.STOPPING == STOPPING
+
+
+def test_an_accepted_command_is_a_row_with_its_answer(held, runtime):
+    row = issue(kind="run", args={"operator": "ann"}, **held, **seen(runtime))
+    found = Command.objects.get(pk=row.pk)
+    assert (found.status, found.reason) == (CommandStatus.ACCEPTED, "")
+    assert "stop" in found.allowed
+    assert found.holder == "web:ann:p1"
+    assert found.answered_at >= found.issued_at
+    assert [(c.kind, c.args, c.user) for c in runtime.commands] == [("run", {"operator": "ann"}, "ann")]
+
+
+def test_the_same_uuid_twice_is_one_command(held, runtime):
+    uuid = uuid4()
+    first = issue(kind="run", uuid=uuid, **held, **seen(runtime))
+    again = issue(kind="run", uuid=str(uuid), **held, **seen(runtime))
+    assert (again.pk, again.status) == (first.pk, CommandStatus.ACCEPTED)
+    assert len(runtime.commands) == 1
+    assert Command.objects.count() == 1
+
+
+def test_a_uuid_of_another_command_is_refused(held, runtime):
+    uuid = issue(kind="run", **held, **seen(runtime)).uuid
+    with pytest.raises(Conflict, match="that of another command"):
+        issue(kind="home", uuid=uuid, **held)
+
+
+def test_what_was_decided_before_a_restart_is_shown_as_refused_with_the_reason(held, runtime):
+    row = issue(kind="run", **held, boot="another", sequence=runtime.session.sequence)
+    assert row.status == CommandStatus.REFUSED
+    assert "decided before the runtime was restarted" in row.reason
+    assert "run" in row.allowed
+
+
+def test_of_two_who_press_run_one_is_refused_with_who_has_the_station(held, runtime, bob):
+    now = seen(runtime)
+    mine = issue(kind="run", **held, **now)
+    theirs = issue(user=bob, station=held["station"], kind="run", page="p2", **now, epoch=held["epoch"])
+    assert (mine.status, theirs.status) == (CommandStatus.ACCEPTED, CommandStatus.REFUSED)
+    assert runtime.session.state == "running"
+
+
+def test_the_second_press_of_the_same_person_is_stale(held, runtime):
+    now = seen(runtime)
+    assert issue(kind="run", **held, **now).status == CommandStatus.ACCEPTED
+    second = issue(kind="run", **held, **now)
+    assert second.status == CommandStatus.REFUSED
+    assert "the state has changed since it was decided" in second.reason
+
+
+def test_no_answer_is_an_unknown_outcome(held, runtime):
+    runtime.swallows.add("run")
+    row = issue(kind="run", **held, **seen(runtime))
+    assert row.status == CommandStatus.UNKNOWN
+    assert "outcome unknown, look at the robot" in row.reason
+
+
+def test_a_station_that_is_not_running_was_sent_nothing(ann):
+    station = Station.objects.create(name="never", robot="agilex_piper")
+    row = issue(user=ann, station=station, kind="run")
+    assert row.status == CommandStatus.FAILED
+    assert row.reason == "never is not running: its runtime has to be started"
+
+
+@pytest.mark.parametrize("kind", ["run", "stop", "halt", "release"])
+def test_a_viewer_commands_nothing(live, vera, runtime, kind):
+    with pytest.raises(NotAllowed, match="vera is a viewer; this needs an operator"):
+        issue(user=vera, station=live, kind=kind)
+    assert runtime.commands == []
+    assert not Command.objects.exists()
+
+
+def test_a_viewer_presses_the_estop(live, vera, runtime):
+    row = issue(user=vera, station=live, kind="estop", args={"why": "smoke"})
+    assert Command.objects.get(pk=row.pk).status == CommandStatus.DONE
+    assert [(c.user, c.args) for c in runtime.pressed] == [("vera", {"why": "smoke"})]
+
+
+def test_a_kind_that_there_is_not_names_those_that_there_are(live, ann):
+    with pytest.raises(EvaError, match="command 'jump' is unknown; allowed: setup, run, stop"):
+        issue(user=ann, station=live, kind="jump")
+
+
+def test_a_lease_is_no_command(live, ann):
+    with pytest.raises(EvaError, match="'lease_claim' is unknown"):
+        issue(user=ann, station=live, kind="lease_claim")
+
+
+def test_stopping_waits_for_no_database(held, runtime, monkeypatch):
+    issue(kind="run", **held, **seen(runtime))
+
+    def locked(*arguments, **named):
+        raise OperationalError("database is locked")
+
+    monkeypatch.setattr(Command, "save", locked)
+    row = issue(kind="stop", **held)
+    assert row.status == CommandStatus.ACCEPTED
+    assert runtime.session.state == "ready"
+    assert not Command.objects.filter(kind="stop").exists()
+
+
+def test_a_command_that_cannot_be_written_down_is_not_sent(held, runtime, monkeypatch):
+    def locked(*arguments, **named):
+        raise OperationalError("database is locked")
+
+    monkeypatch.setattr(Command, "save", locked)
+    with pytest.raises(NotSent, match="run was not sent: the database does not take it now"):
+        issue(kind="run", **held, **seen(runtime))
+    assert runtime.commands == []
+
+
+def test_a_command_that_waited_long_for_the_database_is_not_sent(held, runtime, settings):
+    settings.EVA_COMMAND_TIMEOUT_S = -1.0  # longer than any
+    row = issue(kind="run", **held, **seen(runtime))
+    assert row.status == CommandStatus.FAILED
+    assert "not sent: the database took" in row.reason
+    assert runtime.commands == []
+
+
+def test_an_answer_that_is_not_written_down_is_given_all_the_same_and_found_later(held, runtime, monkeypatch):
+    save = Command.save
+
+    def locked_later(self, *arguments, **named):
+        if named.get("update_fields"):
+            raise OperationalError("database is locked")
+        save(self, *arguments, **named)
+
+    monkeypatch.setattr(Command, "save", locked_later)
+    row = issue(kind="run", **held, **seen(runtime))
+    assert row.status == CommandStatus.ACCEPTED
+    assert Command.objects.get(pk=row.pk).status == CommandStatus.PRESSED
+    monkeypatch.setattr(Command, "save", save)
+    assert _settled_later(row).status == CommandStatus.ACCEPTED
+
+
+def _settled_later(row):
+    Command.objects.filter(pk=row.pk).update(issued_at=row.issued_at - timedelta(seconds=60))
+    (lost,) = commands.unsettled(station=row.station)
+    settle(row=lost)
+    return Command.objects.get(pk=row.pk)
+
+
+def test_a_lost_answer_is_found_by_asking_again(held, runtime):
+    row = issue(kind="run", **held, **seen(runtime))
+    Command.objects.filter(pk=row.pk).update(status=CommandStatus.UNKNOWN)
+    assert _settled_later(row).status == CommandStatus.ACCEPTED
+    assert runtime.session.state == "running"
+
+
+def test_a_command_that_never_arrived_comes_too_late_for_ever(held, runtime):
+    runtime.swallows.add("run")
+    row = issue(kind="run", **held, **seen(runtime))
+    runtime.swallows.clear()
+    settled = _settled_later(row)
+    assert settled.status == CommandStatus.REFUSED
+    assert "stale" in settled.reason
+    assert runtime.session.state == "ready"
+
+
+def test_a_young_command_is_not_asked_about(held, runtime):
+    row = issue(kind="run", **held, **seen(runtime))
+    row.status = CommandStatus.UNKNOWN
+    assert settle(row=row).status == CommandStatus.UNKNOWN
+    assert len(runtime.commands) == 1
+
+
+def test_a_stop_whose_outcome_is_unknown_is_never_given_again(held, runtime):
+    runtime.mute = True
+    row = issue(kind="stop", **held)
+    runtime.mute = False
+    assert row.status == CommandStatus.UNKNOWN
+    assert "the e-stop goes another way" in row.reason
+    Command.objects.filter(pk=row.pk).update(issued_at=row.issued_at - timedelta(seconds=60))
+    assert commands.unsettled(station=row.station) == []
+
+
+def test_an_estop_that_is_not_obeyed_says_use_the_hardware_stop(live, vera, runtime):
+    runtime.guard_says = "failed"
+    assert issue(user=vera, station=live, kind="estop").status == CommandStatus.FAILED
+    runtime.guard_says = "refused"
+    row = issue(user=vera, station=live, kind="estop")
+    assert row.status == CommandStatus.FAILED
+    assert row.reason.startswith(HARDWARE_STOP)
+
+
+def test_an_estop_without_answer_says_use_the_hardware_stop(runtime):
+    runtime.mute = True
+    answer = commands.estop(station=runtime.name, username="ann", why="smoke", uuid=uuid4())
+    assert answer.status == CommandStatus.UNKNOWN
+    assert answer.reason.startswith(HARDWARE_STOP)
+
+
+def test_an_estop_where_nothing_runs_says_use_the_hardware_stop():
+    answer = commands.estop(station="nowhere", username="ann", why="smoke", uuid=uuid4())
+    assert answer.status == CommandStatus.FAILED
+    assert answer.reason.startswith(HARDWARE_STOP)
+
+
+def test_the_estop_touches_no_database(runtime, django_assert_num_queries):
+    with django_assert_num_queries(0):
+        answer = commands.estop(station=runtime.name, username="ann", why="smoke", uuid=uuid4())
+    assert answer.status == CommandStatus.DONE
+
+
+def test_what_is_no_uuid_is_refused(live, ann):
+    with pytest.raises(EvaError, match="uuid 'seven': must be a UUID such as"):
+        issue(user=ann, station=live, kind="run", uuid="seven")
