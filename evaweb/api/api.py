@@ -8,15 +8,33 @@ from typing import Any
 from django.db import OperationalError
 from django.http import Http404, HttpRequest, HttpResponse
 from ninja import NinjaAPI
-from ninja.errors import AuthenticationError, HttpError, ValidationError
+from ninja.errors import AuthenticationError, HttpError, ValidationError, ValidationErrorContext
 
 from evaweb.api import accounts, checkpoints, episodes, jobs, scenes, stations, statistics, trials
 from evaweb.api.auth import Bearer, Session
 from evaweb.errors import EvaError
 
 log = logging.getLogger(__name__)
+_WRAPPERS = ("given", "filters", "paging")  # parameters of views that stand for the whole question
 
-api = NinjaAPI(
+
+class _Api(NinjaAPI):
+    """Says of a malformed question what was given, where Ninja says only what is allowed."""
+
+    def validation_error_from_error_contexts(
+        self, error_contexts: list[ValidationErrorContext]
+    ) -> ValidationError:
+        """Every error with its place and what stood there."""
+        return ValidationError(
+            [
+                {"loc": error["loc"], "msg": error["msg"], "input": error["input"]}
+                for context in error_contexts
+                for error in context.pydantic_validation_error.errors(include_url=False)
+            ]
+        )
+
+
+api = _Api(
     title="EVA Web",
     version="1",
     urls_namespace="api",
@@ -78,7 +96,7 @@ def _failure(request: HttpRequest, sentence: str, status: int) -> HttpResponse:
 
 
 def _sentence(error: Any) -> str:
-    place = ".".join(str(part) for part in error["loc"][1:] if part != "given") or "body"
-    given = error.get("input")
-    shown = "" if given is None or isinstance(given, dict) else f" = {given!r:.80}"
+    place = ".".join(str(part) for part in error["loc"] if part not in _WRAPPERS) or "body"
+    given = error["input"]
+    shown = "" if given is None or isinstance(given, dict | bytes) else f" = {given!r:.80}"
     return f"{place}{shown}: {error['msg']}"

@@ -8,7 +8,7 @@ from uuid import UUID, uuid4
 
 from django.db import DatabaseError
 from django.http import HttpRequest
-from ninja import Field, Router, Schema
+from ninja import Field, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES, Failure
 from evaweb.api.trials import TrialDetail
@@ -206,7 +206,7 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
         if trial.station_id != found.pk:
             raise EvaError(f"trial {trial.pk} is one of {trial.station.name}, not of {found.name}")
         row = trial_command(user=request.auth, trial=trial, **order)
-    return _HTTP[CommandStatus(row.status)], _command_out(row)
+    return Status(_HTTP[CommandStatus(row.status)], _command_out(row))
 
 
 @router.post(
@@ -217,13 +217,8 @@ def estop(request: HttpRequest, name: str, given: EStopIn) -> Any:
     identity = given.uuid or uuid4()
     answer = commands.estop(station=name, username=request.auth.get_username(), why=given.why, uuid=identity)
     _note_estop(request, name, given.why, identity, answer)
-    return _HTTP[answer.status], {
-        "uuid": identity,
-        "status": answer.status,
-        "reason": answer.reason,
-        "allowed": answer.allowed,
-        "data": answer.data,
-    }
+    said = {name: getattr(answer, name) for name in ("status", "reason", "allowed", "data")}
+    return Status(_HTTP[answer.status], {"uuid": identity, **said})
 
 
 @router.post(
@@ -240,7 +235,7 @@ def prepare(request: HttpRequest, name: str, given: TrialIn) -> Any:
         checkpoint=trial_selectors.checkpoint_get(name=given.checkpoint),
         seed=given.seed,
     )
-    return 201, TrialDetail.of(trial_selectors.trial_get(id=made.pk))
+    return Status(201, TrialDetail.of(trial_selectors.trial_get(id=made.pk)))
 
 
 def _request_of(given: LeaseIn) -> int:
