@@ -25,6 +25,7 @@ EVENTS_KEPT = 2000
 _SILENCE_S = 1.5  # ten snapshots come in a second
 _TURN_S = 0.2
 _EVENTS_S = 1.0
+_NEEDED = ("boot", "newest_event", "state", "lease")  # of a snapshot
 Listener = Callable[[str, Any], None]  # told of a stream ("link", "events" among them) and its newest content
 
 
@@ -136,7 +137,7 @@ class _Numbers(_Reader):
         if "joints" in found:
             feed.tell("joints", found["joints"])
         if "state" in found:
-            feed.tell("state", plain(found["state"]))
+            feed.tell("state", _whole(found["state"]))
         if "event" in found or self._behind():
             self._catch_up()
 
@@ -161,6 +162,14 @@ class _Numbers(_Reader):
             return
         if rows or boot != history.boot:
             self._feed.tell("events", history.extended(boot, rows))
+
+
+def _whole(state: Any) -> dict[str, Any]:
+    """A snapshot as JSON may carry it; ValueError where it lacks what this web depends on."""
+    missing = [key for key in _NEEDED if not isinstance(state, Mapping) or key not in state]
+    if missing:
+        raise ValueError(f"a snapshot without {', '.join(missing)}: {state!r:.200}")
+    return dict(plain(state))
 
 
 class _Pictures(_Reader):

@@ -82,6 +82,7 @@ class Mailbox:
     def _flush_events(self, history: History) -> None:
         if self._events_after is None or not history.boot:
             return
+        self._events_of = self._events_of or history.boot
         if self._events_of != history.boot or self._events_after > history.newest:
             self._events_of, self._events_after = history.boot, 0
         rows = history.after(self._events_after)

@@ -49,7 +49,7 @@ class EStop:
 
 @dataclass(frozen=True, slots=True)
 class Events:
-    """Send the events of `boot` (the newest one's where it is another, or "") after a number."""
+    """Send the events of `boot` after a number; where it is no longer that boot, all; "" is the present one."""
 
     after: int
     boot: str

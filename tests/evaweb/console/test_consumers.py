@@ -1,0 +1,428 @@
+"""The live socket, through the whole application, at a runtime without a robot."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from uuid import uuid4
+
+import pytest
+from channels.testing import WebsocketCommunicator
+from django.conf import settings
+from django.contrib.auth.models import AnonymousUser
+from django.db import connections
+from django.test import Client
+
+from evaweb.asgi import application
+from evaweb.console import hub as hubs
+from evaweb.frames import decode
+from evaweb.stations import commands, leases
+from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
+from runtime.session import Happening
+
+pytestmark = pytest.mark.django_db(transaction=True)
+ALL = ["state", "joints", "poses", "camera/cam_high"]
+
+
+class Page:
+    """A browser's page on a station; draws every frame unless it is told not to."""
+
+    def __init__(self, station, user, page="p1", origin=b"http://localhost", query=None):
+        self._user = user
+        self._headers = [(b"origin", origin), (b"host", b"localhost")]
+        query = f"page={page}" if query is None else query
+        self._path = f"/ws/stations/{station}?{query}"
+        self.draws = True
+        self.texts = []
+        self.frames = []
+
+    async def connected(self):
+        if self._user.is_authenticated:
+            cookie = await asyncio.to_thread(_cookie, self._user)
+            self._headers.append((b"cookie", f"{settings.SESSION_COOKIE_NAME}={cookie}".encode()))
+        self._socket = WebsocketCommunicator(application, self._path, self._headers)
+        return (await self._socket.connect(timeout=10))[0]
+
+    async def open(self):
+        assert await self.connected()
+        return self
+
+    async def refused(self):
+        """The code with which the socket is closed right after it was opened."""
+        assert await self.connected()
+        return (await self._socket.receive_output(10))["code"]
+
+    async def say(self, **message):
+        await self._socket.send_to(text_data=json.dumps(message))
+
+    async def next(self, timeout=10):
+        """The next message: a map, or a frame that was drawn."""
+        message = await self._socket.receive_output(timeout)
+        if message["type"] == "websocket.close":
+            return message
+        if message.get("text") is not None:
+            self.texts.append(json.loads(message["text"]))
+            return self.texts[-1]
+        self.frames.append(decode(message["bytes"]))
+        if self.draws:
+            await self.say(type="credit")
+        return self.frames[-1]
+
+    async def told(self, kind, wanted=lambda text: True):
+        """The next text of a kind that is as wanted."""
+        while True:
+            found = await self.next()
+            if isinstance(found, dict) and found.get("type") == kind and wanted(found):
+                return found
+
+    async def shown(self, wanted):
+        """The next frame with what is wanted of its streams."""
+        while True:
+            found = await self.next()
+            if not isinstance(found, dict) and wanted(found.header["streams"]):
+                return found
+
+    async def silent(self):
+        return await self._socket.receive_nothing(0.3)
+
+    async def close(self):
+        await self._socket.disconnect()
+
+
+def _cookie(user):
+    client = Client()
+    client.force_login(user)
+    connections.close_all()
+    return client.cookies[settings.SESSION_COOKIE_NAME].value
+
+
+def run(scenario):
+    """Run it, and leave no room behind."""
+
+    async def whole():
+        try:
+            await scenario
+        finally:
+            rooms = hubs.hub()._rooms.values()
+            assert all(room.empty for room in rooms)
+
+    asyncio.run(whole())
+
+
+def test_a_page_is_greeted_and_shown_what_it_watches(live, ann, runtime):
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        hello = await page.told("hello")
+        assert (hello["station"], hello["user"], hello["role"], hello["page"]) == (
+            live.name,
+            "ann",
+            "operator",
+            "p1",
+        )
+        assert hello["facts"]["robot"] == "agilex_piper"
+        assert len(hello["facts"]["joint_names"]) == 14
+        await page.say(type="watch", streams=ALL)
+        seen = set()
+        while not set(ALL) <= seen:
+            frame = await page.shown(lambda streams: True)
+            seen |= set(frame.header["streams"])
+            for stream in frame.header["streams"]:
+                if stream == "state":
+                    assert frame.header["streams"]["state"]["json"]["boot"] == runtime.boot
+                elif stream == "joints":
+                    assert frame.array("joints", "measured").shape == (14,)
+                elif stream == "poses":
+                    assert frame.array("poses").shape == (2, 20, 16)
+                    assert frame.array("poses")[0, :, 15].tolist() == [1.0] * 20
+                else:
+                    assert frame.data(stream) == b"\xff\xd8 a picture"
+                    assert frame.header["streams"][stream]["age"] >= 0
+        await page.close()
+
+    run(scenario())
+
+
+@pytest.mark.parametrize(
+    ("who", "name", "query", "code"),
+    [
+        ("nobody", None, "page=p1", 4401),
+        ("ann", "nowhere", "page=p1", 4404),
+        ("ann", None, "", 4400),
+        ("ann", None, "page=../x", 4400),
+    ],
+)
+def test_a_page_that_has_no_business_here_is_closed_with_a_code(live, ann, who, name, query, code):
+    async def scenario():
+        page = Page(name or live.name, ann if who == "ann" else AnonymousUser(), query=query)
+        assert await page.refused() == code
+        await page.say(type="estop", uuid=str(uuid4()))
+        await page.close()
+
+    run(scenario())
+    assert not Command.objects.exists()
+
+
+def test_a_page_of_another_site_is_not_let_in(live, ann):
+    async def scenario():
+        assert not await Page(live.name, ann, origin=b"http://evil.example").connected()
+
+    run(scenario())
+
+
+def test_a_page_that_draws_nothing_is_sent_two_frames(live, ann):
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        page.draws = False
+        await page.say(type="watch", streams=ALL)
+        while len(page.frames) < 2:
+            await page.next()
+        await page.told("link", lambda text: text["ok"]) if not page.texts[1:] else None
+        assert await page.silent()
+        await page.say(type="credit")
+        frame = await page.shown(lambda streams: True)
+        assert set(frame.header["streams"]) == set(ALL)
+        await page.close()
+
+    run(scenario())
+
+
+def test_who_comes_late_is_shown_the_last_of_everything_at_once(live, ann, vera, runtime):
+    async def scenario():
+        first = await Page(live.name, ann).open()
+        await first.say(type="watch", streams=ALL)
+        await first.shown(lambda streams: "state" in streams)
+        await first.shown(lambda streams: "camera/cam_high" in streams)
+        runtime.mute = True  # nothing new comes any more
+        await first.told("link", lambda text: not text["ok"])
+        second = await Page(live.name, vera).open()
+        assert (await second.told("hello"))["role"] == "viewer"
+        await second.say(type="watch", streams=ALL)
+        frame = await second.shown(lambda streams: True)
+        assert set(frame.header["streams"]) == set(ALL)
+        assert not (await second.told("link"))["ok"] if len(second.texts) < 2 else True
+        await first.close()
+        await second.close()
+
+    run(scenario())
+
+
+def test_viewers_of_the_same_are_sent_the_very_same_bytes(live, ann):
+    async def scenario():
+        loop = asyncio.get_running_loop()
+        room = hubs.Room(live.name, live.robot, loop, hubs.feeds)
+        got = [[], []]
+        boxes = [room.join(sent.append) for sent in got]
+        for box in boxes:
+            room.watch(box, ["state"])
+        while not all(any(isinstance(message, bytes) for message in sent) for sent in got):
+            await asyncio.sleep(0.01)
+        first, second = (next(m for m in sent if isinstance(m, bytes)) for sent in got)
+        assert first is second
+        for box in boxes:
+            room.leave(box)
+
+    run(scenario())
+
+
+def test_a_lease_is_renewed_and_a_restarted_web_goes_on_with_it(live, ann, runtime):
+    lease = leases.claim(user=ann, station=live, page="p1")
+
+    async def scenario():
+        for _ in range(2):  # the second is the page after a restart of the web
+            page = await Page(live.name, ann).open()
+            await page.say(type="renew", epoch=lease.epoch)
+            assert await page.told("renewed") == {"type": "renewed", "ok": True, "lost": False, "reason": ""}
+            await page.close()
+
+    run(scenario())
+
+
+def test_a_lease_that_is_lost_or_somebody_elses_is_not_renewed(live, ann, bob, runtime):
+    lease = leases.claim(user=ann, station=live, page="p1")
+
+    async def scenario():
+        thief = await Page(live.name, bob).open()
+        await thief.say(type="renew", epoch=lease.epoch)
+        answer = await thief.told("renewed")
+        assert (answer["ok"], answer["lost"]) == (False, True)
+        assert answer["reason"] == "web:ann:p1 holds the lease"
+        await thief.close()
+        page = await Page(live.name, ann).open()
+        runtime.swallows.add("lease_renew")
+        await page.say(type="renew", epoch=lease.epoch)
+        answer = await page.told("renewed")
+        assert (answer["ok"], answer["lost"]) == (False, False)
+        assert "has not answered lease_renew in time" in answer["reason"]
+        await page.close()
+
+    run(scenario())
+
+
+def test_a_viewer_presses_the_estop_and_it_is_written_down(live, vera, runtime):
+    uuid = str(uuid4())
+
+    async def scenario():
+        page = await Page(live.name, vera).open()
+        await page.say(type="estop", uuid=uuid, why="smoke")
+        ack = await page.told("ack")
+        assert ack == {
+            "type": "ack",
+            "kind": "estop",
+            "uuid": uuid,
+            "status": "done",
+            "reason": "every tick now sends the measured position",
+        }
+        await page.close()
+        await _written()
+
+    run(scenario())
+    row = Command.objects.get(pk=uuid)
+    assert (row.kind, row.user, row.status, row.args) == ("estop", vera, CommandStatus.DONE, {"why": "smoke"})
+
+
+async def _written():
+    """What goes on when pages are closed is finished."""
+    from evaweb.console import consumers
+
+    while consumers._under_way:
+        await asyncio.gather(*consumers._under_way)
+
+
+def test_an_estop_is_pressed_although_the_page_is_closed_at_once(live, vera, runtime):
+    async def scenario():
+        page = await Page(live.name, vera).open()
+        await page.told("hello")
+        await page.say(type="estop", uuid=str(uuid4()), why="closing")
+        await page.close()
+        await _written()
+
+    run(scenario())
+    assert [command.args["why"] for command in runtime.pressed] == ["closing"]
+
+
+def test_the_estop_waits_neither_for_the_database_nor_for_a_renewal(live, ann, runtime, monkeypatch):
+    order = []
+    lease = leases.claim(user=ann, station=live, page="p1")
+    noted = commands.estop_noted
+
+    def locked(**named):
+        order.append("row")
+        return noted(**named)
+
+    monkeypatch.setattr(commands, "estop_noted", locked)
+
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        runtime.swallows.add("lease_renew")
+        await page.say(type="renew", epoch=lease.epoch)  # hangs until its deadline
+        await page.say(type="estop", uuid=str(uuid4()), why="smoke")
+        first = await page.told("ack")
+        order.insert(0, first["status"])
+        assert all(text["type"] != "renewed" for text in page.texts)
+        await page.told("renewed")
+        await page.close()
+        await _written()
+
+    run(scenario())
+    assert order == ["done", "row"]
+
+
+def test_an_estop_that_cannot_be_delivered_says_use_the_hardware_stop(ann):
+    Station.objects.create(name="switched-off", robot="agilex_piper")
+
+    async def scenario():
+        page = await Page("switched-off", ann).open()
+        await page.say(type="estop", uuid=str(uuid4()))
+        ack = await page.told("ack")
+        assert ack["status"] == "failed"
+        assert ack["reason"].startswith("USE THE HARDWARE STOP")
+        await page.close()
+        await _written()
+
+    run(scenario())
+
+
+def test_events_come_without_gaps_over_a_restart(live, ann, runtime):
+    for number in range(3):
+        runtime.say("before", str(number))
+
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        await page.say(type="events", after=1)
+        told = await page.told("events")
+        assert [row["number"] for row in told["events"]] == [2, 3]
+        runtime.say("live", "now")
+        assert [row["text"] for row in (await page.told("events"))["events"]] == ["now"]
+        runtime.end()
+        runtime.boot_up()
+        runtime.enter(Happening.CONNECTED)
+        told = await page.told("events")
+        assert (told["boot"], [row["number"] for row in told["events"]]) == (runtime.boot, [1])
+        await page.close()
+
+    run(scenario())
+
+
+def test_a_station_that_dies_and_comes_back_is_said(live, ann, runtime):
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        await page.told("link", lambda text: text["ok"])
+        await page.say(type="watch", streams=["state"])
+        runtime.end(tidy=True)
+        gone = await page.told("link", lambda text: not text["ok"])
+        assert gone["reason"] == f"{live.name} is not running: its runtime has to be started"
+        runtime.boot_up()
+        await page.told("link", lambda text: text["ok"])
+        await page.shown(
+            lambda streams: "state" in streams and streams["state"]["json"]["boot"] == runtime.boot
+        )
+        await page.close()
+
+    run(scenario())
+
+
+def test_what_changes_in_the_database_is_said(live, ann, bob, runtime):
+    lease = leases.claim(user=ann, station=live, page="p1")
+
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        await page.told("link")
+        await asyncio.sleep(1.2)  # the first look
+        ask = asyncio.to_thread(LeaseRequest.objects.create, station=live, user=bob, holder="web:bob:p2")
+        await ask
+        assert (await page.told("changed"))["what"] == ["lease"]
+        await page.close()
+
+    run(scenario())
+    assert lease.pk
+
+
+def test_what_means_nothing_is_answered_with_what_is_allowed_and_at_last_with_the_end(live, ann):
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        await page.say(type="jump")
+        assert "'jump' is unknown; allowed: watch" in (await page.told("error"))["reason"]
+        for _ in range(25):
+            await page.say(type="jump")
+        while (found := await page.next()).get("type") != "websocket.close":
+            assert found["type"] in ("error", "link")
+        assert found["code"] == 4400
+        await page.close()
+
+    run(scenario())
+
+
+def test_a_station_with_an_unknown_robot_can_be_stopped_all_the_same(live, ann, runtime):
+    Station.objects.filter(pk=live.pk).update(robot="unknown")
+
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        assert "robot 'unknown' does not exist" in (await page.told("hello"))["facts"]["error"]
+        await page.say(type="watch", streams=["state", "joints"])
+        await page.shown(lambda streams: "joints" in streams)
+        await page.say(type="estop", uuid=str(uuid4()))
+        assert (await page.told("ack"))["status"] == "done"
+        await page.close()
+        await _written()
+
+    run(scenario())

@@ -1,0 +1,60 @@
+"""What a page may say."""
+
+from __future__ import annotations
+
+import json
+from uuid import uuid4
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evaweb.console.requests import BadRequest, Credit, EStop, Events, Renew, Watch, parse
+
+CAMERAS = ("cam_high", "cam_left_wrist")
+
+
+def said(**message):
+    return parse(json.dumps(message), CAMERAS)
+
+
+def test_requests_are_read():
+    uuid = uuid4()
+    assert said(type="watch", streams=["state", "camera/cam_high"]) == Watch(("state", "camera/cam_high"))
+    assert said(type="credit") == Credit()
+    assert said(type="renew", epoch=3) == Renew(3)
+    assert said(type="estop", uuid=str(uuid), why="smoke") == EStop(uuid, "smoke")
+    assert said(type="events", after=7) == Events(7, "")
+    assert said(type="events", after=7, boot="b") == Events(7, "b")
+
+
+@pytest.mark.parametrize(
+    ("message", "sentence"),
+    [
+        ({"type": "jump"}, "type 'jump' is unknown; allowed: watch, credit, renew, estop, events"),
+        ({"type": "watch", "streams": "state"}, "streams = 'state'; allowed: a list of state, joints"),
+        ({"type": "watch", "streams": ["camera/none"]}, "camera/cam_left_wrist"),
+        ({"type": "watch", "streams": [["state"]]}, "allowed: a list of"),
+        ({"type": "renew", "epoch": "3"}, "epoch = '3'; allowed: a whole number"),
+        ({"type": "renew", "epoch": True}, "epoch = True"),
+        ({"type": "events", "after": -1}, "after = -1"),
+        ({"type": "events", "after": 0, "boot": 5}, "boot = 5; allowed: a text"),
+        ({"type": ["watch"]}, "is unknown"),
+    ],
+)
+def test_what_means_nothing_is_refused_with_what_is_allowed(message, sentence):
+    with pytest.raises(BadRequest, match=sentence):
+        said(**message)
+
+
+@pytest.mark.parametrize("extra", [{}, {"uuid": 7, "why": 3}, {"uuid": "x", "why": "y" * 999}])
+def test_an_estop_is_pressed_whatever_else_is_wrong(extra):
+    pressed = said(type="estop", **extra)
+    assert isinstance(pressed, EStop)
+    assert 0 < len(pressed.why) <= 240
+
+
+@given(st.text())
+def test_a_text_at_random_is_a_bad_request_and_nothing_worse(text):
+    with pytest.raises(BadRequest):
+        parse(text, CAMERAS)
