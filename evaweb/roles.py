@@ -5,6 +5,8 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Any
 
+from django.db import transaction
+
 from evaweb.errors import NotAllowed
 
 
@@ -32,3 +34,13 @@ def require(user: Any, role: Role) -> None:
     has = role_of(user)
     if _RANK[has] < _RANK[role]:
         raise NotAllowed(f"{user.get_username()} is a {has}; this needs an {role}: ask an administrator")
+
+
+@transaction.atomic
+def grant(*, user: Any, role: Role) -> None:
+    """Give a user this role and no other; what they were by another way, a superuser say, they are no more."""
+    user.is_superuser = False
+    user.is_staff = role is Role.ADMIN  # pages of others look at it; ours look at the role
+    user.save(update_fields=["is_superuser", "is_staff"])
+    groups = user.groups.model.objects  # models cannot be imported before the apps are ready
+    user.groups.set(groups.filter(name=role.value))

@@ -11,6 +11,7 @@ from django.utils import timezone
 
 from evaweb.episodes.models import Episode
 from evaweb.stations.models import Station
+from evaweb.trials.tables import check_bench, check_policy
 
 
 class Scene(models.Model):
@@ -49,6 +50,7 @@ class Position(models.Model):
     bench = models.JSONField(
         null=True,
         blank=True,
+        validators=[check_bench],
         help_text='For simulated benches: {"block": [x, y, yaw in degrees], "plate": [x, y]} in metres.',
     )
 
@@ -91,6 +93,8 @@ class Checkpoint(models.Model):
     description = models.TextField(blank=True, help_text="Trained on what, for how long, by whom.")
     policy = models.JSONField(
         default=dict,
+        blank=True,
+        validators=[check_policy],
         help_text='Keys of the deployment\'s [policy] table, e.g. {"url": "ws://127.0.0.1:8000"}.',
     )
     active = models.BooleanField(default=True, help_text="Off: not offered to operators.")

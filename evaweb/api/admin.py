@@ -1,0 +1,143 @@
+"""Accounts and tokens in the admin pages: a user has one role, and is made with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django import forms
+from django.contrib import admin
+from django.contrib.auth.admin import UserAdmin
+from django.contrib.auth.forms import UserChangeForm, UserCreationForm
+from django.contrib.auth.models import Group, User
+from django.db.models import QuerySet
+from django.http import HttpRequest
+
+from evaweb.api.models import Token
+from evaweb.roles import Role, grant, role_of
+
+_MEANING = {
+    Role.VIEWER: "viewer: sees everything, presses the e-stop, commands nothing",
+    Role.OPERATOR: "operator: takes stations, runs and scores trials",
+    Role.ADMIN: "admin: also scenes, checkpoints, stations and accounts",
+}
+
+
+def _role_field() -> forms.ChoiceField:
+    return forms.ChoiceField(
+        choices=[(role.value, _MEANING[role]) for role in Role], widget=forms.RadioSelect, initial=Role.VIEWER
+    )
+
+
+class NewAccountForm(UserCreationForm):
+    """A name, a password, a role."""
+
+    role = _role_field()
+
+    class Meta(UserCreationForm.Meta):
+        model = User
+        fields = ("username", "first_name", "last_name", "email")
+
+
+class AccountForm(UserChangeForm):
+    """The same for one that there is; nobody takes their own rights away by mistake."""
+
+    role = _role_field()
+    asking: User | None = None
+
+    def __init__(self, *args: Any, **named: Any) -> None:
+        super().__init__(*args, **named)
+        self.fields["role"].initial = role_of(self.instance).value
+
+    def clean(self) -> dict[str, Any]:
+        """Refuse to lock oneself out."""
+        cleaned: dict[str, Any] = super().clean() or self.cleaned_data
+        loses = cleaned.get("role") != Role.ADMIN or not cleaned.get("is_active")
+        if self.asking is not None and self.asking.pk == self.instance.pk and loses:
+            raise forms.ValidationError(
+                "This is your own account: another administrator has to switch it off or take its role."
+            )
+        return cleaned
+
+
+class RoleFilter(admin.SimpleListFilter):
+    """By role."""
+
+    title, parameter_name = "role", "role"
+
+    def lookups(self, request: HttpRequest, model_admin: Any) -> list[tuple[str, str]]:
+        """The three of them."""
+        return [(role.value, role.value) for role in Role]
+
+    def queryset(self, request: HttpRequest, queryset: QuerySet[User]) -> QuerySet[User]:
+        """Users whose highest role it is."""
+        if self.value() not in set(Role):
+            return queryset
+        users = queryset.prefetch_related("groups")
+        return queryset.filter(pk__in=[user.pk for user in users if role_of(user) == self.value()])
+
+
+class AccountAdmin(UserAdmin):
+    """Who may log in, and what they may do."""
+
+    form, add_form = AccountForm, NewAccountForm
+    list_display = ("username", "full_name", "role", "is_active", "last_login")
+    list_filter = ("is_active", RoleFilter)
+    fieldsets = (
+        (None, {"fields": ("username", "password")}),
+        ("Person", {"fields": (("first_name", "last_name"), "email")}),
+        ("Rights", {"fields": ("role", "is_active")}),
+        ("Times", {"fields": ("last_login", "date_joined")}),
+    )
+    add_fieldsets = (
+        (None, {"fields": ("username", "password1", "password2", "role")}),
+        ("Person", {"fields": (("first_name", "last_name"), "email")}),
+    )
+    readonly_fields = ("last_login", "date_joined")
+    filter_horizontal = ()
+
+    def get_form(self, request: HttpRequest, obj: User | None = None, **named: Any) -> Any:
+        """The form knows who asks."""
+        made = super().get_form(request, obj, **named)
+        return type(made.__name__, (made,), {"asking": request.user})
+
+    def save_model(self, request: HttpRequest, obj: User, form: Any, change: bool) -> None:
+        """The account, then its role."""
+        super().save_model(request, obj, form, change)
+        if "role" in form.cleaned_data:
+            grant(user=obj, role=Role(form.cleaned_data["role"]))
+
+    def has_delete_permission(self, request: HttpRequest, obj: User | None = None) -> bool:
+        """Nobody: accounts are switched off, records refer to them."""
+        return False
+
+    @admin.display(description="name")
+    def full_name(self, user: User) -> str:
+        """First and last name."""
+        return user.get_full_name()
+
+    @admin.display(description="role")
+    def role(self, user: User) -> str:
+        """The highest role."""
+        return role_of(user).value
+
+
+admin.site.unregister(User)
+admin.site.unregister(Group)  # the three roles are fixed
+admin.site.register(User, AccountAdmin)
+
+
+@admin.register(Token)
+class TokenAdmin(admin.ModelAdmin):
+    """Tokens are made by `manage.py api_token USER NAME`, and revoked here by deleting them."""
+
+    list_display = ("name", "user", "created_at", "used_at")
+    list_filter = ("user",)
+    search_fields = ("name", "user__username")
+
+    def has_add_permission(self, request: HttpRequest) -> bool:
+        """Nobody: it could not be shown."""
+        return False
+
+    def has_change_permission(self, request: HttpRequest, obj: Token | None = None) -> bool:
+        """Nobody."""
+        return False

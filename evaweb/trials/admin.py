@@ -1,0 +1,296 @@
+"""Scenes and checkpoints in the admin pages; evaluations, trials and scores are records and only read there."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from django import forms
+from django.contrib import admin, messages
+from django.core.exceptions import ValidationError
+from django.db.models import Count, QuerySet
+from django.http import HttpRequest
+from django.urls import reverse
+from django.utils.html import format_html
+
+from evaweb.trials.models import (
+    Checkpoint,
+    Evaluation,
+    Milestone,
+    MilestoneOutcome,
+    Position,
+    Scene,
+    Score,
+    Trial,
+)
+
+
+class Table(forms.JSONField):
+    """JSON that says where it cannot be read."""
+
+    widget = forms.Textarea(attrs={"rows": 3, "cols": 60, "spellcheck": "false", "class": "mono"})
+
+    def to_python(self, value: Any) -> Any:
+        """The table; ValidationError with line and column."""
+        if isinstance(value, str) and value.strip():
+            try:
+                json.loads(value)
+            except json.JSONDecodeError as error:
+                raise ValidationError(
+                    f"This is not JSON: {error.msg} in line {error.lineno}, column {error.colno}. "
+                    'Keys and texts stand in double quotes, as in {"url": "ws://127.0.0.1:8000"}.'
+                ) from None
+        return super().to_python(value)
+
+
+class PositionForm(forms.ModelForm):
+    """One initial condition."""
+
+    bench = Table(required=False, help_text=Position._meta.get_field("bench").help_text)
+
+    class Meta:
+        model = Position
+        fields = ("number", "label", "description", "bench")
+        widgets = {"description": forms.Textarea(attrs={"rows": 2, "cols": 40})}
+
+
+class PositionInline(admin.StackedInline):
+    """Where things stand at the beginning."""
+
+    model = Position
+    form = PositionForm
+    extra = 0
+    min_num = 1
+    validate_min = True
+    fields = (("number", "label"), "description", "bench")
+
+
+class MilestoneInline(admin.TabularInline):
+    """What is reached on the way."""
+
+    model = Milestone
+    extra = 0
+    fields = ("order", "text", "points", "required", "truth")
+
+
+class ActiveActions:
+    """Switching on and off for whole selections."""
+
+    actions = ("switch_on", "switch_off")
+
+    @admin.action(description="Switch on: offer to operators")
+    def switch_on(self, request: HttpRequest, rows: QuerySet[Any]) -> None:
+        """Operators can choose them."""
+        messages.success(request, f"{rows.update(active=True)} switched on")
+
+    @admin.action(description="Switch off: offer no longer")
+    def switch_off(self, request: HttpRequest, rows: QuerySet[Any]) -> None:
+        """Operators cannot choose them; what was tried stays."""
+        messages.success(request, f"{rows.update(active=False)} switched off")
+
+
+@admin.register(Scene)
+class SceneAdmin(ActiveActions, admin.ModelAdmin):
+    """A task on a bench, with its positions and milestones."""
+
+    list_display = ("title", "name", "active", "instruction", "positions_n", "milestones_n", "trials_n")
+    list_filter = ("active",)
+    search_fields = ("title", "name", "instruction")
+    prepopulated_fields = {"name": ("title",)}
+    inlines = (PositionInline, MilestoneInline)
+    save_on_top = True
+    fieldsets = (
+        (None, {"fields": (("title", "name"), "instruction", "active")}),
+        ("At the bench", {"fields": ("layout", "criterion", "time_limit_s")}),
+    )
+
+    def get_queryset(self, request: HttpRequest) -> QuerySet[Scene]:
+        """With how much belongs to each."""
+        return (
+            super()
+            .get_queryset(request)
+            .annotate(
+                n_positions=Count("positions", distinct=True),
+                n_milestones=Count("milestones", distinct=True),
+                n_trials=Count("trials", distinct=True),
+            )
+        )
+
+    def get_readonly_fields(self, request: HttpRequest, obj: Scene | None = None) -> tuple[str, ...]:
+        """The name of a scene is in its seeds and in every export."""
+        return ("name",) if obj else ()
+
+    def get_prepopulated_fields(self, request: HttpRequest, obj: Scene | None = None) -> dict[str, Any]:
+        """Only as long as the name can be chosen."""
+        return {} if obj else dict(self.prepopulated_fields)
+
+    def save_formset(self, request: HttpRequest, form: Any, formset: Any, change: bool) -> None:
+        """Say what a change of milestones or positions means for trials that were made with the others."""
+        super().save_formset(request, form, formset, change)
+        changed = formset.changed_objects or formset.deleted_objects or formset.new_objects
+        trials = form.instance.trials.count() if change and changed else 0
+        if trials:
+            what = formset.model._meta.verbose_name_plural
+            messages.warning(
+                request,
+                f"{trials} trials were made before these {what} were changed. Their scores keep the old ones: "
+                "where trials are to be compared, make another scene instead.",
+            )
+
+    @admin.display(description="positions", ordering="n_positions")
+    def positions_n(self, scene: Scene) -> int:
+        """How many positions."""
+        return scene.n_positions  # type: ignore[attr-defined, no-any-return]
+
+    @admin.display(description="milestones", ordering="n_milestones")
+    def milestones_n(self, scene: Scene) -> int:
+        """How many milestones."""
+        return scene.n_milestones  # type: ignore[attr-defined, no-any-return]
+
+    @admin.display(description="trials", ordering="n_trials")
+    def trials_n(self, scene: Scene) -> int:
+        """How many trials."""
+        return scene.n_trials  # type: ignore[attr-defined, no-any-return]
+
+
+class CheckpointForm(forms.ModelForm):
+    """A policy, and how it is reached."""
+
+    policy = Table(required=False, help_text=Checkpoint._meta.get_field("policy").help_text)
+
+    class Meta:
+        model = Checkpoint
+        fields = ("name", "description", "policy", "active")
+
+    def clean_policy(self) -> dict[str, Any]:
+        """An empty field is an empty table: everything as in the deployment."""
+        given = self.cleaned_data["policy"]
+        return {} if given is None else given
+
+
+@admin.register(Checkpoint)
+class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
+    """A trained policy."""
+
+    form = CheckpointForm
+    list_display = ("name", "active", "reached_at", "trials_n", "created_at")
+    list_filter = ("active",)
+    search_fields = ("name", "description")
+
+    def get_queryset(self, request: HttpRequest) -> QuerySet[Checkpoint]:
+        """With the number of trials."""
+        return super().get_queryset(request).annotate(n_trials=Count("trials"))
+
+    def get_readonly_fields(self, request: HttpRequest, obj: Checkpoint | None = None) -> tuple[str, ...]:
+        """The name is in every manifest from the first trial on."""
+        return ("name",) if obj and obj.trials.exists() else ()
+
+    def save_model(self, request: HttpRequest, obj: Checkpoint, form: Any, change: bool) -> None:
+        """Say so where trials were made with another table."""
+        super().save_model(request, obj, form, change)
+        trials = obj.trials.count() if change and "policy" in form.changed_data else 0
+        if trials:
+            messages.warning(
+                request,
+                f"{trials} trials of {obj} were made with another policy table. If this is another policy and "
+                "not only another address, make another checkpoint: their trials would be counted together.",
+            )
+
+    @admin.display(description="policy")
+    def reached_at(self, checkpoint: Checkpoint) -> str:
+        """Its address, where it has one."""
+        policy = checkpoint.policy if isinstance(checkpoint.policy, dict) else {}
+        return str(policy.get("url") or policy.get("path") or policy.get("kind") or "as deployed")
+
+    @admin.display(description="trials", ordering="n_trials")
+    def trials_n(self, checkpoint: Checkpoint) -> int:
+        """How many trials."""
+        return checkpoint.n_trials  # type: ignore[attr-defined, no-any-return]
+
+
+class ReadOnly:
+    """What happened is not edited."""
+
+    def has_add_permission(self, request: HttpRequest, obj: Any = None) -> bool:
+        """Nobody."""
+        return False
+
+    def has_change_permission(self, request: HttpRequest, obj: Any = None) -> bool:
+        """Nobody."""
+        return False
+
+    def has_delete_permission(self, request: HttpRequest, obj: Any = None) -> bool:
+        """Nobody."""
+        return False
+
+
+@admin.register(Evaluation)
+class EvaluationAdmin(ReadOnly, admin.ModelAdmin):
+    """What trials belong to; the open bench of a station is made by itself."""
+
+    list_display = ("name", "version", "kind", "station", "created_at")
+    list_filter = ("kind", "station")
+    search_fields = ("name",)
+
+
+class ScoreInline(ReadOnly, admin.TabularInline):
+    """Every score that it was given; the last one counts."""
+
+    model = Score
+    fk_name = "trial"
+    extra = 0
+    fields = ("scored_at", "rater", "source", "success", "score", "failure", "note", "reason")
+    readonly_fields = fields
+
+
+@admin.register(Trial)
+class TrialAdmin(ReadOnly, admin.ModelAdmin):
+    """Trials are scored, corrected and voided on their result page, where the reason is asked for."""
+
+    list_display = (
+        "id",
+        "status",
+        "scene",
+        "position_n",
+        "checkpoint",
+        "number",
+        "attempt",
+        "station",
+        "page",
+    )
+    list_filter = ("status", "scene", "checkpoint", "station")
+    search_fields = ("uuid", "scores__note", "scores__failure", "operator__username")
+    list_select_related = ("scene", "position", "checkpoint", "station")
+    date_hierarchy = "prepared_at"
+    inlines = (ScoreInline,)
+
+    @admin.display(description="position")
+    def position_n(self, trial: Trial) -> int:
+        """Its number alone."""
+        return trial.position.number
+
+    @admin.display(description="result")
+    def page(self, trial: Trial) -> str:
+        """A link to its result page."""
+        return format_html('<a href="{}">open</a>', reverse("result-trial", args=[trial.pk]))
+
+
+class OutcomeInline(ReadOnly, admin.TabularInline):
+    """Its milestones as they were."""
+
+    model = MilestoneOutcome
+    extra = 0
+    fields = ("order", "text", "points", "required", "reached")
+    readonly_fields = fields
+
+
+@admin.register(Score)
+class ScoreAdmin(ReadOnly, admin.ModelAdmin):
+    """Every score there ever was."""
+
+    list_display = ("scored_at", "trial", "rater", "source", "success", "score", "failure", "reason")
+    list_filter = ("success", "source", "trial__scene", "trial__checkpoint")
+    search_fields = ("note", "failure", "reason", "rater__username")
+    list_select_related = ("trial__scene", "trial__checkpoint", "trial__position", "rater")
+    date_hierarchy = "scored_at"
+    inlines = (OutcomeInline,)

@@ -1,0 +1,85 @@
+"""Checks tables that an administrator writes as JSON: how a policy is reached, how a bench is laid out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import cache
+from typing import Any, get_args
+
+import pydantic
+from django.core.exceptions import ValidationError
+
+from runtime.config import PolicyConfig
+
+_PLACES = {"block": ("x", "y", "yaw in degrees"), "plate": ("x", "y")}
+
+
+def check_policy(given: object) -> None:
+    """ValidationError unless `given` fits on top of a deployment's [policy] table of some kind."""
+    if not isinstance(given, Mapping):
+        raise ValidationError(_sentence(given, 'a table such as {"url": "ws://127.0.0.1:8000"}'))
+    kinds = _kinds()
+    wanted = given.get("kind")
+    if wanted is not None and wanted not in kinds:
+        raise ValidationError(f"kind = {wanted!r}; allowed: {', '.join(kinds)}")
+    problems = [_problems(given, kinds[kind]) for kind in ([wanted] if wanted else kinds)]
+    if all(problems):
+        raise ValidationError(min(problems, key=len))
+
+
+def check_bench(given: object) -> None:
+    """ValidationError unless `given` says where things lie: "block": [x, y, yaw], "plate": [x, y]."""
+    if given is None:
+        return
+    if not isinstance(given, Mapping):
+        raise ValidationError(
+            _sentence(given, 'a table such as {"block": [0.1, 0.3, 0], "plate": [-0.1, 0.3]}')
+        )
+    problems = [problem for key, value in given.items() if (problem := _place_problem(key, value))]
+    if problems:
+        raise ValidationError(problems)
+
+
+def _place_problem(key: object, value: object) -> str:
+    if key not in _PLACES:
+        return f"{key}: unknown key; allowed: {', '.join(_PLACES)}"
+    parts = _PLACES[str(key)]
+    numbers = isinstance(value, list) and all(_is_number(part) for part in value)
+    if not numbers or len(value) != len(parts):  # type: ignore[arg-type]
+        return _sentence(value, f"{len(parts)} numbers: [{', '.join(parts)}], x and y in metres", str(key))
+    if max(map(abs, value[:2])) > 2:  # type: ignore[index]
+        return _sentence(value, "x and y in metres, at most 2 from the middle", str(key))
+    return ""
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _problems(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> list[str]:
+    """What is wrong with it as a table of that kind; what is missing comes from the deployment."""
+    kind = config.model_fields["kind"].default
+    try:
+        config.model_validate({**given, "kind": kind})
+    except pydantic.ValidationError as invalid:
+        errors = [error for error in invalid.errors() if error["type"] != "missing"]
+        return [_problem(error, config, kind) for error in errors]
+    return []
+
+
+def _problem(error: Any, config: type[pydantic.BaseModel], kind: str) -> str:
+    key = ".".join(map(str, error["loc"])) or "policy"
+    if error["type"] == "extra_forbidden":
+        return f"{key}: unknown key for kind {kind!r}; allowed: {', '.join(config.model_fields)}"
+    return f"{key} = {error['input']!r:.80}: {error['msg']}"
+
+
+@cache
+def _kinds() -> dict[str, type[pydantic.BaseModel]]:
+    union = get_args(PolicyConfig)[0] if get_args(PolicyConfig) else PolicyConfig
+    return {config.model_fields["kind"].default: config for config in get_args(union) or (union,)}
+
+
+def _sentence(given: object, allowed: str, name: str = "") -> str:
+    return f"{name}{' = ' if name else ''}{given!r:.80}; allowed: {allowed}"
