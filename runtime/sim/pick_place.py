@@ -37,6 +37,8 @@ _GRIPPED = 1.25  # of the block's edge: jaws narrower than that have closed on i
 _EMPTY = 0.75  # of the block's edge: jaws narrower than that hold nothing
 _SHORT = 0.05  # m by which a grasp is short where it slips
 _CARRYING = ("lift", "carry", "lower")
+_LEAVING = ("back off", "retreat")
+_PAUSED = 3.0  # s without a request, after which a robot that was leaving begins another episode
 
 
 class ScriptError(RuntimeFault):
@@ -47,8 +49,8 @@ class ScriptError(RuntimeFault):
 class Skill:
     """How good the policy is: `noise` [m] on the block's place in each attempt, one sigma in x and in y.
 
-    `failure_rate` is the probability that in an episode it lets the block go on the way or always grasps
-    short; `seed` decides both, episode by episode.
+    A block's edge of noise is one radian of it on the block's turn. `failure_rate` is the probability that in
+    an episode it lets the block go on the way or always grasps short; `seed` decides both, episode by episode.
     """
 
     noise: float = 0.0
@@ -65,7 +67,7 @@ class PickPlace(Script):
         horizon: int,
         rate: float,
         skill: Skill,
-        name: str = "",
+        name: str | None = None,
         clock: Clock | None = None,
     ) -> None:
         self.robot, self.clock = robot, clock or MonotonicClock()
@@ -89,23 +91,23 @@ class PickPlace(Script):
 
     def luck(self) -> Luck:
         """What the next episode has in store."""
-        return Luck(self.skill, next(self._episodes))
+        return Luck(self.skill, next(self._episodes), self.table.block_edge)
 
 
 class Luck:
     """The chances of one episode: the same for the same seed and number."""
 
-    def __init__(self, skill: Skill, episode: int) -> None:
+    def __init__(self, skill: Skill, episode: int, edge: float) -> None:
         self._chance = np.random.default_rng([skill.seed, episode])
-        self._noise = skill.noise
+        self._noise = skill.noise * np.array([1.0, 1.0, 1.0 / edge])
         fails, lets_go = self._chance.random(2)
         slips = fails < skill.failure_rate
         self.slip = Slip(_SHORT * (slips and lets_go >= 0.5), bool(slips and lets_go < 0.5))
 
     def perceived(self, block: tuple[float, float, float]) -> tuple[float, float, float]:
-        """The block's place as one attempt takes it to be."""
-        x, y = np.array(block[:2]) + self._chance.normal(0.0, self._noise, 2)
-        return float(x), float(y), block[2]
+        """The block's place and turn as one attempt takes them to be."""
+        x, y, yaw = np.array(block) + self._chance.normal(0.0, self._noise)
+        return float(x), float(y), float(yaw)
 
 
 class Pursuit:
@@ -126,16 +128,19 @@ class Pursuit:
     def __call__(self, q: Float64, pictures: Mapping[str, UInt8], prompt: str) -> Float32:
         """Rows float32 [H, D]: the rest of the route, or the joints themselves where there is nothing to do."""
         sight = self._look(pictures)
-        if prompt != self._prompt or self._elsewhere(q, sight):
-            self._forget()
         now = self._policy.clock.now()
-        elapsed, self._asked, self._prompt = now - self._asked, now, prompt
+        elapsed, self._asked = now - self._asked, now
+        if prompt != self._prompt or self._is_over(elapsed) or self._elsewhere(q, sight):
+            self._forget()
+        self._prompt = prompt
+        if sight.dark:
+            return self._still(q)
         self._advance(q, elapsed)
         if self._misses(q):
             self._take(self._policy.planner.retreat(q, self._on().arm))
         if self._route is None:
             self._decide(q, sight)
-        return self._rows(q).astype(np.float32)
+        return self._still(q) if self._route is None else self._ahead(self._route)
 
     def _look(self, pictures: Mapping[str, UInt8]) -> Sight:
         key = self._policy.overhead.key
@@ -172,6 +177,11 @@ class Pursuit:
         self._luck = self._left = None
         self._resigned = False
         self._take(None)
+
+    def _is_over(self, pause: float) -> bool:
+        """Whether what follows the pause [s] is another episode: nothing was going on any more before it."""
+        leaving = self._route is None or self._route.legs[self._leg].name in _LEAVING
+        return leaving and pause > _PAUSED
 
     def _elsewhere(self, q: Float64, sight: Sight) -> bool:
         """Whether robot or things are not where they should be if this were still the episode it was."""
@@ -238,13 +248,13 @@ class Pursuit:
         assert arm.gripper is not None
         return abs(float(q[gripper_dim(arm)]) - arm.gripper.close)
 
-    def _rows(self, q: Float64) -> Float64:
-        """The next rows [H, D]; the last one is repeated."""
-        horizon = self._policy.horizon
-        if self._route is None:
-            return np.repeat(q[None], horizon, axis=0)
-        wanted = np.minimum(round(self._row) + np.arange(horizon), len(self._route.rows) - 1)
-        return np.asarray(self._route.rows[wanted])
+    def _ahead(self, route: Route) -> Float32:
+        """The next rows of the route; its last one is repeated."""
+        wanted = round(self._row) + np.arange(self._policy.horizon)
+        return route.rows[np.minimum(wanted, len(route.rows) - 1)].astype(np.float32)
+
+    def _still(self, q: Float64) -> Float32:
+        return np.repeat(q[None], self._policy.horizon, axis=0).astype(np.float32)
 
 
 def _differs(sight: Sight, before: Sight) -> bool:

@@ -29,11 +29,12 @@ CLEAR = 0.12  # m: fingertips so high pass over everything, also with a block be
 _GRASP = 0.45  # of the block's edge: the height of the fingertips that grasp it
 _DROP = 0.003  # m between block and plate when the jaws open
 _TILTS = ((0.0, 0.26), (0.26, 0.26), (0.4, 0.4))  # rad outwards from straight down: below, above
-_SPEED = 0.55  # rad/s of the fastest joint, at its fastest
-_TIP_SPEED = 0.08  # m/s on vertical ways, at its fastest
+_SPEED = 0.75  # rad/s of the fastest joint, at its fastest
+_TIP_SPEED = 0.11  # m/s on vertical ways, at its fastest
 _SHORTEST = 0.5  # s
-_JAW_SPEED = 0.12  # m/s
+_JAW_SPEED = 0.16  # m/s
 _PAUSE = 0.3  # s that a route stands still at first: its rows arrive late
+_MARGIN = 0.05  # of the jaws' whole way, at both ends
 _DWELL = 0.2  # s by which a gate outlasts the way of its jaws
 _PEAK = 1.875  # highest over mean speed of a minimum-jerk motion
 _AHEAD = 0.3  # m from an arm's base to the place over which searches begin
@@ -114,7 +115,7 @@ class Planner:
 
     def retreat(self, q: Float64, arm: Group) -> Route:
         """Open the jaws, rise, and go where the arm is out of the camera's way."""
-        high = self._with_jaws(arm, self._risen(arm, q), jaws(arm).open)
+        high = self._with_jaws(arm, self._risen(arm, q), _opened(arm))
         return self._begun(
             arm, [self._leg("back off", q, high), self._leg("retreat", high, self._rested(arm, q))]
         )
@@ -123,7 +124,7 @@ class Planner:
 
     def _route(self, arm: Group, q: Float64, down: Float64, over: Float64, slip: Slip) -> Route:
         """From the stations above to below the block, `down`, and the plate, `over`, [stations, D], jaws open."""
-        held, lowered = (self._with_jaws(arm, way, jaws(arm).close) for way in (down, over))
+        held, lowered = (self._with_jaws(arm, way, _closed(arm)) for way in (down, over))
         legs = []
         if bench.tip_in_world(arm, q)[2, 3] < 0.75 * CLEAR:
             legs.append(self._leg("rise", q, self._risen(arm, q)))
@@ -133,7 +134,7 @@ class Planner:
         carry = self._leg("carry", held[0], lowered[0])
         if slip.lets_go:
             half = carry.rows[: len(carry.rows) // 2]
-            last = self._with_jaws(arm, half[-1], jaws(arm).open)
+            last = self._with_jaws(arm, half[-1], _opened(arm))
             legs += [Leg("carry", half), self._jaw_leg("open", half[-1], last)]
         else:
             last = over[0]
@@ -198,7 +199,7 @@ class Planner:
         """Joints [stations, D] of an arm with open jaws, the others as in q [D]; None where it cannot reach."""
         bearing = self._bearing(arm, place)
         seed, across = self._nominal[arm.name]
-        start = self._with_jaws(arm, q, jaws(arm).open)
+        start = self._with_jaws(arm, q, _opened(arm))
         start[arm.joint_dims] = seed
         start[arm.joint_dims[0]] += bearing - self._bearing(arm, self._ahead(arm))
         start = np.clip(start, self._robot.lower, self._robot.upper)
@@ -249,14 +250,18 @@ class Planner:
         tip = bench.tip_in_world(arm, q)
         if tip[2, 3] >= CLEAR:
             return q
-        tip[2, 3] = CLEAR
-        found = self._solved(arm, [tip], q)
-        return q if found is None else found[0]
+        place = float(tip[0, 3]), float(tip[1, 3])
+        yaw, bearing = math.atan2(tip[1, 1], tip[0, 1]), self._bearing(arm, place)
+        for _, tilt in _TILTS:
+            found = self._solved(arm, [_tip(place, CLEAR, yaw, bearing, tilt)], q)
+            if found is not None:
+                return np.asarray(found[0])
+        return q
 
     def _rested(self, arm: Group, q: Float64) -> Float64:
         rest = q.copy()
         rest[arm.slice] = self._rest[arm.slice]
-        return rest
+        return self._with_jaws(arm, rest, _opened(arm))
 
     def _with_jaws(self, arm: Group, q: Float64, opening: float) -> Float64:
         changed = q.copy()
@@ -274,6 +279,15 @@ def gripper_dim(arm: Group) -> int:
     """The place of an arm's gripper in the robot's vector."""
     assert arm.gripper_dim is not None
     return arm.gripper_dim
+
+
+def _opened(arm: Group) -> float:
+    """Nearly as far as the jaws go: safety slows them close to their limits."""
+    return jaws(arm).open + _MARGIN * (jaws(arm).close - jaws(arm).open)
+
+
+def _closed(arm: Group) -> float:
+    return jaws(arm).close + _MARGIN * (jaws(arm).open - jaws(arm).close)
 
 
 def _tip(place: Place, height: float, yaw: float, bearing: float, tilt: float) -> Float64:

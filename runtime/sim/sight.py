@@ -39,11 +39,12 @@ Matrix = NDArray[Any]  # what OpenCV's own annotations call a picture or a mask
 class Sight:
     """Block (x, y, yaw) and plate (x, y) in the world [m, rad], each None where it is not seen whole.
 
-    The yaw is that of a square: within 45 degrees of zero.
+    The yaw is that of a square: within 45 degrees of zero. `dark`: there was nothing but black.
     """
 
     block: tuple[float, float, float] | None = None
     plate: tuple[float, float] | None = None
+    dark: bool = False
 
 
 class Overhead:
@@ -60,6 +61,8 @@ class Overhead:
     def look(self, picture: UInt8) -> Sight:
         """What is to be seen in an RGB picture [H, W, 3] or [3, H, W] of any size, letterboxed or not."""
         shown = _without_bars(_channels_last(picture))
+        if int(shown.max(initial=0)) < _DARKEST:
+            return Sight(dark=True)
         hsv = cv2.cvtColor(np.ascontiguousarray(shown), cv2.COLOR_RGB2HSV)
         return Sight(self._block(shown, hsv), self._plate(hsv))
 

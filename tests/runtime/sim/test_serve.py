@@ -20,8 +20,11 @@ from runtime.clock import MonotonicClock
 from runtime.errors import PolicyError
 from runtime.policies import openpi
 from runtime.policies.link import PolicyGone
+from runtime.policies.pictures import fitted, laid_out
 from runtime.sim.gestures import Gesture
+from runtime.sim.layout import layout_of
 from runtime.types import Observation
+from tests.runtime.sim.drawn_bench import drawn
 
 ROBOT = robots.load("agilex_piper")
 HOME = ROBOT.poses["home"]
@@ -139,3 +142,39 @@ def test_an_unknown_fault_names_the_known_ones() -> None:
     ended = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60)
     assert ended.returncode == 2
     assert "'boom' is no fault; allowed: mute_on_connect" in ended.stderr
+
+
+def test_the_pick_and_place_policy_says_what_it_is_and_moves_only_for_a_block_that_it_sees(
+    serve: Any,
+) -> None:
+    url = serve(
+        "--behaviour", "pick_place", "--name", "checkpoint A", "--noise", "2", "--horizon", "40"
+    ).ready["url"]
+    with conversation(url) as connection:
+        metadata = receive(connection)
+        connection.send(request(images={"cam_high": np.zeros((3, 224, 224), np.uint8)}))
+        dark = receive(connection)["actions"]
+        seen = fitted(drawn(layout_of(0)), 224, 224, "pad")
+        connection.send(request(images={"cam_high": laid_out(seen, "chw")}))
+        moving = receive(connection)["actions"]
+    assert metadata["name"] == "checkpoint A"
+    assert "scripted pick-and-place" in metadata["description"]
+    assert metadata["noise_mm"] == 2.0
+    assert dark.shape == moving.shape == (40, 14)
+    np.testing.assert_array_equal(dark, np.tile(HOME.astype(np.float32), (40, 1)))
+    assert np.abs(moving[-1] - HOME).max() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--noise", "5"), "--noise and --failure-rate are for --behaviour pick_place"),
+        (("--behaviour", "pick_place", "--failure-rate", "1.5"), "1.5 was given; allowed: 0 to 1"),
+        (("--behaviour", "dance"), "invalid choice: 'dance'"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(options: tuple[str, ...], said: str) -> None:
+    arguments = ["-m", "runtime.sim.serve", "openpi", "--robot", "agilex_piper", "--port", "0", *options]
+    ended = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 2
+    assert said in ended.stderr

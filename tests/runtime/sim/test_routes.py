@@ -1,0 +1,153 @@
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import robots
+from runtime.errors import SetupError
+from runtime.sim import bench
+from runtime.sim.bench import Bench
+from runtime.sim.layout import layout_of
+from runtime.sim.routes import CLEAR, Planner, Slip, gripper_dim, jaws
+
+ROBOT = robots.load("agilex_piper")
+LEFT, RIGHT = ROBOT.arms
+READY, HOME = ROBOT.poses["ready"], ROBOT.poses["home"]
+RATE = 30.0
+PLANNER = Planner(ROBOT, RATE, Bench())
+BLOCK, PLATE = (-0.1, 0.26, 0.4), (-0.05, 0.38)
+ANGLES = np.setdiff1d(np.arange(ROBOT.dim), ROBOT.gripper_dims)
+SURE = Slip()
+
+
+def planned(q=READY, block=BLOCK, plate=PLATE, slip=SURE):
+    route = PLANNER.pick_and_place(q, block, plate, slip)
+    assert route is not None
+    return route
+
+
+def leg(route, name):
+    return next(leg for leg in route.legs if leg.name == name)
+
+
+def tips(route, rows):
+    return np.stack([bench.tip_in_world(route.arm, row) for row in rows])
+
+
+def test_the_legs_follow_each_other_without_a_jump_of_the_arm():
+    route = planned()
+    assert [leg.name for leg in route.legs] == [
+        "reach", "descend", "close", "lift", "carry", "lower", "open", "leave", "retreat"
+    ]  # fmt: skip
+    np.testing.assert_allclose(route.rows[0], READY)
+    for before, after in itertools.pairwise(route.legs):
+        np.testing.assert_allclose(before.end[ANGLES], after.rows[0][ANGLES], atol=1e-9)
+    assert len(route.rows) == sum(len(leg.rows) for leg in route.legs)
+    for start, part in zip(route.starts, route.legs, strict=True):
+        np.testing.assert_array_equal(route.rows[start], part.rows[0])
+
+
+@pytest.mark.parametrize("q", [READY, HOME], ids=["ready", "home"])
+@pytest.mark.parametrize("seed", range(20))
+def test_every_layout_is_reached_slowly_and_above_the_table(seed, q):
+    layout = layout_of(seed)
+    route = planned(q, layout.blocks[0], layout.plate)
+    speeds = np.abs(np.diff(route.rows, axis=0)) * RATE
+    assert speeds[:, ANGLES].max() < 1.2
+    accelerations = np.abs(np.diff(route.rows, n=2, axis=0)) * RATE**2
+    assert accelerations[:, ANGLES].max() < 15.0
+    assert (route.rows >= ROBOT.lower).all()
+    assert (route.rows <= ROBOT.upper).all()
+    assert tips(route, route.rows)[:, 2, 3].min() > 0.012
+    assert 9.0 < len(route.rows) / RATE < 22.0
+
+
+def test_the_arm_on_the_other_side_stays():
+    for block, arm, other in ((BLOCK, LEFT, RIGHT), ((0.1, 0.26, 0.0), RIGHT, LEFT)):
+        route = planned(block=block, plate=(0.0, 0.38))
+        assert route.arm.name == arm.name
+        still = route.rows[:, other.slice]
+        np.testing.assert_allclose(still, np.broadcast_to(READY[other.slice], still.shape))
+
+
+@pytest.mark.parametrize("yaw", [-0.7, -0.3, 0.0, 0.5])
+def test_it_comes_straight_down_on_the_block_with_the_jaws_along_its_sides(yaw):
+    route = planned(block=(-0.1, 0.26, yaw))
+    way = tips(route, leg(route, "descend").rows)
+    np.testing.assert_allclose(way[:, :2, 3], np.broadcast_to([-0.1, 0.26], (len(way), 2)), atol=0.004)
+    assert way[0, 2, 3] == pytest.approx(CLEAR, abs=0.002)
+    assert way[-1, 2, 3] == pytest.approx(0.018, abs=0.002)
+    across = way[-1, :2, 1]
+    assert abs(math.remainder(math.atan2(across[1], across[0]) - yaw, math.pi / 2)) < math.radians(3)
+    assert -way[:, 2, 2].max() > math.cos(math.radians(25))
+
+
+def test_it_lets_go_just_above_the_middle_of_the_plate():
+    route = planned()
+    tip = bench.tip_in_world(LEFT, leg(route, "lower").end)
+    np.testing.assert_allclose(tip[:2, 3], PLATE, atol=0.002)
+    assert tip[2, 3] == pytest.approx(0.012 + 0.018 + 0.003, abs=0.002)
+
+
+def test_the_jaws_are_closed_while_it_carries_and_open_before_and_after():
+    route = planned(HOME)
+    jaw = gripper_dim(route.arm)
+    for name in ("lift", "carry", "lower"):
+        assert leg(route, name).rows[:, jaw].max() < 0.01
+    for name in ("descend", "leave", "retreat"):
+        assert leg(route, name).rows[:, jaw].min() > 0.09
+    assert (leg(route, "close").gate, leg(route, "open").gate) == ("close", "open")
+
+
+def test_it_ends_at_rest_out_of_the_way():
+    route = planned(HOME)
+    arm = route.arm.joint_dims
+    np.testing.assert_allclose(route.legs[-1].end[arm], READY[arm])
+
+
+def test_what_neither_arm_reaches_has_no_route():
+    assert PLANNER.pick_and_place(READY, (0.0, 0.75, 0.0), PLATE, SURE) is None
+    assert PLANNER.pick_and_place(READY, BLOCK, (0.0, 0.75), SURE) is None
+
+
+def test_the_other_arm_takes_what_the_nearer_one_cannot_bring_home():
+    route = planned(block=(-0.02, 0.3, 0.0), plate=(0.3, 0.36))
+    assert route.arm.name == RIGHT.name
+
+
+def test_a_grasp_can_be_short_of_the_block():
+    tip = bench.tip_in_world(LEFT, leg(planned(slip=Slip(short=0.05)), "descend").end)
+    assert math.dist(tip[:2, 3], BLOCK[:2]) == pytest.approx(0.05, abs=0.002)
+    assert math.dist(tip[:2, 3], LEFT.mount[:2]) < math.dist(BLOCK[:2], LEFT.mount[:2])
+
+
+def test_the_block_can_be_let_go_of_on_the_way():
+    route = planned(slip=Slip(lets_go=True))
+    assert [leg.name for leg in route.legs[-3:]] == ["carry", "open", "retreat"]
+    assert math.dist(bench.tip_in_world(LEFT, leg(route, "carry").end)[:2, 3], PLATE) > 0.03
+
+
+def test_a_retreat_from_the_table_rises_first():
+    low = leg(planned(), "descend").end
+    route = PLANNER.retreat(low, LEFT)
+    assert [leg.name for leg in route.legs] == ["back off", "retreat"]
+    heights = tips(route, leg(route, "back off").rows)[:, 2, 3]
+    assert (np.diff(heights) > -1e-4).all()
+    assert heights[-1] == pytest.approx(CLEAR, abs=0.003)
+
+
+def test_a_route_from_the_table_rises_first():
+    low = leg(planned(), "descend").end
+    route = planned(q=low)
+    assert route.legs[0].name == "rise"
+    assert bench.tip_in_world(LEFT, route.legs[0].end)[2, 3] == pytest.approx(CLEAR, abs=0.003)
+
+
+def test_a_gripper_whose_number_is_no_length_cannot_pick():
+    arm = replace(LEFT, gripper=replace(jaws(LEFT), unit="percent"))
+    with pytest.raises(SetupError, match="left_arm cannot pick things up"):
+        Planner(replace(ROBOT, groups=(arm, RIGHT)), RATE, Bench())
