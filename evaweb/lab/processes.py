@@ -42,6 +42,7 @@ class Program:
     announces: bool = False
     again: Callable[[Mapping[str, Any]], tuple[str, ...]] | None = None
     patience_s: float = 5.0  # to end by itself
+    nice: int = 0  # above 0: gives way to the stations of this machine
 
 
 @dataclass
@@ -105,7 +106,7 @@ class Processes:
             path.replace(path.with_suffix(".log.old"))
         output = path.open("ab")
         process = subprocess.Popen(
-            [sys.executable, *arguments, "--lifeline"],
+            ["nice", "-n", str(program.nice), sys.executable, *arguments, "--lifeline"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE if program.announces else output,
             stderr=output,

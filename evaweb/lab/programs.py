@@ -18,7 +18,9 @@ def web(host: str, port: int) -> Program:
     def arguments(where: object) -> tuple[str, ...]:
         return (_MANAGE, "serve", "--host", host, "--port", str(where))
 
-    return Program("web", arguments(port), announces=True, again=lambda found: arguments(found["port"]))
+    return Program(
+        "web", arguments(port), announces=True, again=lambda found: arguments(_port(found)), nice=5
+    )
 
 
 def worker(queues: Sequence[str]) -> Program:

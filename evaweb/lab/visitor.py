@@ -88,7 +88,7 @@ class Visitor:
             with refusal:
                 body = refusal.read().decode("utf-8", "replace")
             raise VisitFailed(
-                f"{request.method} {request.selector}: HTTP {refusal.code}: {_sentence(body)}"
+                f"{request.get_method()} {request.selector}: HTTP {refusal.code}: {_sentence(body)}"
             ) from None
         except URLError as error:
             raise VisitFailed(f"{self.url} does not answer: {error.reason}") from None
