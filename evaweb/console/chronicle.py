@@ -102,7 +102,6 @@ class Scribe:
         if sweep and self._feed.link.ok:
             for row in commands.unsettled(station=station):
                 commands.settle(row=row)
-        if sweep:
             self._swept = time.monotonic()
 
     @staticmethod

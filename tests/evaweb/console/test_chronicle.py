@@ -163,6 +163,7 @@ def test_a_restart_of_the_runtime_is_written_down(scribe, live, runtime, service
 def test_a_lost_answer_is_found(scribe, live, runtime, services, ann, settings, monkeypatch):
     settings.EVA_COMMAND_TIMEOUT_S = 0.3
     monkeypatch.setattr(commands, "_patience_s", lambda: 0.1)
+    monkeypatch.setattr(chronicle, "_SWEEP_S", 0.2)
     runtime.ready()
     lease = leases.claim(user=ann, station=live, page="p1")
     runtime.swallows.add("run")
