@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evaweb.errors import NotFound
 from evaweb.frames import Stream, encode
+from evaweb.stations.geometry import looks_of
 from runtime.recording.reader import Episode, open_episode
 from runtime.recording.summary import HELD
 
@@ -20,23 +22,41 @@ def curves(folder: Path) -> bytes:
     """One message of evaweb.frames; RecordingError names the file that is absent or damaged.
 
     Times are seconds of the video: row k is at k / fps. Streams, vectors joint by joint (a row per joint):
-    rows: time f8 [N], measured and sent f4 [D, N]. ticks, at the control rate: time f8 [M], smoothed and
-    executed f4 [D, M] (NaN where nothing was asked for or sent), safety u1 [M] (1 changed, 2 refused). raw,
-    where the policy speaks in joints: time f8 [R], values f4 [D, R], chunk i4 [R].
+    ticks, at the control rate: time f8 [M], measured, smoothed and executed f4 [D, M] (NaN where nothing was
+    asked for or sent), safety u1 [M] (1 changed, 2 refused). raw, where the policy speaks in joints: time
+    f8 [R], values f4 [D, R], chunk i4 [R].
     """
     episode = open_episode(folder)
     start = _start(episode)
-    streams = {"rows": _rows(episode), "ticks": _ticks(episode, start), "raw": _raw(episode, start)}
-    robot = episode.manifest.get("robot")
-    names = robot.get("joint_names") if isinstance(robot, dict) else None
+    streams = {"ticks": _ticks(episode, start), "raw": _raw(episode, start)}
+    names = _robot(episode).get("joint_names")
     return encode(
         streams,
         joints=names if isinstance(names, list) else [f"joint {k}" for k in range(episode.layout.dim)],
+        units=_units(episode),
         frames=episode.frames,
         fps=episode.layout.fps,
         held=held_spans(episode.rows.column("control_source").to_pylist(), episode.layout.fps),
         marks=_marks(episode, start),
     )
+
+
+def _robot(episode: Episode) -> Mapping[str, Any]:
+    robot = episode.manifest.get("robot")
+    return robot if isinstance(robot, Mapping) else {}
+
+
+def _units(episode: Episode) -> list[str]:
+    """The unit of every joint, "" where the robot is not known any more, or is another one today."""
+    dim = episode.layout.dim
+    try:
+        robot = looks_of(str(_robot(episode).get("name", ""))).robot
+    except NotFound:
+        return [""] * dim
+    if robot.dim != dim:
+        return [""] * dim
+    grippers = {group.gripper_dim: group.gripper.unit for group in robot.groups if group.gripper}
+    return [grippers.get(index, "rad") for index in range(dim)]
 
 
 def _start(episode: Episode) -> float:
@@ -56,17 +76,6 @@ def vectors(table: Any, name: str, width: int) -> Array:
     return np.ascontiguousarray(values.T)
 
 
-def _rows(episode: Episode) -> Stream:
-    dim = episode.layout.dim
-    return Stream(
-        arrays={
-            "time": np.arange(episode.rows.num_rows) / episode.layout.fps,
-            "measured": vectors(episode.rows, "qpos", dim),
-            "sent": vectors(episode.rows, "action", dim),
-        }
-    )
-
-
 def _ticks(episode: Episode, start: float) -> Stream:
     ticks, dim = episode.ticks, episode.layout.dim
     steps = ticks.column("step").to_numpy()
@@ -81,6 +90,7 @@ def _ticks(episode: Episode, start: float) -> Stream:
     return Stream(
         arrays={
             "time": ticks.column("planned").to_numpy() - start,
+            "measured": vectors(ticks, "qpos", dim),
             "smoothed": smoothed,
             "executed": vectors(ticks, "executed", dim),
             "safety": np.maximum(changed, 2 * refused).astype(np.uint8),

@@ -1,0 +1,17 @@
+// The binary messages of an episode.
+
+import { decode } from "../console/frame.js";
+
+/** The message at `address`; throws with the server's sentence. */
+export async function message(address) {
+  const response = await fetch(address, { credentials: "same-origin", redirect: "manual", headers: { Accept: "application/json" } });
+  if (response.ok) return decode(await response.arrayBuffer());
+  if (response.type === "opaqueredirect") throw new Error("your session has ended: log in again");
+  const said = await response.json().catch(() => ({}));
+  throw new Error(said.error ?? `the server answered with HTTP ${response.status}`);
+}
+
+/** Joint j of an array that lies joint by joint; nothing is copied. */
+export function joint(values, index, length) {
+  return values.subarray(index * length, (index + 1) * length);
+}

@@ -1,0 +1,79 @@
+// The robot in 3D on the clock: poses come in parts of some hundred rows, when they are needed.
+
+import { get } from "../site/api.js";
+import { Scene3D } from "../console/scene3d.js";
+import { message } from "./data.js";
+
+const MATRIX = 16;
+
+export class Robot {
+  #scene;
+  #clock;
+  #address;
+  #part = 0; // rows of an answer
+  #parts = new Map(); // first row -> promise of its numbers
+  #size = 0; // numbers of a row
+  #shown = -1;
+
+  constructor({ scene, clock, address, size }) {
+    this.#scene = scene;
+    this.#clock = clock;
+    this.#address = address;
+    this.#size = size;
+    for (const kind of ["tick", "seek"]) clock.addEventListener(kind, () => this.#show());
+  }
+
+  /** Fetch the first rows; throws where the robot cannot be placed. */
+  async begin() {
+    const numbers = await this.#fetch(0);
+    this.#part = numbers.length / this.#size;
+    this.#parts.set(0, Promise.resolve(numbers));
+    await this.#show();
+  }
+
+  async #fetch(first) {
+    const { header, numbers } = await message(`${this.#address}?first=${first}`);
+    return numbers(header.streams.poses);
+  }
+
+  #rows(first) {
+    if (!this.#parts.has(first)) {
+      const coming = this.#fetch(first);
+      coming.catch(() => this.#parts.delete(first));
+      this.#parts.set(first, coming);
+    }
+    return this.#parts.get(first);
+  }
+
+  async #show() {
+    const { row, rows } = this.#clock;
+    if (!this.#part || row === this.#shown) return;
+    const first = Math.floor(row / this.#part) * this.#part;
+    const next = first + this.#part;
+    if (next < rows && row - first > this.#part / 2) this.#rows(next);
+    const numbers = await this.#rows(first);
+    if (row !== this.#clock.row) return; // the clock has gone on meanwhile
+    this.#shown = row;
+    const from = (row - first) * this.#size;
+    this.#scene.setPoses(numbers.subarray(from, from + this.#size), 1);
+  }
+}
+
+/** Fill the pane, or put a sentence in its place. */
+export async function robotPane({ clock, geometry: address, poses }) {
+  const note = document.getElementById("scene-note");
+  try {
+    if (!address) throw new Error("the episode names no robot");
+    const geometry = await get(address);
+    const scene = new Scene3D(document.getElementById("scene"), geometry);
+    scene.toggle("path"); // a path that jumps with the clock would be none
+    for (const button of document.querySelectorAll("[data-view]")) {
+      button.addEventListener("click", () => scene.view(button.dataset.view));
+    }
+    await new Robot({ scene, clock, address: poses, size: geometry.parts.length * MATRIX }).begin();
+    note.hidden = true;
+  } catch (error) {
+    note.textContent = `No 3D scene: ${error.message}.`;
+    console.error(error);
+  }
+}
