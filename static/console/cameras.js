@@ -5,6 +5,7 @@ import { age } from "./words.js";
 const STALE_S = 0.5; // as the runtime's own bound on pictures
 const SLOW = 0.8; // of the fastest camera's rate
 const WINDOW_MS = 2000;
+const TELL_MS = 500;
 
 class Camera {
   constructor(figure) {
@@ -13,6 +14,7 @@ class Camera {
     this.canvas = figure.querySelector("canvas");
     this.context = this.canvas.getContext("2d");
     this.rateText = figure.querySelector(".camera-rate");
+    this.freshText = figure.querySelector(".camera-fresh");
     this.ageText = figure.querySelector(".camera-age");
     this.capturedAt = -Infinity; // on this page's clock [ms]
     this.drawn = []; // when the last pictures were drawn
@@ -46,11 +48,13 @@ class Camera {
     return (this.drawn.length * 1000) / WINDOW_MS;
   }
 
-  rate(measured, fastest, now) {
+  rate(measured, captured, fastest, now) {
     const shown = this.shownRate(now);
     const known = Number.isFinite(measured);
     const slow = known && measured < SLOW * fastest;
     const text = known ? `${measured.toFixed(1)} Hz${slow ? " !" : ""}` : "no picture yet";
+    const fresh = known && !this.figure.hasAttribute("data-stale") && Number.isFinite(captured);
+    this.freshText.textContent = fresh ? `${age(captured)} ago` : "";
     if (this.rateText.textContent !== text) this.rateText.textContent = text;
     this.rateText.toggleAttribute("data-slow", slow);
     this.rateText.title = `The camera delivers ${known ? measured.toFixed(1) : "no"} pictures per second; this page shows ${shown.toFixed(1)}.`;
@@ -59,13 +63,14 @@ class Camera {
 
 export class Cameras {
   #cameras = new Map();
+  #told = 0;
 
   constructor(store) {
     for (const figure of document.querySelectorAll("[data-camera]")) {
       const camera = new Camera(figure);
       this.#cameras.set(camera.name, camera);
     }
-    store.on("snapshot", (snapshot) => this.#rates(snapshot.link.rates));
+    store.on("snapshot", ({ link }) => this.#measured(link));
     setInterval(() => this.#tell(), 100);
   }
 
@@ -91,10 +96,12 @@ export class Cameras {
     return () => draws.forEach((draw) => draw());
   }
 
-  #rates(rates) {
+  #measured({ rates, ages }) {
     const now = performance.now();
+    if (now - this.#told < TELL_MS) return; // figures that flicker cannot be read
+    this.#told = now;
     const fastest = Math.max(0, ...[...this.#cameras.keys()].map((name) => rates[name] ?? 0));
-    for (const camera of this.#cameras.values()) camera.rate(rates[camera.name] ?? NaN, fastest, now);
+    for (const camera of this.#cameras.values()) camera.rate(rates[camera.name] ?? NaN, ages[camera.name] ?? NaN, fastest, now);
   }
 
   #tell() {

@@ -31,7 +31,7 @@ export class EStop {
     const id = uuid();
     this.#show("pressed", "E-stop pressed …");
     this.#waiting.set(id, setTimeout(() => this.#unanswered(id), ACK_MS));
-    const text = `${why}, page of ${this.#store.user}`;
+    const text = `${why} on the page`;
     if (!this.#socket.send({ type: "estop", uuid: id, why: text })) this.#byPost(id, text);
   }
 
@@ -48,7 +48,7 @@ export class EStop {
 
   #unanswered(id) {
     this.#hardware("the software stop was not acknowledged");
-    this.#byPost(id, `not acknowledged within ${ACK_MS} ms, page of ${this.#store.user}`);
+    this.#byPost(id, `no answer within ${ACK_MS} ms`);
   }
 
   async #byPost(id, why) {

@@ -3,7 +3,7 @@
 const FIXED = [
   ["Esc", "E-stop"],
   ["Space", "E-stop, outside text fields"],
-  ["?", "These keys"],
+  ["?", "These keys, and away with them"],
 ];
 const TYPING = 'input:not([type="checkbox"]):not([type="radio"]), textarea, select, [contenteditable="true"]';
 
@@ -12,8 +12,15 @@ function usable(element) {
 }
 
 function keyOf(event) {
-  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key.toLowerCase();
+  const key = event.key.toLowerCase();
   return event.ctrlKey ? `ctrl+${key}` : key;
+}
+
+function label(key) {
+  return key
+    .split("+")
+    .map((part) => part[0].toUpperCase() + part.slice(1))
+    .join(" + ");
 }
 
 function text(element) {
@@ -33,13 +40,14 @@ function show(dialog) {
   for (const [key, what] of rows) {
     const name = document.createElement("dt");
     const cap = document.createElement("kbd");
-    cap.textContent = key.length === 1 ? key.toUpperCase() : key;
+    cap.textContent = label(key);
     name.append(cap);
     const meaning = document.createElement("dd");
     meaning.textContent = what;
     list.append(name, meaning);
   }
-  dialog.showModal();
+  dialog.show(); // never modal: that would put the e-stop out of reach
+  dialog.querySelector("button").focus();
 }
 
 /** Listen for keys; text fields keep theirs, but for those with Ctrl. */
@@ -47,11 +55,12 @@ export function keyboard() {
   const dialog = document.getElementById("keys");
   document.querySelector("[data-open-keys]")?.addEventListener("click", () => show(dialog));
   window.addEventListener("keydown", (event) => {
-    if (event.altKey || event.metaKey || event.repeat || dialog.open) return;
+    if (event.altKey || event.metaKey || event.repeat) return;
     if (event.target.closest?.(TYPING) && !event.ctrlKey) return;
     const key = keyOf(event);
     if (key === "?") {
-      show(dialog);
+      if (dialog.open) dialog.close();
+      else show(dialog);
       return;
     }
     const candidates = [...document.querySelectorAll(`[data-key="${CSS.escape(key)}"]`)];

@@ -5,6 +5,14 @@ import { config } from "./config.js";
 import { holderName } from "./store.js";
 
 const RENEW_MS = 1000;
+const NAMES = {
+  claim: "Take the station",
+  give_up: "Give up",
+  request: "Ask for the station",
+  withdraw: "Withdraw",
+  hand_over: "Hand over",
+  decline: "Decline",
+};
 const AWAY_S = 5; // the lease's time to live
 
 export class LeaseControls {
@@ -14,6 +22,7 @@ export class LeaseControls {
   #hiddenAt = 0;
   #title = document.title;
   #awake = null;
+  #refused = 0;
   #before = "unknown";
 
   constructor(store, socket, commands) {
@@ -32,7 +41,8 @@ export class LeaseControls {
 
   /** The server answered a renewal; the station's own state says the rest. */
   renewed({ ok, reason }) {
-    if (!ok && this.#store.lease === "mine") this.#commands.say(`Lease not renewed: ${reason}`, "refused");
+    this.#refused = ok || this.#store.lease !== "mine" ? 0 : this.#refused + 1;
+    if (this.#refused > 1) this.#commands.say(`Lease not renewed: ${reason}`, "refused"); // once: it was just handed over
   }
 
   #draw() {
@@ -56,7 +66,7 @@ export class LeaseControls {
     const button = event.target.closest("[data-lease][type='button']");
     if (!button) return;
     const content = button.dataset.request ? { request: Number(button.dataset.request) } : {};
-    await this.#act(button.dataset.lease, button.textContent.trim(), content);
+    await this.#act(button.dataset.lease, NAMES[button.dataset.lease], content);
   }
 
   async #taken(event) {

@@ -27,9 +27,11 @@ export class Scene3D {
 
   constructor(element, geometry) {
     if (!window.MeshCat) throw new Error("the viewer script did not load");
-    this.#viewer = new window.MeshCat.Viewer(element);
+    const renderer = drawing(element);
+    this.software = drawnBySoftware(renderer);
+    this.#viewer = new window.MeshCat.Viewer(element, undefined, renderer);
     this.#viewer.gui.domElement.remove();
-    this.#viewer.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 1.5));
+    renderer.setPixelRatio(this.software ? 1 : Math.min(window.devicePixelRatio, 1.5));
     this.#fitTo(element);
     this.#views = new Views(this.#viewer);
     this.#geometry = geometry;
@@ -108,7 +110,7 @@ export class Scene3D {
 
   #ground() {
     const THREE = three();
-    const grid = new THREE.GridHelper(4, 40, css("--edge"), css("--scene-grid"));
+    const grid = new THREE.GridHelper(4, 40, css("--scene-grid"), css("--scene-grid"));
     grid.rotateX(Math.PI / 2);
     grid.position.z = -0.04;
     this.#add("Grid", grid);
@@ -160,10 +162,29 @@ export class Scene3D {
     const radius = box.getSize(corner).length() / 2;
     const ahead = desk ? [desk.centre[0], desk.centre[1]] : [0, 1];
     const length = Math.hypot(...ahead) || 1;
-    this.#views.frame(centre.toArray(), radius * 1.05, length > 1e-6 ? ahead.map((value) => value / length) : [0, 1]);
+    this.#views.frame(centre.toArray(), radius * 1.12, length > 1e-6 ? ahead.map((value) => value / length) : [0, 1]);
     this.#framed = true;
     this.view("all");
   }
+}
+
+/** Edges are smoothed where a graphics card does it; in software that would cost more than all the rest. */
+function drawing(element) {
+  const THREE = three();
+  let renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
+  if (drawnBySoftware(renderer)) {
+    renderer.dispose();
+    renderer.forceContextLoss();
+    renderer = new THREE.WebGLRenderer({ antialias: false, alpha: true });
+  }
+  element.append(renderer.domElement);
+  return renderer;
+}
+
+function drawnBySoftware(renderer) {
+  const gl = renderer.getContext();
+  const names = gl.getExtension("WEBGL_debug_renderer_info");
+  return names !== null && /swiftshader|llvmpipe|software/i.test(gl.getParameter(names.UNMASKED_RENDERER_WEBGL));
 }
 
 function place(groups, numbers, from) {

@@ -4,7 +4,7 @@ import { get } from "../site/api.js";
 import { config } from "./config.js";
 import { Scene3D } from "./scene3d.js";
 
-/** Resolves to {poses(numbers, count), bench(truth)}, which do nothing where there is no scene. */
+/** Resolves to {poses(numbers, count), bench(truth), software}; the first two do nothing where there is no scene. */
 export async function scenePane() {
   const note = document.getElementById("scene-note");
   try {
@@ -15,11 +15,12 @@ export async function scenePane() {
     return {
       poses: (numbers, count) => scene.setPoses(numbers, count),
       bench: (truth) => scene.setBench(truth),
+      software: scene.software,
     };
   } catch (error) {
     note.textContent = `No 3D scene: ${error.message}. Everything else works without it.`;
     console.error(error);
-    return { poses() {}, bench() {} };
+    return { poses() {}, bench() {}, software: false };
   }
 }
 

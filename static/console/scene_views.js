@@ -3,7 +3,7 @@
 import { three } from "./scene_shapes.js";
 
 const FIELD = 38; // degrees, of the smaller side
-const WRIST = { behind: 0.22, above: 0.1, ahead: 0.06 }; // m from a fingertip
+const WRIST = { behind: 0.16, aside: 0.3, ahead: 0.03 }; // m from a fingertip
 
 function inThree([x, y, z]) {
   return new (three().Vector3)(x, z, -y);
@@ -49,12 +49,13 @@ export class Views {
     this.#look(direction);
   }
 
-  /** Stay behind a fingertip with world matrix `tip` (16, column by column; z the way it points). */
+  /** Stay close to a fingertip with world matrix `tip` (16, column by column; z the way it points). */
   follow(tip) {
-    const at = (along, up) => [0, 1, 2].map((axis) => tip[12 + axis] + along * tip[8 + axis] + (axis === 2 ? up : 0));
-    const back = at(-WRIST.behind, WRIST.above);
-    const aside = Math.abs(tip[10]) > 0.8 ? 0.12 : 0; // from straight above: a little from the front
-    this.#place([back[0] + aside * this.#ahead[0], back[1] + aside * this.#ahead[1], back[2]], at(WRIST.ahead, 0));
+    const [at, way] = [tip.slice(12, 15), tip.slice(8, 11)];
+    const upright = Math.abs(way[2]); // 1 where it points straight down: then look at it from ahead
+    const aside = [this.#ahead[0] * upright, this.#ahead[1] * upright, 0.6 * (1 - upright)];
+    const eye = at.map((value, axis) => value - WRIST.behind * way[axis] + WRIST.aside * aside[axis]);
+    this.#place(eye, at.map((value, axis) => value + WRIST.ahead * way[axis]));
   }
 
   #look(direction) {

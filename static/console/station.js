@@ -19,7 +19,8 @@ import { current, mark } from "./steps.js";
 import { Store } from "./store.js";
 import { TrialPanel } from "./trial.js";
 
-const nothing = { poses() {}, bench() {}, add() {}, joints() {} };
+const nothing = { poses() {}, bench() {}, add() {}, joints() {}, software: false };
+const SOFTWARE_FRAME_MS = 80; // a browser without a graphics card shares the processor with the robot's programs
 
 /** The panes that need time to load; until then their data goes nowhere. */
 const panes = { scene: nothing, curves: nothing };
@@ -37,6 +38,15 @@ async function draw(frame, store, cameras) {
   if (streams.state) store.setSnapshot(streams.state.json);
   if (streams.joints) panes.curves.add(t, vectors(frame, streams.joints));
   if (streams.poses) panes.scene.poses(frame.numbers(streams.poses), streams.poses.shape.length > 2 ? streams.poses.shape[0] : 1);
+  if (panes.scene.software) await pace();
+}
+
+let due = 0; // when the next frame may be asked for, on this page's clock [ms]
+
+function pace() {
+  const now = performance.now();
+  due = Math.max(now, due + SOFTWARE_FRAME_MS);
+  return new Promise((resolve) => setTimeout(resolve, due - now));
 }
 
 function vectors(frame, { json, arrays }) {

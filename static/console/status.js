@@ -84,12 +84,12 @@ function drawFigures(store, snapshot) {
 function drawPolicy(policy) {
   const { latency_p50_ms: p50, latency_p90_ms: p90, answers } = policy;
   if (!answers || p50 === null) {
-    write("policy", `${policy.kind}: no answer yet`);
+    write("policy", "policy: no answer yet");
     return;
   }
   const title = `Inference latency of the last ${answers} answers: median ${figure(p50, 0, "ms")}, 90 % within ${figure(p90, 0, "ms")}`;
   for (const element of shown("policy")) {
-    if (!element.querySelector(".latency")) element.innerHTML = '<span class="latency"><i></i></span><span></span>';
+    if (!element.querySelector(".latency")) element.innerHTML = '<span class="muted">policy</span><span class="latency"><i></i></span><span></span>';
     element.title = title;
     element.style.setProperty("--p50", Math.min(1, p50 / 400));
     element.style.setProperty("--p90", Math.min(1, p90 / 400));

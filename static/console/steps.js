@@ -21,7 +21,11 @@ export function mark(steps, now) {
     if (here) done = false;
     const place = here ? "now" : done ? "done" : "later";
     if (step.dataset.place !== place) step.dataset.place = place;
-    if (here) step.setAttribute("aria-current", "step");
-    else step.removeAttribute("aria-current");
+    if (!here) step.removeAttribute("aria-current");
+    else if (!step.hasAttribute("aria-current")) {
+      step.setAttribute("aria-current", "step");
+      if (step.previousElementSibling) step.scrollIntoView({ block: "nearest" });
+      else step.closest(".controls-scroll").scrollTop = 0;
+    }
   }
 }

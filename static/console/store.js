@@ -24,7 +24,13 @@ export class Store {
   }
 
   tell(name, content) {
-    for (const listener of this.#listeners.get(name) ?? []) listener(content);
+    for (const listener of this.#listeners.get(name) ?? []) {
+      try {
+        listener(content);
+      } catch (error) {
+        reportError(error); // one pane that fails must not take the others with it
+      }
+    }
   }
 
   setSnapshot(snapshot) {

@@ -44,7 +44,7 @@ export class TrialPanel {
     this.#clock(snapshot, Number(limit));
     for (const word of this.#panel.querySelectorAll("[data-truth]")) {
       const reached = snapshot.truth?.milestones?.[word.dataset.truth];
-      word.textContent = reached === undefined ? "" : `bench says ${reached ? "reached" : "not reached"}`;
+      word.textContent = reached === undefined ? "" : ` · bench: ${reached ? "reached" : "not reached"}`;
     }
     scoreRule();
   }
@@ -76,7 +76,7 @@ export class TrialPanel {
     const form = event.target.closest("#score");
     if (!form) return;
     event.preventDefault();
-    const save = form.querySelector('[type="submit"]');
+    const save = saveButton();
     if (save.getAttribute("aria-disabled") === "true") this.#commands.say(save.title, "refused");
     else this.#do("Save score", () => this.#score(form));
   }
@@ -131,6 +131,10 @@ function saved(form) {
   form.dispatchEvent(new Event("eva:saved", { bubbles: true }));
 }
 
+function saveButton() {
+  return document.querySelector('[type="submit"][form="score"]');
+}
+
 /** Say what the ticks come to, and why they cannot be saved yet; a success has nothing that went wrong. */
 function scoreRule() {
   const form = document.getElementById("score");
@@ -138,9 +142,9 @@ function scoreRule() {
   const required = [...form.querySelectorAll('[data-required="yes"]')];
   const choice = form.elements.success;
   const success = required.length ? required.every((box) => box.checked) : choice.value === "" ? null : choice.value === "yes";
-  const verdict = form.querySelector('[data-show="verdict"]');
+  const verdict = form.querySelector(".verdict");
   verdict.textContent = success === null ? "Success? Say yes or no." : success ? "Success" : "No success";
   verdict.dataset.verdict = String(success);
   form.elements.failure.disabled = success === true;
-  form.querySelector('[type="submit"]').dataset.blocked = success === null ? "say whether it was a success" : "";
+  saveButton().dataset.blocked = success === null ? "say whether it was a success" : "";
 }

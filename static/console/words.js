@@ -14,7 +14,7 @@ export const ADVICE = {
   },
   faulted: {
     title: "E-stop is latched",
-    advice: "Make the bench safe, then release and set up again.",
+    advice: "After the release, set up again.",
     buttons: ["release"],
   },
 };
