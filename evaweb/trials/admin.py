@@ -61,8 +61,11 @@ class PositionInline(admin.StackedInline):
     form = PositionForm
     extra = 0
     min_num = 1
-    validate_min = True
     fields = (("number", "label"), "description", "bench")
+
+    def get_formset(self, request: HttpRequest, obj: Scene | None = None, **named: Any) -> Any:
+        """A scene without a position could not be tried."""
+        return super().get_formset(request, obj, **{"validate_min": True, **named})
 
 
 class MilestoneInline(admin.TabularInline):

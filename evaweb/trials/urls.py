@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
-from django.urls import URLPattern
+from django.urls import path
 
-urlpatterns: list[URLPattern] = []
+from evaweb.trials import views
+
+urlpatterns = [
+    path("result/", views.result, name="result"),
+    path("result/trials/<int:id>/", views.trial, name="result-trial"),
+    path("result/trials/<int:id>/score", views.score, name="result-score"),
+    path("result/trials/<int:id>/void", views.void, name="result-void"),
+]

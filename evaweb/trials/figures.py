@@ -1,0 +1,76 @@
+"""What the result pages draw, computed here so that templates only place it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import groupby
+
+from evaweb.trials.models import Scene
+from evaweb.trials.selectors import StatisticsRow
+from evaweb.trials.statistics import Proportion
+
+_WIDTH, _PAD = 200, 6
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """A rate and its interval on an axis of 200 units; `words` say the same to those who cannot see it."""
+
+    rate: float
+    low: float
+    high: float
+    words: str
+
+    @property
+    def span(self) -> float:
+        """How wide the interval is."""
+        return round(self.high - self.low, 2)
+
+    @property
+    def mark(self) -> float:
+        """Where the mark of the rate begins, which is 3 units wide."""
+        return round(self.rate - 1.5, 2)
+
+
+@dataclass(frozen=True, slots=True)
+class SceneFigure:
+    """One table of the result page: a scene and its checkpoints, and how many of their trials were scored."""
+
+    scene: Scene
+    rows: tuple[tuple[StatisticsRow, Bar | None], ...]
+    n: int
+
+
+def bar(found: Proportion) -> Bar | None:
+    """The bar of a proportion; None where nothing is known."""
+    if found.rate is None or found.interval is None:
+        return None
+    words = f"{percent(found.rate)} of {found.n}, 95 % interval {interval(found)}"
+    return Bar(_x(found.rate), _x(found.interval.low), _x(found.interval.high), words)
+
+
+def scene_figures(rows: Iterable[StatisticsRow]) -> list[SceneFigure]:
+    """One per scene, in the order of the rows."""
+    figures = []
+    for _, group in groupby(rows, key=lambda row: row.scene.pk):
+        found = list(group)
+        drawn = tuple((row, bar(row.summary.success)) for row in found)
+        figures.append(SceneFigure(found[0].scene, drawn, sum(row.summary.success.n for row in found)))
+    return figures
+
+
+def percent(share: float) -> str:
+    """A share as whole percent."""
+    return f"{100 * share:.0f} %"
+
+
+def interval(found: Proportion) -> str:
+    """The ends of the interval in whole percent, without the sign: "49 to 94"."""
+    if found.interval is None:
+        return ""
+    return f"{100 * found.interval.low:.0f} to {100 * found.interval.high:.0f}"
+
+
+def _x(share: float) -> float:
+    return round(_PAD + share * (_WIDTH - 2 * _PAD), 2)

@@ -1,0 +1,143 @@
+"""The result pages: what the trials say, and one trial with everything that is known of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from typing import Any
+
+from django.core.paginator import Paginator
+from django.http import HttpRequest, HttpResponse
+from django.shortcuts import redirect, render
+from django.views.decorators.http import require_GET, require_POST
+
+from evaweb.episodes.selectors import stage_of
+from evaweb.errors import EvaError
+from evaweb.roles import Role, role_of
+from evaweb.stations.selectors import station_list
+from evaweb.trials import lifecycle, selectors, services
+from evaweb.trials.figures import scene_figures
+from evaweb.trials.lifecycle import Move
+from evaweb.trials.models import Trial, TrialStatus
+from evaweb.trials.selectors import TrialFilters
+
+PER_PAGE = 50
+
+
+@require_GET
+def result(request: HttpRequest) -> HttpResponse:
+    """Success per scene and checkpoint, then the trials; the filters are in the address."""
+    filters, fault = _filters(request.GET)
+    rows = selectors.statistics(replace(filters, status=""))  # which is about the list of trials
+    context = {
+        "figures": scene_figures(rows),
+        "page": Paginator(selectors.trial_list(filters), PER_PAGE).get_page(request.GET.get("page")),
+        "chosen": asdict(filters),
+        "query": _query(filters),
+        "fault": fault,
+        "scenes": selectors.scene_list(all_of_them=True).prefetch_related(None),
+        "checkpoints": selectors.checkpoint_list(all_of_them=True),
+        "stations": station_list(all_of_them=True),
+        "evaluations": selectors.evaluation_list(),
+        "statuses": TrialStatus.choices,
+    }
+    fragment = request.headers.get("HX-Request") and not request.headers.get("HX-History-Restore-Request")
+    return render(request, "trials/body.html" if fragment else "trials/result.html", context)
+
+
+@require_GET
+def trial(request: HttpRequest, id: int) -> HttpResponse:
+    """One trial."""
+    return _trial_page(request, id)
+
+
+@require_POST
+def score(request: HttpRequest, id: int) -> HttpResponse:
+    """Score it, or correct its score; what was typed stays where that cannot be done."""
+    found = selectors.trial_get(id=id)
+    ticked = set(request.POST.getlist("milestone"))
+    milestones = {key: str(key) in ticked for key in found.scene.milestones.values_list("pk", flat=True)}
+    given = {name: request.POST.get(name, "") for name in ("note", "failure", "reason")}
+    try:
+        services.trial_score(
+            user=request.user,  # type: ignore[arg-type]
+            trial=found,
+            milestones=milestones,
+            success={"yes": True, "no": False}.get(request.POST.get("success", "")),
+            **given,
+        )
+    except EvaError as fault:
+        typed = {**given, "milestones": milestones, "success": request.POST.get("success", "")}
+        return _trial_page(request, id, fault=fault, typed=typed)
+    return redirect("result-trial", id=id)
+
+
+@require_POST
+def void(request: HttpRequest, id: int) -> HttpResponse:
+    """Take it out of the count."""
+    reason = request.POST.get("void_reason", "")
+    try:
+        services.trial_void(
+            user=request.user,  # type: ignore[arg-type]
+            trial=selectors.trial_get(id=id),
+            reason=reason,
+        )
+    except EvaError as fault:
+        return _trial_page(request, id, fault=fault, typed={"void_reason": reason})
+    return redirect("result-trial", id=id)
+
+
+def _trial_page(
+    request: HttpRequest, id: int, fault: EvaError | None = None, typed: Mapping[str, Any] | None = None
+) -> HttpResponse:
+    found = selectors.trial_get(id=id)
+    operator = role_of(request.user) is not Role.VIEWER
+    milestones = list(found.scene.milestones.order_by("order"))
+    context = {
+        "trial": found,
+        "episode": found.episode,
+        "stage": stage_of(episode=found.episode) if found.episode else None,
+        "scores": list(found.scores.all()),
+        "truth": sorted((found.truth or {}).get("milestones", {}).items()),
+        "milestones": [(milestone, _ticked(found, milestone.pk, typed)) for milestone in milestones],
+        "implied": any(milestone.required for milestone in milestones),
+        "may_score": operator and lifecycle.allows(found, Move.SCORE),
+        "may_void": operator and lifecycle.allows(found, Move.VOID),
+        "attempts": selectors.attempts_of(trial=found),
+        "commands": selectors.commands_of(trial=found),
+        "fault": fault,
+        "typed": typed or _as_scored(found),
+    }
+    return render(request, "trials/trial.html", context, status=fault.status if fault else 200)
+
+
+def _ticked(trial: Trial, milestone: int, typed: Mapping[str, Any] | None) -> bool:
+    """Whether its box is ticked: as it was typed, else as it was last scored."""
+    if typed and "milestones" in typed:
+        return bool(typed["milestones"].get(milestone))
+    outcomes = trial.scores.all()[0].outcomes.all() if trial.verdict_id else ()
+    return any(outcome.reached for outcome in outcomes if outcome.milestone_id == milestone)
+
+
+def _as_scored(trial: Trial) -> dict[str, Any]:
+    """A correction begins with what was said before."""
+    verdict = trial.verdict
+    if verdict is None:
+        return {}
+    success = "yes" if verdict.success else "no"
+    return {"note": verdict.note, "failure": verdict.failure, "success": success}
+
+
+def _filters(given: Mapping[str, str]) -> tuple[TrialFilters, EvaError | None]:
+    """The filters of the address; where they name what does not exist, none of them and the sentence."""
+    names = ("evaluation", "checkpoint", "scene", "station", "status", "since")
+    filters = TrialFilters(**{name: given.get(name, "").strip() for name in names})
+    try:
+        filters.apply(Trial.objects.all())
+    except EvaError as fault:
+        return TrialFilters(), fault
+    return filters, None
+
+
+def _query(filters: TrialFilters) -> dict[str, str]:
+    return {name: value for name, value in asdict(filters).items() if value}

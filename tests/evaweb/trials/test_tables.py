@@ -1,0 +1,55 @@
+import pytest
+from django.core.exceptions import ValidationError
+
+from evaweb.trials.tables import check_bench, check_policy
+
+
+@pytest.mark.parametrize(
+    "policy",
+    [{}, {"url": "ws://10.0.0.1:8000"}, {"kind": "openpi", "image_size": [224, 224]}, {"kind": "mock"}],
+)
+def test_policies_that_a_deployment_could_have_pass(policy):
+    check_policy(policy)
+
+
+@pytest.mark.parametrize(
+    ("policy", "sentence"),
+    [
+        ([], "allowed: a table such as"),
+        ("ws://10.0.0.1", "allowed: a table such as"),
+        ({"kind": "gpt"}, "kind = 'gpt'; allowed: mock, openpi"),
+        ({"kind": "openpi", "urll": "x"}, "urll: unknown key for kind 'openpi'; allowed: kind, url"),
+        ({"kind": "openpi", "url": "http://x"}, "url = 'http://x': "),
+        ({"nonsense": 1}, "nonsense: unknown key"),
+    ],
+)
+def test_other_policies_are_refused_with_what_is_allowed(policy, sentence):
+    with pytest.raises(ValidationError) as refused:
+        check_policy(policy)
+    assert sentence in " ".join(refused.value.messages)
+
+
+@pytest.mark.parametrize(
+    "bench", [None, {}, {"block": [0.1, 0.3, 45]}, {"block": [0, 0, 0], "plate": [-0.1, 0.3]}]
+)
+def test_benches_that_can_be_pass(bench):
+    check_bench(bench)
+
+
+@pytest.mark.parametrize(
+    ("bench", "sentence"),
+    [
+        ([1], "allowed: a table such as"),
+        ({"cup": [0, 0]}, "cup: unknown key; allowed: block, plate"),
+        ({"block": [0, 0]}, "block = [0, 0]; allowed: 3 numbers: [x, y, yaw in degrees]"),
+        ({"plate": [0, "a"]}, "allowed: 2 numbers"),
+        ({"plate": [0, True]}, "allowed: 2 numbers"),
+        ({"plate": [0, float("nan")]}, "allowed: 2 numbers"),
+        ({"plate": 3}, "allowed: 2 numbers"),
+        ({"plate": [300, 0]}, "at most 2 from the middle"),
+    ],
+)
+def test_other_benches_are_refused_with_what_is_allowed(bench, sentence):
+    with pytest.raises(ValidationError) as refused:
+        check_bench(bench)
+    assert sentence in " ".join(refused.value.messages)
