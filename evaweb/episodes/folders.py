@@ -40,6 +40,11 @@ def datasets_dir() -> Path:
     return data_dir() / "datasets"
 
 
+def scores_dir() -> Path:
+    """What raters said, a file per episode."""
+    return data_dir() / "scores"
+
+
 def scores_file(uuid: UUID) -> Path:
     """What raters said of an episode, a line each."""
-    return data_dir() / "scores" / f"{uuid}.jsonl"
+    return scores_dir() / f"{uuid}.jsonl"

@@ -67,6 +67,7 @@ def reconcile_all(work: Work) -> Mapping[str, Any]:
         "made": report.made,
         "missing": report.missing,
         "published": report.published,
+        "restored": report.restored,
         "problems": list(report.problems),
     }
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from email.utils import formatdate, parsedate_to_datetime
 from os import stat_result
 
-_RANGE = re.compile(r"bytes=\s*(\d*)-(\d*)\s*", re.IGNORECASE)
+_RANGE = re.compile(r"bytes=\s*(\d*)-(\d*)\s*", re.IGNORECASE | re.ASCII)
 _DIGITS = 18  # enough for any file; int() of a longer header would only cost time
 
 

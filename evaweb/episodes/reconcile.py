@@ -3,19 +3,38 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 from uuid import UUID
 
 from evaweb.episodes import services
-from evaweb.episodes.folders import data_dir, datasets_dir, episodes_dir
+from evaweb.episodes.folders import data_dir, datasets_dir, episodes_dir, scores_dir
 from evaweb.episodes.models import Episode
+from evaweb.episodes.publishing import score_lines
+from evaweb.errors import EvaError
 from runtime.datasets.catalog import Catalog
 from runtime.datasets.layout import EVA_EPISODES
 from runtime.recording.files import RecordingError
 
 log = logging.getLogger(__name__)
+
+Lines = Sequence[Mapping[str, Any]]
+Restorer = Callable[[UUID, Lines], int]
+
+_restorers: list[Restorer] = []
+
+
+def restores_scores(function: Restorer) -> Restorer:
+    """Declare who understands the lines of DATA/scores/<uuid>.jsonl: an app above this one, from its `ready`.
+
+    It is given all whole lines of one file, makes the rows that are not there, and returns how many.
+    """
+    if function not in _restorers:
+        _restorers.append(function)
+    return function
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +45,7 @@ class Report:
     made: int  # rows that were not there
     missing: int  # rows whose folder is not on this disk
     published: int  # rows that are in a dataset
+    restored: int  # verdicts that were not in the database, brought back from the files of scores
     problems: tuple[str, ...]
 
 
@@ -42,6 +62,7 @@ def reconcile() -> Report:
             read.append(uuid)
     missing = services.missing_marked()
     problems += _datasets()
+    restored = _scores(problems)
     for problem in problems:
         log.warning("%s", problem)
     return Report(
@@ -49,6 +70,7 @@ def reconcile() -> Report:
         made=len(set(read) - before),
         missing=missing,
         published=Episode.objects.exclude(dataset_index=None).count(),
+        restored=restored,
         problems=tuple(problems),
     )
 
@@ -95,3 +117,15 @@ def _places(folder: Path) -> None:
         row = Episode.objects.filter(uuid=line["uuid"])
         if not row.filter(**place).exists():
             row.update(**place, published_at=published_at)
+
+
+def _scores(problems: list[str]) -> int:
+    """Give every file of scores to who understands it; what cannot be restored is added to `problems`."""
+    restored = 0
+    for file in sorted(scores_dir().glob("*.jsonl")):
+        try:
+            lines = list(score_lines(file))
+            restored += sum(restore(UUID(file.stem), lines) for restore in _restorers)
+        except (RecordingError, EvaError, ValueError) as error:
+            problems.append(f"{file}: {error}")
+    return restored

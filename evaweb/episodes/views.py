@@ -133,7 +133,7 @@ def episode_poses(request: HttpRequest, uuid: UUID) -> HttpResponse:
     """Where the robot's parts were from row ?first= on, as one message of evaweb.frames."""
     episode = episode_get(uuid=uuid)
     first = request.GET.get("first", "0")
-    if not first.isdecimal() or len(first) > 9:
+    if not (first.isascii() and first.isdecimal()) or len(first) > 9:
         raise EvaError(f"first = {first!r:.40}; allowed: a whole number from 0")
     return _message(lambda: poses(journal_folder(uuid), episode.robot, int(first)))
 

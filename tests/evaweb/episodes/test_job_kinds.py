@@ -245,7 +245,14 @@ def test_the_job_reconcile_tells_what_it_found(closed: Closed, data: Path) -> No
     job = jobs.enqueue(kind="reconcile", key="reconcile", args={})
     jobs.work("lab")
     job.refresh_from_db()
-    assert job.result == {"episodes": 1, "made": 1, "missing": 0, "published": 0, "problems": []}
+    assert job.result == {
+        "episodes": 1,
+        "made": 1,
+        "missing": 0,
+        "published": 0,
+        "restored": 0,
+        "problems": [],
+    }
     shutil.rmtree(data / "episodes" / str(episode.uuid))
     again = jobs.enqueue(kind="reconcile", key="reconcile", args={})
     jobs.work("lab")

@@ -1,0 +1,36 @@
+"""Episodes in the admin pages: to look at, and to ask anew for their preview."""
+
+from __future__ import annotations
+
+from django.contrib import admin, messages
+from django.db.models import QuerySet
+from django.http import HttpRequest
+
+from evaweb.episodes import services
+from evaweb.episodes.models import Episode
+
+
+@admin.register(Episode)
+class EpisodeAdmin(admin.ModelAdmin):
+    """The folders are the authority: rows are written by services alone."""
+
+    list_display = ("uuid", "status", "station", "kind", "checkpoint", "started_at", "frames", "dataset")
+    list_filter = ("status", "kind", "station", "checkpoint")
+    search_fields = ("uuid", "task", "checkpoint", "operator")
+    list_select_related = ("station",)
+    actions = ("preview_again",)
+
+    @admin.action(description="Make the previews anew", permissions=("view",))
+    def preview_again(self, request: HttpRequest, episodes: QuerySet) -> None:
+        for episode in episodes:
+            services.preview_asked(episode=episode)
+        self.message_user(request, f"{len(episodes)} asked for", messages.SUCCESS)
+
+    def has_add_permission(self, request: HttpRequest) -> bool:
+        return False
+
+    def has_change_permission(self, request: HttpRequest, obj: Episode | None = None) -> bool:
+        return False
+
+    def has_delete_permission(self, request: HttpRequest, obj: Episode | None = None) -> bool:
+        return False

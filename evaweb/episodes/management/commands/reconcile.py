@@ -1,0 +1,25 @@
+"""manage.py reconcile: reads the data folder into the database."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django.core.management.base import BaseCommand
+
+from evaweb.episodes.reconcile import reconcile
+
+
+class Command(BaseCommand):
+    """Can be run at any time, also while everything is running; a second run changes nothing."""
+
+    help = "Makes the database say what the data folder holds: episodes, datasets, scores."
+
+    def handle(self, *args: Any, **options: Any) -> None:
+        report = reconcile()
+        for problem in report.problems:
+            self.stderr.write(self.style.WARNING(problem))
+        self.stdout.write(
+            f"{report.episodes} episodes read, {report.made} of them new to the database; "
+            f"{report.missing} missing on this disk; {report.published} in datasets; "
+            f"{report.restored} verdicts restored; {len(report.problems)} problems"
+        )

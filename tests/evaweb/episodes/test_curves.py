@@ -1,0 +1,140 @@
+"""Curves and poses: what is drawn is what was recorded, on the clock of the videos."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaweb.episodes import poses as posing
+from evaweb.episodes.curves import curves, held_spans
+from evaweb.episodes.poses import poses
+from evaweb.errors import NotFound
+from evaweb.frames import decode
+from evaweb.stations.geometry import looks_of
+from runtime.recording.files import RecordingError
+from runtime.recording.reader import open_episode
+from tests.runtime.station import STANDS, Station, column, plan
+
+
+@pytest.fixture(scope="module")
+def folder(recorded: dict[str, Path]) -> Path:
+    return recorded["finished"]
+
+
+def test_every_tick_has_what_was_measured_asked_for_and_sent(folder: Path) -> None:
+    frame, episode = decode(curves(folder)), open_episode(folder)
+    time = frame.array("ticks", "time")
+    assert time[0] == 0
+    assert np.allclose(time, np.arange(len(time)) / 30)
+    assert frame.header["frames"] == episode.frames
+    assert frame.header["joints"][7] == "right_arm.joint0"
+    assert (frame.header["units"][0], frame.header["units"][6]) == ("rad", "m")
+    assert np.array_equal(frame.array("ticks", "measured").T, column(episode.ticks, "qpos"))
+    assert np.array_equal(frame.array("ticks", "executed").T, column(episode.ticks, "executed"))
+    smoothed = frame.array("ticks", "smoothed").T
+    steps = column(episode.ticks, "step").tolist()
+    asked = column(episode.smoothed, "step").tolist()
+    places = [steps.index(step) for step in asked]
+    assert np.array_equal(smoothed[places], column(episode.smoothed, "smoothed"))
+    others = sorted(set(range(len(steps))) - set(places))
+    assert others
+    assert np.isnan(smoothed[others]).all()
+
+
+def test_the_policys_own_rows_lie_at_the_step_they_were_meant_for(folder: Path) -> None:
+    frame, episode = decode(curves(folder)), open_episode(folder)
+    used = [row for row in episode.raw.to_pylist() if row["target_step"] >= 0]
+    first = episode.ticks["step"][0].as_py()
+    assert len(used) > 10
+    assert np.allclose(frame.array("raw", "time"), [(row["target_step"] - first) / 30 for row in used])
+    assert np.array_equal(
+        frame.array("raw", "values").T, np.array([row["action"] for row in used], np.float32)
+    )
+    assert frame.array("raw", "chunk").tolist() == [row["chunk_id"] for row in used]
+    assert frame.header["streams"]["raw"]["json"]["spaces"] == ["joint"]
+
+
+def test_held_spans_and_events_are_on_the_same_clock(folder: Path) -> None:
+    frame, episode = decode(curves(folder)), open_episode(folder)
+    sources = column(episode.rows, "control_source").tolist()
+    held = sum(round((to - since) * 30) for since, to in frame.header["held"])
+    assert held == sources.count("hold") + sources.count("none") > 0
+    marks = {mark["text"].split(" by ")[0]: mark["time"] for mark in frame.header["marks"]}
+    halted = next(since for since, to in frame.header["held"] if since > 0)
+    assert marks["halt"] == pytest.approx(halted, abs=1.5 / 30)
+    assert marks["run"] == 0
+
+
+@pytest.mark.parametrize(
+    ("sources", "spans"),
+    [
+        ([], []),
+        (["policy"], []),
+        (["hold"], [[0.0, 0.1]]),
+        (["policy", "hold", "none", "policy", "hold"], [[0.1, 0.3], [0.4, 0.5]]),
+    ],
+)
+def test_spans_of_rows_in_which_nobody_asked(sources: list[str], spans: list[list[float]]) -> None:
+    assert np.allclose(held_spans(sources, 10.0), spans)
+
+
+def test_a_policy_that_speaks_in_poses_has_no_raw_joint_curve(tmp_path: Path) -> None:
+    made = plan(tmp_path, space="eef")
+    eef_of = made.spaces().eef_of
+    stands = replace(made, rows=lambda seen, number: eef_of(np.tile(STANDS, (20, 1))))
+    bench = Station(stands)
+    bench.running(12)
+    frame = decode(curves(bench.stop().path))
+    assert frame.header["streams"]["raw"]["json"]["spaces"] == ["eef"]
+    assert frame.header["streams"]["raw"]["json"]["rows"] > 0
+    assert frame.array("raw", "values").shape == (14, 0)
+    assert np.isfinite(frame.array("ticks", "executed")).all()
+
+
+def test_poses_are_those_of_the_measured_joints_and_come_in_parts(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(posing, "MOST_ROWS", 10)
+    episode = open_episode(folder)
+    looks = looks_of("agilex_piper")
+    wanted = looks.scene.poses(column(episode.rows, "qpos").astype(np.float64))
+    for first, count in ((0, 10), (20, episode.frames - 20)):
+        frame = decode(poses(folder, "agilex_piper", first))
+        found = frame.array("poses")
+        assert found.shape == (count, len(looks.scene.parts), 16)
+        matrices = found.reshape(count, -1, 4, 4).swapaxes(-1, -2)  # column by column
+        assert np.allclose(matrices, wanted[first : first + count], atol=1e-6)
+        assert frame.header["rows"] == episode.frames
+
+
+@pytest.mark.parametrize("robot", ["", "nobody", "../agilex_piper", "/etc"])
+def test_a_robot_that_is_not_known_is_named(folder: Path, robot: str) -> None:
+    with pytest.raises(NotFound, match="agilex_piper"):
+        poses(folder, robot, 0)
+
+
+@pytest.mark.parametrize("first", [-1, 24, 5000])
+def test_a_row_that_there_is_not_is_refused(folder: Path, first: int) -> None:
+    with pytest.raises(NotFound, match="has rows 0 to 23"):
+        poses(folder, "agilex_piper", first)
+
+
+def test_a_robot_that_nobody_knows_any_more_leaves_curves_without_units(put: object) -> None:
+    folder = put()  # type: ignore[operator]
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["robot"]["name"] = "retired"
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    assert decode(curves(folder)).header["units"] == [""] * 14
+
+
+def test_a_table_of_zeros_has_no_curve_and_rows_that_are_missing_are_told(put: object) -> None:
+    folder = put()  # type: ignore[operator]
+    (folder / "ticks.arrow").write_bytes(bytes(100))
+    assert decode(curves(folder)).array("ticks", "time").size == 0
+    (folder / "rows.arrow").unlink()
+    with pytest.raises(RecordingError, match=r"rows\.arrow is damaged: 0 rows readable"):
+        curves(folder)

@@ -1,0 +1,147 @@
+"""Reconcile: a database that was lost comes back from the disk, and a second run changes nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from uuid import UUID
+
+import pytest
+from django.core.management import call_command
+
+from evaweb.episodes import reconcile as reconciling
+from evaweb.episodes import services
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.reconcile import reconcile
+from evaweb.jobs import services as jobs
+from evaweb.jobs.models import Job
+from evaweb.stations.models import Station
+
+pytestmark = pytest.mark.django_db
+
+
+def everything() -> list[dict[str, object]]:
+    rows = Episode.objects.order_by("uuid").values()
+    return [{name: value for name, value in row.items() if name != "published_at"} for row in rows]
+
+
+def test_a_lost_database_comes_back_with_stations_previews_and_datasets(
+    closed: Callable[..., Episode], data: Path
+) -> None:
+    for status in ("finished", "interrupted"):
+        episode = closed(status)
+        scores = data / "scores" / f"{episode.uuid}.jsonl"
+        scores.parent.mkdir(exist_ok=True)
+        scores.write_text('{"kind": "score", "success": true}\n')
+        services.publish_asked(episode=episode)
+    jobs.work("lab")
+    before = {row.uuid: row for row in Episode.objects.all()}
+    Episode.objects.all().delete()
+    Station.objects.all().delete()
+    Job.objects.all().delete()
+    report = reconcile()
+    assert (report.episodes, report.made, report.missing, report.published) == (2, 2, 0, 2)
+    assert report.problems == ()
+    for row in Episode.objects.select_related("station"):
+        was = before[row.uuid]
+        for name in ("status", "reason", "frames", "duration_s", "task", "robot", "cameras", "dataset"):
+            assert getattr(row, name) == getattr(was, name), name
+        assert row.dataset_index == was.dataset_index
+        assert row.previewed_at is not None
+        assert row.station.name == "bench"
+    assert not Job.objects.exists(), "nothing is missing, so nothing is asked for"
+    found = everything()
+    assert reconcile().made == 0
+    assert everything() == found
+
+
+def test_a_folder_that_comes_back_is_not_missing_any_more(
+    closed: Callable[..., Episode], data: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    episode = closed()
+    elsewhere = tmp_path_factory.mktemp("elsewhere") / "kept"
+    folder = data / "episodes" / str(episode.uuid)
+    shutil.move(folder, elsewhere)
+    assert reconcile().missing == 1
+    shutil.move(elsewhere, folder)
+    assert reconcile().missing == 0
+    episode.refresh_from_db()
+    assert episode.status == EpisodeStatus.FINISHED
+
+
+def test_what_cannot_be_read_is_told_and_keeps_no_other(
+    put: Callable[..., Path], data: Path, station: Station
+) -> None:
+    put()
+    damaged = put("interrupted")
+    (damaged / "manifest.json").write_bytes(b"\0\0\0")
+    (data / "episodes" / "notes").mkdir()
+    broken = data / "datasets" / "other" / "meta"
+    broken.mkdir(parents=True)
+    (broken / "info.json").write_text('{"codebase_version": "v9"}')
+    report = reconcile()
+    assert report.episodes == 1
+    assert Episode.objects.count() == 1
+    told = " ".join(report.problems)
+    assert f"{damaged / 'manifest.json'} is not a whole JSON document" in told
+    assert f"{data / 'episodes' / 'notes'} is no episode: its name is no uuid" in told
+    assert "is a dataset of version 'v9'" in told
+
+
+def test_a_manifest_of_another_episode_is_not_taken_for_this_one(
+    put: Callable[..., Path], station: Station
+) -> None:
+    folder, other = put(), put("interrupted")
+    shutil.copy(other / "manifest.json", folder / "manifest.json")
+    report = reconcile()
+    assert f"is of episode {other.name}, not of {folder.name}" in report.problems[0]
+    assert [str(row.uuid) for row in Episode.objects.all()] == [other.name]
+
+
+def test_a_damaged_folder_leaves_the_row_that_was_read_before(
+    closed: Callable[..., Episode], data: Path
+) -> None:
+    episode = closed()
+    (data / "episodes" / str(episode.uuid) / "outcome.json").write_text(json.dumps({"status": "x"}))
+    assert len(reconcile().problems) == 1
+    episode.refresh_from_db()
+    assert (episode.status, episode.frames) == (EpisodeStatus.FINISHED, 24)
+
+
+def test_an_empty_lab_has_nothing_to_reconcile(data: Path, db: None) -> None:
+    report = reconcile()
+    assert (report.episodes, report.made, report.missing, report.problems) == (0, 0, 0, ())
+
+
+def test_scores_go_to_who_understands_them_and_a_stranger_is_told(
+    data: Path, db: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[tuple[UUID, list[object]]] = []
+
+    def restore(uuid: UUID, lines: object) -> int:
+        given.append((uuid, list(lines)))  # type: ignore[call-overload]
+        return len(given[-1][1])
+
+    monkeypatch.setattr(reconciling, "_restorers", [restore])
+    identity = "c86a888b-6d03-4355-9e03-66fd3445e50b"
+    (data / "scores").mkdir()
+    (data / "scores" / f"{identity}.jsonl").write_text('{"success": true}\n[1]\n{"success": fal\n{"a": 1}\n')
+    (data / "scores" / "notes.jsonl").write_text("{}\n")
+    report = reconcile()
+    assert report.restored == 2
+    assert given == [(UUID(identity), [{"success": True}, {"a": 1}])]
+    assert len(report.problems) == 1
+    assert "notes.jsonl" in report.problems[0]
+
+
+def test_the_command_says_what_it_found(
+    put: Callable[..., Path], db: None, data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    put()
+    (data / "episodes" / "notes").mkdir()
+    call_command("reconcile")
+    told = capsys.readouterr()
+    assert told.out.startswith("1 episodes read, 1 of them new to the database; 0 missing on this disk")
+    assert "notes is no episode" in told.err

@@ -1,0 +1,333 @@
+"""Pages and files of episodes, as a browser asks for them."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from asgiref.sync import async_to_sync
+from django.contrib.auth.models import Group, User
+from django.test import AsyncClient, Client
+from django.urls import reverse
+
+from evaweb.episodes import streaming
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.frames import decode
+from evaweb.jobs import services as jobs
+from evaweb.jobs.models import Job
+from evaweb.stations.models import Station
+
+pytestmark = pytest.mark.django_db
+
+
+@pytest.fixture
+def user() -> User:
+    made = User.objects.create_user("ann")
+    made.groups.add(Group.objects.get(name="operator"))
+    return made
+
+
+@pytest.fixture
+def browser(client: Client, user: User) -> Client:
+    client.force_login(user)
+    return client
+
+
+Fetch = Callable[..., tuple[int, dict[str, str], bytes]]
+
+
+@pytest.fixture
+def fetch(user: User) -> Fetch:
+    """Ask over ASGI, as daphne does: status, headers, all pieces together."""
+    client = AsyncClient()
+    client.force_login(user)
+
+    async def ask(method: str, path: str, headers: dict[str, str]) -> tuple[int, dict[str, str], bytes]:
+        answer = await client.generic(method, path, headers=headers)
+        pieces = [piece async for piece in answer.streaming_content] if answer.streaming else [answer.content]
+        return answer.status_code, dict(answer.headers), b"".join(pieces)
+
+    def run(path: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
+        named = {name.replace("_", "-"): value for name, value in headers.items()}
+        return async_to_sync(ask)(method, path, named)
+
+    return run
+
+
+def video_of(episode: Episode, camera: str = "cam_high") -> str:
+    return reverse("episode-video", args=[episode.uuid, camera])
+
+
+def file_of(episode: Episode, data: Path, camera: str = "cam_high") -> bytes:
+    return (data / "previews" / str(episode.uuid) / f"{camera}.mp4").read_bytes()
+
+
+# --- videos --------------------------------------------------------------------------------------------------
+
+
+def test_a_whole_video_says_that_it_can_be_had_in_parts(previewed: Episode, data: Path, fetch: Fetch) -> None:
+    content = file_of(previewed, data)
+    status, headers, body = fetch(video_of(previewed))
+    assert (status, body) == (200, content)
+    assert headers["Accept-Ranges"] == "bytes"
+    assert headers["Content-Type"] == "video/mp4"
+    assert headers["Content-Length"] == str(len(content))
+    assert headers["ETag"].startswith('"')
+    assert headers["Last-Modified"].endswith("GMT")
+
+
+@pytest.mark.parametrize(("asked", "first", "last"), [("10-19", 10, 20), ("-7", -7, None), ("5-", 5, None)])
+def test_a_part_is_exactly_those_bytes(
+    previewed: Episode, data: Path, fetch: Fetch, asked: str, first: int, last: int | None
+) -> None:
+    content = file_of(previewed, data)
+    status, headers, body = fetch(video_of(previewed), Range=f"bytes={asked}")
+    assert (status, body) == (206, content[first:last])
+    begins = len(content) + first if first < 0 else first
+    assert headers["Content-Range"] == f"bytes {begins}-{begins + len(body) - 1}/{len(content)}"
+    assert headers["Content-Length"] == str(len(body))
+
+
+def test_a_range_behind_the_end_is_refused_with_the_length(
+    previewed: Episode, data: Path, fetch: Fetch
+) -> None:
+    size = len(file_of(previewed, data))
+    status, headers, body = fetch(video_of(previewed), Range=f"bytes={size}-")
+    assert (status, body) == (416, b"")
+    assert headers["Content-Range"] == f"bytes */{size}"
+
+
+@pytest.mark.parametrize("asked", ["bytes=5-2", "bytes=0-1,4-5", "frames=1-2"])
+def test_what_is_no_single_range_gets_the_whole(
+    previewed: Episode, data: Path, fetch: Fetch, asked: str
+) -> None:
+    status, _, body = fetch(video_of(previewed), Range=asked)
+    assert (status, body) == (200, file_of(previewed, data))
+
+
+def test_a_long_part_comes_in_pieces_and_ends_early_so_that_nothing_piles_up(
+    previewed: Episode, data: Path, fetch: Fetch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(streaming, "PIECE", 100)
+    monkeypatch.setattr(streaming, "LONGEST_PART", 250)
+    content = file_of(previewed, data)
+    status, headers, body = fetch(video_of(previewed), Range="bytes=0-")
+    assert (status, body) == (206, content[:250])
+    assert headers["Content-Range"] == f"bytes 0-249/{len(content)}"
+    assert fetch(video_of(previewed))[2] == content
+
+
+def test_the_head_has_no_body_and_knows_no_ranges(previewed: Episode, data: Path, fetch: Fetch) -> None:
+    status, headers, body = fetch(video_of(previewed), "HEAD", Range="bytes=0-5")
+    assert (status, body) == (200, b"")
+    assert headers["Content-Length"] == str(len(file_of(previewed, data)))
+
+
+def test_a_browser_that_has_it_is_told_so(previewed: Episode, fetch: Fetch) -> None:
+    _, headers, _ = fetch(video_of(previewed))
+    assert fetch(video_of(previewed), If_None_Match=headers["ETag"])[0] == 304
+    assert fetch(video_of(previewed), If_Modified_Since=headers["Last-Modified"])[0] == 304
+    assert fetch(video_of(previewed), If_None_Match='"older"')[0] == 200
+
+
+def test_a_part_of_an_older_version_gets_the_whole_of_the_new_one(
+    previewed: Episode, data: Path, fetch: Fetch
+) -> None:
+    _, headers, _ = fetch(video_of(previewed))
+    assert fetch(video_of(previewed), Range="bytes=0-3", If_Range=headers["ETag"])[0] == 206
+    status, _, body = fetch(video_of(previewed), Range="bytes=0-3", If_Range='"older"')
+    assert (status, body) == (200, file_of(previewed, data))
+
+
+def test_nothing_can_be_written_there(previewed: Episode, fetch: Fetch) -> None:
+    status, headers, _ = fetch(video_of(previewed), "PUT")
+    assert status in (403, 405)
+    assert "ETag" not in headers
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        "cam_low",
+        "..%2F..%2Feva.sqlite3",
+        "%2e%2e",
+        "..",
+        "../cam_high",
+        "cam_high.mp4",
+        "%00",
+        "cam_high%00",
+        "/etc/passwd",
+    ],
+)
+def test_a_camera_that_the_row_does_not_name_never_reaches_the_disk(
+    previewed: Episode, fetch: Fetch, camera: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Path] = []
+    monkeypatch.setattr(streaming, "_open", opened.append)
+    assert fetch(f"/episodes/{previewed.uuid}/video/{camera}")[0] == 404
+    assert opened == []
+
+
+@pytest.mark.parametrize("identity", ["..", "%2e%2e", "not-a-uuid", "c86a888b"])
+@pytest.mark.parametrize("what", ["thumbnail", "video/cam_high", "curves", "poses"])
+def test_an_address_without_a_uuid_does_not_exist(fetch: Fetch, identity: str, what: str) -> None:
+    assert fetch(f"/episodes/{identity}/{what}")[0] == 404
+
+
+@pytest.mark.parametrize("what", ["thumbnail", "video/cam_high", "curves", "poses"])
+def test_a_folder_that_the_database_does_not_know_is_not_shown(
+    put: Callable[..., Path], fetch: Fetch, what: str
+) -> None:
+    folder = put()
+    status, _, body = fetch(f"/episodes/{folder.name}/{what}")
+    assert status == 404
+    assert f"episode {folder.name} does not exist in this lab" in body.decode()
+
+
+def test_a_video_that_is_not_there_is_named(closed: Callable[..., Episode], fetch: Fetch) -> None:
+    status, _, body = fetch(video_of(closed()))
+    assert status == 404
+    assert "cam_high.mp4 of this episode is not on this machine" in body.decode()
+
+
+@pytest.mark.parametrize("name", ["episode-thumbnail", "episode-curves", "episode-poses", "replay"])
+def test_nobody_sees_an_episode_without_logging_in(previewed: Episode, client: Client, name: str) -> None:
+    answer = client.get(reverse(name, args=[previewed.uuid]))
+    assert answer.status_code == 302
+    assert answer["Location"].startswith("/login/")
+
+
+def test_the_thumbnail_is_a_picture(previewed: Episode, fetch: Fetch) -> None:
+    status, headers, body = fetch(reverse("episode-thumbnail", args=[previewed.uuid]))
+    assert (status, headers["Content-Type"], body[:2]) == (200, "image/jpeg", b"\xff\xd8")
+
+
+# --- messages ------------------------------------------------------------------------------------------------
+
+
+def test_curves_and_poses_are_messages(previewed: Episode, browser: Client) -> None:
+    curves = decode(browser.get(reverse("episode-curves", args=[previewed.uuid])).content)
+    assert curves.header["frames"] == previewed.frames
+    poses = decode(browser.get(reverse("episode-poses", args=[previewed.uuid]), {"first": "20"}).content)
+    assert poses.header["first"] == 20
+    assert poses.array("poses").shape[0] == previewed.frames - 20
+
+
+@pytest.mark.parametrize(("first", "status"), [("-1", 400), ("x", 400), ("9" * 12, 400), ("5000", 404)])
+def test_a_row_that_is_none_is_refused(previewed: Episode, browser: Client, first: str, status: int) -> None:
+    answer = browser.get(reverse("episode-poses", args=[previewed.uuid]), {"first": first})
+    assert answer.status_code == status
+    assert answer.json()["error"]
+
+
+def test_a_damaged_journal_is_a_sentence_with_its_file(
+    previewed: Episode, data: Path, browser: Client
+) -> None:
+    (data / "episodes" / str(previewed.uuid) / "manifest.json").write_text("{")
+    answer = browser.get(reverse("episode-curves", args=[previewed.uuid]))
+    assert answer.status_code == 409
+    assert "manifest.json is not a whole JSON document" in answer.json()["error"]
+
+
+# --- pages ---------------------------------------------------------------------------------------------------
+
+
+def page_of(browser: Client, episode: Episode) -> str:
+    answer = browser.get(reverse("replay", args=[episode.uuid]), headers={"Accept": "text/html"})
+    assert answer.status_code == 200
+    return answer.content.decode()
+
+
+def test_the_page_has_a_video_for_each_camera_and_no_stop(previewed: Episode, browser: Client) -> None:
+    page = page_of(browser, previewed)
+    assert page.count("<video ") == 3
+    assert 'data-stage="ready"' in page
+    assert "estop" not in page
+
+
+def test_an_episode_with_one_camera_has_one_video(previewed: Episode, browser: Client) -> None:
+    Episode.objects.update(cameras=["cam_high"])
+    assert page_of(browser, previewed).count("<video ") == 1
+
+
+def test_the_page_waits_for_the_preview_and_goes_on_by_itself(
+    closed: Callable[..., Episode], browser: Client
+) -> None:
+    episode = closed()
+    page = page_of(browser, episode)
+    assert "The preview is being made" in page
+    assert 'hx-trigger="every 1s"' in page
+    address = reverse("replay-stage", args=[episode.uuid])
+    assert "HX-Refresh" not in browser.get(address)
+    jobs.work("lab")
+    assert browser.get(address)["HX-Refresh"] == "true"
+
+
+def test_an_episode_that_is_being_written_says_so(station: Station, data: Path, browser: Client) -> None:
+    episode = Episode.objects.create(station=station)
+    assert "This episode is still being written" in page_of(browser, episode)
+
+
+def test_an_episode_whose_folder_is_gone_says_what_to_do(
+    station: Station, data: Path, browser: Client
+) -> None:
+    episode = Episode.objects.create(station=station, status=EpisodeStatus.MISSING)
+    assert "missing on the disk" in page_of(browser, episode)
+    assert "manage.py reconcile" in page_of(browser, episode)
+
+
+def test_a_preview_that_failed_is_asked_for_anew(
+    closed: Callable[..., Episode], data: Path, browser: Client, user: User
+) -> None:
+    episode = closed()
+    Job.objects.update(status="failed", error="cam_high.mp4 is cut off")
+    assert "cam_high.mp4 is cut off" in page_of(browser, episode)
+    address = reverse("replay-preview", args=[episode.uuid])
+    assert browser.get(address).status_code == 405
+    assert browser.post(address).status_code == 302
+    assert Job.objects.filter(status="queued").count() == 1
+    user.groups.clear()
+    assert browser.post(address).status_code == 403
+
+
+def test_an_unknown_episode_is_a_page_with_a_sentence(browser: Client) -> None:
+    answer = browser.get(reverse("replay", args=[uuid.uuid4()]), headers={"Accept": "text/html"})
+    assert answer.status_code == 404
+    assert "does not exist in this lab" in answer.content.decode()
+
+
+def test_an_empty_list_says_how_to_fill_it(db: Any, browser: Client) -> None:
+    assert "Nothing has been recorded yet" in browser.get("/replay/").content.decode()
+
+
+def test_the_list_shows_how_each_stands_and_looks_again_while_something_goes_on(
+    previewed: Episode, station: Station, browser: Client
+) -> None:
+    page = browser.get("/replay/").content.decode()
+    assert f'data-episode="{previewed.uuid}" data-stage="ready"' in page
+    assert "hx-trigger" not in page
+    Episode.objects.create(station=station)
+    page = browser.get("/replay/").content.decode()
+    assert 'hx-trigger="every 3s"' in page
+    rows = browser.get("/replay/", headers={"HX-Request": "true"}).content.decode()
+    assert rows.startswith("<tbody")
+
+
+@pytest.mark.parametrize(
+    ("query", "count"),
+    [
+        ({"words": "CUPS"}, 1),
+        ({"words": "cups nowhere"}, 0),
+        ({"station": "bench"}, 1),
+        ({"station": "other"}, 0),
+        ({"status": "finished"}, 1),
+        ({"status": "failed"}, 0),
+        ({"page": "99"}, 1),
+        ({"page": "x"}, 1),
+    ],
+)
+def test_the_list_is_filtered(previewed: Episode, browser: Client, query: dict[str, str], count: int) -> None:
+    assert browser.get("/replay/", query).content.decode().count("data-episode=") == count
