@@ -10,7 +10,7 @@ import logging
 from typing import Any
 
 from channels.db import database_sync_to_async
-from django.db import DatabaseError
+from django.db import Error
 from django.db.models import Count, Max, Q
 
 from evaweb.episodes.models import Episode, EpisodeStatus
@@ -26,7 +26,7 @@ async def look(station: str) -> Marks | None:
     """The marks of the station now; None where the database does not answer: nothing live depends on it."""
     try:
         return await database_sync_to_async(marks, thread_sensitive=False)(station)
-    except DatabaseError as error:
+    except Error as error:
         log.warning("the database does not say what has changed: %s", error)
         return None
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from django.db import DatabaseError, InterfaceError, close_old_connections
+from django.db import Error, close_old_connections
 from django.db.models import Q
 
 from evaweb.console.feed import Feeds, History, feeds
@@ -66,7 +66,7 @@ class Scribe:
             try:
                 self._write()
                 self._failing = False
-            except (DatabaseError, InterfaceError) as error:
+            except Error as error:
                 self._again(error)
             except Exception:  # a station of another version must not silence the thread for good
                 log.exception("what happens at %s cannot be written down", self._station)
@@ -161,7 +161,7 @@ def _hand_on(station: Station, boot: str, event: Mapping[str, Any]) -> None:
         if event["kind"] == "episode_closed":
             episodes.episode_closed(station=station, data=event["data"])
         trials.run_changed(station=station, event=event, boot=boot)
-    except (DatabaseError, InterfaceError):
+    except Error:
         raise
     except Exception:
         log.exception("event %s of %s (%s) is not in the database", event["number"], station, event["text"])
@@ -192,7 +192,7 @@ class Chronicle:
             try:
                 self._look()
                 failing = False
-            except (DatabaseError, InterfaceError) as error:
+            except Error as error:
                 if not failing:
                     log.warning("the database does not say which stations there are: %s", error)
                 failing = True

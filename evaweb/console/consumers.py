@@ -1,7 +1,7 @@
 """The live socket of a page on a station.
 
-Watching needs the database once, when the socket opens. Renewing a lease and pressing the e-stop never do: they
-have threads of their own, and go straight to the runtime.
+Watching needs the database once, when the socket opens. Renewing a lease and stopping never do: they have
+threads of their own, and go straight to the runtime.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 from urllib.parse import parse_qs
+from uuid import UUID
 
 from channels.db import database_sync_to_async
 from channels.generic.websocket import AsyncWebsocketConsumer
@@ -21,7 +22,7 @@ from channels.generic.websocket import AsyncWebsocketConsumer
 from evaweb.console import requests
 from evaweb.console.hub import Room, hub
 from evaweb.console.mailbox import Mailbox
-from evaweb.console.requests import BadRequest, Credit, EStop, Events, Renew, Request, Watch
+from evaweb.console.requests import BadRequest, Credit, EStop, Events, Renew, Request, Stop, Watch
 from evaweb.errors import NotFound, StationGone
 from evaweb.roles import Role, role_of
 from evaweb.stations import commands, leases
@@ -33,7 +34,7 @@ log = logging.getLogger(__name__)
 BAD_REQUEST, NO_LOGIN, NO_STATION = 4400, 4401, 4404  # codes of a closed socket, after those of HTTP
 _MOST_ERRORS = 20
 _renewals = ThreadPoolExecutor(8, "renew")
-_stops = ThreadPoolExecutor(8, "estop")
+_stops = ThreadPoolExecutor(8, "stop")
 _under_way: set[asyncio.Task[None]] = set()  # they go on when the page is closed
 
 
@@ -112,6 +113,8 @@ class StationConsumer(AsyncWebsocketConsumer):
         assert self._mailbox is not None
         if isinstance(request, EStop):
             _go_on(self._press(request))
+        elif isinstance(request, Stop):
+            _go_on(self._stop(request))
         elif isinstance(request, Renew):
             if not self._renewing:  # else the one before has no answer yet
                 self._renewing = True
@@ -127,24 +130,25 @@ class StationConsumer(AsyncWebsocketConsumer):
 
     async def _press(self, request: EStop) -> None:
         """Press and say what came of it; then write it down."""
-        press = partial(
-            commands.estop,
-            station=self._station.name,
-            username=self._username,
-            why=request.why,
-            uuid=request.uuid,
-        )
+        name, why, uuid = self._station.name, request.why, request.uuid
+        press = partial(commands.estop, station=name, username=self._username, why=why, uuid=uuid)
         answer = await asyncio.get_running_loop().run_in_executor(_stops, press)
-        said = {"uuid": str(request.uuid), "status": answer.status.value, "reason": answer.reason}
-        self._say({"type": "ack", "kind": "estop", **said})
-        await _in_database(
-            commands.estop_noted,
-            user=self._user,
-            station=self._station,
-            why=request.why,
-            uuid=request.uuid,
-            answer=answer,
-        )
+        self._acknowledge("estop", uuid, answer)
+        note = partial(commands.estop_noted, why=why, uuid=uuid, answer=answer)
+        await _in_database(note, user=self._user, station=self._station)
+
+    async def _stop(self, request: Stop) -> None:
+        """Stop or halt and say what came of it; then write it down."""
+        given = {"kind": request.kind, "page": self._page, "epoch": request.epoch, "uuid": request.uuid}
+        stop = partial(commands.stop, station=self._station.name, username=self._username, **given)
+        answer = await asyncio.get_running_loop().run_in_executor(_stops, stop)
+        self._acknowledge(request.kind, request.uuid, answer)
+        note = partial(commands.stop_noted, answer=answer, **given)
+        await _in_database(note, user=self._user, station=self._station)
+
+    def _acknowledge(self, kind: str, uuid: UUID, answer: commands.Answer) -> None:
+        said = {"kind": kind, "uuid": str(uuid), "status": answer.status.value, "reason": answer.reason}
+        self._say({"type": "ack", **said})
 
     async def _renew(self, request: Renew) -> None:
         """Pass the page's sign of life on; `lost`: the runtime says that the lease has ended."""

@@ -48,6 +48,15 @@ class EStop:
 
 
 @dataclass(frozen=True, slots=True)
+class Stop:
+    """Stop or halt, under the lease of this epoch."""
+
+    kind: str
+    uuid: UUID
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
 class Events:
     """Send the events of `boot` after a number; where it is no longer that boot, all; "" is the present one."""
 
@@ -55,7 +64,7 @@ class Events:
     boot: str
 
 
-Request = Watch | Credit | Renew | EStop | Events
+Request = Watch | Credit | Renew | EStop | Stop | Events
 
 
 def parse(text: str, cameras: Collection[str]) -> Request:
@@ -97,17 +106,27 @@ def _text(said: Mapping[str, Any], key: str, default: str) -> str:
 
 def _estop(said: Mapping[str, Any]) -> EStop:
     """Pressing is never refused for what else the message says."""
-    why, uuid = said.get("why"), said.get("uuid")
+    why = said.get("why")
+    return EStop(_uuid(said), why[:_LONGEST_WHY] if isinstance(why, str) and why else "pressed")
+
+
+def _stop(kind: str) -> Callable[[Mapping[str, Any]], Stop]:
+    return lambda said: Stop(kind, _uuid(said), _whole(said, "epoch"))
+
+
+def _uuid(said: Mapping[str, Any]) -> UUID:
+    """The page's own, so that it knows the answer; one of ours where it gave none."""
     try:
-        identity = UUID(str(uuid))
+        return UUID(str(said.get("uuid")))
     except ValueError:
-        identity = uuid4()
-    return EStop(identity, why[:_LONGEST_WHY] if isinstance(why, str) and why else "pressed")
+        return uuid4()
 
 
 _READ: dict[str, Callable[[Mapping[str, Any]], Request]] = {
     "credit": lambda said: Credit(),
     "renew": lambda said: Renew(_whole(said, "epoch")),
     "estop": _estop,
+    "stop": _stop("stop"),
+    "halt": _stop("halt"),
     "events": lambda said: Events(_whole(said, "after"), _text(said, "boot", "")),
 }

@@ -14,7 +14,7 @@ from typing import Any
 from uuid import UUID, uuid4
 
 from django.conf import settings
-from django.db import DatabaseError, IntegrityError, transaction
+from django.db import Error, IntegrityError, transaction
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, StationGone
@@ -110,6 +110,22 @@ def estop_noted(*, user: Any, station: Station, why: str, uuid: UUID | str, answ
     return _noted(row, answer)
 
 
+def stop(*, kind: str, station: str, username: str, page: str, epoch: int, uuid: UUID | str) -> Answer:
+    """Stop or halt, without the database: the runtime itself knows who has the lease."""
+    holder = holder_of(username, page)
+    command = messages.Command(str(uuid), kind, user=username, holder=holder, epoch=epoch)
+    return _stopped(command, station)
+
+
+def stop_noted(
+    *, user: Any, station: Station, kind: str, page: str, epoch: int, uuid: UUID | str, answer: Answer
+) -> Command:
+    """The row of a stop or halt that was given."""
+    holder = holder_of(user.get_username(), page)
+    row = Command(uuid=_uuid(uuid), station=station, user=user, kind=kind, holder=holder, epoch=epoch)
+    return _noted(row, answer)
+
+
 def settle(*, row: Command) -> Command:
     """Find out what became of a command whose answer was lost; leaves it as it is where nobody can know yet.
 
@@ -156,7 +172,7 @@ def _give(row: Command) -> Command:
         if first is None:
             raise
         return first
-    except DatabaseError as error:
+    except Error as error:
         raise NotSent(
             f"{row.kind} was not sent: the database does not take it now ({error}); stopping works"
         ) from error
@@ -182,16 +198,17 @@ def _stop(row: Command) -> Command:
     if row.kind == "estop":
         why, username = str(row.args.get("why", "pressed")), row.user.get_username()
         return _noted(row, estop(station=row.station.name, username=username, why=why, uuid=row.uuid))
+    return _noted(row, _stopped(_message(row), row.station.name))
+
+
+def _stopped(command: messages.Command, station: str) -> Answer:
     try:
-        ack = wire_to(row.station.name).urgent(
-            _message(row), "main", "commands", settings.EVA_COMMAND_TIMEOUT_S
-        )
-        answer = _answer_of(ack)
+        timeout = settings.EVA_COMMAND_TIMEOUT_S
+        return _answer_of(wire_to(station).urgent(command, "main", "commands", timeout))
     except NoAnswer as fault:
-        answer = Answer(CommandStatus.UNKNOWN, f"{fault}; the e-stop goes another way")
+        return Answer(CommandStatus.UNKNOWN, f"{fault}; the e-stop goes another way")
     except StationGone as fault:
-        answer = Answer(CommandStatus.FAILED, str(fault))
-    return _noted(row, answer)
+        return Answer(CommandStatus.FAILED, str(fault))
 
 
 def _noted(row: Command, answer: Answer) -> Command:
@@ -208,7 +225,7 @@ def _noted(row: Command, answer: Answer) -> Command:
             return first
     except IntegrityError:  # pressed twice in the same moment: the other one has written it
         return row
-    except DatabaseError as error:
+    except Error as error:
         log.error("%s (%s) is not in the database: %s", row, row.uuid, error)
     return row
 
@@ -231,7 +248,7 @@ def _update(row: Command) -> None:
     """Where the database refuses, `settle` asks the runtime again later."""
     try:
         row.save(update_fields=["status", "reason", "allowed", "data", "answered_at"])
-    except DatabaseError as error:
+    except Error as error:
         log.error(
             "the answer to %s %s (%s) is not in the database: %s", row.kind, row.uuid, row.status, error
         )

@@ -89,9 +89,7 @@ def hand_over(*, user: Any, station: Station, page: str, request: int) -> Lease:
     held = _held(station)
     if (held["holder"], held["epoch"]) != (own.holder, own.epoch):
         raise Conflict(f"the lease has ended: {who(held['holder']) or 'nobody'} has {station} now")
-    lease = _grant(station, asked.holder, _next_epoch(station, held), f"handed over to {asked.user}")
-    _answered(asked, LeaseRequest.Answer.GRANTED)
-    return lease
+    return _grant(station, asked.holder, _next_epoch(station, held), f"handed over to {asked.user}")
 
 
 def take(*, user: Any, station: Station, page: str, reason: str) -> Lease:
@@ -154,13 +152,21 @@ def _tell(station: str, kind: str, holder: str, epoch: int) -> messages.Ack:
 
 
 def _grant(station: Station, holder: str, epoch: int, end_reason: str) -> Lease:
-    """Have the runtime accept the lease, then write it down; raises Conflict where somebody was faster."""
+    """Have the runtime accept the lease, then write it down; raises Conflict where somebody was faster.
+
+    Whoever gets the station has got what they asked for.
+    """
     ack = _tell(station.name, "lease_claim", holder, epoch)
     if ack.status == "refused":
         raise Conflict(f"{station} was not given: {ack.reason}")
     with transaction.atomic():
         _lock(station)
-        return _record(station, holder, epoch, ack.boot, end_reason)[0]
+        lease = _record(station, holder, epoch, ack.boot, end_reason)[0]
+        waiting = LeaseRequest.objects.filter(
+            station=station, user=lease.user, answer=LeaseRequest.Answer.OPEN
+        )
+        waiting.update(answer=LeaseRequest.Answer.GRANTED, answered_at=timezone.now())
+    return lease
 
 
 def _record(station: Station, holder: str, epoch: int, boot: str, end_reason: str) -> tuple[Lease, bool]:

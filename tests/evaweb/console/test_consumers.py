@@ -18,7 +18,7 @@ from evaweb.console import hub as hubs
 from evaweb.frames import decode
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
-from runtime.session import Happening
+from runtime.session import Happening, State
 
 pytestmark = pytest.mark.django_db(transaction=True)
 ALL = ["state", "joints", "poses", "camera/cam_high"]
@@ -206,24 +206,6 @@ def test_who_comes_late_is_shown_the_last_of_everything_at_once(live, ann, vera,
     run(scenario())
 
 
-def test_viewers_of_the_same_are_sent_the_very_same_bytes(live, ann):
-    async def scenario():
-        loop = asyncio.get_running_loop()
-        room = hubs.Room(live.name, live.robot, loop, hubs.feeds)
-        got = [[], []]
-        boxes = [room.join(sent.append) for sent in got]
-        for box in boxes:
-            room.watch(box, ["state"])
-        while not all(any(isinstance(message, bytes) for message in sent) for sent in got):
-            await asyncio.sleep(0.01)
-        first, second = (next(m for m in sent if isinstance(m, bytes)) for sent in got)
-        assert first is second
-        for box in boxes:
-            room.leave(box)
-
-    run(scenario())
-
-
 def test_a_lease_is_renewed_and_a_restarted_web_goes_on_with_it(live, ann, runtime):
     lease = leases.claim(user=ann, station=live, page="p1")
 
@@ -327,6 +309,33 @@ def test_the_estop_waits_neither_for_the_database_nor_for_a_renewal(live, ann, r
     assert order == ["done", "row"]
 
 
+@pytest.mark.parametrize(("kind", "state"), [("stop", "ready"), ("halt", "holding")])
+def test_the_holder_stops_over_the_socket_and_it_is_written_down_later(live, ann, bob, runtime, kind, state):
+    lease = leases.claim(user=ann, station=live, page="p1")
+    runtime.ready()
+    runtime.do(lambda: runtime.session._enter(State.RUNNING, ""))
+    uuid = str(uuid4())
+
+    async def scenario():
+        other = await Page(live.name, bob).open()
+        await other.say(type=kind, uuid=str(uuid4()), epoch=lease.epoch)
+        refused = await other.told("ack")
+        assert (refused["status"], refused["reason"]) == ("refused", "web:ann:p1 holds the lease")
+        await other.close()
+        assert runtime.session.state == "running"
+        page = await Page(live.name, ann).open()
+        await page.say(type=kind, uuid=uuid, epoch=lease.epoch)
+        ack = await page.told("ack")
+        assert (ack["kind"], ack["uuid"], ack["status"]) == (kind, uuid, "accepted")
+        await page.close()
+        await _written()
+
+    run(scenario())
+    assert runtime.session.state == state
+    row = Command.objects.get(pk=uuid)
+    assert (row.kind, row.user, row.holder, row.status) == (kind, ann, "web:ann:p1", CommandStatus.ACCEPTED)
+
+
 def test_an_estop_that_cannot_be_delivered_says_use_the_hardware_stop(ann):
     Station.objects.create(name="switched-off", robot="agilex_piper")
 
@@ -381,15 +390,22 @@ def test_a_station_that_dies_and_comes_back_is_said(live, ann, runtime):
     run(scenario())
 
 
-def test_what_changes_in_the_database_is_said(live, ann, bob, runtime):
+def test_what_changes_in_the_database_is_said(live, ann, bob, runtime, monkeypatch):
     lease = leases.claim(user=ann, station=live, page="p1")
+    looked, look = asyncio.Event(), hubs.changes.look
+
+    async def watched(station):
+        found = await look(station)
+        looked.set()
+        return found
+
+    monkeypatch.setattr(hubs.changes, "look", watched)
+    monkeypatch.setattr(hubs, "_CHANGES_S", 0.05)
 
     async def scenario():
         page = await Page(live.name, ann).open()
-        await page.told("link")
-        await asyncio.sleep(1.2)  # the first look
-        ask = asyncio.to_thread(LeaseRequest.objects.create, station=live, user=bob, holder="web:bob:p2")
-        await ask
+        await looked.wait()
+        await asyncio.to_thread(LeaseRequest.objects.create, station=live, user=bob, holder="web:bob:p2")
         assert (await page.told("changed"))["what"] == ["lease"]
         await page.close()
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaweb.console.requests import BadRequest, Credit, EStop, Events, Renew, Watch, parse
+from evaweb.console.requests import BadRequest, Credit, EStop, Events, Renew, Stop, Watch, parse
 
 CAMERAS = ("cam_high", "cam_left_wrist")
 
@@ -24,6 +24,8 @@ def test_requests_are_read():
     assert said(type="credit") == Credit()
     assert said(type="renew", epoch=3) == Renew(3)
     assert said(type="estop", uuid=str(uuid), why="smoke") == EStop(uuid, "smoke")
+    assert said(type="stop", uuid=str(uuid), epoch=4) == Stop("stop", uuid, 4)
+    assert said(type="halt", uuid=str(uuid), epoch=4) == Stop("halt", uuid, 4)
     assert said(type="events", after=7) == Events(7, "")
     assert said(type="events", after=7, boot="b") == Events(7, "b")
 
@@ -31,7 +33,10 @@ def test_requests_are_read():
 @pytest.mark.parametrize(
     ("message", "sentence"),
     [
-        ({"type": "jump"}, "type 'jump' is unknown; allowed: watch, credit, renew, estop, events"),
+        (
+            {"type": "jump"},
+            "type 'jump' is unknown; allowed: watch, credit, renew, estop, stop, halt, events",
+        ),
         ({"type": "watch", "streams": "state"}, "streams = 'state'; allowed: a list of state, joints"),
         ({"type": "watch", "streams": ["camera/none"]}, "camera/cam_left_wrist"),
         ({"type": "watch", "streams": [["state"]]}, "allowed: a list of"),

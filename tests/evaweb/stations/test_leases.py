@@ -111,6 +111,15 @@ def test_asking_again_is_the_same_request_for_the_newer_page(live, ann, bob):
     assert again.holder == "web:bob:p3"
 
 
+def test_who_gets_a_station_has_got_what_they_asked_for(live, ann, bob):
+    claim(ann, live)
+    asked = leases.request(user=bob, station=live, page="p2")
+    leases.give_up(user=ann, station=live, page="p1")
+    claim(bob, live, "p2")
+    asked.refresh_from_db()
+    assert asked.answer == LeaseRequest.Answer.GRANTED
+
+
 def test_what_nobody_has_is_not_asked_for(live, bob):
     with pytest.raises(Conflict, match="nobody has Bench 1: take it"):
         leases.request(user=bob, station=live, page="p2")
