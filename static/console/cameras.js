@@ -18,6 +18,7 @@ class Camera {
     this.ageText = figure.querySelector(".camera-age");
     this.capturedAt = -Infinity; // on this page's clock [ms]
     this.drawn = []; // when the last pictures were drawn
+    this.drawnAny = false;
   }
 
   draw(picture, seconds) {
@@ -30,6 +31,7 @@ class Camera {
     const now = performance.now();
     this.capturedAt = now - seconds * 1000;
     this.drawn.push(now);
+    this.drawnAny = true;
     this.tell(now);
   }
 
@@ -40,6 +42,7 @@ class Camera {
     this.figure.toggleAttribute("data-stale", stale);
     const text = Number.isFinite(seconds) && stale ? `${age(seconds)} old` : "";
     if (this.ageText.textContent !== text) this.ageText.textContent = text;
+    if (stale) this.freshText.textContent = "";
   }
 
   /** Pictures that this page drew per second. */
@@ -52,7 +55,7 @@ class Camera {
     const shown = this.shownRate(now);
     const known = Number.isFinite(measured);
     const slow = known && measured < SLOW * fastest;
-    const text = known ? `${measured.toFixed(1)} Hz${slow ? " !" : ""}` : "no picture yet";
+    const text = known ? `${measured.toFixed(1)} Hz${slow ? " !" : ""}` : this.drawnAny ? "rate unknown" : "no picture yet";
     const fresh = known && !this.figure.hasAttribute("data-stale") && Number.isFinite(captured);
     this.freshText.textContent = fresh ? `${age(captured)} ago` : "";
     if (this.rateText.textContent !== text) this.rateText.textContent = text;
@@ -71,6 +74,7 @@ export class Cameras {
       this.#cameras.set(camera.name, camera);
     }
     store.on("snapshot", ({ link }) => this.#measured(link));
+    store.on("second", () => store.fresh || this.#measured({ rates: {}, ages: {} }));
     setInterval(() => this.#tell(), 100);
   }
 

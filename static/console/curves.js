@@ -27,6 +27,7 @@ export class Curves {
   #joint = 0;
   #seen = new Set(); // kinds that have come
   #frozen = null;
+  #addedAt = 0; // on this page's clock [ms]
 
   constructor({ element, library, names, units }) {
     this.#element = element;
@@ -52,6 +53,7 @@ export class Curves {
     if (t < this.#trace.newest - 1) this.#trace.clear(); // another server, another clock
     if (t - this.#trace.newest > GAP_S) this.#trace.add(t - 1e-3, {});
     this.#trace.add(t, vectors);
+    this.#addedAt = performance.now();
     for (const kind of Object.keys(vectors)) this.#seen.add(kind);
   }
 
@@ -71,8 +73,14 @@ export class Curves {
     this.#draw(true);
   }
 
+  /** Seconds since something came, where that is worth showing. */
+  get #silence() {
+    const seconds = (performance.now() - this.#addedAt) / 1000;
+    return seconds > GAP_S ? seconds : 0;
+  }
+
   #column() {
-    const newest = this.#trace.newest;
+    const newest = this.#trace.newest + this.#silence; // without news the curve moves on and nothing follows it
     const { times, values } = this.#trace.joint(this.#joint, newest - SECONDS);
     return { times: times.map((t) => t - newest), values };
   }
@@ -93,7 +101,7 @@ export class Curves {
     for (const [index, kind] of KINDS.entries()) {
       const part = document.querySelector(`[data-curve="${kind.name}"]`);
       part.hidden = !this.#seen.has(kind.name);
-      const value = columns[index].at(-1);
+      const value = this.#silence ? NaN : columns[index].at(-1);
       part.lastElementChild.textContent = Number.isFinite(value) ? `${kind.name} ${value.toFixed(3)} ${unit}` : `${kind.name} –`;
     }
   }

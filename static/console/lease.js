@@ -2,7 +2,6 @@
 
 import { post } from "../site/api.js";
 import { config } from "./config.js";
-import { holderName } from "./store.js";
 
 const RENEW_MS = 1000;
 const NAMES = {
@@ -49,7 +48,7 @@ export class LeaseControls {
     const lease = this.#store.fresh ? this.#store.lease : "unknown";
     for (const part of document.querySelectorAll("[data-lease-when]")) part.hidden = part.dataset.leaseWhen !== lease;
     for (const name of document.querySelectorAll("[data-lease-holder]")) {
-      name.textContent = holderName(this.#store.snapshot?.lease.holder ?? "");
+      name.textContent = this.#store.commander;
     }
     document.body.dataset.lease = lease;
     if (lease === this.#before) return;

@@ -3,7 +3,7 @@
 import { three } from "./scene_shapes.js";
 
 const FIELD = 38; // degrees, of the smaller side
-const WRIST = { behind: 0.16, aside: 0.3, ahead: 0.03 }; // m from a fingertip
+const WRIST = { behind: 0.28, aside: 0.4, ahead: 0 }; // m from a fingertip
 
 function inThree([x, y, z]) {
   return new (three().Vector3)(x, z, -y);

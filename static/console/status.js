@@ -1,6 +1,5 @@
 // The status bar and the box that says what a person has to do: state by place, not by pop-up.
 
-import { holderName } from "./store.js";
 import { ADVICE, age, duration, figure, words } from "./words.js";
 
 const shown = (name) => document.querySelectorAll(`[data-show="${name}"]`);
@@ -12,6 +11,7 @@ function write(name, text) {
 /** Keeps the bar true: as news come, and each second for what grows old without news. */
 export function statusBar(store) {
   const draw = () => {
+    document.body.toggleAttribute("data-stale", !store.fresh && store.snapshot !== null);
     drawState(store);
     drawSituation(store);
     if (store.snapshot) drawFigures(store, store.snapshot);
@@ -68,12 +68,16 @@ function part(box, name) {
 
 function drawFigures(store, snapshot) {
   const joints = snapshot.link.ages.joints;
+  if (!store.fresh) {
+    write("transport", `last news ${age(store.age)} ago`);
+    return;
+  }
   write("transport", `${snapshot.transport} ${joints !== null && joints < 1 ? "ok" : `silent ${age(joints ?? Infinity)}`}`);
   drawPolicy(snapshot.policy);
-  const held = { mine: "you", free: "free", other: holderName(snapshot.lease.holder) }[store.lease];
+  const held = { mine: "you", free: "free", other: store.commander }[store.lease];
   write("lease", `lease: ${held}`);
   for (const element of shown("lease")) element.dataset.lease = store.lease;
-  const stage = snapshot.state === "setting_up" && store.fresh ? `${words(snapshot.stage)} …` : "";
+  const stage = snapshot.state === "setting_up" ? `${words(snapshot.stage)} …` : "";
   write("stage", stage);
   for (const element of shown("stage")) element.hidden = !stage;
   const { uuid, rows, repeated } = snapshot.recording;

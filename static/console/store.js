@@ -56,13 +56,14 @@ export class Store {
     return holder === this.holder ? "mine" : "other";
   }
 
+  /** Who has the lease, as people know them. */
+  get commander() {
+    const [kind, name] = (this.snapshot?.lease.holder ?? "").split(":");
+    if (kind !== "web") return this.snapshot?.lease.holder ?? "";
+    return name === this.user ? `${name} (another page)` : name;
+  }
+
   get epoch() {
     return this.snapshot?.lease.epoch ?? 0;
   }
-}
-
-/** A holder of a lease as people know it. */
-export function holderName(holder) {
-  const [kind, name] = holder.split(":");
-  return kind === "web" ? name : holder;
 }
