@@ -15,16 +15,16 @@ from django.http import HttpRequest
 from evaweb.api.models import Token
 from evaweb.roles import Role, grant, role_of
 
-_MEANING = {
-    Role.VIEWER: "viewer: sees everything, presses the e-stop, commands nothing",
-    Role.OPERATOR: "operator: takes stations, runs and scores trials",
-    Role.ADMIN: "admin: also scenes, checkpoints, stations and accounts",
-}
+_MEANINGS = (
+    "A viewer sees everything and can press the e-stop. An operator also takes stations, runs and scores "
+    "trials. An admin also writes scenes, checkpoints, stations and accounts."
+)
 
 
 def _role_field() -> forms.ChoiceField:
+    choices = [(role.value, role.value) for role in Role]
     return forms.ChoiceField(
-        choices=[(role.value, _MEANING[role]) for role in Role], widget=forms.RadioSelect, initial=Role.VIEWER
+        choices=choices, widget=forms.RadioSelect, initial=Role.VIEWER, help_text=_MEANINGS
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from django import forms
 from django.contrib import admin, messages
 from django.core.exceptions import ValidationError
+from django.db import models
 from django.db.models import Count, QuerySet
 from django.http import HttpRequest
 from django.urls import reverse
@@ -23,6 +24,8 @@ from evaweb.trials.models import (
     Score,
     Trial,
 )
+
+_SHORT = {models.TextField: {"widget": forms.Textarea(attrs={"rows": 2, "cols": 80})}}
 
 
 class Table(forms.JSONField):
@@ -92,6 +95,10 @@ class ActiveActions:
         messages.success(request, f"{rows.update(active=False)} switched off")
 
 
+def _trials(n: int) -> str:
+    return "1 trial" if n == 1 else f"{n} trials"
+
+
 @admin.register(Scene)
 class SceneAdmin(ActiveActions, admin.ModelAdmin):
     """A task on a bench, with its positions and milestones."""
@@ -102,6 +109,7 @@ class SceneAdmin(ActiveActions, admin.ModelAdmin):
     prepopulated_fields = {"name": ("title",)}
     inlines = (PositionInline, MilestoneInline)
     save_on_top = True
+    formfield_overrides = _SHORT
     fieldsets = (
         (None, {"fields": (("title", "name"), "instruction", "active")}),
         ("At the bench", {"fields": ("layout", "criterion", "time_limit_s")}),
@@ -136,7 +144,7 @@ class SceneAdmin(ActiveActions, admin.ModelAdmin):
             what = formset.model._meta.verbose_name_plural
             messages.warning(
                 request,
-                f"{trials} trials were made before these {what} were changed. Their scores keep the old ones: "
+                f"{_trials(trials)} made before these {what} were changed keep the old ones in their scores: "
                 "where trials are to be compared, make another scene instead.",
             )
 
@@ -176,6 +184,7 @@ class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
     """A trained policy."""
 
     form = CheckpointForm
+    formfield_overrides = _SHORT
     list_display = ("name", "active", "reached_at", "trials_n", "created_at")
     list_filter = ("active",)
     search_fields = ("name", "description")
@@ -195,8 +204,8 @@ class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
         if trials:
             messages.warning(
                 request,
-                f"{trials} trials of {obj} were made with another policy table. If this is another policy and "
-                "not only another address, make another checkpoint: their trials would be counted together.",
+                f"Checkpoint {obj} has {_trials(trials)} made with another policy table. If this is another policy and "
+                "not only another address, make another checkpoint: all would be counted together.",
             )
 
     @admin.display(description="policy")

@@ -25,6 +25,7 @@ class Scene(models.Model):
     )
     layout = models.TextField(blank=True, help_text="How to lay out the bench before each trial.")
     time_limit_s = models.FloatField(
+        "time limit [s]",
         null=True,
         blank=True,
         validators=[MinValueValidator(1), MaxValueValidator(3600)],

@@ -112,7 +112,7 @@ def test_a_change_of_a_tried_policy_is_warned_about(admin, bench):
     bench.scored()
     form = {"policy": '{"url": "ws://127.0.0.1:9000"}', "active": "on"}
     answer = admin.post(f"/admin/trials/checkpoint/{bench.checkpoint.pk}/change/", form, follow=True)
-    assert "1 trials of pi0-block were made with another policy table" in answer.content.decode()
+    assert "Checkpoint pi0-block has 1 trial made with another policy table" in answer.content.decode()
     bench.checkpoint.refresh_from_db()
     assert (bench.checkpoint.name, bench.checkpoint.policy) == ("pi0-block", {"url": "ws://127.0.0.1:9000"})
 
