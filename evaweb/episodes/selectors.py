@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
 
-from django.db.models import Q, QuerySet
+from django.db.models import F, Q, QuerySet
 
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode, EpisodeStatus
@@ -41,7 +41,8 @@ def episode_get(*, uuid: UUID) -> Episode:
 
 def episode_list(*, station: str = "", status: str = "", words: str = "") -> QuerySet[Episode]:
     """The newest first; `words` are looked for in task, checkpoint, operator, scene and uuid."""
-    found = Episode.objects.select_related(*_WITH)
+    newest = (F("started_at").desc(nulls_last=True), "-created_at")
+    found = Episode.objects.select_related(*_WITH).order_by(*newest)
     if station:
         found = found.filter(station__name=station)
     if status:
@@ -70,8 +71,8 @@ def stage_of(*, episode: Episode) -> Stage:
     if episode.status == EpisodeStatus.MISSING or not journal_folder(episode.uuid).is_dir():
         return Stage(
             "missing",
-            "Its folder is not on this machine: it was moved, or recorded elsewhere. Bring it back and run "
-            "`manage.py reconcile`.",
+            "Its folder is not on this machine: it was moved, or recorded elsewhere. Bring it back, then run "
+            "manage.py reconcile.",
         )
     if not episode.frames:
         return Stage("empty", f"Nothing was recorded: {episode.reason or 'it has no rows'}.")

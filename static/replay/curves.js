@@ -79,17 +79,11 @@ class Pane {
   }
 
   #legend() {
-    const element = document.getElementById("legend");
-    for (const { name, colour } of LEGEND) {
-      const part = document.createElement("span");
-      part.className = "legend";
-      const swatch = document.createElement("i");
-      swatch.style.background = `var(${colour})`;
-      this.#values[name] = document.createElement("span");
-      this.#values[name].textContent = name;
-      part.append(swatch, this.#values[name]);
-      element.append(part);
-    }
+    const { safety } = this.#episode.ticks;
+    for (const { name, colour } of LEGEND) this.#values[name] = entry(name, colour, "line");
+    if (this.#episode.header.held.length) entry("held", "--holding-soft", "patch");
+    if (safety.includes(1)) entry("changed by safety", "--holding", "line");
+    if (safety.includes(2)) entry("refused", "--faulted", "line");
     if (!this.#episode.spaces.includes("joint")) this.#values.raw.textContent = `raw: the policy speaks in ${this.#episode.spaces.join(", ") || "no"} space`;
   }
 
@@ -102,6 +96,20 @@ class Pane {
       this.#values[name].textContent = `${name} ${Number.isFinite(value) ? `${value.toFixed(3)} ${this.#unit}` : "–"}`;
     }
   }
+}
+
+/** Add one entry to the legend; returns where its words stand. */
+function entry(name, colour, shape) {
+  const part = document.createElement("span");
+  part.className = "legend";
+  const swatch = document.createElement("i");
+  swatch.className = shape;
+  swatch.style.background = `var(${colour})`;
+  const words = document.createElement("span");
+  words.textContent = name;
+  part.append(swatch, words);
+  document.getElementById("legend").append(part);
+  return words;
 }
 
 /** Consecutive values of one chunk belong to one line. */
