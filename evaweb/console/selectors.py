@@ -58,6 +58,12 @@ class Panel:
         return any(milestone.required for milestone in self.milestones)
 
     @property
+    def layout(self) -> str:
+        """How to lay out the bench, in words."""
+        scene = self.trial.scene if self.trial else self.scene
+        return scene.layout if scene else ""
+
+    @property
     def last_address(self) -> str:
         """Where the last trial is shown."""
         return f"/result/trials/{self.last.pk}/" if self.last else ""

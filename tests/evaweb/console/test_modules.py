@@ -1,0 +1,168 @@
+"""The page's modules that need no browser, run by Node; frames are those that the server makes."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evaweb.console import parts
+
+MODULES = Path(__file__).parents[3] / "static" / "console"
+NODE = shutil.which("node")
+pytestmark = pytest.mark.skipif(NODE is None, reason="Node is not installed: the page's modules are not run")
+
+
+def run(module: str, body: str, given: Any = None) -> Any:
+    """What `body` returns, where `m` is the module and `given` the argument."""
+    script = (
+        f"const m = await import({json.dumps((MODULES / module).as_uri())});"
+        "const given = JSON.parse((await import('node:fs')).readFileSync(0, 'utf8'));"
+        f"console.log(JSON.stringify(await (async () => {{ {body} }})()));"
+    )
+    assert NODE is not None
+    found = subprocess.run(
+        [NODE, "--input-type=module", "-e", script],
+        input=json.dumps(given),
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert found.returncode == 0, found.stderr
+    return json.loads(found.stdout)
+
+
+def test_a_frame_of_the_server_is_read_with_every_number_and_picture() -> None:
+    rows = np.arange(14, dtype=np.float32) / 8
+    poses = np.arange(2 * 3 * 16, dtype=np.float32).reshape(2, 3, 16)
+    frame = parts.frame(
+        [
+            parts.facts("state", {"state": "running", "nothing": float("nan")}, 1.0),
+            parts.numbers("joints", {"engaged": True}, {"measured": rows, "commanded": -rows}, 1.0),
+            parts.picture("camera/cam_high", b"\xff\xd8jpeg", 1.0),
+            parts.array("poses", poses, 1.0),
+        ],
+        7,
+        1.25,
+    )
+    read = run(
+        "frame.js",
+        """
+        const bytes = Buffer.from(given, "base64");
+        const frame = m.decode(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.length));
+        const { state, joints, poses, "camera/cam_high": picture } = frame.header.streams;
+        return {
+          header: [frame.header.frame, frame.header.t], state: state.json, engaged: joints.json.engaged,
+          measured: [...frame.numbers(joints.arrays.measured)],
+          commanded: [...frame.numbers(joints.arrays.commanded)],
+          shape: poses.shape, poses: [...frame.numbers(poses)],
+          picture: [...frame.bytes(picture)], age: picture.age,
+        };
+        """,
+        base64.b64encode(frame).decode(),
+    )
+
+    assert read["header"] == [7, 1.25]
+    assert read["state"] == {"state": "running", "nothing": None}
+    assert read["engaged"] is True
+    assert read["measured"] == rows.tolist()
+    assert read["commanded"] == (-rows).tolist()
+    assert read["shape"] == [2, 3, 16]
+    assert read["poses"] == poses.ravel().tolist()
+    assert bytes(read["picture"]) == b"\xff\xd8jpeg"
+    assert read["age"] == 0.25
+
+
+@pytest.mark.parametrize("message", [b"", b"\x01", b"\xff\xff\xff\x7f{}"])
+def test_what_is_no_frame_is_refused(message: bytes) -> None:
+    said = run(
+        "frame.js",
+        """
+        const bytes = Uint8Array.from(given);
+        try { m.decode(bytes.buffer); return "read"; }
+        catch (error) { return error instanceof m.BadFrame ? error.message : `not a BadFrame: ${error}`; }
+        """,
+        list(message),
+    )
+
+    assert "bytes" in said
+    assert not said.startswith("not a BadFrame")
+
+
+def test_a_spike_survives_decimation() -> None:
+    flat = [0.0] * 20_000
+    flat[12_345], flat[777] = 9.0, -9.0
+    calm = [float(index % 2) for index in range(20_000)]
+    kept = run("decimate.js", "return m.keep(given, 1200)", [flat, calm])
+
+    assert len(kept) <= 1200
+    assert {777, 12_345} <= set(kept)
+    assert kept == sorted(set(kept))
+
+
+def test_few_points_are_all_kept() -> None:
+    assert run("decimate.js", "return m.keep(given, 1000)", [[1.0, 2.0, 3.0]]) == [0, 1, 2]
+
+
+def test_a_gap_stays_a_gap() -> None:
+    kept = run(
+        "decimate.js",
+        "return m.keep([Array.from({length: 900}, (_, i) => i > 300 && i < 600 ? NaN : i)], 90)",
+    )
+
+    assert any(300 < index < 600 for index in kept)
+
+
+def test_the_trace_keeps_the_newest_rows_and_knows_what_did_not_come() -> None:
+    found = run(
+        "trace.js",
+        """
+        const trace = new m.Trace({ dim: 2, kinds: ["measured", "commanded"], rows: 4 });
+        for (let t = 1; t <= 6; t += 1) trace.add(t, { measured: [t, 10 * t], commanded: t > 4 ? [0, t] : undefined });
+        trace.add(3, { measured: [99, 99] });  // overtaken by newer ones
+        const { times, values } = trace.joint(1, 4);
+        return { newest: trace.newest, times, measured: values.measured, commanded: values.commanded };
+        """,
+    )
+
+    assert found["newest"] == 6
+    assert found["times"] == [4, 5, 6]
+    assert found["measured"] == [40, 50, 60]
+    assert found["commanded"] == [None, 5, 6]  # NaN where nothing was sent
+
+
+@pytest.mark.parametrize(
+    ("panel", "state", "step"),
+    [
+        ({"panel": "eval", "status": "", "setUp": ""}, "idle", "choose"),
+        ({"panel": "eval", "status": "", "setUp": ""}, "ready", "choose"),
+        ({"panel": "eval", "status": "prepared", "setUp": ""}, "ready", "setup"),
+        ({"panel": "eval", "status": "prepared", "setUp": "yes"}, "setting_up", "setup"),
+        ({"panel": "eval", "status": "prepared", "setUp": "yes"}, "ready", "run"),
+        ({"panel": "eval", "status": "prepared", "setUp": "yes"}, "faulted", "setup"),
+        ({"panel": "eval", "status": "running", "setUp": "yes"}, "running", "run"),
+        ({"panel": "eval", "status": "paused", "setUp": "yes"}, "holding", "run"),
+        ({"panel": "eval", "status": "ended", "setUp": "yes"}, "ready", "score"),
+        ({"panel": "debug"}, "idle", "setup"),
+        ({"panel": "debug"}, "ready", "run"),
+        ({"panel": "debug"}, "holding", "run"),
+    ],
+)
+def test_the_step_to_do_now_follows_trial_and_state(panel: dict[str, str], state: str, step: str) -> None:
+    assert run("steps.js", "return m.current(given[0], given[1])", [panel, {"state": state}]) == step
+
+
+def test_an_identity_is_a_random_uuid_of_version_four() -> None:
+    first, second = run("../site/identity.js", "return [m.uuid(), m.uuid()]")
+
+    assert first != second
+    assert first[14] == "4"
+    assert first[19] in "89ab"
+    assert [len(part) for part in first.split("-")] == [8, 4, 4, 4, 12]
