@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from django import template
@@ -33,11 +34,26 @@ def interval(found: Proportion) -> str:
 
 
 @register.filter
-def figure(value: Any) -> str:
-    """A figure of the control loop: numbers short, all else as it is."""
-    if isinstance(value, bool) or not isinstance(value, float):
-        return str(value)
-    return f"{value:.4g}"
+def control_figures(control: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """How well the control loop kept time: label, and value with its unit; those that the episode has."""
+    found = ((label, unit, control.get(key)) for key, (label, unit) in _CONTROL.items())
+    return [(label, f"{_short(value)} {unit}".strip()) for label, unit, value in found if value is not None]
+
+
+_CONTROL = {
+    "rate": ("Rate", "Hz"),
+    "ticks": ("Ticks", ""),
+    "missed": ("Ticks missed", ""),
+    "lateness_p50_ms": ("Lateness, median", "ms"),
+    "lateness_p99_ms": ("Lateness, 99th percentile", "ms"),
+    "lateness_max_ms": ("Lateness, worst", "ms"),
+    "scheduling": ("Scheduling", ""),
+    "records_lost": ("Records lost", ""),
+}
+
+
+def _short(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 @register.filter

@@ -138,7 +138,7 @@ def test_its_videos_are_there_once_they_can_be_played(bench, browser, settings):
     text = page(browser, f"/result/trials/{trial.pk}/")
     assert text.count("<video") == 2
     assert f"/episodes/{uuid}/video/left_wrist" in text
-    assert "0.1235" in text
+    assert "<dt>Lateness, 99th percentile</dt><dd>0.123 ms</dd>" in text
 
 
 def test_a_score_is_given_and_corrected_on_the_page(bench, browser):
