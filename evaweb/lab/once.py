@@ -64,7 +64,7 @@ def perform(visitor: Visitor, choice: Choice) -> Done:
         )["id"]
         page.wait(lambda state: state["lease"]["epoch"] == page.epoch, _STOPPED_S, "waiting for the lease")
         page.command("setup", trial)
-        set_up = page.wait(_settled, _READY_S, "setting up")
+        set_up = page.wait(lambda state: state["state"] != "setting_up", _READY_S, "setting up")
         if set_up["state"] != "ready":
             raise VisitFailed(f"set-up ended {set_up['state']}: {set_up['reason']}")
         page.command("run", trial)
@@ -90,12 +90,6 @@ def perform(visitor: Visitor, choice: Choice) -> Done:
 def report(done: Done) -> dict[str, Any]:
     """The result as JSON."""
     return asdict(done)
-
-
-def _settled(state: Mapping[str, Any]) -> bool:
-    return state["state"] not in ("setting_up", "idle") or bool(
-        state["state"] == "idle" and "failed" in state["reason"]
-    )
 
 
 def _run(page: LivePage, trial: int, limit: float) -> int:

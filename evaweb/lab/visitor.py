@@ -115,6 +115,7 @@ class LivePage:
         self.frames = 0
         self._visitor = visitor
         self._state: Mapping[str, Any] = {}
+        self._decided = ("", 0)  # boot and sequence that our last command was decided by
         self._failure = ""
         self._changed = threading.Condition()
         address = urlsplit(visitor.url)
@@ -132,10 +133,13 @@ class LivePage:
     def wait(
         self, reached: Callable[[Mapping[str, Any]], bool], seconds: float, what: str
     ) -> Mapping[str, Any]:
-        """The first state that satisfies `reached`; VisitFailed with the state where none comes in time."""
+        """The first state that satisfies `reached`; VisitFailed with the state where none comes in time.
+
+        After a command only states count that came about since: an old `ready` is no answer to `setup`.
+        """
         deadline = time.monotonic() + seconds
         with self._changed:
-            while not (self._state and reached(self._state)):
+            while not (self._state and self._is_news() and reached(self._state)):
                 if self._failure:
                     raise VisitFailed(f"{what}: {self._failure}")
                 if not self._changed.wait(deadline - time.monotonic()) and time.monotonic() >= deadline:
@@ -165,8 +169,14 @@ class LivePage:
         }
         if trial is not None:
             content["trial"] = trial
+        decided = (content["boot"], content["sequence"])
         answer: Mapping[str, Any] = self._visitor.post(f"stations/{self.station}/commands", content)
+        self._decided = decided
         return answer
+
+    def _is_news(self) -> bool:
+        boot, sequence = self._decided
+        return self._state["boot"] != boot or self._state["sequence"] > sequence
 
     def close(self) -> None:
         """Close the page; the lease ends by itself."""

@@ -1,0 +1,65 @@
+"""A person at the bench: what they press and what they see."""
+
+from tests.e2e.lab import STATION, eventually
+from tests.e2e.pixels import pixels
+
+
+class BenchPage:
+    """One browser window of one logged-in person; `errors` collects what its scripts complain of."""
+
+    def __init__(self, browser, demo, username, size):
+        self.demo = demo
+        self.context = browser.new_context(viewport=size)
+        self.page = self.context.new_page()
+        self.page.set_default_timeout(30_000)
+        self.errors = []
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("console", lambda said: said.type == "error" and self.errors.append(said.text))
+        self.page.goto(f"{demo.url}/login/")
+        self.page.fill("input[name=username]", username)
+        self.page.fill("input[name=password]", demo.passwords[username])
+        self.page.click("button[type=submit]")
+        self.page.wait_for_url(lambda url: "/login" not in url)
+
+    def open(self, path):
+        self.page.goto(f"{self.demo.url}{path}")
+        return self
+
+    def state(self):
+        """The one word of the status bar."""
+        return self.page.locator(".status-state .state").inner_text().strip().upper()
+
+    def reaches(self, word, seconds=60):
+        eventually(lambda: word in self.state(), seconds, f"the status bar says {word}, not {self.state()}")
+
+    def take(self):
+        self.page.click("[data-lease=claim]")
+        self.page.locator("[data-lease-when=mine]").wait_for()
+
+    def press(self, command):
+        self.page.locator(f"[data-command={command}]:visible:enabled").first.click()
+
+    def api(self, path):
+        answer = self.page.request.get(f"{self.demo.url}/api/v1/{path}")
+        assert answer.ok, answer.text()
+        return answer.json()
+
+    def truth(self):
+        """What the simulated bench says of itself."""
+        return self.api(f"stations/{STATION}")["snapshot"]["truth"]
+
+    def cameras_live(self):
+        """Every camera pane has a picture that is not stale."""
+        panes = self.page.locator(".camera")
+        live = self.page.locator(".camera:not([data-stale])")
+        eventually(lambda: panes.count() == live.count() > 0, 30, "all cameras show fresh pictures")
+        return panes.count()
+
+    def camera(self, key):
+        return pixels(self.page.locator(f".camera[data-camera={key}] canvas"))
+
+    def scene(self):
+        return pixels(self.page.locator("#scene"))
+
+    def close(self):
+        self.context.close()

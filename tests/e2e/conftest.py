@@ -1,0 +1,24 @@
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.lab import CHROMIUM, NO_CHROMIUM, Demo, browsing
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    """One demo lab per module; its log is shown where it did not end well."""
+    lab = Demo(tmp_path_factory.mktemp("demo")).start()
+    yield lab
+    assert lab.end() == 0, (lab.folder / "demo.log").read_text()[-2000:]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if not (shutil.which("chromium") or Path(CHROMIUM).exists()):
+        pytest.skip(NO_CHROMIUM)
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright, browsing(playwright) as opened:
+        yield opened
