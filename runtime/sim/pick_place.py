@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _LEAD = 0.12  # s by which rows lead the measured joints where time does not tell: what robots lag behind
 _BEHIND, _AHEAD = 0.8, 0.6  # s between the row of the clock and that of the joints, beyond which they win
+_FAR = 0.2  # rad between the row of the clock and the joints, beyond which they win
 _THERE = 0.015  # rad from the end of a leg
 _LOST = 0.35  # rad from a leg: something else has moved the robot
 _MOVED = 0.025  # m; a block that lies elsewhere is another scene
@@ -198,10 +199,14 @@ class Pursuit:
         return self._route
 
     def _distances(self, q: Float64) -> Float64:
-        """Of the joints [D] from each row of the present leg, grippers aside [rad]."""
-        rows = self._on().legs[self._leg].rows
-        angles = np.setdiff1d(np.arange(rows.shape[1]), self._policy.robot.gripper_dims)
-        return np.asarray(np.abs(rows[:, angles] - q[angles]).max(axis=1))
+        """Of the joints [D] from each row of the present leg [rad]."""
+        return self._apart(self._on().legs[self._leg].rows, q)
+
+    def _apart(self, rows: Float64, q: Float64) -> Float64:
+        """Of the joints [D] from each of the rows [n, D], grippers aside [rad]."""
+        apart = np.abs(rows - q)
+        apart[:, list(self._policy.robot.gripper_dims)] = 0.0
+        return np.asarray(apart.max(axis=1))
 
     def _advance(self, q: Float64, elapsed: float) -> None:
         """Find the leg and the row that the robot is at; a route that is done is dropped."""
@@ -223,7 +228,8 @@ class Pursuit:
         jaw = gripper_dim(route.arm)
         away = np.abs(leg.rows[:, jaw] - q[jaw]) if leg.gate else self._distances(q)
         seen = start + int(away.argmin())
-        if not seen - _BEHIND * rate <= row <= seen + _AHEAD * rate:
+        near = self._apart(route.rows[[min(round(row), len(route.rows) - 1)]], q)[0] <= _FAR
+        if not (near and seen - _BEHIND * rate <= row <= seen + _AHEAD * rate):
             row = seen + _LEAD * rate
         return min(row, start + len(leg.rows) - 1.0) if leg.gate else row
 

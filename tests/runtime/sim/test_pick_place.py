@@ -122,11 +122,12 @@ def test_a_scene_that_changes_on_the_way_is_looked_at_again():
     assert trial.run(20.0).success
 
 
-def test_a_pause_on_the_way_is_no_harm():
+@pytest.mark.parametrize("pause", [0.4, 2.0, 60.0])
+def test_a_pause_on_the_way_is_no_harm(pause):
     trial = Trial(GOOD).lay(2)
-    trial.run(7.0)
+    trial.run(8.0)
     q = trial.plant.q.copy()
-    trial.clock.advance(60.0)
+    trial.clock.advance(pause)
     assert moved(trial.ask()[0], q) < 0.2
     assert trial.run(15.0).success
 
