@@ -30,8 +30,8 @@ _POLICIES = {
         ("--noise", "1", "--latency-ms", "80"),
     ),
     _CLUMSY: (
-        "Scripted; misjudges the block by centimetres, sometimes lets go early, answers in 250 ms.",
-        ("--noise", "14", "--failure-rate", "0.25", "--latency-ms", "250"),
+        "Scripted; misjudges the block by centimetres, often lets go early or grasps short, answers in 250 ms.",
+        ("--noise", "14", "--failure-rate", "0.4", "--latency-ms", "250"),
     ),
 }
 
