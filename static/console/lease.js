@@ -92,16 +92,18 @@ export class LeaseControls {
 
   /** A page nobody sees does not command: said beforehand on the page, and here in the tab's title. */
   #visibility() {
-    if (this.#store.lease !== "mine") return;
     if (document.hidden) {
+      if (this.#store.lease !== "mine") return;
       this.#hiddenAt = performance.now();
       document.title = "COME BACK: the robot will hold";
       return;
     }
+    if (!this.#hiddenAt) return;
+    const away = (performance.now() - this.#hiddenAt) / 1000;
+    this.#hiddenAt = 0;
     document.title = this.#title;
     this.#stayAwake();
     this.#renew();
-    const away = (performance.now() - this.#hiddenAt) / 1000;
     if (away > AWAY_S) this.#commands.say(`This page was hidden for ${away.toFixed(0)} s: its lease has ended, and a run that was going on is held.`, "refused");
   }
 
@@ -122,6 +124,5 @@ export class LeaseControls {
   #letSleep() {
     this.#awake?.release();
     this.#awake = null;
-    document.title = this.#title;
   }
 }
