@@ -4,6 +4,7 @@ import { three } from "./scene_shapes.js";
 
 const POINTS = 240;
 const STEP_M = 0.003; // nearer than this is no new point
+const JUMP_M = 0.15;
 
 export class Path {
   #points = [];
@@ -24,7 +25,9 @@ export class Path {
 
   add(x, y, z) {
     const last = this.#points.at(-1);
-    if (last && Math.hypot(x - last[0], y - last[1], z - last[2]) < STEP_M) return;
+    const step = last ? Math.hypot(x - last[0], y - last[1], z - last[2]) : Infinity;
+    if (step < STEP_M) return;
+    if (step > JUMP_M) this.#points = []; // not a way it went: nothing was seen in between
     this.#points.push([x, y, z]);
     if (this.#points.length > POINTS) this.#points.shift();
     this.#write();
