@@ -94,9 +94,11 @@ class StationDetail(StationOut):
 
 
 class LeaseIn(Schema):
-    """What is wanted; `request` is the id of somebody's request, `reason` why an administrator takes it."""
+    """What is wanted; `request` is the id of somebody's request, `reason` why an administrator takes it.
 
-    action: Literal["claim", "give_up", "request", "withdraw", "hand_over", "decline", "take"]
+    `move` brings one's own lease from another page to this one."""
+
+    action: Literal["claim", "give_up", "request", "withdraw", "hand_over", "decline", "move", "take"]
     page: PageId
     request: int | None = None
     reason: str = ""
@@ -181,6 +183,8 @@ def lease(request: HttpRequest, name: str, given: LeaseIn) -> Any:
         leases.request(user=user, station=found, page=page)
     elif given.action == "withdraw":
         leases.withdraw(user=user, station=found)
+    elif given.action == "move":
+        leases.move(user=user, station=found, page=page)
     elif given.action == "take":
         leases.take(user=user, station=found, page=page, reason=given.reason)
     else:

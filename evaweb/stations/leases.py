@@ -92,6 +92,21 @@ def hand_over(*, user: Any, station: Station, page: str, request: int) -> Lease:
     return _grant(station, asked.holder, _next_epoch(station, held), f"handed over to {asked.user}")
 
 
+def move(*, user: Any, station: Station, page: str) -> Lease:
+    """Bring one's own lease from another page to this one; a run goes on without a pause.
+
+    Raises Conflict where nobody or somebody else has the station.
+    """
+    require(user, Role.OPERATOR)
+    _require_active(station)
+    holder, held = holder_of(user.get_username(), page), _held(station)
+    if held["holder"] == holder:
+        return _grant(station, holder, held["epoch"], end_reason="expired")
+    if not held["holder"].startswith(holder_of(user.get_username(), "")):
+        raise Conflict(f"{who(held['holder']) or 'nobody'} has {station}, no other page of yours")
+    return _grant(station, holder, _next_epoch(station, held), "moved to another page")
+
+
 def take(*, user: Any, station: Station, page: str, reason: str) -> Lease:
     """An administrator takes the station from whoever has it, and says why."""
     require(user, Role.ADMIN)

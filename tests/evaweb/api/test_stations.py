@@ -122,6 +122,16 @@ def test_the_lease_is_claimed_and_shown(rest, bench, wire):
     assert Lease.objects.get().end_reason == "given up"
 
 
+def test_ones_own_lease_is_moved_to_the_page_that_asks(rest, bench, wire):
+    wire.snapshot = {"lease": {"holder": "web:ann:p1", "epoch": 4}, "boot": BOOT}
+    status, lease = rest.post("stations/bench-1/lease", action="move", page="p2")
+    assert (status, lease["holder"], lease["epoch"]) == (200, "web:ann:p2", 5)
+    wire.snapshot = {"lease": {"holder": "web:bob:p7", "epoch": 6}, "boot": BOOT}
+    status, answer = rest.post("stations/bench-1/lease", action="move", page="p2")
+    assert status == 409
+    assert "bob has" in answer["error"]
+
+
 def test_a_viewer_asks_and_the_holder_declines_or_nobody_may(viewer, rest, bench, wire):
     wire.snapshot = {"lease": {"holder": "web:ann:p1", "epoch": 1}, "boot": BOOT}
     assert viewer.post("stations/bench-1/lease", action="request", page="p2")[0] == 403

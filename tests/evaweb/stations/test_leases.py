@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import timedelta
 
 import pytest
+from django.contrib.auth import get_user_model
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
@@ -101,6 +102,42 @@ def test_a_request_is_granted_with_the_next_epoch_and_no_gap(live, runtime, ann,
     assert (mine.end_reason, asked.answer) == ("handed over to bob", LeaseRequest.Answer.GRANTED)
     assert held(runtime)["holder"] == "web:bob:p2"
     assert not request_list(station=live).exists()
+
+
+def test_ones_own_lease_moves_to_another_page_with_the_next_epoch(live, runtime, ann):
+    first = claim(ann, live)
+    second = leases.move(user=ann, station=live, page="p2")
+    first.refresh_from_db()
+    assert (second.holder, second.epoch) == ("web:ann:p2", first.epoch + 1)
+    assert first.end_reason == "moved to another page"
+    assert (held(runtime)["holder"], held(runtime)["epoch"]) == ("web:ann:p2", second.epoch)
+    assert leases.renew(username="ann", page="p1", station=live.name, epoch=first.epoch).status == "refused"
+
+
+def test_a_lease_that_this_page_has_stays_where_it_is(live, ann):
+    first = claim(ann, live)
+    assert leases.move(user=ann, station=live, page="p1").epoch == first.epoch
+    assert Lease.objects.count() == 1
+
+
+def test_nobody_elses_lease_is_moved(live, runtime, ann, bob):
+    with pytest.raises(Conflict, match="nobody has Bench 1, no other page of yours"):
+        leases.move(user=bob, station=live, page="p2")
+    claim(ann, live)
+    an = get_user_model().objects.create_user("an")  # the name of one may begin that of another
+    an.groups.set(ann.groups.all())
+    for user in (bob, an):
+        with pytest.raises(Conflict, match="ann has Bench 1, no other page of yours"):
+            leases.move(user=user, station=live, page="p2")
+    assert held(runtime)["holder"] == "web:ann:p1"
+
+
+def test_a_station_that_is_switched_off_is_not_moved(live, runtime, ann):
+    claim(ann, live)
+    live.active = False
+    with pytest.raises(NotAllowed, match="switched off"):
+        leases.move(user=ann, station=live, page="p2")
+    assert held(runtime)["holder"] == "web:ann:p1"
 
 
 def test_asking_again_is_the_same_request_for_the_newer_page(live, ann, bob):
