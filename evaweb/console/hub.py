@@ -22,6 +22,7 @@ from robots import RobotError
 log = logging.getLogger(__name__)
 _FLUSH_S = 1 / 40  # frames leave at most so often
 _CHANGES_S = 1.0
+_VECTORS = ("measured", "raw", "planned", "commanded")  # of the joints, as runtime.main publishes them
 
 
 class Encoder:
@@ -42,9 +43,10 @@ class Encoder:
         return []
 
     def _joints(self, content: dict[str, Any], now: float) -> list[Part]:
-        measured, commanded = np.asarray(content["measured"]), np.asarray(content["commanded"])
-        words = {key: content[key] for key in content if key not in ("measured", "commanded")}
-        made = [parts.numbers("joints", words, {"measured": measured, "commanded": commanded}, now)]
+        vectors = {name: np.asarray(content[name]) for name in _VECTORS if name in content}
+        measured, commanded = vectors["measured"], vectors["commanded"]
+        words = {key: content[key] for key in content if key not in vectors}
+        made = [parts.numbers("joints", words, vectors, now)]
         rows = (
             [measured, commanded] if content.get("engaged") and np.isfinite(commanded).all() else [measured]
         )

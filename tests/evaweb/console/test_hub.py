@@ -33,6 +33,14 @@ def test_joints_become_numbers_and_the_poses_of_all_parts():
     assert not np.allclose(measured, commanded)
 
 
+def test_what_the_policy_wants_and_what_is_planned_are_numbers_too():
+    nothing = np.full(14, np.nan, np.float32)
+    frame = encoded(joints() | {"raw": nothing, "planned": Q + 0.2})
+    assert frame.header["streams"]["joints"]["json"] == {"step": 3, "engaged": True}
+    assert np.isnan(frame.array("joints", "raw")).all()
+    assert np.allclose(frame.array("joints", "planned"), Q + 0.2)
+
+
 @pytest.mark.parametrize(
     "content", [joints(engaged=False), joints(commanded=np.full(14, np.nan, np.float32))]
 )
