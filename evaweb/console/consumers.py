@@ -1,7 +1,8 @@
 """The live socket of a page on a station.
 
 Watching needs the database once, when the socket opens. Renewing a lease and stopping never do: they have
-threads of their own, and go straight to the runtime.
+threads of their own, and go straight to the runtime. Beside them the login is looked at every few seconds: who has
+logged out, or is no operator any more, keeps no lease.
 """
 
 from __future__ import annotations
@@ -18,9 +19,11 @@ from uuid import UUID
 
 from channels.db import database_sync_to_async
 from channels.generic.websocket import AsyncWebsocketConsumer
+from django.db import Error
 
 from evaweb.console import requests
 from evaweb.console.hub import Room, hub
+from evaweb.console.logins import role_now
 from evaweb.console.mailbox import Mailbox
 from evaweb.console.requests import BadRequest, Credit, EStop, Events, Renew, Request, Stop, Watch
 from evaweb.errors import NotFound, StationGone
@@ -31,10 +34,14 @@ from evaweb.stations.models import Station
 from evaweb.stations.selectors import station_get
 
 log = logging.getLogger(__name__)
-BAD_REQUEST, NO_LOGIN, NO_STATION = 4400, 4401, 4404  # codes of a closed socket, after those of HTTP
+# Codes of a closed socket, after those of HTTP. After NEW_ROLE a page may come again at once.
+BAD_REQUEST, NO_LOGIN, NEW_ROLE, NO_STATION = 4400, 4401, 4403, 4404
 _MOST_ERRORS = 20
-_renewals = ThreadPoolExecutor(8, "renew")
-_stops = ThreadPoolExecutor(8, "stop")
+_LOGIN_S = 5.0  # how often the login is looked at
+# Each waits for a station that may hang, and none of them may keep the others waiting; an e-stop least of all.
+_renewals = ThreadPoolExecutor(32, "renew")
+_stops = ThreadPoolExecutor(32, "stop")
+_presses = ThreadPoolExecutor(32, "e-stop")
 _under_way: set[asyncio.Task[None]] = set()  # they go on when the page is closed
 
 
@@ -47,7 +54,7 @@ class StationConsumer(AsyncWebsocketConsumer):
     def __init__(self) -> None:
         super().__init__()
         self._outbox: asyncio.Queue[str | bytes] = asyncio.Queue()
-        self._writer: asyncio.Task[None] | None = None
+        self._tasks: list[asyncio.Task[None]] = []
         self._room: Room | None = None
         self._mailbox: Mailbox | None = None
         self._renewing = False
@@ -58,10 +65,9 @@ class StationConsumer(AsyncWebsocketConsumer):
         try:
             await super().__call__(scope, receive, send)
         finally:
-            if self._writer is not None:
-                self._writer.cancel()
-            if self._room is not None and self._mailbox is not None:
-                self._room.leave(self._mailbox)
+            for task in self._tasks:
+                task.cancel()
+            self._leave()
 
     async def dispatch(self, message: dict[str, Any]) -> None:
         """Channels would first close old connections to the database, in a thread that may be waiting for it."""
@@ -94,7 +100,30 @@ class StationConsumer(AsyncWebsocketConsumer):
         self._say({"type": "hello", **hello, "facts": facts})
         self._room = hub().room(station.name, station.robot)
         self._mailbox = self._room.join(self._outbox.put_nowait)
-        self._writer = asyncio.create_task(self._write())
+        self._tasks = [asyncio.create_task(work) for work in (self._write(), self._follow_login(role))]
+        for task in self._tasks:
+            task.add_done_callback(_finished)
+
+    def _leave(self) -> None:
+        """Show nothing more, and hear nothing."""
+        if self._room is not None and self._mailbox is not None:
+            self._room.leave(self._mailbox)
+        self._mailbox = None
+
+    async def _follow_login(self, role: Role) -> None:
+        """Close the socket when the user is logged out or has another role; a database that is away changes nothing."""
+        now: Role | None = role
+        while now is role:
+            await asyncio.sleep(_LOGIN_S)
+            try:
+                now = await _in_database(role_now, self.scope["session"].session_key)
+            except Error as error:
+                log.warning("the database does not say who is logged in: %s", error)
+        self._leave()
+        if now is None:
+            await self.close(NO_LOGIN, "log in again")
+        else:
+            await self.close(NEW_ROLE, f"you are {now} now")
 
     async def receive(self, text_data: str | None = None, bytes_data: bytes | None = None) -> None:
         """One message of the page."""
@@ -132,7 +161,7 @@ class StationConsumer(AsyncWebsocketConsumer):
         """Press and say what came of it; then write it down."""
         name, why, uuid = self._station.name, request.why, request.uuid
         press = partial(commands.estop, station=name, username=self._username, why=why, uuid=uuid)
-        answer = await asyncio.get_running_loop().run_in_executor(_stops, press)
+        answer = await asyncio.get_running_loop().run_in_executor(_presses, press)
         self._acknowledge("estop", uuid, answer)
         note = partial(commands.estop_noted, why=why, uuid=uuid, answer=answer)
         await _in_database(note, user=self._user, station=self._station)
@@ -208,4 +237,4 @@ def _go_on(work: Coroutine[Any, Any, None]) -> None:
 def _finished(task: asyncio.Task[None]) -> None:
     _under_way.discard(task)
     if not task.cancelled() and task.exception() is not None:
-        log.error("a request of a page failed", exc_info=task.exception())
+        log.error("what was done for a page failed", exc_info=task.exception())

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from uuid import uuid4
 
 import pytest
 from channels.testing import WebsocketCommunicator
 from django.conf import settings
-from django.contrib.auth.models import AnonymousUser
-from django.db import connections
+from django.contrib.auth.models import AnonymousUser, User
+from django.contrib.sessions.models import Session
+from django.db import OperationalError, connections
 from django.test import Client
 
 from evaweb.asgi import application
+from evaweb.console import consumers
 from evaweb.console import hub as hubs
 from evaweb.frames import decode
 from evaweb.stations import commands, leases
@@ -307,6 +310,80 @@ def test_the_estop_waits_neither_for_the_database_nor_for_a_renewal(live, ann, r
 
     run(scenario())
     assert order == ["done", "row"]
+
+
+def test_the_estop_does_not_queue_behind_stops_that_hang(live, ann, runtime, settings):
+    settings.EVA_COMMAND_TIMEOUT_S = 0.5
+    runtime.swallows = {"stop"}
+
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        for _ in range(100):
+            await page.say(type="stop", uuid=str(uuid4()), epoch=1)
+        await page.say(type="estop", uuid=str(uuid4()), why="it does not stop")
+        first = await page.told("ack")
+        assert (first["kind"], first["status"]) == ("estop", "done")
+        for _ in range(100):
+            assert (await page.told("ack"))["status"] == "unknown"
+        await page.close()
+        await _written()
+
+    run(scenario())
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        (lambda ann: User.objects.filter(pk=ann.pk).update(is_active=False), 4401),
+        (lambda ann: Session.objects.all().delete(), 4401),
+        (lambda ann: User.objects.filter(pk=ann.pk).update(password="another"), 4401),
+        (lambda ann: ann.groups.clear(), 4403),
+    ],
+    ids=["switched off", "logged out", "another password", "another role"],
+)
+def test_who_may_not_be_there_any_more_is_shown_out_and_keeps_no_lease(
+    live, ann, runtime, monkeypatch, change, code
+):
+    monkeypatch.setattr(consumers, "_LOGIN_S", 0.02)
+    lease = leases.claim(user=ann, station=live, page="p1")
+
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        await page.say(type="renew", epoch=lease.epoch)
+        assert (await page.told("renewed"))["ok"]
+        await asyncio.to_thread(_closed_after, change, ann)
+        while (said := await page.next()).get("type") != "websocket.close":
+            pass
+        assert said["code"] == code
+        await page.close()
+
+    run(scenario())
+
+
+def _closed_after(change, ann):
+    change(ann)
+    connections.close_all()
+
+
+def test_a_page_outlasts_a_database_that_does_not_say_who_is_logged_in(live, ann, runtime, monkeypatch):
+    asked = threading.Event()
+
+    def away(session):
+        asked.set()
+        raise OperationalError("gone")
+
+    monkeypatch.setattr(consumers, "_LOGIN_S", 0.02)
+    monkeypatch.setattr(consumers, "role_now", away)
+    lease = leases.claim(user=ann, station=live, page="p1")
+
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        assert await asyncio.to_thread(asked.wait, 10)
+        await page.say(type="renew", epoch=lease.epoch)
+        assert (await page.told("renewed"))["ok"]
+        await page.close()
+
+    run(scenario())
 
 
 @pytest.mark.parametrize(("kind", "state"), [("stop", "ready"), ("halt", "holding")])
