@@ -8,13 +8,21 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from http.cookiejar import CookieJar
 from typing import Any
 from urllib.error import HTTPError, URLError
 from urllib.parse import urlencode, urlsplit
-from urllib.request import HTTPCookieProcessor, HTTPRedirectHandler, OpenerDirector, Request, build_opener
+from urllib.request import (
+    HTTPCookieProcessor,
+    HTTPRedirectHandler,
+    OpenerDirector,
+    ProxyHandler,
+    Request,
+    build_opener,
+)
 
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection, connect
 
 from evaweb.errors import EvaError
@@ -43,7 +51,11 @@ class Visitor:
     def __init__(self, url: str) -> None:
         self.url = url.rstrip("/")
         self._cookies = CookieJar()
-        self._opener: OpenerDirector = build_opener(HTTPCookieProcessor(self._cookies), _NoRedirect())
+        self._opener: OpenerDirector = build_opener(
+            ProxyHandler({}),  # the lab is here or in the same house
+            HTTPCookieProcessor(self._cookies),
+            _NoRedirect(),
+        )
 
     def login(self, username: str, password: str) -> None:
         """Fill in the form; VisitFailed where it comes back."""
@@ -106,10 +118,13 @@ def _sentence(body: str) -> str:
 
 
 class LivePage:
-    """A page that is open on a station: newest state, the lease renewed while it is held, credits paid."""
+    """A page that is open on a station: newest state, the lease renewed while it is held, credits paid.
 
-    def __init__(self, visitor: Visitor, station: str) -> None:
-        self.page = uuid.uuid4().hex
+    `page` is the id of a page that was open before, under which it goes on; "" makes another one.
+    """
+
+    def __init__(self, visitor: Visitor, station: str, page: str = "") -> None:
+        self.page = page or uuid.uuid4().hex
         self.station = station
         self.epoch = 0  # of our lease; 0: none
         self.frames = 0
@@ -118,17 +133,25 @@ class LivePage:
         self._decided = ("", 0)  # boot and sequence that our last command was decided by
         self._failure = ""
         self._changed = threading.Condition()
-        address = urlsplit(visitor.url)
-        self._socket: ClientConnection = connect(
-            f"ws://{address.netloc}/ws/stations/{station}?page={self.page}",
-            origin=visitor.url,  # type: ignore[arg-type]
-            additional_headers={"Cookie": f"sessionid={visitor.cookie('sessionid')}"},
-            max_size=_LARGEST_FRAME,
-        )
+        self._open = ExitStack()
+        self._socket = self._open.enter_context(self._connected())
         self._send({"type": "watch", "streams": ["state"]})
         self._threads = [threading.Thread(target=work, daemon=True) for work in (self._read, self._renew)]
         for thread in self._threads:
             thread.start()
+
+    def _connected(self) -> ClientConnection:
+        address = urlsplit(self._visitor.url)
+        try:
+            return connect(
+                f"ws://{address.netloc}/ws/stations/{self.station}?page={self.page}",
+                origin=self._visitor.url,  # type: ignore[arg-type]
+                additional_headers={"Cookie": f"sessionid={self._visitor.cookie('sessionid')}"},
+                max_size=_LARGEST_FRAME,
+                proxy=None,
+            )
+        except (OSError, InvalidHandshake) as error:
+            raise VisitFailed(f"the live connection to {self.station} does not open: {error}") from error
 
     def wait(
         self, reached: Callable[[Mapping[str, Any]], bool], seconds: float, what: str
@@ -181,7 +204,7 @@ class LivePage:
     def close(self) -> None:
         """Close the page; the lease ends by itself."""
         self.epoch = 0
-        self._socket.close()
+        self._open.close()
 
     def _read(self) -> None:
         try:
@@ -205,7 +228,7 @@ class LivePage:
         self._send({"type": "credit"})
 
     def _told(self, message: Mapping[str, Any]) -> None:
-        if message.get("type") == "renewed" and not message.get("ok") and self.epoch:
+        if message.get("type") == "renewed" and message.get("lost") and self.epoch:
             self._fail(f"the lease was lost: {message.get('reason')}")
 
     def _fail(self, why: str) -> None:

@@ -6,19 +6,22 @@ A row first, then the wire, then the answer. The stopping commands go to the wir
 from __future__ import annotations
 
 import logging
+import re
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import Any
 from uuid import UUID, uuid4
 
 from django.conf import settings
-from django.db import Error, IntegrityError, transaction
+from django.db import Error, IntegrityError, connection, transaction
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, StationGone
 from evaweb.frames import plain
+from evaweb.lock_wait import lock_wait
 from evaweb.roles import Role, require
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.stations.wire import NoAnswer, wire_to
@@ -28,8 +31,11 @@ log = logging.getLogger(__name__)
 STOPPING = ("stop", "halt", "estop")  # never stale; the runtime has the same list
 KINDS = ("setup", "run", "stop", "halt", "resume", "home", "release", "record_start", "record_stop", "estop")
 HARDWARE_STOP = "USE THE HARDWARE STOP"
+_HOLDER = re.compile(r"\bweb:([^:\s]+):[A-Za-z0-9_-]+")
 _ESTOP_S = 1.0  # what a person waits for before the page turns red
 _UNANSWERED = (CommandStatus.PRESSED, CommandStatus.UNKNOWN)
+_NOTE_S = 0.5  # for which the answer to a stopping command is kept by its row; then the row is written later
+_later = ThreadPoolExecutor(2, "note")
 _LONG_AGO = 0.0  # on the runtime's clock: a command that must not be carried out any more
 
 
@@ -52,6 +58,11 @@ class Answer:
 def holder_of(username: str, page: str) -> str:
     """The name under which a page holds a lease."""
     return f"web:{username}:{page}"
+
+
+def readable(reason: str) -> str:
+    """A sentence of the runtime with people's names where it names their pages."""
+    return _HOLDER.sub(r"\1", reason)
 
 
 def issue(
@@ -212,8 +223,29 @@ def _stopped(command: messages.Command, station: str) -> Answer:
 
 
 def _noted(row: Command, answer: Answer) -> Command:
-    """Write down what has been done already; where the database refuses, the log has it."""
+    """Write down what has been done already, later where the database is locked."""
     _put(row, answer)
+    try:
+        with lock_wait(_NOTE_S):
+            return _written(row)
+    except Error as error:
+        log.warning("%s (%s) is written down later: %s", row, row.uuid, error)
+        _later.submit(_written_later, row)
+        return row
+
+
+def _written_later(row: Command) -> None:
+    """With all patience; where the database refuses, the log has it."""
+    try:
+        _written(row)
+    except (Error, Conflict) as error:
+        log.error("%s (%s) is not in the database: %s", row, row.uuid, error)
+    finally:
+        connection.close()
+
+
+def _written(row: Command) -> Command:
+    """The row as it is in the database: this one, or the first of that uuid."""
     try:
         first = _first(row)
         if first is None:
@@ -224,9 +256,7 @@ def _noted(row: Command, answer: Answer) -> Command:
         else:
             return first
     except IntegrityError:  # pressed twice in the same moment: the other one has written it
-        return row
-    except Error as error:
-        log.error("%s (%s) is not in the database: %s", row, row.uuid, error)
+        pass
     return row
 
 
@@ -269,7 +299,7 @@ def _message(row: Command, valid_until: float = float("inf")) -> messages.Comman
 
 
 def _answer_of(ack: messages.Ack) -> Answer:
-    return Answer(CommandStatus(ack.status), ack.reason, list(ack.allowed), plain(ack.data))
+    return Answer(CommandStatus(ack.status), readable(ack.reason), list(ack.allowed), plain(ack.data))
 
 
 def _patience_s() -> float:

@@ -18,7 +18,7 @@ from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.roles import Role, require
-from evaweb.stations.commands import holder_of
+from evaweb.stations.commands import holder_of, readable
 from evaweb.stations.models import Lease, LeaseRequest, Station
 from evaweb.stations.wire import wire_to
 from runtime import messages
@@ -48,7 +48,7 @@ def give_up(*, user: Any, station: Station, page: str) -> Lease:
     lease = _own(user, station, page)
     ack = _tell(station.name, "lease_give_up", lease.holder, lease.epoch)
     if ack.status == "refused":
-        raise Conflict(ack.reason)
+        raise Conflict(readable(ack.reason))
     _end(lease, "given up")
     return lease
 
@@ -173,7 +173,7 @@ def _grant(station: Station, holder: str, epoch: int, end_reason: str) -> Lease:
     """
     ack = _tell(station.name, "lease_claim", holder, epoch)
     if ack.status == "refused":
-        raise Conflict(f"{station} was not given: {ack.reason}")
+        raise Conflict(f"{station} was not given: {readable(ack.reason)}")
     with transaction.atomic():
         _lock(station)
         lease = _record(station, holder, epoch, ack.boot, end_reason)[0]

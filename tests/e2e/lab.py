@@ -4,11 +4,14 @@ import json
 import os
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
+
+import psutil
 
 ROOT = Path(__file__).parents[2]
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
@@ -35,11 +38,12 @@ def eventually(check, seconds, what):
 
 
 class Demo:
-    """`manage.py demo` in a data folder of its own."""
+    """`manage.py demo` in a data folder of its own; `settings` go into its environment."""
 
-    def __init__(self, folder, *options):
+    def __init__(self, folder, *options, **settings):
         self.folder = folder
         self.data = folder / "data"
+        self.environment = environment(self.data) | settings
         self._options = options
         self.child = None
 
@@ -51,7 +55,7 @@ class Demo:
         self.child = subprocess.Popen(
             [sys.executable, "manage.py", "demo", "--port", "0", "--ready-file", str(ready), *self._options],
             cwd=ROOT,
-            env=environment(self.data),
+            env=self.environment,
             stdout=self.output,
             stderr=self.output,
         )
@@ -64,6 +68,38 @@ class Demo:
         found = json.loads(ready.read_text())
         self.url, self.passwords, self.pids = found["url"], found["passwords"], found["pids"]
         return self
+
+    def pid(self, word):
+        """The program of the lab that has `word` among its arguments, as it runs now."""
+        own = psutil.Process(self.child.pid).children()
+        found = [child.pid for child in own if alive(child.pid) and word in child.cmdline()]
+        assert len(found) == 1, f"{len(found)} programs of the lab have {word!r} among their arguments"
+        return found[0]
+
+    def everyone(self):
+        """All that runs for this lab."""
+        return [child.pid for child in psutil.Process(self.child.pid).children(recursive=True)]
+
+    def python(self, program):
+        """What a Python program says that runs in this lab's Django, beside its own processes."""
+        run = [sys.executable, "manage.py", "shell", "--verbosity", "0", "--command", program]
+        return subprocess.run(
+            run, cwd=ROOT, env=self.environment, check=True, capture_output=True, text=True
+        ).stdout
+
+    def rows(self, question, *values):
+        """What the database has, read past everything."""
+        with closing(sqlite3.connect(self.data / "eva.sqlite3")) as database:
+            return database.execute(question, values).fetchall()
+
+    @contextmanager
+    def locked(self):
+        """The database, held by somebody who writes and writes."""
+        with closing(sqlite3.connect(self.data / "eva.sqlite3", isolation_level=None)) as database:
+            database.execute("PRAGMA busy_timeout = 20000")
+            database.execute("BEGIN IMMEDIATE")
+            yield
+            database.execute("ROLLBACK")
 
     def end(self, number=signal.SIGINT):
         """End it as a person would; returns the exit code."""
