@@ -41,7 +41,8 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
     success = success_of(scores_file(episode.uuid))
     if success is None and recorded.facts["status"] in (EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED):
         return {"published": False, "why": f"it is {recorded.facts['status']} and nobody has scored it"}
-    name = dataset_name(recorded, scored=success is not None, simulated=episode.station.simulated)
+    simulated = recorded.simulated or episode.station.simulated
+    name = dataset_name(recorded, scored=success is not None, simulated=simulated)
     work.tell(f"into {name}")
     placed = publish(folder, datasets_dir() / name, success=success, include_interrupted=success is not None)
     dataset = str(placed.dataset.relative_to(data_dir()))

@@ -10,10 +10,19 @@ from pathlib import Path
 from typing import Any
 from uuid import UUID
 
+from django.db import DataError, IntegrityError
+
 from evaweb.episodes import services
-from evaweb.episodes.folders import data_dir, datasets_dir, episodes_dir, scores_dir
+from evaweb.episodes.folders import (
+    data_dir,
+    datasets_dir,
+    episodes_dir,
+    journal_folder,
+    scores_dir,
+    scores_file,
+)
 from evaweb.episodes.models import Episode
-from evaweb.episodes.publishing import score_lines
+from evaweb.episodes.publishing import read_scores, success_of
 from evaweb.errors import EvaError
 from runtime.datasets.catalog import Catalog
 from runtime.datasets.layout import EVA_EPISODES
@@ -21,16 +30,29 @@ from runtime.recording.files import RecordingError
 
 log = logging.getLogger(__name__)
 
-Lines = Sequence[Mapping[str, Any]]
-Restorer = Callable[[UUID, Lines], int]
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What the disk keeps of one run: its folder, if `recorded`, and the whole `lines` of its scores file.
+
+    `uuid` is the episode's; of a run that was not recorded, whatever those who wrote the lines named it by.
+    """
+
+    uuid: UUID
+    recorded: bool
+    lines: Sequence[Mapping[str, Any]]
+
+
+Restorer = Callable[[Kept], int]
 
 _restorers: list[Restorer] = []
 
 
-def restores_scores(function: Restorer) -> Restorer:
-    """Declare who understands the lines of DATA/scores/<uuid>.jsonl: an app above this one, from its `ready`.
+def restores(function: Restorer) -> Restorer:
+    """Declare who understands scores and the `trial` of a manifest: an app above this one, from its `ready`.
 
-    It is given all whole lines of one file, makes the rows that are not there, and returns how many.
+    It is given every run once, makes the rows that are not there, and returns how many. EvaError says what
+    could not be restored.
     """
     if function not in _restorers:
         _restorers.append(function)
@@ -45,7 +67,7 @@ class Report:
     made: int  # rows that were not there
     missing: int  # rows whose folder is not on this disk
     published: int  # rows that are in a dataset
-    restored: int  # verdicts that were not in the database, brought back from the files of scores
+    restored: int  # trials and verdicts that were not in the database
     problems: tuple[str, ...]
 
 
@@ -62,7 +84,7 @@ def reconcile() -> Report:
             read.append(uuid)
     missing = services.missing_marked()
     problems += _datasets()
-    restored = _scores(problems)
+    restored = _restored(read, problems)
     for problem in problems:
         log.warning("%s", problem)
     return Report(
@@ -97,19 +119,22 @@ def _datasets() -> list[str]:
     folders = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
     # Where an episode is in two, the one that knows its success counts.
     folders.sort(key=lambda folder: not folder.name.endswith("-unscored"))
-    problems = []
+    problems, successes = [], {}
     for folder in folders:
         try:
-            _places(folder)
+            successes |= _places(folder)
         except RecordingError as error:
             problems.append(str(error))
+    for uuid, success in successes.items():
+        _publish_outdated(uuid, success)
     return problems
 
 
-def _places(folder: Path) -> None:
+def _places(folder: Path) -> dict[UUID, bool | None]:
+    """Write down where the episodes of a dataset are; returns the success that it says of each."""
     lines = Catalog.read(folder).eva
     if not lines:
-        return
+        return {}
     published_at = datetime.fromtimestamp((folder / EVA_EPISODES).stat().st_mtime, UTC)
     name = str(folder.relative_to(data_dir()))
     for line in lines:
@@ -117,15 +142,44 @@ def _places(folder: Path) -> None:
         row = Episode.objects.filter(uuid=line["uuid"])
         if not row.filter(**place).exists():
             row.update(**place, published_at=published_at)
+    return {UUID(line["uuid"]): line.get("success") for line in lines}
 
 
-def _scores(problems: list[str]) -> int:
-    """Give every file of scores to who understands it; what cannot be restored is added to `problems`."""
+def _publish_outdated(uuid: UUID, success: bool | None) -> None:
+    """Have an episode published again that was scored, or scored otherwise, after it was; its job is lost."""
+    newest = success_of(scores_file(uuid))
+    if newest is not None and newest != success and journal_folder(uuid).is_dir():
+        for episode in Episode.objects.filter(uuid=uuid):
+            services.publish_asked(episode=episode)
+
+
+def _restored(read: Sequence[UUID], problems: list[str]) -> int:
+    """Give every run to who understands it; what cannot be restored is added to `problems`."""
+    recorded = set(read)
+    in_order = Episode.objects.order_by("started_at").values_list("uuid", flat=True)
+    scored = _scored(problems)
     restored = 0
+    for uuid in (*(uuid for uuid in in_order if uuid in recorded), *sorted(scored - recorded)):
+        try:
+            lines = _lines(uuid, problems) if uuid in scored else ()
+            restored += sum(restore(Kept(uuid, uuid in recorded, lines)) for restore in _restorers)
+        except (RecordingError, EvaError, DataError, IntegrityError) as error:
+            problems.append(f"run {uuid}: {error}")
+    return restored
+
+
+def _scored(problems: list[str]) -> set[UUID]:
+    """The runs that have a file of scores."""
+    found = set()
     for file in sorted(scores_dir().glob("*.jsonl")):
         try:
-            lines = list(score_lines(file))
-            restored += sum(restore(UUID(file.stem), lines) for restore in _restorers)
-        except (RecordingError, EvaError, ValueError) as error:
-            problems.append(f"{file}: {error}")
-    return restored
+            found.add(UUID(file.stem))
+        except ValueError:
+            problems.append(f"{file} is no file of scores: its name is no uuid")
+    return found
+
+
+def _lines(uuid: UUID, problems: list[str]) -> Sequence[Mapping[str, Any]]:
+    found = read_scores(scores_file(uuid))
+    problems += [f"{scores_file(uuid)}: line {number} is not whole and was left out" for number in found.torn]
+    return found.lines

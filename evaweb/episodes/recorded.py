@@ -21,6 +21,9 @@ class Recorded:
 
     uuid: str
     station: str
+    simulated: bool  # declared so by the deployment it was recorded with
+    trial: Mapping[str, Any]  # as the one who asked for the run named it; {} for none
+    ended_at: datetime | None  # when the recording ended
     facts: Mapping[str, Any]
 
     @property
@@ -48,14 +51,21 @@ def recorded_in(folder: Path) -> Recorded:
         "fps": layout.fps,
         "started_at": _time(manifest.get("started_wall")),
     }
-    return Recorded(layout.uuid, _text(manifest, "station", 63), facts | _outcome(folder))
-
-
-def _outcome(folder: Path) -> dict[str, Any]:
     path = folder / "outcome.json"
-    if not path.exists():
+    outcome = read_document(path) if path.exists() else {}
+    return Recorded(
+        uuid=layout.uuid,
+        station=_text(manifest, "station", 63),
+        simulated=_table(_table(manifest, "configuration"), "transport").get("simulated") is True,
+        trial=_table(manifest, "trial"),
+        ended_at=_time(outcome.get("ended_wall")),
+        facts=facts | _end(path, outcome),
+    )
+
+
+def _end(path: Path, outcome: Mapping[str, Any]) -> dict[str, Any]:
+    if not outcome:
         return {"status": EpisodeStatus.RECORDING}
-    outcome = read_document(path)
     if outcome.get("status") not in CLOSED:
         allowed = ", ".join(CLOSED)
         raise RecordingError(f"{path}: status is {outcome.get('status')!r}, must be one of {allowed}")

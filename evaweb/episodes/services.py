@@ -75,6 +75,16 @@ def episode_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
 
 
 @transaction.atomic
+def episode_missed(*, station: Station, uuid: UUID, **facts: Any) -> Episode:
+    """The row of an episode that others still know of, although its folder is gone."""
+    episode, _ = Episode.objects.get_or_create(
+        uuid=uuid,
+        defaults={"station": station, "robot": station.robot, "status": EpisodeStatus.MISSING, **facts},
+    )
+    return episode
+
+
+@transaction.atomic
 def episode_read(*, uuid: UUID, station: Station | None = None) -> Episode:
     """Make the row say what the folder says, and ask for a preview where there is something to play.
 
@@ -140,12 +150,21 @@ def _previewed_at(uuid: UUID) -> datetime | None:
 
 def _station_of(recorded: Recorded) -> Station:
     """The station it was recorded at; one that is not known any more is known from it again."""
-    name = recorded.station or "unknown"
+    return station_known(
+        name=recorded.station or "unknown",
+        robot=recorded.facts.get("robot", ""),
+        simulated=recorded.simulated,
+        source=f"episode {recorded.uuid}",
+    )
+
+
+def station_known(*, name: str, robot: str, simulated: bool, source: str) -> Station:
+    """The station of that name; one that is not in the database any more is made from what `source` says."""
     station, made = Station.objects.get_or_create(
-        name=name, defaults={"robot": recorded.facts.get("robot", ""), "title": name}
+        name=name, defaults={"robot": robot, "simulated": simulated, "title": name}
     )
     if made:
-        log.warning("station %s was not in the database: made from episode %s", name, recorded.uuid)
+        log.warning("station %s was not in the database: made from %s", name, source)
     return station
 
 

@@ -8,3 +8,6 @@ class TrialsConfig(AppConfig):
 
     name = "evaweb.trials"
     default_auto_field = "django.db.models.BigAutoField"
+
+    def ready(self) -> None:
+        from evaweb.trials import restoring  # noqa: F401  it declares itself to those that reconcile

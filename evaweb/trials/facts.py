@@ -1,4 +1,4 @@
-"""What names a trial wherever it goes: into manifests, journals, exports."""
+"""What names a trial wherever it goes, into manifests and journals, and is enough to make it again."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ def trial_facts(trial: Trial) -> dict[str, Any]:
         "id": trial.pk,
         "uuid": str(trial.uuid),
         "evaluation": trial.evaluation.name,
+        "evaluation_kind": str(trial.evaluation.kind),
         "version": trial.evaluation_version,
         "checkpoint": trial.checkpoint.name,
         "scene": trial.scene.name,
@@ -21,5 +22,21 @@ def trial_facts(trial: Trial) -> dict[str, Any]:
         "attempt": trial.attempt,
         "seed": trial.seed,
         "instruction": trial.instruction,
+        "time_limit_s": trial.time_limit_s,
         "station": trial.station.name,
+        "simulated": trial.station.simulated,
+        "operator": trial.operator.get_username(),
+        "prepared_at": trial.prepared_at.isoformat(),
+    }
+
+
+def trial_course(trial: Trial) -> dict[str, Any]:
+    """The same and how its run went, as far as is known: for those who judge it."""
+    return {
+        **trial_facts(trial),
+        "started_at": trial.started_at.isoformat() if trial.started_at else None,
+        "ended_at": trial.ended_at.isoformat() if trial.ended_at else None,
+        "duration_s": trial.duration_s,
+        "reason": trial.reason,
+        "truth": trial.truth,
     }

@@ -16,7 +16,7 @@ from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
 from evaweb.trials import journal, lifecycle
-from evaweb.trials.facts import trial_facts
+from evaweb.trials.facts import trial_course
 from evaweb.trials.following import run_changed
 from evaweb.trials.lifecycle import Move
 from evaweb.trials.models import (
@@ -204,7 +204,7 @@ def trial_void(*, user: User, trial: Trial, reason: str) -> Trial:
             held.episode_id or held.uuid,
             {
                 "kind": "void",
-                "trial": trial_facts(held),
+                "trial": trial_course(held),
                 "by": user.get_username(),
                 "reason": why,
                 "at": held.voided_at.isoformat(),
@@ -301,7 +301,7 @@ def _line(trial: Trial, score: Score, outcomes: list[MilestoneOutcome]) -> dict[
     return {
         "kind": "score",
         "uuid": str(score.uuid),
-        "trial": trial_facts(trial),
+        "trial": trial_course(trial),
         "rater": score.rater.get_username(),
         "at": score.scored_at.isoformat(),
         **words,

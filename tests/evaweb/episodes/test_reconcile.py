@@ -14,12 +14,19 @@ from django.core.management import call_command
 from evaweb.episodes import reconcile as reconciling
 from evaweb.episodes import services
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.episodes.reconcile import reconcile
+from evaweb.episodes.reconcile import Kept, reconcile
+from evaweb.errors import EvaError
 from evaweb.jobs import services as jobs
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Station
 
 pytestmark = pytest.mark.django_db
+
+
+@pytest.fixture(autouse=True)
+def _alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No app above this one takes part."""
+    monkeypatch.setattr(reconciling, "_restorers", [])
 
 
 def everything() -> list[dict[str, object]]:
@@ -115,25 +122,78 @@ def test_an_empty_lab_has_nothing_to_reconcile(data: Path, db: None) -> None:
     assert (report.episodes, report.made, report.missing, report.problems) == (0, 0, 0, ())
 
 
-def test_scores_go_to_who_understands_them_and_a_stranger_is_told(
-    data: Path, db: None, monkeypatch: pytest.MonkeyPatch
+def test_runs_go_to_who_understands_them_and_a_stranger_is_told(
+    put: Callable[..., Path], data: Path, db: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given: list[tuple[UUID, list[object]]] = []
+    given: list[Kept] = []
 
-    def restore(uuid: UUID, lines: object) -> int:
-        given.append((uuid, list(lines)))  # type: ignore[call-overload]
-        return len(given[-1][1])
+    def restore(kept: Kept) -> int:
+        given.append(kept)
+        return len(kept.lines)
 
     monkeypatch.setattr(reconciling, "_restorers", [restore])
-    identity = "c86a888b-6d03-4355-9e03-66fd3445e50b"
+    recorded, alone = UUID(put().name), UUID("c86a888b-6d03-4355-9e03-66fd3445e50b")
     (data / "scores").mkdir()
-    (data / "scores" / f"{identity}.jsonl").write_text('{"success": true}\n[1]\n{"success": fal\n{"a": 1}\n')
+    file = data / "scores" / f"{alone}.jsonl"
+    file.write_text('{"success": true}\n[1]\n\n{"success": fal\n{"a": 1}\n')
     (data / "scores" / "notes.jsonl").write_text("{}\n")
     report = reconcile()
     assert report.restored == 2
-    assert given == [(UUID(identity), [{"success": True}, {"a": 1}])]
-    assert len(report.problems) == 1
-    assert "notes.jsonl" in report.problems[0]
+    assert given == [Kept(recorded, True, ()), Kept(alone, False, ({"success": True}, {"a": 1}))]
+    assert report.problems == (
+        f"{data / 'scores' / 'notes.jsonl'} is no file of scores: its name is no uuid",
+        f"{file}: line 2 is not whole and was left out",
+        f"{file}: line 4 is not whole and was left out",
+    )
+
+
+def test_what_cannot_be_restored_is_told_and_keeps_no_other(
+    put: Callable[..., Path], data: Path, db: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [put(status).name for status in ("finished", "interrupted")]
+    seen = []
+
+    def restore(kept: Kept) -> int:
+        seen.append(str(kept.uuid))
+        if len(seen) == 1:
+            raise EvaError("its scores are odd")
+        return 1
+
+    monkeypatch.setattr(reconciling, "_restorers", [restore])
+    report = reconcile()
+    assert sorted(seen) == sorted(names)
+    assert (report.restored, report.problems) == (1, (f"run {seen[0]}: its scores are odd",))
+
+
+def test_an_episode_that_was_scored_after_it_was_published_is_published_again(
+    closed: Callable[..., Episode], data: Path
+) -> None:
+    episode = closed()
+    services.publish_asked(episode=episode)
+    jobs.work("lab")
+    Job.objects.all().delete()
+    assert reconcile().published == 1
+    assert not Job.objects.exists()
+    scores = data / "scores" / f"{episode.uuid}.jsonl"
+    scores.parent.mkdir(exist_ok=True)
+    scores.write_text('{"kind": "score", "success": false}\n')
+    reconcile()
+    assert Job.objects.get().key == f"publish:{episode.uuid}"
+    jobs.work("lab")
+    Job.objects.all().delete()
+    reconcile()
+    assert not Job.objects.exists()
+
+
+def test_a_station_that_is_gone_is_known_to_be_simulated_from_its_recordings(
+    put: Callable[..., Path], data: Path, db: None
+) -> None:
+    folder = put()
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["configuration"]["transport"] = {"kind": "zmq", "simulated": True}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    reconcile()
+    assert Station.objects.get().simulated is True
 
 
 def test_the_command_says_what_it_found(

@@ -21,5 +21,5 @@ class Command(BaseCommand):
         self.stdout.write(
             f"{report.episodes} episodes read, {report.made} of them new to the database; "
             f"{report.missing} missing on this disk; {report.published} in datasets; "
-            f"{report.restored} verdicts restored; {len(report.problems)} problems"
+            f"{report.restored} trials and verdicts restored; {len(report.problems)} problems"
         )

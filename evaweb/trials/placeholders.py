@@ -1,0 +1,80 @@
+"""What restored trials refer to: found by name; what is gone is made by name, switched off, and says so."""
+
+from __future__ import annotations
+
+import logging
+
+from django.contrib.auth.models import User
+
+from evaweb.episodes.services import station_known
+from evaweb.stations.models import Station
+from evaweb.trials.kept import KeptTrial
+from evaweb.trials.models import Checkpoint, Evaluation, Position, Scene
+from evaweb.trials.services import open_bench
+
+log = logging.getLogger(__name__)
+
+LOST = "Known from recordings alone: the database was lost."
+
+
+def station(facts: KeptTrial) -> Station:
+    """The station of the trial."""
+    return station_known(
+        name=facts.station, robot="", simulated=facts.simulated, source=f"trial {facts.uuid}"
+    )
+
+
+def evaluation(facts: KeptTrial, station: Station) -> Evaluation:
+    """The trial's evaluation; the open bench of its station takes all versions."""
+    if facts.evaluation_kind == Evaluation.Kind.PLAN:
+        found, _ = Evaluation.objects.get_or_create(
+            name=facts.evaluation, version=facts.version, defaults={"description": LOST}
+        )
+        return found
+    found = open_bench(station)
+    if found.version < facts.version:
+        found.version = facts.version
+        found.save()
+    return found
+
+
+def checkpoint(facts: KeptTrial) -> Checkpoint:
+    """The checkpoint of that name."""
+    words = f"{LOST} Say again how it is reached, then switch it on."
+    found, _ = Checkpoint.objects.get_or_create(
+        name=facts.checkpoint, defaults={"description": words, "active": False}
+    )
+    return found
+
+
+def scene(facts: KeptTrial) -> Scene:
+    """The scene of that name; milestones it gets from the first scores that are restored."""
+    words = f"{LOST} Write down again what counts as success, then switch it on."
+    found, _ = Scene.objects.get_or_create(
+        name=facts.scene,
+        defaults={
+            "title": facts.scene,
+            "instruction": facts.instruction,
+            "criterion": words,
+            "time_limit_s": facts.time_limit_s,
+            "active": False,
+        },
+    )
+    return found
+
+
+def position(scene: Scene, number: int) -> Position:
+    """The position of that number."""
+    words = f"{LOST} Write down again where things stand."
+    found, _ = Position.objects.get_or_create(scene=scene, number=number, defaults={"description": words})
+    return found
+
+
+def user(name: str) -> User:
+    """The account of that name; one that is gone is made again, deactivated and without a password."""
+    user, made = User.objects.get_or_create(username=name or "unknown", defaults={"is_active": False})
+    if made:
+        user.set_unusable_password()
+        user.save()
+        log.warning("user %s was not in the database: made, deactivated", user.username)
+    return user

@@ -1,0 +1,253 @@
+"""Trials and scores that the database has lost, made again from manifests and scores files.
+
+What was there is never overwritten; a row that is older than the disk (from a backup) is brought up to it.
+Scenes, positions, checkpoints and people that are gone too are made by name, switched off, and say so.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from typing import Any
+
+from django.core.management.color import no_style
+from django.db import connection, transaction
+from django.db.models import Max
+from django.utils import timezone
+
+from evaweb.episodes import services as episodes
+from evaweb.episodes.folders import journal_folder
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.reconcile import Kept, restores
+from evaweb.episodes.recorded import CLOSED, recorded_in
+from evaweb.errors import EvaError
+from evaweb.trials import lifecycle, placeholders
+from evaweb.trials.kept import KeptOutcome, KeptScore, KeptTrial, KeptVoid, kept_line, kept_trial
+from evaweb.trials.models import (
+    Milestone,
+    MilestoneOutcome,
+    Scene,
+    Score,
+    Trial,
+    TrialStatus,
+)
+from runtime.recording.reader import read_events
+
+log = logging.getLogger(__name__)
+
+_BEHIND = (*lifecycle.OPEN, TrialStatus.ABANDONED)  # what a trial with a closed recording cannot be
+_JUDGED = (TrialStatus.SCORED, TrialStatus.VOIDED)
+
+
+@restores
+def restore(kept: Kept) -> int:
+    """Make the trial of a run and its scores, where they are not there; how many rows that were."""
+    lines = _judgements(kept)
+    if not lines and Trial.objects.filter(episode_id=kept.uuid).exclude(status__in=_BEHIND).exists():
+        return 0
+    facts = _facts(kept, lines)
+    episode = Episode.objects.filter(uuid=kept.uuid).first()
+    if facts is None or not (lines or (episode is not None and episode.status in CLOSED)):
+        return 0
+    with transaction.atomic():
+        trial, made = _trial(facts, kept, episode)
+        scores = _scores(trial, [line for line in lines if isinstance(line, KeptScore)])
+        _judged(trial, lines)
+        if made or scores:
+            _publish(trial, made=made)
+    return made + scores
+
+
+def _judgements(kept: Kept) -> list[KeptScore | KeptVoid]:
+    read = (kept_line(line, number) for number, line in enumerate(kept.lines, start=1))
+    return [line for line in read if line is not None]
+
+
+def _facts(kept: Kept, lines: Sequence[KeptScore | KeptVoid]) -> KeptTrial | None:
+    """The newest line knows most of its trial; without one it is as its run was asked for."""
+    named = {line.trial.uuid for line in lines}
+    if len(named) > 1:
+        raise EvaError(f"its scores are of several trials: {', '.join(sorted(map(str, named)))}")
+    if lines:
+        return lines[-1].trial
+    return kept_trial(recorded_in(journal_folder(kept.uuid)).trial) if kept.recorded else None
+
+
+# --- the trial ---------------------------------------------------------------------------------------------
+
+
+def _trial(facts: KeptTrial, kept: Kept, episode: Episode | None) -> tuple[Trial, bool]:
+    """The trial's row, held, and whether it was made."""
+    trial = Trial.objects.select_for_update().filter(uuid=facts.uuid).first()
+    if trial is None:
+        return _made(facts, _episode(facts, kept, episode)), True
+    if kept.uuid not in (trial.uuid, trial.episode_id or kept.uuid):
+        raise EvaError(f"trial {trial.pk} has episode {trial.episode_id}, and cannot have another one")
+    if trial.status in _BEHIND:
+        for name, value in _course(facts, _episode(facts, kept, episode)).items():
+            setattr(trial, name, value)
+        log.warning("trial %s was behind its recording: it is %s now", trial.pk, trial.status)
+    elif trial.episode is None:
+        trial.episode = _episode(facts, kept, episode)
+    trial.save()
+    return trial, False
+
+
+def _episode(facts: KeptTrial, kept: Kept, found: Episode | None) -> Episode | None:
+    """The recording, known as missing where its folder is lost too; a run that was none has the trial's uuid."""
+    if found is not None or kept.uuid == facts.uuid:
+        return found
+    return episodes.episode_missed(
+        station=placeholders.station(facts),
+        uuid=kept.uuid,
+        task=facts.instruction,
+        checkpoint=facts.checkpoint,
+        operator=facts.operator,
+        started_at=facts.started_at,
+        duration_s=facts.duration_s,
+    )
+
+
+def _made(facts: KeptTrial, episode: Episode | None) -> Trial:
+    """The row as it was; its id too, where that is free, so that addresses of trials stay valid."""
+    station, scene = placeholders.station(facts), placeholders.scene(facts)
+    key = {
+        "evaluation": placeholders.evaluation(facts, station),
+        "evaluation_version": facts.version,
+        "checkpoint": placeholders.checkpoint(facts),
+        "scene": scene,
+        "position": placeholders.position(scene, facts.position),
+    }
+    course = _course(facts, episode)
+    trial = Trial.objects.create(
+        pk=None if Trial.objects.filter(pk=facts.id).exists() else facts.id,
+        uuid=facts.uuid,
+        station=station,
+        operator=placeholders.user((episode.operator if episode else "") or facts.operator),
+        instruction=facts.instruction,
+        time_limit_s=facts.time_limit_s,
+        seed=facts.seed,
+        **key,
+        **(course | _numbered(facts, key, course["reason"])),
+    )
+    prepared_at = facts.prepared_at or course["started_at"] or timezone.now()
+    Trial.objects.filter(pk=trial.pk).update(prepared_at=prepared_at)  # `create` takes the present
+    _count_on(Trial)
+    return Trial.objects.get(pk=trial.pk)
+
+
+def _numbered(facts: KeptTrial, key: Mapping[str, Any], reason: str) -> dict[str, Any]:
+    """Its number and attempt; the next number where others were given these since, and the reason says so."""
+    same = Trial.objects.filter(**key)
+    if not same.filter(number=facts.number, attempt=facts.attempt).exists():
+        return {"number": facts.number, "attempt": facts.attempt}
+    newest = same.aggregate(newest=Max("number"))["newest"]
+    was = f"restored as another number: it was {facts.number}, attempt {facts.attempt}"
+    return {"number": newest + 1, "attempt": 1, "reason": f"{reason} ({was})" if reason else was}
+
+
+def _course(facts: KeptTrial, episode: Episode | None) -> dict[str, Any]:
+    """How the run went: what is kept of the trial itself first, then what its recording says."""
+    ended_at, truth = _end(episode) if episode else (None, None)
+    exact = episode.duration_s if episode else None
+    whole = episode is None or episode.status in (EpisodeStatus.FINISHED, EpisodeStatus.MISSING)
+    return {
+        "episode": episode,
+        "status": TrialStatus.ENDED if whole else TrialStatus.INTERRUPTED,
+        "reason": facts.reason or (episode.reason if episode else ""),
+        "started_at": facts.started_at or (episode.started_at if episode else None),
+        "ended_at": facts.ended_at or ended_at,
+        "duration_s": exact if exact is not None else facts.duration_s,
+        "truth": facts.truth or truth,
+    }
+
+
+def _end(episode: Episode) -> tuple[datetime | None, Mapping[str, Any] | None]:
+    """When the recording was closed, and how a simulated bench said it was left then."""
+    if episode.status not in CLOSED:
+        return None, None
+    folder = journal_folder(episode.uuid)
+    events = (json.loads(line) for line in read_events(folder / "events.jsonl").lines)
+    told = [event.get("data") for event in events if event.get("kind") == "truth"]
+    return recorded_in(folder).ended_at, told[-1] if told else None
+
+
+# --- what was said of it -----------------------------------------------------------------------------------
+
+
+def _scores(trial: Trial, lines: Sequence[KeptScore]) -> int:
+    """Add the scores that are not there."""
+    there = set(Score.objects.filter(uuid__in=[line.uuid for line in lines]).values_list("uuid", flat=True))
+    absent = [line for line in lines if line.uuid not in there]
+    for line in absent:
+        _score(trial, line)
+    if absent:
+        trial.verdict = _newest(trial, lines)
+        trial.save()
+    return len(absent)
+
+
+def _newest(trial: Trial, lines: Sequence[KeptScore]) -> Score:
+    """That of the last line; of a trial with scores in two files (its episode was found late) the later one."""
+    newest, known = Score.objects.get(uuid=lines[-1].uuid), trial.verdict
+    elsewhere = known is not None and known.uuid not in [line.uuid for line in lines]
+    return known if known and elsewhere and known.scored_at > newest.scored_at else newest
+
+
+def _score(trial: Trial, line: KeptScore) -> None:
+    score = Score.objects.create(
+        uuid=line.uuid,
+        trial=trial,
+        rater=placeholders.user(line.rater),
+        success=line.success,
+        score=line.score,
+        note=line.note,
+        failure=line.failure,
+        reason=line.reason,
+        source=line.source,
+        scored_at=line.at,
+    )
+    known = _milestones(trial.scene, line.milestones)
+    MilestoneOutcome.objects.bulk_create(
+        MilestoneOutcome(score=score, milestone=known.get((each.order, each.text)), **each.model_dump())
+        for each in line.milestones
+    )
+
+
+def _milestones(scene: Scene, outcomes: Sequence[KeptOutcome]) -> dict[tuple[int, str], Milestone]:
+    """The scene's by order and words; a scene that was made here gets those of the first score that has any."""
+    if not scene.active and scene.criterion.startswith(placeholders.LOST) and not scene.milestones.exists():
+        for each in outcomes:
+            Milestone.objects.create(scene=scene, **each.model_dump(exclude={"reached"}))
+    return {(milestone.order, milestone.text): milestone for milestone in scene.milestones.all()}
+
+
+def _judged(trial: Trial, lines: Sequence[KeptScore | KeptVoid]) -> None:
+    """Move the trial to where its lines have brought it; nothing leaves voided."""
+    void = next((line for line in lines if isinstance(line, KeptVoid)), None)
+    if void is not None and trial.status != TrialStatus.VOIDED:
+        trial.status, trial.reason = TrialStatus.VOIDED, void.reason
+        trial.voided_by, trial.voided_at = placeholders.user(void.by), void.at
+        trial.save()
+    elif lines and trial.status not in _JUDGED:
+        trial.status = TrialStatus.SCORED
+        trial.save()
+
+
+def _publish(trial: Trial, *, made: bool) -> None:
+    """Have it published where that may not have been done: the job is lost with the database."""
+    episode = trial.episode
+    if trial.status not in _JUDGED or episode is None or episode.status not in CLOSED:
+        return
+    if not made or episode.dataset_index is None:
+        episodes.publish_asked(episode=episode)
+
+
+def _count_on(model: type[Trial]) -> None:
+    """Where the database counts apart from the rows, let it go on after the highest number given by us."""
+    statements = connection.ops.sequence_reset_sql(no_style(), [model])
+    with connection.cursor() as cursor:
+        for statement in statements:
+            cursor.execute(statement)

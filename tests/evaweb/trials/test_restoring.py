@@ -1,0 +1,399 @@
+"""A database that was lost comes back from the disk: real journals, the services' own lines, nothing mocked but the
+wire."""
+
+import json
+import shutil
+from dataclasses import replace
+from uuid import uuid4
+
+import pytest
+from django.contrib.auth.models import User
+
+from evaweb.api.trials import TrialDetail
+from evaweb.episodes import reconcile as reconciling
+from evaweb.episodes.folders import journal_folder
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.reconcile import reconcile
+from evaweb.episodes.services import episode_closed
+from evaweb.jobs import doorbell
+from evaweb.jobs.models import Job
+from evaweb.stations.models import Command, Station
+from evaweb.trials import journal, restoring, services
+from evaweb.trials.bench import trial_command
+from evaweb.trials.models import (
+    Checkpoint,
+    Evaluation,
+    Milestone,
+    MilestoneOutcome,
+    Position,
+    Scene,
+    Score,
+    Trial,
+)
+from evaweb.trials.selectors import statistics, trial_get, trial_list
+from tests.evaweb.trials import builders
+from tests.runtime.station import Station as Lockstep
+from tests.runtime.station import plan
+
+pytestmark = pytest.mark.django_db
+
+RECORDS = (MilestoneOutcome, Score, Trial, Evaluation, Episode, Command, Job)
+CHOICES = (Milestone, Position, Scene, Checkpoint, Station, User)
+
+
+class Direct:
+    """The wire to a station in this process, under a lease of its own."""
+
+    def __init__(self, station):
+        self._station = station
+
+    def urgent(self, command, process, key, timeout):
+        return self.request(command)
+
+    def request(self, command, **how):
+        self._station._handle("lease_claim")
+        main = self._station.main
+        held = {"holder": "lockstep", "epoch": main.lease.epoch, "boot": main.boot}
+        return main.handle(replace(command, **held, sequence=main.session.sequence))
+
+
+@pytest.fixture
+def lab(tmp_path, monkeypatch, db):
+    """A lab around a whole station in lockstep."""
+    monkeypatch.setattr(doorbell, "ring", lambda queue: True)
+    made = Lab(builders.bench("bench"), Lockstep(plan(tmp_path, simulated=True)))
+    monkeypatch.setattr("evaweb.stations.commands.wire_to", lambda name: Direct(made.station))
+    return made
+
+
+class Lab:
+    """Runs trials as console and chronicle do."""
+
+    def __init__(self, bench, station):
+        self.bench, self.station = bench, station
+        bench.checkpoint.policy = {}  # the deployment's own
+        bench.checkpoint.save()
+        self._heard = 0
+
+    def give(self, trial, kind):
+        order = {
+            "user": self.bench.operator,
+            "page": "p",
+            "epoch": 1,
+            "boot": self.station.main.boot,
+            "sequence": 0,
+        }
+        row = trial_command(trial=trial, kind=kind, **order)
+        assert row.status in ("accepted", "done"), row.reason
+
+    def run(self, ticks=12, smoke=False, **given):
+        """A trial that has ended, or was interrupted by an e-stop."""
+        trial = self.bench.prepare(**given)
+        self.station.until(
+            lambda: str(self.station.state) in ("idle", "ready"), 30.0, "a state to set up from"
+        )
+        self.give(trial, "setup")
+        self.station.until(lambda: str(self.station.state) == "ready", 60.0, "set-up")
+        self.give(trial, "run")
+        self.station.go(ticks)
+        if smoke:
+            self.station.guard.press("ann", "smoke")
+        else:
+            self.give(trial, "stop")
+        self.station.go(3)
+        self.listen()
+        trial.refresh_from_db()
+        return trial
+
+    def folder(self, trial):
+        return journal_folder(trial.episode_id)
+
+    def listen(self):
+        """Hand the station's events on, as the chronicle does."""
+        for event in self.station.main.events.since(self._heard):
+            self._heard = event["number"]
+            if event["kind"] == "episode_closed":
+                episode_closed(station=self.bench.station, data=event["data"])
+            services.run_changed(station=self.bench.station, event=event, boot=self.station.main.boot)
+
+    def score(self, trial, *reached, **words):
+        ticks = self.bench.ticks(*reached)
+        return services.trial_score(user=self.bench.operator, trial=trial, milestones=ticks, **words)
+
+
+def lose(*models):
+    """All rows of these are gone, as with the file they were in."""
+    Trial.objects.update(verdict=None)
+    for model in models:
+        model.objects.all().delete()
+
+
+def told(*without):
+    """The trials as the API tells them, the newest first."""
+    found = [TrialDetail.of(trial_get(id=trial.pk)) for trial in trial_list()]
+    for trial in found:
+        trial["scores"] = [{**one, "milestones": outcomes(one["milestones"])} for one in trial["scores"]]
+    return [{name: value for name, value in trial.items() if name not in without} for trial in found]
+
+
+def outcomes(rows):
+    return [(row.order, row.text, row.points, row.required, row.reached) for row in rows]
+
+
+def counted():
+    return [
+        (row.scene.name, row.checkpoint.name, row.summary, row.to_score, row.interrupted, row.voided)
+        for row in statistics()
+    ]
+
+
+def everything():
+    """All rows of this app but when they were written."""
+    rows = {model: list(model.objects.order_by("pk").values()) for model in (*RECORDS, *CHOICES)}
+    return {
+        model: [{name: value for name, value in row.items() if name != "changed_at"} for row in found]
+        for model, found in rows.items()
+    }
+
+
+@pytest.fixture
+def judged(lab):
+    """Trials of every kind that is over: scored, corrected, voided, repeated without a recording, interrupted."""
+    lab.score(lab.run(), True, True, True, note="zuerst ⟂, dann gut")
+    corrected = lab.run(position=2)
+    lab.score(corrected, True, False, False, failure="slipped")
+    lab.score(corrected, True, True, True, reason="seen on the video")
+    voided = lab.run()
+    lab.score(voided, True, False, False)
+    services.trial_void(user=lab.bench.operator, trial=voided, reason="a hand was in the picture")
+    lab.bench.scored(success=False)
+    lab.run(smoke=True)
+    assert [trial.status for trial in trial_list().order_by("pk")] == [
+        "scored",
+        "scored",
+        "voided",
+        "scored",
+        "interrupted",
+    ]
+    return lab
+
+
+def test_trials_scores_and_statistics_of_a_lost_database_come_back(judged):
+    before, counts = told(), counted()
+    assert counts[0][2].success.n == 3
+    lose(*RECORDS)
+    report = reconcile()
+    assert (report.problems, report.restored) == ((), 5 + 5)
+    # The interrupted one was never judged: the times and the reason of its run are those of its recording.
+    found, exact = told(), {name: before[0][name] for name in ("started_at", "ended_at", "reason")}
+    assert [{**found[0], **exact}, *found[1:]] == before
+    assert "smoke" in found[0]["reason"]
+    assert found[0]["started_at"] < found[0]["ended_at"]
+    assert counted() == counts
+
+
+def test_a_second_time_changes_nothing(judged):
+    lose(*RECORDS)
+    reconcile()
+    found = everything()
+    assert reconcile().restored == 0
+    assert everything() == found
+
+
+def test_what_is_all_there_is_left_alone(judged):
+    found = everything()
+    assert reconcile().restored == 0
+    assert everything() == found
+
+
+def test_scenes_checkpoints_and_people_that_are_gone_too_are_made_switched_off(judged):
+    before, counts = told(), counted()
+    lose(*RECORDS, *CHOICES)
+    assert reconcile().problems == ()
+    assert [trial["scores"] for trial in told()] == [trial["scores"] for trial in before]
+    assert counted() == counts
+    scene, checkpoint, ann = Scene.objects.get(), Checkpoint.objects.get(), User.objects.get(username="ann")
+    assert (scene.name, scene.active, checkpoint.active) == ("block-on-plate", False, False)
+    assert "the database was lost" in scene.criterion
+    assert "the database was lost" in checkpoint.description
+    assert all("the database was lost" in position.description for position in scene.positions.all())
+    assert list(scene.milestones.values_list("text", "points", "required")) == [
+        ("held", 1, False),
+        ("lifted", 1, False),
+        ("on the plate", 2, True),
+    ]
+    assert MilestoneOutcome.objects.filter(milestone=None).count() == 0
+    assert (ann.is_active, ann.has_usable_password(), ann.groups.count()) == (False, False, 0)
+
+
+def test_a_rater_whom_nobody_knows_any_more_becomes_a_deactivated_user(judged, caplog):
+    name = "dorothea"
+    User.objects.filter(username="ann").update(username=name)
+    judged.bench.operator.refresh_from_db()
+    trial = trial_list().order_by("pk")[0]
+    judged.score(trial, False, False, False, reason="seen again")
+    lose(*RECORDS)
+    User.objects.all().delete()
+    reconcile()
+    user = User.objects.get(username=name)
+    assert (user.is_active, Trial.objects.get(pk=trial.pk).verdict.rater) == (False, user)
+    assert f"user {name} was not in the database" in caplog.text
+
+
+def test_a_trial_that_waits_for_its_score_still_waits_with_the_truth_of_its_bench(lab):
+    trial = lab.run()
+    assert (trial.status, trial.truth["success"]) == ("ended", False)
+    lose(*RECORDS)
+    assert reconcile().restored == 1
+    found = services.trial_open(lab.bench.station)
+    assert (found.uuid, found.pk, found.status, found.truth) == (trial.uuid, trial.pk, "ended", trial.truth)
+    assert (found.prepared_at, found.duration_s) == (trial.prepared_at, trial.duration_s)
+    assert lab.score(found, True, True, True).success is True
+
+
+def test_a_judged_trial_whose_publication_was_lost_is_published(lab):
+    lab.score(lab.run(), True, True, True)
+    lose(*RECORDS)
+    reconcile()
+    uuid = Episode.objects.get().uuid
+    assert sorted(Job.objects.values_list("key", flat=True)) == [f"preview:{uuid}", f"publish:{uuid}"]
+
+
+def test_the_next_trial_goes_on_where_the_lost_ones_ended(judged):
+    highest = Trial.objects.order_by("-pk")[0]
+    lose(*RECORDS)
+    reconcile()
+    assert (
+        judged.bench.prepare().number,
+        judged.bench.station.trials.order_by("-pk")[0].pk,
+    ) == (highest.number, highest.pk + 1), "the interrupted one is repeated"
+
+
+def test_a_number_that_was_given_out_again_makes_the_old_trial_another_number(lab):
+    old = lab.run()
+    lab.score(old, True, True, True)
+    lose(*RECORDS)
+    new = lab.bench.scored(success=False)
+    assert new.number == old.number
+    assert reconcile().problems == ()
+    found = Trial.objects.get(uuid=old.uuid)
+    assert (found.number, found.attempt, found.verdict.success) == (2, 1, True)
+    assert "restored as another number: it was 1, attempt 1" in found.reason
+    assert counted()[0][2].success.n == 2
+
+
+def test_a_row_from_an_old_backup_is_brought_up_to_the_disk(lab):
+    trial = lab.run()
+    lab.score(trial, True, True, True)
+    lose(MilestoneOutcome, Score)
+    Trial.objects.update(status="running", episode=None, ended_at=None, duration_s=None)
+    assert reconcile().restored == 1
+    found = Trial.objects.get(pk=trial.pk)
+    assert (found.status, found.episode_id) == ("scored", trial.episode_id)
+    assert (found.ended_at, found.duration_s) == (trial.ended_at, trial.duration_s)
+
+
+def test_a_recording_that_was_never_bound_to_its_trial_is(lab):
+    trial = lab.run()
+    Trial.objects.update(episode=None)
+    assert reconcile().restored == 0
+    assert Trial.objects.get().episode_id == trial.episode_id
+
+
+def test_a_trial_that_runs_is_none_of_ours_yet(lab):
+    trial = lab.run()
+    outcome = lab.folder(trial) / "outcome.json"
+    kept = outcome.read_bytes()
+    outcome.unlink()
+    lose(*RECORDS)
+    assert (reconcile().restored, Trial.objects.count()) == (0, 0)
+    outcome.write_bytes(kept)
+    assert (reconcile().restored, Trial.objects.get().uuid) == (1, trial.uuid)
+
+
+def test_a_line_cut_in_half_is_left_out_and_told(lab):
+    trial = lab.run()
+    lab.score(trial, True, False, False)
+    lab.score(trial, True, True, True, reason="seen on the video")
+    file = journal.path_of(trial.episode_id)
+    first, second = file.read_bytes().splitlines()
+    file.write_bytes(first + b"\n" + second[: len(second) // 2])
+    lose(*RECORDS)
+    report = reconcile()
+    assert report.problems == (f"{file}: line 2 is not whole and was left out",)
+    found = Trial.objects.get()
+    assert (found.status, found.verdict.success, found.scores.count()) == ("scored", False, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("success", "yes", "line 1 of its scores: success is 'yes'"),
+        ("score", 1.5, "line 1 of its scores: score is 1.5"),
+        ("at", "2026-01-31T08:00:00", "line 1 of its scores: at is '2026-01-31T08:00:00'"),
+        ("trial", {}, "line 1 of its scores: trial.uuid is {}"),
+        ("failure", "x" * 61, "at most 60 characters"),
+    ],
+)
+def test_a_line_that_says_what_cannot_be_is_told_and_keeps_no_other_run(lab, name, value, words):
+    damaged = lab.run()
+    lab.score(damaged, True, True, True)
+    whole = lab.run()
+    lab.score(whole, True, True, True)
+    file = journal.path_of(damaged.episode_id)
+    file.write_text(json.dumps(json.loads(file.read_text()) | {name: value}) + "\n")
+    lose(*RECORDS)
+    (problem,) = reconcile().problems
+    assert problem.startswith(f"run {damaged.episode_id}: ")
+    assert words in problem
+    assert [trial.uuid for trial in Trial.objects.all()] == [whole.uuid]
+
+
+def test_lines_of_several_trials_in_one_file_are_told(lab):
+    first = lab.run()
+    lab.score(first, True, True, True)
+    second = lab.run()
+    lab.score(second, True, True, True)
+    other = journal.path_of(second.episode_id)
+    other.write_bytes(other.read_bytes() + journal.path_of(first.episode_id).read_bytes())
+    lose(*RECORDS)
+    (problem,) = reconcile().problems
+    assert f"run {second.episode_id}: its scores are of several trials" in problem
+    assert Trial.objects.get().uuid == first.uuid
+
+
+def test_a_verdict_outlives_its_recording(lab):
+    trial = lab.run()
+    lab.score(trial, True, True, True)
+    shutil.rmtree(lab.folder(trial))
+    lose(*RECORDS)
+    assert reconcile().problems == ()
+    found = Trial.objects.get()
+    assert (found.verdict.success, found.episode.uuid) == (True, trial.episode_id)
+    assert found.episode.status == EpisodeStatus.MISSING
+    assert found.duration_s == trial.duration_s
+    assert not Job.objects.exists()
+
+
+def test_a_run_that_was_no_trial_stays_none(lab):
+    lab.station.running(6)
+    lab.station.stop()
+    assert reconcile().restored == 0
+    assert (Episode.objects.count(), Trial.objects.count()) == (1, 0)
+
+
+def test_a_score_that_only_the_disk_has_counts_and_is_published(lab):
+    trial = lab.run()
+    lab.score(trial, True, False, False)
+    line = json.loads(journal.path_of(trial.episode_id).read_text())
+    Job.objects.all().delete()
+    uuid = str(uuid4())
+    journal.append(trial.episode_id, line | {"uuid": uuid, "success": True, "score": 1.0, "reason": "again"})
+    assert reconcile().restored == 1
+    found = Trial.objects.get()
+    assert (str(found.verdict.uuid), found.scores.count()) == (uuid, 2)
+    assert Job.objects.filter(key=f"publish:{trial.episode_id}").exists()
+
+
+def test_this_app_restores_what_the_episodes_hand_out():
+    assert restoring.restore in reconciling._restorers
