@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import datetime
 from typing import Annotated, Any, Literal
 from uuid import UUID, uuid4
@@ -9,6 +10,7 @@ from uuid import UUID, uuid4
 from django.db import DatabaseError
 from django.http import HttpRequest
 from ninja import Field, Router, Schema, Status
+from pydantic import ValidationError, field_validator
 
 from evaweb.api.answers import FAILURES, Failure
 from evaweb.api.trials import TrialDetail
@@ -22,6 +24,7 @@ from evaweb.trials.bench import trial_command
 
 router = Router(tags=["stations"])
 PageId = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$", description="Made by the page at random")]
+_LONGEST_WHY = 240
 _HTTP = {
     CommandStatus.ACCEPTED: 200,
     CommandStatus.DONE: 200,
@@ -131,10 +134,23 @@ class CommandOut(Schema):
 
 
 class EStopIn(Schema):
-    """Why; the same uuid again is the same press."""
+    """Why; the same uuid again is the same press. Pressing is never refused for what is said with it."""
 
     uuid: UUID | None = None
-    why: Annotated[str, Field(max_length=200)] = "pressed"
+    why: str = "pressed"
+
+    @field_validator("uuid", mode="wrap")
+    @classmethod
+    def _any_uuid(cls, given: Any, read: Callable[[Any], UUID | None]) -> UUID | None:
+        try:
+            return read(given)
+        except ValidationError:
+            return None
+
+    @field_validator("why", mode="before")
+    @classmethod
+    def _any_words(cls, given: Any) -> str:
+        return given[:_LONGEST_WHY] if isinstance(given, str) and given else "pressed"
 
 
 class TrialIn(Schema):
@@ -216,8 +232,9 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
 @router.post(
     "/{name}/estop", response={**ANSWERS, 409: CommandOut | Failure}, summary="E-stop", url_name="estop"
 )
-def estop(request: HttpRequest, name: str, given: EStopIn) -> Any:
-    """Stop the robot now; anybody who is logged in. To the wire first; the row waits for nobody."""
+def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
+    """Stop the robot now; anybody who is logged in. To the wire first, and nobody waits for the row."""
+    given = given or EStopIn()
     identity = given.uuid or uuid4()
     answer = commands.estop(station=name, username=request.auth.get_username(), why=given.why, uuid=identity)
     _note_estop(request, name, given.why, identity, answer)

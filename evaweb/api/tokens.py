@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import secrets
 from datetime import timedelta
 
 from django.contrib.auth.models import User
-from django.db import IntegrityError, transaction
+from django.db import IntegrityError, OperationalError, transaction
 from django.utils import timezone
 
 from evaweb.api.models import Token
 from evaweb.errors import Conflict, EvaError
+from evaweb.lock_wait import lock_wait
 
+log = logging.getLogger(__name__)
 PREFIX = "eva_"  # so that a scanner of secrets knows one when it sees it
 _USED_EVERY = timedelta(minutes=1)  # how exactly `used_at` is kept: not every request is a write
 
@@ -38,11 +41,21 @@ def token_user(*, secret: str) -> User | None:
     found = Token.objects.select_related("user").filter(digest=_digest(secret), user__is_active=True).first()
     if found is None:
         return None
-    now = timezone.now()
-    if found.used_at is None or now - found.used_at > _USED_EVERY:
-        Token.objects.filter(pk=found.pk).update(used_at=now)
+    _note_use(found)
     user: User = found.user
     return user
+
+
+def _note_use(token: Token) -> None:
+    """Whoever comes may want to stop a robot: nobody is kept waiting while the database is locked."""
+    now = timezone.now()
+    if token.used_at is not None and now - token.used_at <= _USED_EVERY:
+        return
+    try:
+        with lock_wait(0):
+            Token.objects.filter(pk=token.pk).update(used_at=now)
+    except OperationalError as error:
+        log.warning("the use of token %s is not noted: %s", token, error)
 
 
 def _digest(secret: str) -> str:

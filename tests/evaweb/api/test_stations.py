@@ -1,12 +1,21 @@
+import sqlite3
+from concurrent.futures import Future
+from functools import partial
 from uuid import uuid4
 
 import pytest
-from django.db import OperationalError
+from django.contrib.auth.models import User
+from django.db import OperationalError, connection
+from django.test import Client
 
+from evaweb.api.tokens import token_create
 from evaweb.errors import StationGone
-from evaweb.stations.models import Command, Lease, Station
+from evaweb.stations import commands
+from evaweb.stations.models import Command, CommandStatus, Lease, Station
 from evaweb.stations.wire import NoAnswer
 from evaweb.trials.models import Trial
+from tests.evaweb.api.conftest import Rest
+from tests.evaweb.trials import builders
 from tests.evaweb.trials.builders import BOOT
 
 
@@ -111,6 +120,63 @@ def test_an_e_stop_works_without_the_database(rest, bench, wire, monkeypatch):
     status, answer = rest.post("stations/bench-1/estop")
     assert (status, answer["status"]) == (200, "accepted")
     assert [given.kind for given in wire.heard] == ["estop"]
+
+
+@pytest.fixture
+def locked(transactional_db):
+    """Somebody else writes and does not end."""
+    if connection.vendor != "sqlite":
+        pytest.skip("only SQLite is locked as a whole")
+    other = sqlite3.connect(connection.settings_dict["NAME"], isolation_level=None)
+    begin = partial(other.execute, "BEGIN IMMEDIATE")
+    yield begin
+    other.close()
+
+
+@pytest.mark.parametrize("kind", ["estop", "stop"])
+def test_who_stops_with_a_token_is_not_kept_by_a_locked_database(locked, bench, wire, kind):
+    User.objects.update(is_superuser=True)
+    rest = Rest(token_create(user=bench.operator, name="never used"))
+    identity = str(uuid4())
+    later = Future()
+    wait = commands._written_later
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(commands, "_NOTE_S", 0)
+        patch.setattr(commands._later, "submit", lambda work, row: later.set_result((work, row)))
+        locked()
+        if kind == "estop":
+            answer = rest.post("stations/bench-1/estop", uuid=identity)
+        else:
+            answer = rest.post("stations/bench-1/commands", uuid=identity, kind="stop", page="p1", epoch=3)
+    assert (answer[0], answer[1]["status"]) == (200, "accepted")
+    assert [given.kind for given in wire.heard] == [kind]
+    work, row = later.result(0)
+    assert (work, str(row.uuid)) == (wait, identity)
+    assert not Command.objects.exists()
+
+
+def test_what_was_not_written_down_at_once_is_written_later(live_stop):
+    commands._written_later(live_stop)
+    commands._written_later(live_stop)
+    assert Command.objects.get().status == CommandStatus.DONE
+
+
+@pytest.fixture
+def live_stop(transactional_db):
+    bench = builders.bench()
+    return Command(
+        uuid=uuid4(), station=bench.station, user=bench.operator, kind="estop", status=CommandStatus.DONE
+    )
+
+
+@pytest.mark.parametrize("body", ["", "null", "[]", '{"uuid": 5, "why": 7}', '{"why": "%s"}' % ("x" * 999)])
+def test_a_press_is_not_refused_for_what_is_said_with_it(rest, bench, wire, body):
+    answer = Client().post(
+        "/api/v1/stations/bench-1/estop", body, content_type="application/json", headers=rest._headers()
+    )
+    assert answer.status_code == 200
+    assert [given.kind for given in wire.heard] == ["estop"]
+    assert len(wire.heard[0].args["why"]) <= 240
 
 
 def test_the_lease_is_claimed_and_shown(rest, bench, wire):
