@@ -3,17 +3,24 @@
 import { post, RequestFailed } from "../site/api.js";
 import { uuid } from "../site/identity.js";
 import { config } from "./config.js";
+import { answered, STOPPING, Stops } from "./stops.js";
 import { verb, words } from "./words.js";
 
-const STOPPING = ["stop", "halt"]; // pressed again while the first one is under way, they are sent again
+const STOP_ADVICE = "Press it again; if the robot still moves, press E-STOP.";
 
 /** Gives commands, says what became of them, and shows which can be given now. */
 export class Commands {
   #store;
   #pending = new Set();
+  #stops;
 
-  constructor(store) {
+  constructor(store, socket) {
     this.#store = store;
+    this.#stops = new Stops({
+      send: (message) => socket.send(message),
+      post: (command) => post(config.api.commands, command),
+      late: (ack) => this.#late(ack),
+    });
     document.addEventListener("click", (event) => this.#clicked(event));
     store.on(["snapshot", "link", "open", "second"], () => this.gate());
     document.body.addEventListener("htmx:afterSettle", () => this.gate());
@@ -28,19 +35,36 @@ export class Commands {
     Object.assign(command, { boot: this.#store.snapshot?.boot ?? "", sequence: this.#store.snapshot?.sequence ?? 0 });
     if (trial) command.trial = Number(trial);
     try {
-      const answer = await post(config.api.commands, command);
+      const answer = await (STOPPING.includes(kind) ? this.#stops.give(command) : post(config.api.commands, command));
       this.say(`${name}: ${answer.status}`, "accepted");
       return answer;
     } catch (error) {
-      this.fail(name, error);
+      this.fail(name, error, STOPPING.includes(kind) ? STOP_ADVICE : undefined);
       return null;
     }
   }
 
-  /** Say what went wrong with `name`. */
-  fail(name, error) {
+  /** The acknowledgement of a stop or pause came over the socket. */
+  acknowledged(ack) {
+    this.#stops.acknowledged(ack);
+  }
+
+  /** An answer after the page had given up, or has been answered by post: said only where it was not known. */
+  #late(ack) {
+    if (document.getElementById("outcome").dataset.kind !== "unknown") return;
+    const name = verb(ack.kind);
+    try {
+      this.say(`${name}: ${answered(ack).status}, answered late`, "accepted");
+    } catch (error) {
+      this.fail(name, error, STOP_ADVICE);
+    }
+  }
+
+  /** Say what went wrong with `name`, and what to do where nobody knows whether it was done. */
+  fail(name, error, advice = "Look at the state before you repeat it.") {
     if (!(error instanceof RequestFailed)) throw error;
-    if (error.unknown) this.say(`${name}: outcome unknown. ${error.message}. Look at the state before you repeat it.`, "unknown");
+    if (error.unknown) this.say(`${name}: outcome unknown. ${error.message}. ${advice}`, "unknown");
+    else if (error.body.status === "failed") this.say(`${name} failed: ${error.message}`, "refused");
     else this.say(`${name} refused: ${error.message}`, "refused");
   }
 
@@ -57,6 +81,7 @@ export class Commands {
     if (!store.fresh) return "nothing is known of the station at the moment";
     if (store.role === "viewer") return "a viewer watches; an administrator can make you an operator";
     if (store.lease === "free") return "take the station first";
+    if (store.lease === "elsewhere") return "another page of yours commands the station; take it here first";
     if (store.lease !== "mine") return "somebody else commands the station; ask for it";
     const { allowed, state } = store.snapshot;
     if (kind && !allowed.includes(kind)) {

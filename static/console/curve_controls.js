@@ -1,11 +1,12 @@
 // Which joint is drawn, and whether it stands still; a sentence in its place where uPlot is not installed.
 
 import { config } from "./config.js";
-import { Curves, legend } from "./curves.js";
+import { Legend } from "./curve_legend.js";
+import { Curves } from "./curves.js";
 
 const KEY = `eva-joint-${config.station}`;
 
-/** The pane of the curves; resolves to {add(t, vectors), joints(names, units)}. */
+/** The pane of the curves; resolves to {add(t, vectors), joints(names)}. */
 export async function curvePane() {
   const note = document.getElementById("curves-note");
   let library;
@@ -16,8 +17,8 @@ export async function curvePane() {
     note.textContent = "Curves are drawn by uPlot, which is not installed: run npm install in the project's folder and start the web server again.";
     return { add() {}, joints() {} };
   }
-  legend(document.getElementById("curves-legend"));
-  const curves = new Curves({ element: document.getElementById("curves"), library, names: config.joints, units: config.units });
+  const legend = new Legend(document.getElementById("curves-legend"), (name, shown) => curves.reveal(name, shown));
+  const curves = new Curves({ element: document.getElementById("curves"), library, legend, names: config.joints });
   const select = joints(curves, config.joints);
   document.getElementById("joint-next").addEventListener("click", () => {
     select.selectedIndex = (select.selectedIndex + 1) % Math.max(1, select.options.length);
@@ -26,8 +27,8 @@ export async function curvePane() {
   pauseButton(curves);
   return {
     add: (t, vectors) => curves.add(t, vectors),
-    joints: (names, units) => {
-      curves.joints(names, units);
+    joints: (names) => {
+      curves.joints(names);
       if (names.join() !== [...select.options].map((option) => option.text).join()) joints(curves, names);
     },
   };
@@ -38,11 +39,15 @@ function joints(curves, names) {
   select.replaceChildren(...names.map((name, index) => new Option(name, String(index))));
   const wanted = names.indexOf(localStorage.getItem(KEY));
   select.selectedIndex = names.length ? Math.max(0, wanted) : -1;
+  const show = () => {
+    curves.show(select.selectedIndex);
+    document.getElementById("curves-unit").textContent = config.units[select.selectedIndex] ?? "";
+  };
   select.onchange = () => {
     localStorage.setItem(KEY, names[select.selectedIndex]);
-    curves.show(select.selectedIndex);
+    show();
   };
-  if (names.length) curves.show(select.selectedIndex);
+  if (names.length) show();
   return select;
 }
 

@@ -1,5 +1,6 @@
-// Curves of one joint over the last seconds: where it is, where it was told to be, where the plan wants it.
+// Curves of one joint over the last seconds: where it is, what the policy wants, what was planned, what was sent.
 
+import { KINDS, axes, blank, series, spread } from "./curve_kinds.js";
 import { keep } from "./decimate.js";
 import { Trace } from "./trace.js";
 
@@ -7,60 +8,55 @@ const SECONDS = 20;
 const ROWS = 60 * (SECONDS + 2);
 const GAP_S = 0.5; // without news for so long: a gap, not a line
 const DRAW_MS = 100;
-const KINDS = [
-  { name: "measured", colour: "--curve-1", width: 2 },
-  { name: "commanded", colour: "--curve-2", width: 1.5 },
-  { name: "planned", colour: "--curve-3", width: 1.5, dash: [4, 4] },
-];
-
-function css(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-}
 
 export class Curves {
   #element;
   #plot = null;
   #library = null;
+  #legend;
   #trace = null;
   #names = [];
-  #units = [];
   #joint = 0;
-  #seen = new Set(); // kinds that have come
   #frozen = null;
   #addedAt = 0; // on this page's clock [ms]
 
-  constructor({ element, library, names, units }) {
+  constructor({ element, library, legend, names }) {
     this.#element = element;
     this.#library = library;
-    this.joints(names, units);
+    this.#legend = legend;
+    this.joints(names);
     new ResizeObserver(() => this.#fit()).observe(element);
     document.addEventListener("eva:theme", () => this.#build());
     setInterval(() => this.#draw(), DRAW_MS);
     this.#build();
   }
 
-  /** The joints' names and units, in the order of the vectors. */
-  joints(names, units) {
+  /** The joints' names, in the order of the vectors. */
+  joints(names) {
     if (names.join() === this.#names.join()) return;
     this.#names = names;
-    this.#units = units;
     this.#trace = new Trace({ dim: names.length, kinds: KINDS.map((kind) => kind.name), rows: ROWS });
   }
 
-  /** One row of vectors {measured, commanded, planned} at `t` [s]. */
+  /** One row of vectors by the kinds' names at `t` [s]; NaN, or a kind that is not there: a gap. */
   add(t, vectors) {
     if (!this.#trace) return;
     if (t < this.#trace.newest - 1) this.#trace.clear(); // another server, another clock
     if (t - this.#trace.newest > GAP_S) this.#trace.add(t - 1e-3, {});
     this.#trace.add(t, vectors);
     this.#addedAt = performance.now();
-    for (const kind of Object.keys(vectors)) this.#seen.add(kind);
   }
 
+  /** Draw that joint. */
   show(joint) {
     this.#joint = joint;
     this.#frozen &&= this.#column();
     this.#draw(true);
+  }
+
+  /** Draw the curve of that name, or leave it out. */
+  reveal(name, shown) {
+    this.#plot.setSeries(1 + KINDS.findIndex((kind) => kind.name === name), { show: shown });
   }
 
   get paused() {
@@ -91,18 +87,17 @@ export class Curves {
     const { times, values } = this.#frozen ?? this.#column();
     const columns = KINDS.map((kind) => values[kind.name]);
     const kept = keep(columns, 2 * this.#plot.width);
-    const blank = (value) => (Number.isNaN(value) ? null : value);
-    this.#plot.setData([kept.map((at) => times[at]), ...columns.map((column) => kept.map((at) => blank(column[at])))]);
-    this.#legend(columns);
+    this.#plot.setData([kept.map((at) => times[at]), ...columns.map((column) => blank(kept.map((at) => column[at])))]);
+    this.#tell();
   }
 
-  #legend(columns) {
-    const unit = this.#units[this.#joint] ?? "";
+  /** The values under the cursor, else the newest ones; what is old has none. */
+  #tell() {
+    const at = this.#plot.cursor.idx;
+    const newest = this.#silence && !this.#frozen ? () => NaN : (column) => column.at(-1) ?? NaN;
     for (const [index, kind] of KINDS.entries()) {
-      const part = document.querySelector(`[data-curve="${kind.name}"]`);
-      part.hidden = !this.#seen.has(kind.name);
-      const value = this.#silence ? NaN : columns[index].at(-1);
-      part.lastElementChild.textContent = Number.isFinite(value) ? `${kind.name} ${value.toFixed(3)} ${unit}` : `${kind.name} –`;
+      const column = this.#plot.data[index + 1];
+      this.#legend.value(kind.name, Number.isInteger(at) ? (column[at] ?? NaN) : newest(column));
     }
   }
 
@@ -113,42 +108,17 @@ export class Curves {
 
   #build() {
     this.#plot?.destroy();
-    const line = { stroke: css("--text-muted"), grid: { stroke: css("--hairline"), width: 1 }, ticks: { show: false }, font: `13px ${css("--font")}` };
     const options = {
       width: this.#element.clientWidth || 600,
       height: this.#element.clientHeight || 160,
       legend: { show: false },
-      cursor: { drag: { x: false, y: false } },
+      cursor: { drag: { x: false, y: false }, points: { show: false } },
       scales: { x: { time: false, range: [-SECONDS, 0] }, y: { range: (plot, low, high) => spread(low, high) } },
-      axes: [
-        { ...line, size: 24, values: (plot, ticks) => ticks.map((tick) => `${tick} s`) },
-        { ...line, size: 56, values: (plot, ticks) => ticks.map((tick) => tick.toFixed(2)) },
-      ],
-      series: [{}, ...KINDS.map((kind) => ({ label: kind.name, stroke: css(kind.colour), width: kind.width, dash: kind.dash, points: { show: false } }))],
+      axes: axes(),
+      series: series(KINDS, (name) => this.#legend.shown(name)),
+      hooks: { setCursor: [(plot) => plot === this.#plot && this.#tell()] },
     };
     this.#plot = new this.#library(options, [[], ...KINDS.map(() => [])], this.#element);
     this.#draw(true);
-  }
-}
-
-/** The range of the value axis: never so narrow that noise looks like motion. */
-function spread(low, high) {
-  if (low === null || !Number.isFinite(low)) return [-0.1, 0.1];
-  const middle = (low + high) / 2;
-  const half = Math.max((high - low) * 0.55, 0.02);
-  return [middle - half, middle + half];
-}
-
-/** Legend entries for the page. */
-export function legend(element) {
-  for (const kind of KINDS) {
-    const part = document.createElement("span");
-    part.className = "legend";
-    part.dataset.curve = kind.name;
-    part.hidden = true;
-    const swatch = document.createElement("i");
-    swatch.style.background = `var(${kind.colour})`;
-    part.append(swatch, document.createElement("span"));
-    element.append(part);
   }
 }

@@ -11,6 +11,7 @@ const NAMES = {
   withdraw: "Withdraw",
   hand_over: "Hand over",
   decline: "Decline",
+  move: "Take it here",
 };
 const AWAY_S = 5; // the lease's time to live
 

@@ -20,6 +20,7 @@ import { Store } from "./store.js";
 import { TrialPanel } from "./trial.js";
 
 const nothing = { poses() {}, bench() {}, add() {}, joints() {}, software: false };
+const CURVES = { measured: "state", raw: "raw", planned: "smoothed", commanded: "executed" }; // of the stream, as drawn
 const SOFTWARE_FRAME_MS = 80; // a browser without a graphics card shares the processor with the robot's programs
 
 /** The panes that need time to load; until then their data goes nowhere. */
@@ -51,17 +52,17 @@ function pace() {
 
 function vectors(frame, { json, arrays }) {
   const found = {};
-  for (const [kind, place] of Object.entries(arrays)) found[kind] = frame.numbers(place);
-  if (json?.engaged === false) delete found.commanded; // nothing is being sent
+  for (const [kind, place] of Object.entries(arrays)) found[CURVES[kind]] = frame.numbers(place);
+  if (json?.engaged === false) delete found.executed; // nothing is being sent
   return found;
 }
 
-function listen(store, { events, estop, lease, trial }) {
+function listen(store, { events, estop, commands, lease, trial }) {
   const answers = {
     hello: ({ facts, role }) => {
       store.facts = facts;
       store.role = role ?? store.role;
-      if (facts.joint_names?.length) panes.curves.joints(facts.joint_names, config.units);
+      if (facts.joint_names?.length) panes.curves.joints(facts.joint_names);
       store.tell("hello");
     },
     link: (link) => {
@@ -69,7 +70,7 @@ function listen(store, { events, estop, lease, trial }) {
       store.tell("link");
     },
     events: (news) => events.add(news),
-    ack: (ack) => estop().acknowledged(ack),
+    ack: (ack) => (ack.kind === "estop" ? estop() : commands()).acknowledged(ack),
     renewed: (answer) => lease().renewed(answer),
     changed: ({ what }) => {
       if (what.includes("lease")) window.htmx.trigger("#lease", "eva:lease");
@@ -88,7 +89,7 @@ async function start() {
   const cameras = new Cameras(store);
   const parts = {};
   const socket = new LiveSocket(`${config.socket}?page=${store.page}`, {
-    told: listen(store, { events, estop: () => parts.estop, lease: () => parts.lease, trial: () => parts.trial }),
+    told: listen(store, { events, estop: () => parts.estop, commands: () => parts.commands, lease: () => parts.lease, trial: () => parts.trial }),
     draw: (frame) => draw(frame, store, cameras),
     changed: (open) => {
       store.open = open;
@@ -104,7 +105,8 @@ async function start() {
   parts.estop = new EStop(store, socket); // first of all that can be pressed
   keyboard();
   statusBar(store);
-  const commands = new Commands(store);
+  const commands = new Commands(store, socket);
+  parts.commands = commands;
   parts.lease = new LeaseControls(store, socket, commands);
   if (config.page === "eval") parts.trial = new TrialPanel(store, commands);
   figures(store);

@@ -74,7 +74,7 @@ function drawFigures(store, snapshot) {
   }
   write("transport", `${snapshot.transport} ${joints !== null && joints < 1 ? "ok" : `silent ${age(joints ?? Infinity)}`}`);
   drawPolicy(snapshot.policy);
-  const held = { mine: "you", free: "free", other: store.commander }[store.lease];
+  const held = { mine: "you", elsewhere: "your other page", free: "free", other: store.commander }[store.lease];
   write("lease", `lease: ${held}`);
   for (const element of shown("lease")) element.dataset.lease = store.lease;
   const stage = snapshot.state === "setting_up" ? `${words(snapshot.stage)} …` : "";

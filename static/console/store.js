@@ -48,19 +48,20 @@ export class Store {
     return this.open && this.link.ok && this.snapshot !== null && this.age < 1.5;
   }
 
-  /** "mine", "other", "free", or "unknown" where nothing is known. */
+  /** "mine", "elsewhere" (another page of the same person), "other", "free", or "unknown". */
   get lease() {
     if (!this.snapshot) return "unknown";
     const { holder } = this.snapshot.lease;
     if (!holder) return "free";
-    return holder === this.holder ? "mine" : "other";
+    if (holder === this.holder) return "mine";
+    return holder.startsWith(`web:${this.user}:`) ? "elsewhere" : "other";
   }
 
   /** Who has the lease, as people know them. */
   get commander() {
     const [kind, name] = (this.snapshot?.lease.holder ?? "").split(":");
     if (kind !== "web") return this.snapshot?.lease.holder ?? "";
-    return name === this.user ? `${name} (another page)` : name;
+    return name;
   }
 
   get epoch() {

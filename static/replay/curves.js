@@ -1,7 +1,8 @@
 // The pane of the curves: which joint, what its values are at the clock, and the plot.
 
+import { Legend } from "../console/curve_legend.js";
 import { joint, message } from "./data.js";
-import { LEGEND, Plot } from "./plot.js";
+import { Plot } from "./plot.js";
 
 const KEY = "eva-replay-joint";
 
@@ -34,16 +35,19 @@ class Pane {
   #episode;
   #plot;
   #curves = null;
-  #values = {};
-  #unit = "";
+  #chunks = [];
+  #legend;
 
   constructor(clock, episode, library) {
     this.#clock = clock;
     this.#episode = episode;
     const { held, marks } = episode.header;
     const behind = { held, marks, safety: this.#safety(), chunks: [] };
-    this.#plot = new Plot({ element: document.getElementById("curves"), library, behind, seek: (time) => clock.seekRow(Math.floor(time * clock.fps)) });
-    this.#legend();
+    const element = document.getElementById("legend");
+    this.#legend = new Legend(element, (name, shown) => this.#plot.reveal(name, shown));
+    this.#explain(element);
+    const seek = (time) => clock.seekRow(Math.floor(time * clock.fps));
+    this.#plot = new Plot({ element: document.getElementById("curves"), library, behind, shown: (name) => this.#legend.shown(name), seek });
     this.#select();
     for (const kind of ["tick", "seek"]) clock.addEventListener(kind, () => this.#at());
   }
@@ -72,44 +76,46 @@ class Pane {
     const { ticks, raw } = this.#episode;
     const length = ticks.time.length;
     const pick = (name) => joint(ticks[name], index, length);
-    this.#curves = { time: ticks.time, measured: pick("measured"), executed: pick("executed"), smoothed: pick("smoothed") };
-    this.#unit = this.#episode.header.units[index];
-    this.#plot.show(this.#curves, chunks(raw.time, joint(raw.values, index, raw.time.length), raw.chunk));
+    this.#curves = { time: ticks.time, state: pick("measured"), executed: pick("executed"), smoothed: pick("smoothed") };
+    document.getElementById("unit").textContent = this.#episode.header.units[index] ?? "";
+    this.#chunks = chunks(raw.time, joint(raw.values, index, raw.time.length), raw.chunk);
+    this.#plot.show(this.#curves, this.#chunks);
     this.#at();
   }
 
-  #legend() {
+  #explain(element) {
     const { safety } = this.#episode.ticks;
-    for (const { name, colour } of LEGEND) this.#values[name] = entry(name, colour, "line");
-    if (this.#episode.header.held.length) entry("held", "--holding-soft", "patch");
-    if (safety.includes(1)) entry("changed by safety", "--holding", "line");
-    if (safety.includes(2)) entry("refused", "--faulted", "line");
-    if (!this.#episode.spaces.includes("joint")) this.#values.raw.textContent = `raw: the policy speaks in ${this.#episode.spaces.join(", ") || "no"} space`;
+    if (this.#episode.header.held.length) mark(element, "held", "--holding-soft", "patch");
+    if (safety.includes(1)) mark(element, "changed by safety", "--holding", "line");
+    if (safety.includes(2)) mark(element, "refused", "--faulted", "line");
+    const { spaces } = this.#episode;
+    if (!spaces.includes("joint")) this.#legend.explain("raw", `The policy speaks in ${spaces.join(", ") || "no"} space: it has no joint to draw.`);
   }
 
   #at() {
     const { time } = this.#clock;
     this.#plot.at(time);
     const tick = last(this.#curves.time, time + 1e-6);
-    for (const name of ["measured", "executed", "smoothed"]) {
-      const value = tick < 0 ? NaN : this.#curves[name][tick];
-      this.#values[name].textContent = `${name} ${Number.isFinite(value) ? `${value.toFixed(3)} ${this.#unit}` : "–"}`;
-    }
+    for (const name of ["state", "executed", "smoothed"]) this.#legend.value(name, tick < 0 ? NaN : this.#curves[name][tick]);
+    this.#legend.value("raw", wanted(this.#chunks, time + 1e-6));
   }
 }
 
-/** Add one entry to the legend; returns where its words stand. */
-function entry(name, colour, shape) {
+/** Say what a colour behind the curves means. */
+function mark(element, name, colour, shape) {
   const part = document.createElement("span");
   part.className = "legend";
   const swatch = document.createElement("i");
   swatch.className = shape;
-  swatch.style.background = `var(${colour})`;
-  const words = document.createElement("span");
-  words.textContent = name;
-  part.append(swatch, words);
-  document.getElementById("legend").append(part);
-  return words;
+  swatch.style.setProperty("--colour", `var(${colour})`);
+  part.append(swatch, name);
+  element.append(part);
+}
+
+/** What the newest chunk wants at `time`; NaN where it says nothing. */
+function wanted(chunks, time) {
+  const chunk = chunks.findLast(({ times }) => times[0] <= time);
+  return chunk ? chunk.values[last(chunk.times, time)] : NaN;
 }
 
 /** Consecutive values of one chunk belong to one line. */

@@ -1,22 +1,10 @@
 // The curves of one joint over the whole episode, with what happened drawn behind and over them.
 
-const KINDS = [
-  { name: "measured", colour: "--curve-1", width: 2 },
-  { name: "executed", colour: "--curve-2", width: 1.5 },
-  { name: "smoothed", colour: "--curve-3", width: 1.5, dash: [4, 4] },
-];
+import { KINDS, axes, blank, css, series, spread } from "../console/curve_kinds.js";
+
+const LINES = KINDS.filter((kind) => kind.name !== "raw"); // raw is drawn chunk by chunk
+const RAW = KINDS.find((kind) => kind.name === "raw");
 const SAFETY_HEIGHT = 5; // px
-
-export const LEGEND = [...KINDS, { name: "raw", colour: "--edge" }];
-
-function css(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-}
-
-/** NaN is no value to uPlot. */
-function blank(values) {
-  return Array.from(values, (value) => (Number.isNaN(value) ? null : value));
-}
 
 export class Plot {
   #element;
@@ -26,24 +14,32 @@ export class Plot {
   #data;
   #behind; // {held, marks, safety, chunks}
   #time = 0;
+  #shown;
 
-  constructor({ element, library, behind, seek }) {
+  constructor({ element, library, behind, shown, seek }) {
     this.#element = element;
     this.#library = library;
     this.#behind = behind;
+    this.#shown = shown;
     this.seek = seek;
     this.#cursor.className = "replay-cursor";
     new ResizeObserver(() => this.#fit()).observe(element);
     document.addEventListener("eva:theme", () => this.#build());
   }
 
-  /** `curves`: {time, measured, executed, smoothed} of one joint; `chunks`: [{times, values}] as the policy gave them. */
+  /** `curves`: {time, state, executed, smoothed} of one joint; `chunks`: [{times, values}] as the policy gave them. */
   show(curves, chunks) {
     this.#behind.chunks = chunks;
-    this.#data = [Array.from(curves.time), ...KINDS.map((kind) => blank(curves[kind.name]))];
+    this.#data = [Array.from(curves.time), ...LINES.map((kind) => blank(curves[kind.name]))];
     if (this.#plot) this.#plot.setData(this.#data);
     else this.#build();
     this.at(this.#time);
+  }
+
+  /** Draw the curve of that name, or leave it out. */
+  reveal(name, shown) {
+    if (name === RAW.name) this.#plot?.redraw();
+    else this.#plot?.setSeries(1 + LINES.findIndex((kind) => kind.name === name), { show: shown });
   }
 
   /** Move the line of the clock. */
@@ -64,18 +60,14 @@ export class Plot {
   #build() {
     if (!this.#data) return;
     this.#plot?.destroy();
-    const line = { stroke: css("--text-muted"), grid: { stroke: css("--hairline"), width: 1 }, ticks: { show: false }, font: `13px ${css("--font")}` };
     const options = {
       width: this.#element.clientWidth || 600,
       height: this.#element.clientHeight || 160,
       legend: { show: false },
       cursor: { drag: { x: true, y: false }, points: { show: false } },
       scales: { x: { time: false }, y: { range: (plot, low, high) => spread(low, high) } },
-      axes: [
-        { ...line, size: 24, values: (plot, ticks) => ticks.map((tick) => `${tick} s`) },
-        { ...line, size: 56, values: (plot, ticks) => ticks.map((tick) => tick.toFixed(2)) },
-      ],
-      series: [{}, ...KINDS.map((kind) => ({ label: kind.name, stroke: css(kind.colour), width: kind.width, dash: kind.dash, points: { show: false } }))],
+      axes: axes(),
+      series: series(LINES, this.#shown),
       hooks: {
         drawAxes: [(plot) => this.#drawBehind(plot)],
         draw: [(plot) => this.#drawOver(plot)],
@@ -115,8 +107,8 @@ export class Plot {
       for (const [from, to] of this.#behind.held) ctx.fillRect(x(from), top, Math.max(1, x(to) - x(from)), height);
       ctx.fillStyle = css("--edge");
       for (const { time } of this.#behind.marks) ctx.fillRect(Math.round(x(time)), top, 1, height);
-      ctx.strokeStyle = css("--edge");
-      ctx.globalAlpha = 0.7;
+      if (!this.#shown(RAW.name)) return;
+      ctx.strokeStyle = css(RAW.colour);
       ctx.lineWidth = devicePixelRatio;
       ctx.beginPath();
       for (const { times, values } of this.#behind.chunks) {
@@ -139,12 +131,4 @@ export class Plot {
       }
     });
   }
-}
-
-/** The range of the value axis: never so narrow that noise looks like motion. */
-function spread(low, high) {
-  if (low === null || !Number.isFinite(low)) return [-0.1, 0.1];
-  const middle = (low + high) / 2;
-  const half = Math.max((high - low) * 0.58, 0.02);
-  return [middle - half, middle + half];
 }

@@ -166,3 +166,112 @@ def test_an_identity_is_a_random_uuid_of_version_four() -> None:
     assert first[14] == "4"
     assert first[19] in "89ab"
     assert [len(part) for part in first.split("-")] == [8, 4, 4, 4, 12]
+
+
+STOPS = """
+const sent = [], posted = [], late = [];
+const stops = new m.Stops({
+  send: (message) => { if (given.open) sent.push(message); return given.open; },
+  post: async (command) => { posted.push(command); return given.post ?? new Promise(() => {}); },
+  late: (ack) => late.push(ack.status),
+});
+const order = { kind: "stop", uuid: "u1", epoch: 4, page: "p1" };
+const said = stops
+  .give(order, given.patience)
+  .then((answer) => answer.status, (error) => [error.message, error.unknown]);
+"""
+
+
+def test_a_stop_that_the_socket_answers_is_not_posted() -> None:
+    found = run(
+        "stops.js",
+        STOPS
+        + """
+        stops.acknowledged({ uuid: "u1", kind: "stop", status: "done", reason: "" });
+        return { said: await said, sent, posted };
+        """,
+        {"open": True, "patience": 10_000},
+    )
+
+    assert found == {"said": "done", "sent": [{"type": "stop", "uuid": "u1", "epoch": 4}], "posted": []}
+
+
+def test_a_stop_goes_by_post_under_the_same_uuid_where_the_socket_is_closed() -> None:
+    given = {"open": False, "patience": 10_000, "post": {"status": "accepted"}}
+    found = run("stops.js", STOPS + "return { said: await said, posted };", given)
+
+    assert found["said"] == "accepted"
+    assert [order["uuid"] for order in found["posted"]] == ["u1"]
+
+
+def test_a_stop_that_nobody_acknowledges_is_posted_too_and_the_first_answer_counts() -> None:
+    given = {"open": True, "patience": 5, "post": {"status": "done"}}
+    posted_first = run("stops.js", STOPS + "return { said: await said, sent, posted };", given)
+    acknowledged_first = run(
+        "stops.js",
+        STOPS
+        + """
+        while (!posted.length) await new Promise((resolve) => setTimeout(resolve, 1));
+        stops.acknowledged({ uuid: "u1", kind: "stop", status: "accepted" });
+        return await said;
+        """,
+        {"open": True, "patience": 5},
+    )
+
+    assert posted_first["said"] == "done"
+    assert [order["uuid"] for order in posted_first["sent"] + posted_first["posted"]] == ["u1", "u1"]
+    assert acknowledged_first == "accepted"
+
+
+@pytest.mark.parametrize(
+    ("status", "unknown"), [("refused", False), ("failed", False), ("unknown", True), ("pressed", True)]
+)
+def test_a_stop_that_was_not_carried_out_is_never_called_done(status: str, unknown: bool) -> None:
+    found = run(
+        "stops.js",
+        STOPS
+        + f'stops.acknowledged({{ uuid: "u1", status: "{status}", reason: "because" }}); return await said;',
+        {"open": True, "patience": 10_000},
+    )
+
+    assert found == ["because", unknown]
+
+
+def test_an_answer_after_the_page_was_told_is_passed_on() -> None:
+    found = run(
+        "stops.js",
+        STOPS + 'await said; stops.acknowledged({ uuid: "u1", status: "done" }); return late;',
+        {"open": False, "patience": 10_000, "post": {"status": "done"}},
+    )
+
+    assert found == ["done"]
+
+
+@pytest.mark.parametrize(
+    ("holder", "lease"),
+    [
+        ("", "free"),
+        ("web:ada:p1", "mine"),
+        ("web:ada:p2", "elsewhere"),
+        ("web:adam:p1", "other"),
+        ("terminal", "other"),
+    ],
+)
+def test_the_page_knows_whether_it_or_another_of_the_same_person_commands(holder: str, lease: str) -> None:
+    body = """
+    const store = new m.Store({ user: "ada", page: "p1", role: "operator" });
+    store.snapshot = { lease: { holder: given, epoch: 1 } };
+    return store.lease;
+    """
+    assert run("store.js", body, holder) == lease
+
+
+def test_curves_have_one_word_and_one_colour_each() -> None:
+    kinds = run("curve_kinds.js", "return m.KINDS")
+
+    assert [kind["name"] for kind in kinds] == ["raw", "smoothed", "state", "executed"]
+    assert len({kind["colour"] for kind in kinds}) == len(kinds)
+
+
+def test_no_value_is_a_gap_to_the_plot() -> None:
+    assert run("curve_kinds.js", "return m.blank([1, NaN, 2])") == [1, None, 2]

@@ -496,6 +496,14 @@ def test_who_asks_for_the_station_is_shown_with_an_answer_to_give(
     assert 'data-lease="request"' in html
 
 
+def test_an_operator_can_take_the_station_from_another_page_of_theirs(
+    browser: Client, ada: User, station: Station
+) -> None:
+    html = text_of(browser, "/stations/bench-1/lease")
+
+    assert re.search(r'data-lease-when="elsewhere".*?data-lease="move"', html, re.DOTALL)
+
+
 def test_who_has_asked_can_withdraw(browser: Client, ada: User, station: Station) -> None:
     asked = LeaseRequest.objects.create(station=station, user=ada, holder="web:ada:2")
 

@@ -1,0 +1,42 @@
+// The curves of a joint on the live pages and in Replay: the same words, colours and order in both.
+
+/** `colour` is a custom property; `means` is what a legend says of it. */
+export const KINDS = [
+  { name: "raw", colour: "--curve-4", width: 1.5, means: "What the newest chunk of the policy wants" },
+  { name: "smoothed", colour: "--curve-3", width: 1.5, dash: [4, 4], means: "What was made of all chunks, before safety" },
+  { name: "state", colour: "--curve-1", width: 2, means: "Where the joint was measured" },
+  { name: "executed", colour: "--curve-2", width: 1.5, means: "What was sent to the robot, after safety" },
+];
+
+/** The value of a custom property where the page stands now. */
+export function css(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+}
+
+/** NaN is no value to uPlot. */
+export function blank(values) {
+  return Array.from(values, (value) => (Number.isNaN(value) ? null : value));
+}
+
+/** The series of uPlot for these kinds; those that `shown(name)` is false for are there, but not drawn. */
+export function series(kinds, shown) {
+  const look = ({ name, colour, width, dash }) => ({ label: name, stroke: css(colour), width, dash, show: shown(name), points: { show: false } });
+  return [{}, ...kinds.map(look)];
+}
+
+/** The two axes: seconds and the joint's unit. */
+export function axes() {
+  const line = { stroke: css("--text-muted"), grid: { stroke: css("--hairline"), width: 1 }, ticks: { show: false }, font: `13px ${css("--font")}` };
+  return [
+    { ...line, size: 24, values: (plot, ticks) => ticks.map((tick) => `${tick} s`) },
+    { ...line, size: 56, values: (plot, ticks) => ticks.map((tick) => tick.toFixed(2)) },
+  ];
+}
+
+/** The range of the value axis: never so narrow that noise looks like motion. */
+export function spread(low, high) {
+  if (low === null || !Number.isFinite(low)) return [-0.1, 0.1];
+  const middle = (low + high) / 2;
+  const half = Math.max((high - low) * 0.57, 0.02);
+  return [middle - half, middle + half];
+}
