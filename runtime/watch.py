@@ -18,6 +18,7 @@ from runtime.session import Happening, State
 SIBLINGS = ("control", "media", "guard")
 _LINK_LOST_S = 2.0
 _CONNECTED_S = 1.0
+_LATCH_S = 0.2  # how long the e-stop's flag may be ahead of its latch on the disk
 
 
 class Noticed(NamedTuple):
@@ -39,6 +40,7 @@ class Watch:
         self._generations = {name: page.generation(name) for name in SIBLINGS}
         self._lease_held = False
         self.estop = ""  # who pressed and why, while it is latched
+        self._pressed: float | None = None  # when the flag was seen without its latch
 
     def notice(self, state: State, run: Run | None) -> Iterator[Noticed]:
         """What there is to tell the session, which is in `state` before the first of it."""
@@ -77,11 +79,19 @@ class Watch:
         latched = self._page.estop is EStop.LATCHED
         if latched and state is not State.FAULTED:
             pressed = self._latch.read()
+            if not (pressed and pressed.wall) and self._just_pressed():  # absent, or half written
+                return
             self.estop = f"by {pressed.by}: {pressed.why}" if pressed else "pressed"
             yield Noticed(Happening.ESTOPPED, f"e-stop {self.estop}: make safe, then release")
         elif not latched and state is State.FAULTED:
-            self.estop = ""
+            self.estop, self._pressed = "", None
             yield Noticed(Happening.RELEASED, "e-stop released: set up again")
+
+    def _just_pressed(self) -> bool:
+        """Control obeys the flag already; who pressed and why is on the disk a moment later."""
+        now = self._clock.now()
+        self._pressed = now if self._pressed is None else self._pressed
+        return now - self._pressed < _LATCH_S
 
     def _leases(self) -> Iterator[Noticed]:
         held = self._lease.current(self._clock.now()) is not None

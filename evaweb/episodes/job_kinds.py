@@ -38,6 +38,8 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
     episode = Episode.objects.select_related("station").get(uuid=UUID(work.args["uuid"]))
     folder = journal_folder(episode.uuid)
     recorded = recorded_in(folder)
+    if recorded.closed and not recorded.facts["frames"]:
+        return {"published": False, "why": "it has no rows: its run ended before the first"}
     success = success_of(scores_file(episode.uuid))
     if success is None and recorded.facts["status"] in (EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED):
         return {"published": False, "why": f"it is {recorded.facts['status']} and nobody has scored it"}

@@ -1,6 +1,7 @@
 """A person at the bench: what they press and what they see."""
 
-from tests.e2e.lab import STATION, eventually
+from tests.e2e.lab import STATION
+from tests.processes import eventually
 from tests.e2e.pixels import pixels
 
 

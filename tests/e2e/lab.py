@@ -7,34 +7,18 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import time
 from contextlib import closing, contextmanager
 from pathlib import Path
 
 import psutil
+
+from tests.processes import alive, eventually
 
 ROOT = Path(__file__).parents[2]
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
 NO_CHROMIUM = "Debian's chromium is not installed (apt-get install chromium)"
 STATION = "bench-1"
 WIDE, TABLET = {"width": 1440, "height": 900}, {"width": 1024, "height": 768}
-
-
-def alive(pid):
-    """Whether the process runs; one that only waits to be reaped does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
-def eventually(check, seconds, what):
-    """Wait for something that real processes do in their own time."""
-    deadline = time.monotonic() + seconds
-    while not (found := check()):
-        assert time.monotonic() < deadline, f"{what}: not within {seconds} s"
-        time.sleep(0.05)
-    return found
 
 
 class Demo:

@@ -6,7 +6,8 @@ from contextlib import contextmanager
 import pytest
 
 from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
-from tests.e2e.lab import STATION, eventually
+from tests.e2e.lab import STATION
+from tests.processes import eventually
 
 SCENE, SKILLED = "block-on-plate", "pick-place-40k"
 _SOON_S, _MOTION_S = 20.0, 60.0

@@ -6,7 +6,8 @@ import io
 import pytest
 
 from tests.e2e.bench_page import BenchPage
-from tests.e2e.lab import STATION, WIDE, eventually
+from tests.e2e.lab import STATION, WIDE
+from tests.processes import eventually
 from tests.e2e.pixels import moved, orange, pixels, share, white, wood
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]

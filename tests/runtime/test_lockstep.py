@@ -12,6 +12,7 @@ from runtime import deployment, family, lockstep
 from runtime.datasets.published import publish
 from runtime.errors import SetupError
 from runtime.latch import Latch
+from runtime.page import EStop
 from runtime.recording.reader import Episode, open_episode
 from runtime.session import State
 from runtime.types import Float64, Observation
@@ -271,6 +272,24 @@ def test_the_e_stop_in_the_middle_of_a_run_faults_and_sends_the_measured_positio
     assert outcome is not None
     assert outcome["status"] == "interrupted"
     assert "ada: smoke" in str(outcome["reason"])
+    station.close()
+
+
+@pytest.mark.parametrize(("on_disk", "reason"), [(True, "by ada: smoke"), (False, "e-stop pressed")])
+def test_an_e_stop_is_told_with_who_pressed_where_the_disk_has_it_soon(
+    tmp_path: Path, on_disk: bool, reason: str
+) -> None:
+    station = Station(plan(tmp_path)).running(30)
+    station.page.set_estop(EStop.LATCHED)
+    station.go(3)
+    assert station.state is State.RUNNING  # control obeys already; nobody knows yet who it was
+    if on_disk:
+        Latch(station.plan.deployment.station_dir).set("ada", "smoke")
+        station.go(2)
+    else:
+        station.go(6)
+    assert station.state is State.FAULTED
+    assert reason in station.reason
     station.close()
 
 

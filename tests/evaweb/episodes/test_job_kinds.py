@@ -170,6 +170,17 @@ def test_an_interrupted_episode_is_published_only_where_it_was_scored(closed: Cl
     assert publish(episode).result["published"] is True
 
 
+def test_an_episode_without_rows_is_no_failure_and_in_no_dataset(closed: Closed, data: Path) -> None:
+    episode = closed()
+    outcome = data / "episodes" / str(episode.uuid) / "outcome.json"
+    outcome.write_text(json.dumps(json.loads(outcome.read_text()) | {"frames": 0}))
+    score(data, episode, False)
+    job = publish(episode)
+    assert job.status == JobStatus.DONE
+    assert job.result == {"published": False, "why": "it has no rows: its run ended before the first"}
+    assert not (data / "datasets").exists()
+
+
 def test_an_episode_that_is_still_being_written_is_tried_again(closed: Closed, data: Path) -> None:
     episode = closed()
     score(data, episode, True)
