@@ -10,7 +10,7 @@ from uuid import UUID, uuid4
 from django.db import DatabaseError
 from django.http import HttpRequest
 from ninja import Field, Router, Schema, Status
-from pydantic import ValidationError, field_validator
+from pydantic import AfterValidator, ValidationError, field_validator
 
 from evaweb.api.answers import FAILURES, Failure
 from evaweb.api.trials import TrialDetail
@@ -24,7 +24,6 @@ from evaweb.trials.bench import trial_command
 
 router = Router(tags=["stations"])
 PageId = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$", description="Made by the page at random")]
-_LONGEST_WHY = 240
 _HTTP = {
     CommandStatus.ACCEPTED: 200,
     CommandStatus.DONE: 200,
@@ -107,6 +106,13 @@ class LeaseIn(Schema):
     reason: str = ""
 
 
+def _no_trial(args: dict[str, Any]) -> dict[str, Any]:
+    """What goes with the run of a trial is checked first: see evaweb.trials.bench."""
+    if "trial" in args:
+        raise ValueError("args name a trial: name it beside them, as `trial`")
+    return args
+
+
 class CommandIn(Schema):
     """A discrete verb; boot and sequence are those of the snapshot that it was decided by.
 
@@ -115,7 +121,7 @@ class CommandIn(Schema):
 
     uuid: UUID
     kind: str
-    args: Annotated[dict[str, Any], Field(default_factory=dict)]
+    args: Annotated[dict[str, Any], AfterValidator(_no_trial), Field(default_factory=dict)]
     page: PageId
     epoch: Annotated[int, Field(ge=0, le=2**53)] = 0
     boot: Annotated[str, Field(max_length=64)] = ""
@@ -150,7 +156,7 @@ class EStopIn(Schema):
     @field_validator("why", mode="before")
     @classmethod
     def _any_words(cls, given: Any) -> str:
-        return given[:_LONGEST_WHY] if isinstance(given, str) and given else "pressed"
+        return commands.spoken(given) if isinstance(given, str) and given else "pressed"
 
 
 class TrialIn(Schema):

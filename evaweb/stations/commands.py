@@ -26,6 +26,7 @@ from evaweb.roles import Role, require
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.stations.wire import NoAnswer, wire_to
 from runtime import messages
+from runtime.bus import CodecError
 
 log = logging.getLogger(__name__)
 STOPPING = ("stop", "halt", "estop")  # never stale; the runtime has the same list
@@ -34,6 +35,7 @@ HARDWARE_STOP = "USE THE HARDWARE STOP"
 _HOLDER = re.compile(r"\bweb:([^:\s]+):[A-Za-z0-9_-]+")
 _ESTOP_S = 1.0  # what a person waits for before the page turns red
 _UNANSWERED = (CommandStatus.PRESSED, CommandStatus.UNKNOWN)
+_LONGEST_WHY = 240  # characters
 _NOTE_S = 0.5  # for which the answer to a stopping command is kept by its row; then the row is written later
 _later = ThreadPoolExecutor(2, "note")
 _LONG_AGO = 0.0  # on the runtime's clock: a command that must not be carried out any more
@@ -101,9 +103,14 @@ def issue(
     return _stop(row) if kind in STOPPING else _give(row)
 
 
+def spoken(why: str) -> str:
+    """The beginning of it, with nothing in it that cannot be sent or kept: no press is lost for its words."""
+    return why[:_LONGEST_WHY].encode("utf-8", "replace").decode().replace("\x00", "")
+
+
 def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
     """Press the e-stop of the station of that name; for any user, and without the database."""
-    command = messages.Command(str(uuid), "estop", {"why": why}, user=username, holder=username)
+    command = messages.Command(str(uuid), "estop", {"why": spoken(why)}, user=username, holder=username)
     try:
         answer = _answer_of(wire_to(station).urgent(command, "guard", "estop", _estop_s()))
     except NoAnswer as fault:
@@ -117,7 +124,7 @@ def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
 
 def estop_noted(*, user: Any, station: Station, why: str, uuid: UUID | str, answer: Answer) -> Command:
     """The row of an e-stop that was pressed."""
-    row = Command(uuid=_uuid(uuid), station=station, user=user, kind="estop", args={"why": why})
+    row = Command(uuid=_uuid(uuid), station=station, user=user, kind="estop", args={"why": spoken(why)})
     return _noted(row, answer)
 
 
@@ -174,6 +181,7 @@ def _give(row: Command) -> Command:
     first = _first(row)
     if first is not None:
         return settle(row=first)
+    _require_sendable(row)
     pressed = time.monotonic()
     try:
         with transaction.atomic(durable=True):
@@ -190,6 +198,14 @@ def _give(row: Command) -> Command:
     _put(row, _asked(row, waited=time.monotonic() - pressed))
     _update(row)
     return row
+
+
+def _require_sendable(row: Command) -> None:
+    """Before it is a row that would be asked about for an hour."""
+    try:
+        messages.encode(_message(row))
+    except CodecError as error:
+        raise EvaError(f"{row.kind} cannot be sent with these args: {error}") from None
 
 
 def _asked(row: Command, waited: float) -> Answer:

@@ -10,9 +10,11 @@ from django.contrib.auth.models import User
 from django.db import transaction
 
 from evaweb.errors import Conflict, EvaError
+from evaweb.frames import plain
 from evaweb.roles import Role, require
 from evaweb.stations.commands import issue
 from evaweb.stations.models import Command, CommandStatus
+from evaweb.stations.wire import wire_to
 from evaweb.trials import lifecycle
 from evaweb.trials.facts import trial_facts
 from evaweb.trials.following import run_begun
@@ -82,7 +84,10 @@ def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
     first = Command.objects.filter(pk=given["uuid"]).first()
     if first is None:
         _require_prepared(trial, "set up")
-    args = first.args if first else setup_args(trial, given["uuid"])
+    args = setup_args(trial, given["uuid"])
+    if first is not None:
+        _require_same(first, trial, trial.setup == first.pk or first.args == plain(args))
+        args = first.args
     row = issue(**given, args=args)
     if row.status not in _NOT_CARRIED_OUT:
         with transaction.atomic():
@@ -99,9 +104,12 @@ def _run(trial: Trial, given: Mapping[str, Any]) -> Command:
     if first is None:
         _require_prepared(trial, "run")
         _require_set_up(trial)
+        _require_loaded(trial)
+    else:
+        _require_same(first, trial, _is_about(first, trial))
     args = first.args if first else run_args(trial, given["user"])
     row = issue(**given, args=args)
-    if row.status in _CARRIED_OUT and _is_about(row, trial):
+    if row.status in _CARRIED_OUT:
         with transaction.atomic():
             run_begun(_held(trial), command=row, episode=_episode_of(row))
     trial.refresh_from_db()
@@ -114,6 +122,11 @@ def _require_prepared(trial: Trial, what: str) -> None:
         raise Conflict(
             f"trial {trial.pk} is {status.label} and cannot be {what}: {lifecycle.advice(status)}; "
             "a repetition is another trial"
+        )
+    if not trial.checkpoint.active:
+        raise Conflict(
+            f"checkpoint {trial.checkpoint.name} was switched off since trial {trial.pk} was prepared: "
+            "abandon it, and choose another one"
         )
 
 
@@ -132,6 +145,28 @@ def _require_set_up(trial: Trial) -> None:
     if last != mine:
         raise Conflict(
             f"{trial.station.name} was set up for something else since trial {trial.pk} was: press Set up again"
+        )
+
+
+def _require_loaded(trial: Trial) -> None:
+    """Whoever set the station up last, a terminal included: this is the checkpoint that it would run.
+
+    What changes after this look makes the run stale, which the station refuses by itself.
+    """
+    told = wire_to(trial.station.name).status().get("checkpoint") or {}
+    if told.get("id") != trial.checkpoint_id:
+        raise Conflict(
+            f"{trial.station.name} was set up for {told.get('name') or 'no checkpoint'} by somebody else, "
+            f"not for {trial.checkpoint.name}: press Set up again"
+        )
+
+
+def _require_same(first: Command, trial: Trial, same: bool) -> None:
+    """A uuid that was used before brings back the answer that it had, for the trial that it was used for."""
+    if not same:
+        raise Conflict(
+            f"uuid {first.pk} is that of another command ({first}), which was not for trial {trial.pk}; "
+            "each needs one of its own"
         )
 
 

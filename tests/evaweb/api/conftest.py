@@ -50,7 +50,12 @@ def bench(db):
 @pytest.fixture
 def wire(monkeypatch):
     made = builders.Wire()
-    for place in ("evaweb.stations.commands", "evaweb.stations.leases", "evaweb.api.stations"):
+    for place in (
+        "evaweb.stations.commands",
+        "evaweb.stations.leases",
+        "evaweb.api.stations",
+        "evaweb.trials.bench",
+    ):
         monkeypatch.setattr(f"{place}.wire_to", lambda name: made)
     return made
 

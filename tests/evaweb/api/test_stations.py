@@ -179,6 +179,14 @@ def test_a_press_is_not_refused_for_what_is_said_with_it(rest, bench, wire, body
     assert len(wire.heard[0].args["why"]) <= 240
 
 
+def test_a_run_for_a_trial_goes_by_the_trial(rest, bench, wire):
+    trial = bench.prepare()
+    status, answer = command(rest, "run", args={"trial": {"uuid": str(trial.uuid)}})
+    assert status == 422
+    assert "name it beside them" in answer["error"]
+    assert not wire.heard
+
+
 def test_the_lease_is_claimed_and_shown(rest, bench, wire):
     wire.snapshot = {"lease": {"holder": "", "epoch": 0}, "boot": BOOT}
     status, lease = rest.post("stations/bench-1/lease", action="claim", page="p1")

@@ -58,6 +58,21 @@ def test_the_same_uuid_twice_is_one_command(held, runtime):
     assert Command.objects.count() == 1
 
 
+@pytest.mark.parametrize("value", [10**40, "\ud800"], ids=["too large", "no character"])
+def test_what_cannot_be_sent_is_refused_before_it_is_a_row(held, runtime, value):
+    with pytest.raises(EvaError, match="run cannot be sent with these args"):
+        issue(kind="run", args={"operator": value}, **held, **seen(runtime))
+    assert not Command.objects.exists()
+
+
+def test_a_press_is_not_lost_for_its_words(held, runtime):
+    row = issue(kind="estop", args={"why": "\ud800\x00" + "x" * 999}, **held)
+    assert row.status == CommandStatus.DONE
+    assert runtime.pressed[0].args["why"].startswith("?x")
+    answer = commands.estop(station=held["station"].name, username="ann", why="\udfff", uuid=uuid4())
+    assert answer.status == CommandStatus.DONE
+
+
 def test_a_uuid_of_another_command_is_refused(held, runtime):
     uuid = issue(kind="run", **held, **seen(runtime)).uuid
     with pytest.raises(Conflict, match="that of another command"):

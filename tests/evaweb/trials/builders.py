@@ -111,6 +111,8 @@ class Wire:
             raise self.fault
         data = {"episode": str(self.episode)} if command.kind == "run" else {}
         data = data if self.status_word == "accepted" else {}
+        if command.kind == "setup" and self.status_word == "accepted":
+            self.snapshot = {**self.snapshot, "checkpoint": command.args.get("checkpoint")}
         return Ack(command.uuid, self.status_word, self.reason, ["stop"], BOOT, 7, data)
 
     def urgent(self, command: Command, process: str, key: str, timeout: float) -> Ack:

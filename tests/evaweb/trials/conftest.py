@@ -16,5 +16,6 @@ def bench(db):
 @pytest.fixture
 def wire(monkeypatch):
     made = builders.Wire()
-    monkeypatch.setattr("evaweb.stations.commands.wire_to", lambda name: made)
+    for place in ("evaweb.stations.commands", "evaweb.trials.bench"):
+        monkeypatch.setattr(f"{place}.wire_to", lambda name: made)
     return made

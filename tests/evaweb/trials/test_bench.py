@@ -1,3 +1,4 @@
+from functools import partial
 from uuid import uuid4
 
 import pytest
@@ -99,6 +100,7 @@ def test_a_run_that_is_not_accepted_leaves_the_trial_prepared(bench, wire, word)
 def test_a_run_whose_answer_is_lost_leaves_the_trial_to_its_event(bench, wire):
     trial = bench.prepare()
     give(bench, trial, "setup")
+    wire.status = partial(dict, wire.snapshot)
     wire.fault = NoAnswer("bench-1 has not answered run in time")
     row = give(bench, trial, "run")
     assert (row.status, trial.status) == ("unknown", "prepared")
@@ -133,6 +135,59 @@ def test_nothing_is_run_after_the_station_was_set_up_for_something_else(bench, w
     Trial.objects.filter(pk=third.pk).update(setup=trial.setup)
     with pytest.raises(Conflict, match="set up for something else"):
         give(bench, third, "run")
+
+
+@pytest.mark.parametrize("told", [{}, {"checkpoint": {}}, {"checkpoint": {"id": 999, "name": "other"}}])
+def test_nothing_is_run_after_a_terminal_set_the_station_up_for_something_else(bench, wire, told):
+    trial = bench.prepare()
+    give(bench, trial, "setup")
+    wire.snapshot = told
+    with pytest.raises(Conflict, match="by somebody else, not for pi0-block: press Set up again"):
+        give(bench, trial, "run")
+    assert not heard(wire, "run")
+
+
+def test_the_set_up_of_another_trial_is_not_that_of_this_one(bench, wire):
+    trial = bench.prepare()
+    uuid = give(bench, trial, "setup").pk
+    services.trial_abandon(user=bench.operator, trial=trial)
+    other = bench.prepare(checkpoint=Checkpoint.objects.create(name="other"))
+    with pytest.raises(Conflict, match=f"not for trial {other.pk}"):
+        give(bench, other, "setup", uuid=uuid)
+    with pytest.raises(Conflict, match="is not set up"):
+        give(bench, other, "run")
+
+
+def test_the_run_of_another_trial_is_not_that_of_this_one(bench, wire):
+    trial = bench.prepare()
+    give(bench, trial, "setup")
+    uuid = give(bench, trial, "run").pk
+    Trial.objects.filter(pk=trial.pk).update(status="ended")
+    services.trial_void(user=bench.operator, trial=trial, reason="a person in the way")
+    other = bench.prepare()
+    with pytest.raises(Conflict, match=f"not for trial {other.pk}"):
+        give(bench, other, "run", uuid=uuid)
+    assert (Trial.objects.get(pk=other.pk).status, len(heard(wire, "run"))) == ("prepared", 1)
+
+
+def test_the_same_set_up_again_gets_the_first_answer(bench, wire):
+    trial = bench.prepare()
+    first = give(bench, trial, "setup")
+    Checkpoint.objects.update(policy={"url": "ws://127.0.0.1:9000"})
+    trial.refresh_from_db()
+    assert give(bench, trial, "setup", uuid=first.pk).pk == first.pk
+    assert len(heard(wire, "setup")) == 1
+
+
+@pytest.mark.parametrize("kind", ["setup", "run"])
+def test_a_checkpoint_that_was_switched_off_is_run_no_more(bench, wire, kind):
+    trial = bench.prepare()
+    give(bench, trial, "setup")
+    Checkpoint.objects.update(active=False)
+    trial = Trial.objects.get(pk=trial.pk)
+    with pytest.raises(Conflict, match="was switched off since"):
+        give(bench, trial, kind)
+    assert not heard(wire, "run")
 
 
 @pytest.mark.parametrize("kind", ["setup", "run"])
