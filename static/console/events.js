@@ -1,5 +1,7 @@
 // The station's events, newest first: the sentences of its log, without gaps, filtered by words.
 
+import { kindWords, sentence, weight } from "./event_words.js";
+
 const KEPT = 400;
 
 function clock(wall) {
@@ -44,17 +46,21 @@ export class Events {
     this.#show();
   }
 
-  #row({ number, kind, text, wall }) {
+  #row(event) {
+    const { number, kind, wall } = event;
+    const text = sentence(event);
     const row = document.createElement("li");
     row.className = "event";
     row.dataset.kind = kind;
-    row.dataset.words = `${kind} ${text}`.toLowerCase();
+    row.dataset.weight = weight(event);
+    row.dataset.words = `${kind} ${kindWords(kind)} ${event.text} ${text}`.toLowerCase();
     const time = document.createElement("time");
     time.textContent = clock(wall);
     time.title = `event ${number}`;
     const name = document.createElement("span");
-    name.className = "event-kind mono";
-    name.textContent = kind;
+    name.className = "event-kind";
+    name.textContent = kindWords(kind);
+    name.title = kindWords(kind);
     const words = document.createElement("span");
     words.textContent = text;
     row.append(time, name, words);

@@ -2,6 +2,7 @@
 
 import { ADVICE, age, duration, figure, words } from "./words.js";
 
+const TITLES = { mine: "This page commands", elsewhere: "You command on another page", free: "Nobody commands" };
 const shown = (name) => document.querySelectorAll(`[data-show="${name}"]`);
 
 function write(name, text) {
@@ -74,9 +75,12 @@ function drawFigures(store, snapshot) {
   }
   write("transport", `${snapshot.transport} ${joints !== null && joints < 1 ? "ok" : `silent ${age(joints ?? Infinity)}`}`);
   drawPolicy(snapshot.policy);
-  const held = { mine: "you", elsewhere: "your other page", free: "free", other: store.commander }[store.lease];
+  const held = { mine: "you", elsewhere: "other page", free: "free", other: store.commander }[store.lease];
   write("lease", `lease: ${held}`);
-  for (const element of shown("lease")) element.dataset.lease = store.lease;
+  for (const element of shown("lease")) {
+    element.dataset.lease = store.lease;
+    element.title = TITLES[store.lease] ?? `${held} commands this station`;
+  }
   const stage = snapshot.state === "setting_up" ? `${words(snapshot.stage)} …` : "";
   write("stage", stage);
   for (const element of shown("stage")) element.hidden = !stage;

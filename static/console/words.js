@@ -9,7 +9,7 @@ export const ADVICE = {
   },
   holding: {
     title: "The robot holds",
-    advice: "Look at the bench, then resume or stop.",
+    advice: "Look at the bench first.",
     buttons: ["resume", "stop"],
   },
   faulted: {
