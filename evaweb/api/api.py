@@ -12,6 +12,7 @@ from ninja.errors import AuthenticationError, HttpError, ValidationError, Valida
 
 from evaweb.api import accounts, checkpoints, episodes, jobs, scenes, stations, statistics, trials
 from evaweb.api.auth import Bearer, Session
+from evaweb.api.questions import only_known
 from evaweb.errors import EvaError
 
 log = logging.getLogger(__name__)
@@ -43,6 +44,7 @@ api = _Api(
     openapi_url=None,  # served below, to those who are logged in
     docs_url=None,  # its pages fetch scripts from elsewhere
 )
+api.add_decorator(only_known)
 api.add_router("", accounts.router)
 api.add_router("/stations", stations.router)
 api.add_router("/trials", trials.router)

@@ -80,6 +80,14 @@ def test_a_browser_needs_its_csrf_token_to_change_something_and_none_to_read(ben
         ("trials", {"offset": -1}, "offset"),
         ("trials", {"format": "xml"}, "'json' or 'csv'"),
         ("episodes", {"status": "gone"}, "status = 'gone'"),
+        (
+            "trials",
+            {"checkpont": "pi0-block"},
+            "checkpont: unknown parameter; allowed: evaluation, checkpoint",
+        ),
+        ("statistics", {"limit": 5, "page": 2}, "limit, page: unknown parameter"),
+        ("trials", {"format": "csv", "Status": "scored"}, "Status: unknown parameter"),
+        ("me", {"of": "ann"}, "of: unknown parameter; allowed: none"),
     ],
 )
 def test_malformed_questions_are_answered_with_what_is_allowed(rest, path, query, sentence):
@@ -89,10 +97,21 @@ def test_malformed_questions_are_answered_with_what_is_allowed(rest, path, query
 
 
 def test_what_does_not_exist_is_not_found_in_json(rest):
-    for path in ("trials/999999", "trials/9999999999999999999999", "scenes/nope", "checkpoints/a/b"):
+    known = ("trials/999999", "trials/9999999999999999999999", "scenes/nope", "checkpoints/a/b")
+    for path in (*known, "trails", "trials/", "episodes/no-uuid"):
         status, body = rest.get(path)
         assert status == 404, path
         assert "does not exist" in body["error"], path
+
+
+def test_a_post_to_no_address_is_not_found_in_json(rest):
+    status, body = rest.post("trials/1/scores", milestones={})
+    assert status == 404
+    assert "/api/v1/trials/1/scores does not exist" in body["error"]
+
+
+def test_the_stop_is_never_refused_for_its_query(rest, wire):
+    assert rest.post("stations/bench-1/estop?why=now")[0] == 200
 
 
 def test_a_busy_database_is_a_sentence_and_503(rest, monkeypatch):
