@@ -50,6 +50,9 @@ class Direct:
     def urgent(self, command, process, key, timeout):
         return self.request(command)
 
+    def status(self):
+        return self._station.main.snapshot()
+
     def request(self, command, **how):
         self._station._handle("lease_claim")
         main = self._station.main
@@ -62,7 +65,8 @@ def lab(tmp_path, monkeypatch, db):
     """A lab around a whole station in lockstep."""
     monkeypatch.setattr(doorbell, "ring", lambda queue: True)
     made = Lab(builders.bench("bench"), Lockstep(plan(tmp_path, simulated=True)))
-    monkeypatch.setattr("evaweb.stations.commands.wire_to", lambda name: Direct(made.station))
+    for place in ("evaweb.stations.commands", "evaweb.trials.bench"):
+        monkeypatch.setattr(f"{place}.wire_to", lambda name: Direct(made.station))
     return made
 
 
