@@ -9,13 +9,15 @@ from kombu.exceptions import KombuError
 
 log = logging.getLogger(__name__)
 
+TASK = "evaweb.jobs.work"  # by name: what it does asks for jobs itself
+
 
 def ring(queue: str) -> bool:
     """Whether the broker took it; where it did not, a worker finds the row when it next looks."""
-    try:
-        from evaweb.jobs.tasks import work  # here, for services and tasks know each other
+    from evaweb.celery import app  # here, for it makes the broker's folders
 
-        work.apply_async((queue,), queue=queue, retry=False)
+    try:
+        app.send_task(TASK, (queue,), queue=queue, retry=False)
     except (KombuError, CeleryError, OSError) as error:
         log.warning("no doorbell for queue %s, a worker finds its jobs within seconds: %r", queue, error)
         return False

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from evaweb.celery import app
 from evaweb.jobs import services
+from evaweb.jobs.doorbell import TASK
 
 
-@app.task(name="evaweb.jobs.work")
+@app.task(name=TASK)
 def work(queue: str) -> None:
     """The doorbell of a queue."""
     services.work(queue)

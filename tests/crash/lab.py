@@ -5,33 +5,16 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 from runtime.bus import Endpoints
 from runtime.client import StationClient
 from runtime.errors import RuntimeFault
+from tests.processes import eventually
 
 ROOT = Path(__file__).parents[2]
 ROBOT = "agilex_piper"
 FREE = "tcp://127.0.0.1:0"
-
-
-def alive(pid: int) -> bool:
-    """Whether the process runs; one that only waits to be reaped does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
-def eventually(check, seconds, what):
-    """Wait for something that real processes do in their own time."""
-    deadline = time.monotonic() + seconds
-    while not (found := check()):
-        assert time.monotonic() < deadline, f"{what}: not within {seconds} s"
-        time.sleep(0.02)
-    return found
 
 
 class Lab:

@@ -12,7 +12,7 @@ import pytest
 from runtime.client import Refused, StationClient
 from runtime.errors import TransportError
 from runtime.recording.reader import open_episode
-from tests.crash.lab import eventually
+from tests.processes import eventually
 
 pytestmark = pytest.mark.slow
 

@@ -3,7 +3,7 @@
 import pytest
 
 from runtime.recording.reader import open_episode
-from tests.crash.lab import eventually
+from tests.processes import eventually
 
 pytestmark = pytest.mark.slow
 

@@ -7,7 +7,8 @@ import time
 import pytest
 
 from runtime.recording.reader import open_episode
-from tests.crash.lab import ROOT, alive, eventually
+from tests.crash.lab import ROOT
+from tests.processes import alive, eventually
 
 pytestmark = pytest.mark.slow
 FAMILY = ("control", "main", "media", "guard")

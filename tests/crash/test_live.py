@@ -12,7 +12,8 @@ import simplejpeg
 import zmq
 
 from runtime.bus import Endpoints, Subscriber
-from tests.crash.lab import ROOT, eventually
+from tests.crash.lab import ROOT
+from tests.processes import eventually
 
 pytestmark = pytest.mark.slow
 

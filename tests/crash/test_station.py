@@ -13,7 +13,8 @@ import threading
 import pytest
 
 from runtime.recording.reader import open_episode
-from tests.crash.lab import ROOT, alive, eventually
+from tests.crash.lab import ROOT
+from tests.processes import alive, eventually
 
 pytestmark = pytest.mark.slow
 

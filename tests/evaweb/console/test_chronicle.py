@@ -14,6 +14,7 @@ from evaweb.console.feed import Feeds, History
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Command, CommandStatus, Lease, Station
 from runtime.session import Happening
+from tests.processes import eventually
 
 
 class Services:
@@ -122,11 +123,7 @@ def scribe(live, runtime, transactional_db):
 
 def until(reached):
     """Wait for what another thread writes into the database."""
-    for _ in range(1500):
-        if reached():
-            return
-        threading.Event().wait(0.01)
-    raise AssertionError("not reached")
+    eventually(reached, 20, "a row")
 
 
 @pytest.mark.django_db(transaction=True)

@@ -39,3 +39,8 @@ def test_a_broker_that_cannot_be_written_is_no_error_of_who_asks(
     (broker / "queue").write_text("in the way")
     assert doorbell.ring("lab") is False
     assert "no doorbell for queue lab, a worker finds its jobs within seconds" in caplog.text
+
+
+def test_what_it_names_is_a_task_that_workers_know() -> None:
+    app.loader.import_default_modules()
+    assert doorbell.TASK in app.tasks

@@ -1,12 +1,12 @@
 import os
 import signal
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from evaweb.lab.processes import LabError, Processes, Program
+from tests.processes import alive, eventually
 
 WAITS = "import sys\nsys.stdin.read()\n"
 SAYS = 'import sys\nprint(\'{"url": "here %s"}\' % sys.argv[1], flush=True)\nsys.stdin.read()\n'
@@ -18,21 +18,6 @@ def processes(tmp_path):
     made = Processes(tmp_path, tmp_path / "logs", os.environ)
     yield made
     made.end()
-
-
-def gone(pid):
-    """Whether the process is over; one that waits to be reaped is."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return True
-
-
-def until(check):
-    deadline = time.monotonic() + 20
-    while not check():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def test_a_program_that_announces_is_ready_when_it_says_where_it_is(processes):
@@ -47,7 +32,7 @@ def test_what_dies_is_started_again_where_it_was(processes):
     processes.start(again)
     before = processes.pids()["one"]
     os.kill(before, signal.SIGKILL)
-    until(lambda: gone(before))
+    eventually(lambda: not alive(before), 20, "its end")
     processes.watch()
     assert processes.pids()["one"] != before
     assert processes._children["one"].addresses == {"url": "here here first"}
@@ -56,7 +41,7 @@ def test_what_dies_is_started_again_where_it_was(processes):
 def test_what_dies_too_often_ends_the_lab_with_its_last_words(processes):
     processes.start(Program("one", ("-c", "raise SystemExit('the disk is on fire')")))
     with pytest.raises(LabError, match="one ended with 1 for the 6th time in a minute: the disk is on fire"):
-        until(lambda: processes.watch())
+        eventually(processes.watch, 20, "giving up")
 
 
 def test_a_program_that_does_not_start_is_named_with_what_it_said(processes):
@@ -74,7 +59,7 @@ def test_all_end_with_their_lifelines_and_the_stubborn_are_killed(processes):
     processes.start(Program("two", ("-c", STUBBORN), patience_s=0.2))
     pids = processes.pids().values()
     processes.end()
-    assert all(gone(pid) for pid in pids)
+    assert not any(alive(pid) for pid in pids)
     assert processes.pids() == {}
 
 
@@ -90,8 +75,8 @@ def test_they_end_with_us_even_when_we_are_killed(tmp_path):
 
     parent = subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parents[3])
     written = tmp_path / "pid"
-    until(lambda: written.exists() and written.read_text())
+    eventually(lambda: written.exists() and written.read_text(), 20, "the pid of the child")
     parent.kill()
     parent.wait()
-    until(lambda: gone(int(written.read_text())))
+    eventually(lambda: not alive(int(written.read_text())), 20, "the end of the child")
     assert parent.returncode == -signal.SIGKILL

@@ -17,6 +17,7 @@ from runtime.errors import ConfigurationError, TransportError
 from runtime.transports import zmq as link
 from runtime.transports.zmq import Config, NodeSink, NodeSource
 from runtime.types import Observation, RobotCommand
+from tests.processes import eventually
 
 ROBOT = robots.load("agilex_piper")
 CAMERAS = tuple(camera.key for camera in ROBOT.cameras)
@@ -116,10 +117,7 @@ def joined(node: Node, source: NodeSource) -> None:
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.005)
+    eventually(condition, PATIENCE, "what the wire does")
 
 
 # Configuration
