@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import secrets
+from importlib.util import find_spec
 from pathlib import Path
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from django.core.exceptions import ImproperlyConfigured
 
 _TRUE, _FALSE = ("1", "true", "yes", "on"), ("0", "false", "no", "off", "")
+_LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 
 
 def flag(name: str, default: bool) -> bool:
@@ -40,6 +43,33 @@ def seconds(name: str, default: float) -> float:
     if not 0 < value < float("inf"):
         raise ImproperlyConfigured(f"{name} = {given!r}; allowed: seconds above zero")
     return value
+
+
+def log_level(name: str, default: str) -> str:
+    """From which level on something is logged."""
+    given = os.environ.get(name) or default
+    if given not in _LEVELS:
+        raise ImproperlyConfigured(f"{name} = {given!r}; allowed: {', '.join(_LEVELS)}")
+    return given
+
+
+def time_zone(name: str, default: str) -> str:
+    """In which time zone pages show times."""
+    given = os.environ.get(name) or default
+    try:
+        return ZoneInfo(given).key
+    except (ZoneInfoNotFoundError, ValueError, OSError):  # unknown, no name at all, a folder of names
+        raise ImproperlyConfigured(
+            f"{name} = {given!r}; allowed: names such as UTC, Europe/Berlin, Asia/Shanghai"
+        ) from None
+
+
+def require_driver(name: str, engine: str) -> None:
+    """The Python package that a database needs is there."""
+    if engine.endswith("postgresql") and find_spec("psycopg") is None:
+        raise ImproperlyConfigured(
+            f"{name} names PostgreSQL, whose driver is absent: .venv/bin/python -m pip install -e '.[lab]'"
+        )
 
 
 def data_dir(default: Path) -> Path:

@@ -92,6 +92,7 @@ def _database() -> dict[str, object]:
         raise ImproperlyConfigured(
             f"DATABASE_URL: {error}; for example postgres://user:password@host/name"
         ) from None
+    environment.require_driver("DATABASE_URL", found["ENGINE"])
     if found["ENGINE"].endswith("sqlite3"):
         found["OPTIONS"] = _SQLITE
     return dict(found)
@@ -138,7 +139,7 @@ WHITENOISE_MAX_AGE = 0  # names carry no hash: a browser asks each time, and is 
 # --- language, security, log -------------------------------------------------------------------------------
 
 LANGUAGE_CODE = "en-gb"
-TIME_ZONE = os.environ.get("EVA_TIME_ZONE", "UTC")
+TIME_ZONE = environment.time_zone("EVA_TIME_ZONE", "UTC")
 USE_TZ = True
 SESSION_COOKIE_AGE = 14 * 24 * 3600
 SESSION_COOKIE_SECURE = CSRF_COOKIE_SECURE = environment.flag("EVA_HTTPS", False)
@@ -162,7 +163,7 @@ LOGGING = {
     "disable_existing_loggers": False,
     "formatters": {"line": {"format": "%(asctime)s %(levelname)s %(name)s: %(message)s"}},
     "handlers": {"console": {"class": "logging.StreamHandler", "formatter": "line"}},
-    "root": {"handlers": ["console"], "level": os.environ.get("EVA_LOG_LEVEL", "INFO")},
+    "root": {"handlers": ["console"], "level": environment.log_level("EVA_LOG_LEVEL", "INFO")},
 }
 
 # --- ours --------------------------------------------------------------------------------------------------

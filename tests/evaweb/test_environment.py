@@ -1,0 +1,78 @@
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from django.core.exceptions import ImproperlyConfigured
+
+from evaweb import environment
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize(("given", "found"), [("1", True), (" Yes ", True), ("off", False), ("", False)])
+def test_a_flag_is_a_word(monkeypatch, given, found):
+    monkeypatch.setenv("EVA_X", given)
+    assert environment.flag("EVA_X", not found) is found
+
+
+@pytest.mark.parametrize(
+    ("read", "given", "allowed"),
+    [
+        (lambda: environment.flag("EVA_X", False), "maybe", "1, true, yes, on, 0, false, no, off"),
+        (lambda: environment.seconds("EVA_X", 1.0), "0", "seconds above zero"),
+        (lambda: environment.seconds("EVA_X", 1.0), "nan", "seconds above zero"),
+        (lambda: environment.seconds("EVA_X", 1.0), "2 s", "seconds above zero"),
+        (lambda: environment.log_level("EVA_X", "INFO"), "LOUD", "DEBUG, INFO, WARNING, ERROR, CRITICAL"),
+        (lambda: environment.time_zone("EVA_X", "UTC"), "Mars", "UTC, Europe/Berlin"),
+        (lambda: environment.time_zone("EVA_X", "UTC"), "Europe", "UTC, Europe/Berlin"),
+        (lambda: environment.time_zone("EVA_X", "UTC"), "../passwd", "UTC, Europe/Berlin"),
+    ],
+)
+def test_what_cannot_be_used_is_named_with_what_is_allowed(monkeypatch, read, given, allowed):
+    monkeypatch.setenv("EVA_X", given)
+    with pytest.raises(ImproperlyConfigured) as refused:
+        read()
+    assert f"EVA_X = {given!r}" in str(refused.value)
+    assert allowed in str(refused.value)
+
+
+def test_what_is_not_given_is_the_default(monkeypatch):
+    monkeypatch.delenv("EVA_X", raising=False)
+    assert environment.flag("EVA_X", True) is True
+    assert environment.seconds("EVA_X", 2.5) == 2.5
+    assert environment.words("EVA_X", ("a", "b")) == ["a", "b"]
+    assert environment.log_level("EVA_X", "INFO") == "INFO"
+    assert environment.time_zone("EVA_X", "Asia/Shanghai") == "Asia/Shanghai"
+
+
+def test_a_list_has_commas_and_no_blanks(monkeypatch):
+    monkeypatch.setenv("EVA_X", " lab.example.org, 10.0.0.7 ,")
+    assert environment.words("EVA_X") == ["lab.example.org", "10.0.0.7"]
+
+
+def test_an_absent_driver_is_named_with_how_to_get_it(monkeypatch):
+    monkeypatch.setattr(environment, "find_spec", lambda name: None)
+    environment.require_driver("DATABASE_URL", "django.db.backends.sqlite3")
+    with pytest.raises(ImproperlyConfigured, match=r"DATABASE_URL names PostgreSQL.*\[lab\]"):
+        environment.require_driver("DATABASE_URL", "django.db.backends.postgresql")
+
+
+def test_the_key_is_made_once_and_is_its_users_alone(monkeypatch, tmp_path):
+    monkeypatch.delenv("EVA_SECRET_KEY", raising=False)
+    made = environment.secret_key(tmp_path)
+    assert len(made) > 50
+    assert environment.secret_key(tmp_path) == made
+    assert stat.S_IMODE((tmp_path / "secret_key").stat().st_mode) == 0o600
+    monkeypatch.setenv("EVA_SECRET_KEY", "given")
+    assert environment.secret_key(tmp_path) == "given"
+
+
+def test_a_wrong_setting_ends_the_start_with_one_sentence(tmp_path):
+    environ = {"EVA_DATA_DIR": str(tmp_path), "EVA_LOG_LEVEL": "LOUD"}
+    command = [sys.executable, str(ROOT / "manage.py"), "check"]
+    ended = subprocess.run(command, env=environ, capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("cannot start: EVA_LOG_LEVEL = 'LOUD'; allowed:")
+    assert "Traceback" not in ended.stderr
