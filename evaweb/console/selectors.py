@@ -9,16 +9,14 @@ from django.contrib.sessions.backends.base import SessionBase
 
 from evaweb.errors import NotFound
 from evaweb.stations.geometry import looks_of
-from evaweb.stations.models import Command, CommandStatus, Lease, Station
-from evaweb.stations.selectors import station_list
+from evaweb.stations.models import Lease, Station
+from evaweb.stations.selectors import last_set_up, leases_open, station_list
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene, Score, Trial, TrialStatus
 from evaweb.trials.selectors import UNFINISHED, checkpoint_list, scene_list, trial_list, trial_open
 from robots import RobotError
 
 SESSION_KEY = "station"
 FAILURES_OFFERED = 12
-
-_NOT_CARRIED_OUT = (CommandStatus.REFUSED, CommandStatus.FAILED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +79,7 @@ def station_last_used(*, session: SessionBase) -> Station | None:
 
 def station_rows() -> list[StationRow]:
     """Every station, the active ones first, with its open lease and trial."""
-    leases = {lease.station_id: lease for lease in Lease.objects.filter(ended_at=None).select_related("user")}
+    leases = leases_open()
     unfinished = trial_list().filter(status__in=UNFINISHED).order_by("pk")
     trials = {trial.station_id: trial for trial in unfinished}
     stations = station_list(all_of_them=True).order_by("-active", "name")
@@ -149,8 +147,7 @@ def _next_position(positions: tuple[Position, ...], last: Trial | None) -> Posit
 
 def _is_set_up(trial: Trial) -> bool:
     """Whether the last set-up of the station that may have been carried out was for this trial."""
-    asked = Command.objects.filter(station=trial.station, kind="setup").exclude(status__in=_NOT_CARRIED_OUT)
-    last = asked.order_by("-issued_at").values_list("pk", flat=True).first()
+    last = last_set_up(station=trial.station)
     return last is not None and last == trial.setup
 
 

@@ -67,6 +67,16 @@ def readable(reason: str) -> str:
     return _HOLDER.sub(r"\1", reason)
 
 
+def identity_of(given: UUID | str | None) -> UUID:
+    """The uuid of a command, a new one where none is given; EvaError where it is none."""
+    if given is None:
+        return uuid4()
+    try:
+        return UUID(str(given))
+    except ValueError:
+        raise EvaError(f"uuid {given!r:.60}: must be a UUID such as {uuid4()}") from None
+
+
 def issue(
     *,
     user: Any,
@@ -86,7 +96,7 @@ def issue(
     another command's, NotSent where the database does not take the row.
     """
     row = Command(
-        uuid=_uuid(uuid),
+        uuid=identity_of(uuid),
         station=station,
         user=user,
         kind=kind,
@@ -124,7 +134,7 @@ def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
 
 def estop_noted(*, user: Any, station: Station, why: str, uuid: UUID | str, answer: Answer) -> Command:
     """The row of an e-stop that was pressed."""
-    row = Command(uuid=_uuid(uuid), station=station, user=user, kind="estop", args={"why": spoken(why)})
+    row = Command(uuid=identity_of(uuid), station=station, user=user, kind="estop", args={"why": spoken(why)})
     return _noted(row, answer)
 
 
@@ -140,7 +150,7 @@ def stop_noted(
 ) -> Command:
     """The row of a stop or halt that was given."""
     holder = holder_of(user.get_username(), page)
-    row = Command(uuid=_uuid(uuid), station=station, user=user, kind=kind, holder=holder, epoch=epoch)
+    row = Command(uuid=identity_of(uuid), station=station, user=user, kind=kind, holder=holder, epoch=epoch)
     return _noted(row, answer)
 
 
@@ -325,12 +335,3 @@ def _patience_s() -> float:
 
 def _estop_s() -> float:
     return min(_ESTOP_S, settings.EVA_COMMAND_TIMEOUT_S)
-
-
-def _uuid(given: UUID | str | None) -> UUID:
-    if given is None:
-        return uuid4()
-    try:
-        return UUID(str(given))
-    except ValueError:
-        raise EvaError(f"uuid {given!r:.60}: must be a UUID such as {uuid4()}") from None

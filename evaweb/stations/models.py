@@ -114,6 +114,10 @@ class CommandStatus(models.TextChoices):
     UNKNOWN = "unknown", "outcome unknown"
 
 
+CARRIED_OUT = (CommandStatus.ACCEPTED, CommandStatus.DONE)
+NOT_CARRIED_OUT = (CommandStatus.REFUSED, CommandStatus.FAILED)
+
+
 class Command(models.Model):
     """One discrete verb that a person or a program gave; the runtime's own journal is the authority."""
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from uuid import UUID
+
 from django.db.models import QuerySet
 
 from evaweb.errors import NotFound
-from evaweb.stations.models import Command, Lease, LeaseRequest, Station
+from evaweb.stations.models import NOT_CARRIED_OUT, Command, Lease, LeaseRequest, Station
 
 
 def station_list(*, all_of_them: bool = False) -> QuerySet[Station]:
@@ -27,6 +29,11 @@ def lease_open(*, station: Station) -> Lease | None:
     return station.leases.filter(ended_at=None).select_related("user").first()
 
 
+def leases_open() -> dict[int, Lease]:
+    """Who has which station, by the station's id, as far as the database knows."""
+    return {lease.station_id: lease for lease in Lease.objects.filter(ended_at=None).select_related("user")}
+
+
 def request_list(*, station: Station) -> QuerySet[LeaseRequest]:
     """Who asks for the station and waits, the first who asked first."""
     return station.lease_requests.filter(answer=LeaseRequest.Answer.OPEN).select_related("user")
@@ -35,3 +42,9 @@ def request_list(*, station: Station) -> QuerySet[LeaseRequest]:
 def command_list(*, station: Station, limit: int = 100) -> QuerySet[Command]:
     """The newest commands first."""
     return station.commands.select_related("user")[:limit]
+
+
+def last_set_up(*, station: Station) -> UUID | None:
+    """The newest set-up of the station that may have been carried out."""
+    asked = station.commands.filter(kind="setup").exclude(status__in=NOT_CARRIED_OUT)
+    return asked.order_by("-issued_at").values_list("pk", flat=True).first()

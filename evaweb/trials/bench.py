@@ -4,24 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
-from uuid import UUID, uuid4
+from uuid import UUID
 
 from django.contrib.auth.models import User
 from django.db import transaction
 
-from evaweb.errors import Conflict, EvaError
+from evaweb.errors import Conflict
 from evaweb.frames import plain
 from evaweb.roles import Role, require
-from evaweb.stations.commands import issue
-from evaweb.stations.models import Command, CommandStatus
+from evaweb.stations.commands import identity_of, issue
+from evaweb.stations.models import CARRIED_OUT, NOT_CARRIED_OUT, Command
+from evaweb.stations.selectors import last_set_up
 from evaweb.stations.wire import wire_to
 from evaweb.trials import lifecycle
 from evaweb.trials.facts import trial_facts
 from evaweb.trials.following import run_begun
 from evaweb.trials.models import Trial, TrialStatus
-
-_CARRIED_OUT = (CommandStatus.ACCEPTED, CommandStatus.DONE)
-_NOT_CARRIED_OUT = (CommandStatus.REFUSED, CommandStatus.FAILED)
 
 
 def trial_command(
@@ -42,7 +40,7 @@ def trial_command(
     trial is not prepared, or the station was last set up for something else.
     """
     require(user, Role.OPERATOR)
-    identity = _identity(uuid)
+    identity = identity_of(uuid)
     given = {
         "user": user,
         "station": trial.station,
@@ -89,7 +87,7 @@ def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
         _require_same(first, trial, trial.setup == first.pk or first.args == plain(args))
         args = first.args
     row = issue(**given, args=args)
-    if row.status not in _NOT_CARRIED_OUT:
+    if row.status not in NOT_CARRIED_OUT:
         with transaction.atomic():
             held = _held(trial)
             if held.status == TrialStatus.PREPARED:
@@ -109,7 +107,7 @@ def _run(trial: Trial, given: Mapping[str, Any]) -> Command:
         _require_same(first, trial, _is_about(first, trial))
     args = first.args if first else run_args(trial, given["user"])
     row = issue(**given, args=args)
-    if row.status in _CARRIED_OUT:
+    if row.status in CARRIED_OUT:
         with transaction.atomic():
             run_begun(_held(trial), command=row, episode=_episode_of(row))
     trial.refresh_from_db()
@@ -132,13 +130,7 @@ def _require_prepared(trial: Trial, what: str) -> None:
 
 def _require_set_up(trial: Trial) -> None:
     """Whatever the page thinks: the last set-up of the station that may have been carried out was for this trial."""
-    last = (
-        Command.objects.filter(station=trial.station, kind="setup")
-        .exclude(status__in=_NOT_CARRIED_OUT)
-        .order_by("-issued_at")
-        .values_list("pk", flat=True)
-        .first()
-    )
+    last = last_set_up(station=trial.station)
     mine = Trial.objects.values_list("setup", flat=True).get(pk=trial.pk)
     if mine is None:
         raise Conflict(f"trial {trial.pk} is not set up: press Set up, then Run")
@@ -185,12 +177,3 @@ def _held(trial: Trial) -> Trial:
 
 def _held_status(trial: Trial) -> str:
     return Trial.objects.values_list("status", flat=True).get(pk=trial.pk)
-
-
-def _identity(given: UUID | str | None) -> UUID:
-    if given is None:
-        return uuid4()
-    try:
-        return UUID(str(given))
-    except ValueError:
-        raise EvaError(f"uuid {given!r:.60}: must be a UUID such as {uuid4()}") from None
