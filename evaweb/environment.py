@@ -55,7 +55,9 @@ def log_level(name: str, default: str) -> str:
 
 def time_zone(name: str, default: str) -> str:
     """In which time zone pages show times."""
-    given = os.environ.get(name) or default
+    given = os.environ.get(name)
+    if not given:
+        return default
     try:
         return ZoneInfo(given).key
     except (ZoneInfoNotFoundError, ValueError, OSError):  # unknown, no name at all, a folder of names

@@ -42,6 +42,11 @@ def demo_login(*, username: str, role: Role) -> Login:
     return Login(username, password)
 
 
+def nobody_can_log_in() -> bool:
+    """Whether there is no account yet, or none that is switched on."""
+    return not User.objects.filter(is_active=True).exists()
+
+
 def station_registered(*, name: str, robot: str, deployment: str, simulated: bool) -> Station:
     """The station of a deployment that this lab starts; its title and message are an administrator's."""
     facts = {"robot": robot, "deployment": deployment, "simulated": simulated}

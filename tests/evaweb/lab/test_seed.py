@@ -1,5 +1,6 @@
 import pytest
 from django.contrib.auth import authenticate
+from django.contrib.auth.models import User
 
 from evaweb.lab import seed
 from evaweb.roles import Role, role_of
@@ -16,6 +17,14 @@ def test_a_login_works_with_its_fresh_password_and_the_old_one_no_more():
     assert authenticate(username="operator", password=first.password) is None
     user = authenticate(username="operator", password=second.password)
     assert role_of(user) is Role.OPERATOR
+
+
+def test_nobody_can_log_in_until_there_is_an_account_that_is_switched_on():
+    assert seed.nobody_can_log_in()
+    seed.demo_login(username="operator", role=Role.OPERATOR)
+    assert not seed.nobody_can_log_in()
+    User.objects.update(is_active=False)
+    assert seed.nobody_can_log_in()
 
 
 def test_a_second_start_keeps_what_an_administrator_changed():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from argparse import ArgumentParser
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,12 @@ from django.core.management.base import BaseCommand, CommandError
 from evaweb.errors import EvaError
 from evaweb.lab.lab import Bench, a_lab
 from evaweb.lab.lifetime import Ended
+from evaweb.lab.seed import nobody_can_log_in
+
+_FIRST_ACCOUNT = (
+    "Nobody can log in yet. In another terminal, make an administrator:\n"
+    "  EVA_DATA_DIR={data} {python} manage.py createsuperuser"
+)
 
 
 class Command(BaseCommand):
@@ -34,6 +41,8 @@ class Command(BaseCommand):
                 self.stdout.write(
                     f"EVA Web is at {url}   (data in {settings.DATA_DIR})\nCtrl-C ends everything."
                 )
+                if nobody_can_log_in():
+                    self.stdout.write(_FIRST_ACCOUNT.format(data=settings.DATA_DIR, python=sys.executable))
                 self.stdout.flush()
                 lab.watch()
         except Ended:
