@@ -81,11 +81,19 @@ function drawFigures(store, snapshot) {
     element.dataset.lease = store.lease;
     element.title = TITLES[store.lease] ?? `${held} commands this station`;
   }
-  const stage = snapshot.state === "setting_up" ? `${words(snapshot.stage)} …` : "";
-  write("stage", stage);
-  for (const element of shown("stage")) element.hidden = !stage;
+  drawStage(snapshot);
   const { uuid, rows, repeated } = snapshot.recording;
   write("recording", uuid ? `recording ${rows} rows, ${repeated} with a repeated picture` : "not recording");
+}
+
+/** How far the set-up is, or what an idle station waits for: the reason why a set-up failed among it. */
+function drawStage({ state, stage, reason }) {
+  const text = state === "setting_up" ? `${words(stage)} …` : state === "idle" ? reason : "";
+  write("stage", text);
+  for (const element of shown("stage")) {
+    element.hidden = !text;
+    element.dataset.state = state;
+  }
 }
 
 /** The latency as a small distribution: a bar to the 90th percentile with a mark at the median. */

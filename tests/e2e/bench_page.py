@@ -1,8 +1,8 @@
 """A person at the bench: what they press and what they see."""
 
 from tests.e2e.lab import STATION
-from tests.processes import eventually
 from tests.e2e.pixels import pixels
+from tests.processes import eventually
 
 
 class BenchPage:
@@ -36,6 +36,14 @@ class BenchPage:
     def take(self):
         self.page.click("[data-lease=claim]")
         self.page.locator("[data-lease-when=mine]").wait_for()
+
+    def take_again(self):
+        """Have the station, whether or not its lease has ended meanwhile."""
+        mine, free = (self.page.locator(f"[data-lease-when={lease}]") for lease in ("mine", "free"))
+        mine.or_(free).first.wait_for()
+        eventually(lambda: mine.is_visible() or free.is_visible(), 30, "the page knows who has the station")
+        if not mine.is_visible():
+            self.take()
 
     def press(self, command):
         self.page.locator(f"[data-command={command}]:visible:enabled").first.click()

@@ -13,9 +13,10 @@ from uuid import UUID
 import pytest
 
 from runtime.client import StationClient
-from tests.e2e.lab import STATION, Demo
-from tests.processes import eventually
+from tests.e2e.bench_page import BenchPage
+from tests.e2e.lab import STATION, WIDE, Demo
 from tests.e2e.remote import SKILLED, page_of, refusal, tidy, visitor
+from tests.processes import eventually
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 DEAD = "dead-policy"
@@ -96,6 +97,23 @@ def test_a_command_decided_by_an_old_state_is_refused(bench):
     assert bench.status(trial) == "prepared"
 
 
+def test_a_worker_that_is_killed_right_after_a_score_publishes_the_episode_once(demo, bench):
+    trial = bench.running()
+    bench.stop(trial)
+    bench.score(trial)
+    episode = bench.trial(trial)["episode"]
+    jobs = "SELECT status FROM jobs_job WHERE key = ? AND status IN ('running', 'done')"
+    eventually(lambda: demo.rows(jobs, f"publish:{episode}"), 60, "the dataset is being written")
+    os.kill(demo.pid("worker"), signal.SIGKILL)
+    placed = eventually(lambda: placed_at(bench, episode), 90, "the episode is in the dataset")
+    waiting = "SELECT key FROM jobs_job WHERE status IN ('queued', 'running')"
+    eventually(lambda: not demo.rows(waiting), 90, "the worker has nothing left to do")
+    meta = demo.data / placed["dataset"] / "meta"
+    lines = [json.loads(line) for line in (meta / "eva_episodes.jsonl").read_text().splitlines()]
+    assert [line["episode_index"] for line in lines if line["uuid"] == episode] == [placed["dataset_index"]]
+    assert json.loads((meta / "info.json").read_text())["total_episodes"] == len(lines)
+
+
 def test_a_page_that_is_closed_mid_run_leaves_a_robot_that_holds_for_the_next_operator(bench, people):
     trial = bench.running()
     bench.close()
@@ -147,23 +165,6 @@ def test_a_browser_that_stops_reading_costs_the_others_nothing(demo, bench, peop
         bench.draws(10)
         assert bench.state()["lease"]["epoch"] == bench.epoch
     bench.draws(10)
-
-
-def test_a_worker_that_is_killed_right_after_a_score_publishes_the_episode_once(demo, bench):
-    trial = bench.running()
-    bench.stop(trial)
-    bench.score(trial)
-    episode = bench.trial(trial)["episode"]
-    jobs = "SELECT status FROM jobs_job WHERE key = ? AND status IN ('running', 'done')"
-    eventually(lambda: demo.rows(jobs, f"publish:{episode}"), 60, "the dataset is being written")
-    os.kill(demo.pid("worker"), signal.SIGKILL)
-    placed = eventually(lambda: placed_at(bench, episode), 90, "the episode is in the dataset")
-    waiting = "SELECT key FROM jobs_job WHERE status IN ('queued', 'running')"
-    eventually(lambda: not demo.rows(waiting), 90, "the worker has nothing left to do")
-    meta = demo.data / placed["dataset"] / "meta"
-    lines = [json.loads(line) for line in (meta / "eva_episodes.jsonl").read_text().splitlines()]
-    assert [line["episode_index"] for line in lines if line["uuid"] == episode] == [placed["dataset_index"]]
-    assert json.loads((meta / "info.json").read_text())["total_episodes"] == len(lines)
 
 
 def test_while_the_database_is_locked_pictures_go_on_and_the_e_stop_works(demo, bench):
@@ -226,6 +227,48 @@ def test_a_viewer_stops_the_robot_and_only_the_operator_releases_it(bench, peopl
     assert "a hand in the way" in bench.state()["estop"]
     bench.command("release")
     bench.wait(lambda state: state["state"] == "idle", 20, "released")
+
+
+@pytest.fixture(scope="module")
+def window(browser, demo, people):
+    """The second operator's browser."""
+    window = BenchPage(browser, demo, "ann", WIDE)
+    yield window
+    window.close()
+
+
+@pytest.fixture
+def commanding(window, station):
+    """Its Eval page, which has the station."""
+    window.open(f"/stations/{STATION}/eval/")
+    eventually(lambda: window.state() in ("IDLE", "READY"), 60, "the page shows a station at rest")
+    window.take()
+    return window
+
+
+def test_the_page_says_which_policy_does_not_answer_and_lets_one_choose_again(commanding):
+    page = commanding.page
+    page.select_option("#checkpoint-choice", DEAD)
+    page.check("input[name=position][value='1']")
+    page.click("[data-prepare]")
+    step = page.locator("[data-step=setup]")
+    eventually(lambda: "ws://127.0.0.1:1: start it" in step.inner_text(), 60, "the step says what to do")
+    assert commanding.state() == "IDLE"
+    page.click("[data-abandon]")
+    page.locator("#checkpoint-choice").wait_for()
+
+
+def test_a_page_outlives_the_web_and_says_meanwhile_that_nothing_is_known(demo, commanding):
+    page = commanding.page
+    with suspended(demo.child.pid):
+        os.kill(demo.pid("serve"), signal.SIGKILL)
+        commanding.reaches("NO CONNECTION")
+        assert "nothing is known" in page.locator("#situation").inner_text().lower()
+        assert page.locator("[data-prepare]").get_attribute("aria-disabled") == "true"
+    eventually(lambda: commanding.state() in ("IDLE", "READY"), 60, "the page shows the station again")
+    commanding.cameras_live()
+    commanding.take_again()
+    assert page.locator("[data-prepare]").get_attribute("aria-disabled") == "false"
 
 
 @contextmanager

@@ -7,8 +7,8 @@ import pytest
 
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, WIDE
-from tests.processes import eventually
 from tests.e2e.pixels import moved, orange, pixels, share, white, wood
+from tests.processes import eventually
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 CHECKPOINT = "pick-place-40k"
