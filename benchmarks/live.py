@@ -23,6 +23,7 @@ import numpy as np
 import psutil
 
 from benchmarks.report import Figure, Report
+from evaweb.lab.once import Choice, start
 from evaweb.lab.visitor import LivePage, Visitor
 
 _ROOT = Path(__file__).parents[1]
@@ -78,15 +79,7 @@ def _demo(folder: Path) -> Iterator[tuple[Visitor, dict[str, int]]]:
 def _run(visitor: Visitor, seconds: float, viewers: int) -> Mapping[str, Any]:
     """One trial of `seconds` while so many watch; it is voided afterwards."""
     with closing(LivePage(visitor, _STATION)) as page:
-        page.wait(lambda state: state["state"] != "disconnected", 60, "waiting for the station")
-        page.claim()
-        choice = {"scene": "block-on-plate", "position": 1, "checkpoint": "pick-place-40k", "seed": 1}
-        trial = visitor.post(f"stations/{_STATION}/trials", choice)["id"]
-        page.wait(lambda state: state["lease"]["epoch"] == page.epoch, 10, "waiting for the lease")
-        page.command("setup", trial)
-        page.wait(lambda state: state["state"] == "ready", 60, "setting up")
-        page.command("run", trial)
-        page.wait(lambda state: state["state"] == "running", 10, "running")
+        trial = start(visitor, page, Choice(_STATION, "block-on-plate", 1, "pick-place-40k", seed=1))
         found = _viewers(visitor, seconds, reading=viewers) if viewers else _wait(seconds)
         state = page.wait(lambda state: True, 10, "looking")
         page.command("stop")

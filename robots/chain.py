@@ -84,13 +84,7 @@ class Chain:
                 f"allowed: [..., {self.size}] for {', '.join(self.joints)}"
             )
         values = q if self._plain else q @ self._coupling.T + self._offsets
-        terms = np.empty((*values.shape, 1, 4))
-        terms[..., 0, 0] = 1.0
-        terms[..., 0, 1] = np.cos(values)
-        terms[..., 0, 2] = np.sin(values)
-        terms[..., 0, 3] = values
-        steps: Float64 = (terms @ self._table).reshape(*values.shape, 4, 4)
-        return steps
+        return motions(values, self._table)
 
     def _build(self, urdf: Urdf, pinned: Mapping[str, float]) -> None:
         tables, axes, slides, rows, offsets = [], [], [], [], []
@@ -165,3 +159,13 @@ def motion_table(fixed: Float64, joint: Joint) -> Float64:
         table[1, :3, :3] = np.eye(3) - along
         table[2, :3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
     return np.asarray(fixed @ table).reshape(4, 16)
+
+
+def motions(values: Float64, tables: Float64) -> Float64:
+    """The transforms [..., N, 4, 4] of joints with these values [..., N] and motion tables [N, 4, 16]."""
+    terms = np.empty((*values.shape, 1, 4))
+    terms[..., 0, 0] = 1.0
+    terms[..., 0, 1] = np.cos(values)
+    terms[..., 0, 2] = np.sin(values)
+    terms[..., 0, 3] = values
+    return np.asarray(terms @ tables).reshape(*values.shape, 4, 4)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robots import shapes, urdf
-from robots.chain import motion_table
+from robots.chain import motion_table, motions
 from robots.errors import RobotError
 from robots.robot import Group, Robot
 from robots.rotations import Float64, matrix_of_quaternion
@@ -81,12 +81,7 @@ class RobotScene:
                 f"{self._name}: joints of shape {q.shape} were given; allowed: [..., {self._dim}]"
             )
         values = np.clip(q @ self._coupling.T + self._offsets, self._low, self._high)
-        terms = np.empty((*values.shape, 1, 4))
-        terms[..., 0, 0] = 1.0
-        terms[..., 0, 1] = np.cos(values)
-        terms[..., 0, 2] = np.sin(values)
-        terms[..., 0, 3] = values
-        poses: Float64 = (terms @ self._tables).reshape(*values.shape, 4, 4)
+        poses = motions(values, self._tables)
         for parts, above in self._layers:
             poses[..., parts, :, :] = poses[..., above, :, :] @ poses[..., parts, :, :]
         return poses

@@ -51,23 +51,7 @@ def perform(visitor: Visitor, choice: Choice) -> Done:
     """Take the station, set up, run until it succeeds or its time is over, stop, score, wait for the dataset."""
     begun = time.monotonic()
     with closing(LivePage(visitor, choice.station)) as page:
-        page.wait(lambda state: state["state"] != "disconnected", _STATION_UP_S, "waiting for the station")
-        page.claim()
-        trial = visitor.post(
-            f"stations/{choice.station}/trials",
-            {
-                "scene": choice.scene,
-                "position": choice.position,
-                "checkpoint": choice.checkpoint,
-                "seed": choice.seed,
-            },
-        )["id"]
-        page.wait(lambda state: state["lease"]["epoch"] == page.epoch, _STOPPED_S, "waiting for the lease")
-        page.command("setup", trial)
-        set_up = page.wait(lambda state: state["state"] != "setting_up", _READY_S, "setting up")
-        if set_up["state"] != "ready":
-            raise VisitFailed(f"set-up ended {set_up['state']}: {set_up['reason']}")
-        page.command("run", trial)
+        trial = start(visitor, page, choice)
         resumed = _run(page, trial, float(visitor.get(f"trials/{trial}")["time_limit_s"]))
         scored = _score(visitor, trial)
         episode = _published(visitor, scored["episode"])
@@ -87,6 +71,22 @@ def perform(visitor: Visitor, choice: Choice) -> Done:
     )
 
 
+def start(visitor: Visitor, page: LivePage, choice: Choice) -> int:
+    """Take the station, prepare a trial, set up and run; its id."""
+    page.wait(lambda state: state["state"] != "disconnected", _STATION_UP_S, "waiting for the station")
+    page.claim()
+    named = {name: value for name, value in asdict(choice).items() if name != "station"}
+    trial: int = visitor.post(f"stations/{choice.station}/trials", named)["id"]
+    page.wait(lambda state: state["lease"]["epoch"] == page.epoch, _STOPPED_S, "waiting for the lease")
+    page.command("setup", trial)
+    set_up = page.wait(lambda state: state["state"] != "setting_up", _READY_S, "setting up")
+    if set_up["state"] != "ready":
+        raise VisitFailed(f"set-up ended {set_up['state']}: {set_up['reason']}")
+    page.command("run", trial)
+    page.wait(lambda state: state["state"] == "running", _STOPPED_S, "starting the run")
+    return trial
+
+
 def report(done: Done) -> dict[str, Any]:
     """The result as JSON."""
     return asdict(done)
@@ -98,7 +98,6 @@ def _run(page: LivePage, trial: int, limit: float) -> int:
     Where it holds for a reason that passes (an observation that was late), resume a few times as an operator
     would; returns how often.
     """
-    page.wait(lambda state: state["state"] == "running", _STOPPED_S, "starting the run")
     succeeded = 0.0
 
     def over(state: Mapping[str, Any]) -> bool:

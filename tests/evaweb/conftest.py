@@ -11,6 +11,7 @@ from django.contrib.auth.models import Group, User
 
 from evaweb.stations.models import Station
 from tests.evaweb.stand_in import StandIn
+from tests.evaweb.trials import builders
 
 
 def person(name: str, *groups: str) -> User:
@@ -67,3 +68,19 @@ def runtime(make_stand_in: Callable[..., StandIn]) -> StandIn:
 def live(runtime: StandIn, db: None) -> Station:
     """The station whose runtime is `runtime`."""
     return Station.objects.create(name=runtime.name, robot="agilex_piper", title="Bench 1")
+
+
+@pytest.fixture
+def bench(db: None) -> builders.Bench:
+    """A station without a runtime, with all that a trial is made of."""
+    return builders.bench()
+
+
+@pytest.fixture
+def wire(monkeypatch: pytest.MonkeyPatch) -> builders.Wire:
+    """What stands where wires to runtimes stand."""
+    made = builders.Wire()
+    places = ("stations.commands", "stations.leases", "api.stations", "trials.bench")
+    for place in places:
+        monkeypatch.setattr(f"evaweb.{place}.wire_to", lambda name: made)
+    return made

@@ -43,24 +43,6 @@ def _data_dir(settings, tmp_path):
 
 
 @pytest.fixture
-def bench(db):
-    return builders.bench()
-
-
-@pytest.fixture
-def wire(monkeypatch):
-    made = builders.Wire()
-    for place in (
-        "evaweb.stations.commands",
-        "evaweb.stations.leases",
-        "evaweb.api.stations",
-        "evaweb.trials.bench",
-    ):
-        monkeypatch.setattr(f"{place}.wire_to", lambda name: made)
-    return made
-
-
-@pytest.fixture
 def rest(bench):
     """With the operator's token."""
     return Rest(token_create(user=bench.operator, name="tests"))
