@@ -86,6 +86,12 @@ def data_dir(default: Path) -> Path:
     return folder
 
 
+def private_file(path: Path) -> Path:
+    """`path`, made empty where it is absent: for its user alone, as is what SQLite puts beside it."""
+    os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
+    return path
+
+
 def secret_key(folder: Path) -> str:
     """EVA_SECRET_KEY, or one of the lab's own that is made once and readable by its user alone."""
     given = os.environ.get("EVA_SECRET_KEY")

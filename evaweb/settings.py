@@ -85,7 +85,9 @@ _SQLITE = {
 def _database() -> dict[str, object]:
     url = os.environ.get("DATABASE_URL")
     if not url:
-        return {"ENGINE": "django.db.backends.sqlite3", "NAME": DATA_DIR / "eva.sqlite3", "OPTIONS": _SQLITE}
+        # Whoever can read it can be everybody who is logged in.
+        name = environment.private_file(DATA_DIR / "eva.sqlite3")
+        return {"ENGINE": "django.db.backends.sqlite3", "NAME": name, "OPTIONS": _SQLITE}
     try:
         found = dj_database_url.parse(url, conn_max_age=60, conn_health_checks=True)
     except (ValueError, dj_database_url.ParseError) as error:

@@ -1,3 +1,4 @@
+import sqlite3
 import stat
 import subprocess
 import sys
@@ -67,6 +68,19 @@ def test_the_key_is_made_once_and_is_its_users_alone(monkeypatch, tmp_path):
     assert stat.S_IMODE((tmp_path / "secret_key").stat().st_mode) == 0o600
     monkeypatch.setenv("EVA_SECRET_KEY", "given")
     assert environment.secret_key(tmp_path) == "given"
+
+
+def test_a_private_file_is_made_for_its_user_alone_and_left_as_it_is_where_it_is(tmp_path):
+    path = environment.private_file(tmp_path / "eva.sqlite3")
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    database = sqlite3.connect(path)
+    database.executescript(
+        "PRAGMA journal_mode=WAL; CREATE TABLE session (key); INSERT INTO session VALUES (1);"
+    )
+    assert {stat.S_IMODE(file.stat().st_mode) for file in tmp_path.iterdir()} == {0o600}
+    environment.private_file(path)
+    assert database.execute("SELECT key FROM session").fetchall() == [(1,)]
+    database.close()
 
 
 def test_a_wrong_setting_ends_the_start_with_one_sentence(tmp_path):
