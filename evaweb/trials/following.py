@@ -43,9 +43,9 @@ def run_changed(*, station: Station, event: Mapping[str, Any], boot: str | None 
         if kind == "state":
             return _state_entered(station, event, boot)
         if kind == "truth":
-            return _truth_told(event)
+            return _truth_told(station, event)
         if kind == "episode_closed":
-            return _episode_closed(event)
+            return _episode_closed(station, event)
     return None
 
 
@@ -159,10 +159,10 @@ def _moved(trial: Trial, move: Move, reason: str, time: float | None) -> None:
         trial.ended_at = timezone.now()
 
 
-def _truth_told(event: Mapping[str, Any]) -> Trial | None:
+def _truth_told(station: Station, event: Mapping[str, Any]) -> Trial | None:
     """How the simulated bench was left at the end of an episode."""
     data = dict(event.get("data") or {})
-    trial = _held(episode_id=_uuid(data.get("episode")))
+    trial = _held(station=station, episode_id=_uuid(data.get("episode")))
     if trial is None or trial.truth == data:
         return None
     trial.truth = data
@@ -170,11 +170,10 @@ def _truth_told(event: Mapping[str, Any]) -> Trial | None:
     return trial
 
 
-def _episode_closed(event: Mapping[str, Any]) -> Trial | None:
+def _episode_closed(station: Station, event: Mapping[str, Any]) -> Trial | None:
     """The recording is on disk: its duration is the exact one, and what is not whole is interrupted."""
     data = event.get("data") or {}
-    uuid = _uuid(data.get("uuid"))
-    trial = _held(episode_id=uuid)
+    trial = _held(station=station, episode_id=_uuid(data.get("uuid")))
     if trial is None:
         return None
     _closed_as(trial, str(data.get("status")), str(data.get("reason") or ""), _time(event))

@@ -125,6 +125,17 @@ def test_another_stations_events_do_not_touch_it(bench, running):
     other = Station.objects.create(name="bench-2", robot="agilex_piper")
     row = {"number": 9, "kind": "state", "text": "", "time": 1.0, "data": {"state": "faulted"}}
     assert services.run_changed(station=other, event=row, boot=BOOT) is None
+    ours = str(running.episode_id)
+    for number, (kind, data) in enumerate(
+        [
+            ("truth", {"episode": ours, "success": True}),
+            ("episode_closed", {"uuid": ours, "status": "failed"}),
+        ]
+    ):
+        row = {"number": 10 + number, "kind": kind, "text": "", "time": 1.0, "data": data}
+        assert services.run_changed(station=other, event=row, boot=BOOT) is None
+    running.refresh_from_db()
+    assert (running.status, running.truth) == ("running", None)
 
 
 def test_a_restarted_station_interrupts_what_was_under_way(bench, running):
