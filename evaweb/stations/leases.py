@@ -86,6 +86,7 @@ def hand_over(*, user: Any, station: Station, page: str, request: int) -> Lease:
     """The holder gives the station to the page that asked; a run goes on without a pause."""
     own = _own(user, station, page)
     asked = _open_request(station, request)
+    _require_commander(asked.user)
     held = _held(station)
     if (held["holder"], held["epoch"]) != (own.holder, own.epoch):
         raise Conflict(f"the lease has ended: {who(held['holder']) or 'nobody'} has {station} now")
@@ -141,6 +142,13 @@ def who(holder: str) -> str:
 
 def _why_over(lease: Lease, boot: str) -> str:
     return "expired: it was not renewed" if lease.boot == boot else "the station was restarted"
+
+
+def _require_commander(user: Any) -> None:
+    """Somebody who was switched off, or became a viewer, after asking gets no station any more."""
+    if not user.is_active:
+        raise NotAllowed(f"{user.get_username()} is switched off: decline the request")
+    require(user, Role.OPERATOR)
 
 
 def _require_active(station: Station) -> None:

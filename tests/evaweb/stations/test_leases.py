@@ -6,6 +6,7 @@ from datetime import timedelta
 
 import pytest
 from django.contrib.auth import get_user_model
+from django.contrib.auth.models import User
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
@@ -178,6 +179,23 @@ def test_a_request_is_withdrawn_or_declined_once(live, ann, bob):
         leases.withdraw(user=bob, station=live)
     leases.request(user=bob, station=live, page="p2")
     assert leases.withdraw(user=bob, station=live).answer == "withdrawn"
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda bob: bob.groups.clear(), "bob is a viewer"),
+        (lambda bob: User.objects.filter(pk=bob.pk).update(is_active=False), "bob is switched off"),
+    ],
+    ids=["a viewer now", "switched off"],
+)
+def test_who_may_not_command_any_more_is_not_handed_the_station(live, runtime, ann, bob, change, sentence):
+    claim(ann, live)
+    asked = leases.request(user=bob, station=live, page="p2")
+    change(bob)
+    with pytest.raises(NotAllowed, match=sentence):
+        leases.hand_over(user=ann, station=live, page="p1", request=asked.pk)
+    assert held(runtime)["holder"] == "web:ann:p1"
 
 
 def test_only_the_holder_hands_over(live, ann, bob):
