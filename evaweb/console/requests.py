@@ -71,7 +71,7 @@ def parse(text: str, cameras: Collection[str]) -> Request:
     """The request in a text message; raises BadRequest."""
     try:
         said = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         raise BadRequest(f"{text!r:.60} is no JSON") from None
     kind = said.get("type") if isinstance(said, dict) else None
     if kind == "watch":

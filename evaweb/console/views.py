@@ -56,7 +56,10 @@ def _station(name: str) -> Station:
 
 
 def _page(request: HttpRequest, station: Station, page: str, extra: dict[str, Any]) -> HttpResponse:
-    request.session[selectors.SESSION_KEY] = station.name
+    if (
+        request.session.get(selectors.SESSION_KEY) != station.name
+    ):  # a page is shown while the database is locked
+        request.session[selectors.SESSION_KEY] = station.name
     robot = selectors.robot_facts(robot=station.robot)
     context = {
         "station": station,

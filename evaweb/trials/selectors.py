@@ -6,7 +6,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from datetime import datetime, time
+from datetime import UTC, datetime, time
 from typing import TypeVar
 
 from django.db.models import Count, Model, Prefetch, Q, QuerySet
@@ -250,4 +250,8 @@ def _since(given: str) -> datetime:
         raise EvaError(
             f"since = {given!r:.80}; allowed: a day such as 2026-01-31, or a time such as 2026-01-31T08:00:00Z"
         )
-    return moment if timezone.is_aware(moment) else timezone.make_aware(moment)
+    try:
+        moment = moment if timezone.is_aware(moment) else timezone.make_aware(moment)
+        return moment.astimezone(UTC)
+    except OverflowError:  # at an end of the calendar: no time in another zone
+        raise EvaError(f"since = {given!r:.80}: there is no such time in UTC") from None

@@ -52,6 +52,11 @@ def test_what_means_nothing_is_refused_with_what_is_allowed(message, sentence):
         said(**message)
 
 
+def test_a_text_that_is_nested_too_deeply_is_a_bad_request():
+    with pytest.raises(BadRequest, match="is no JSON"):
+        parse("[" * 60_000, ())
+
+
 @pytest.mark.parametrize("extra", [{}, {"uuid": 7, "why": 3}, {"uuid": "x", "why": "y" * 999}])
 def test_an_estop_is_pressed_whatever_else_is_wrong(extra):
     pressed = said(type="estop", **extra)

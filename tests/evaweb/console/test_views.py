@@ -8,7 +8,9 @@ from typing import Any
 
 import pytest
 from django.contrib.auth.models import Group, User
+from django.db import connection
 from django.test import Client
+from django.test.utils import CaptureQueriesContext
 from django.urls import reverse
 from django.utils import timezone
 
@@ -32,6 +34,13 @@ NASTY = '<script>alert("x")</script>'
 ESCAPED = "&lt;script&gt;alert(&quot;x&quot;)&lt;/script&gt;"
 PAGES = ("/", "/stations/bench-1/", "/stations/bench-1/debug/", "/stations/bench-1/eval/")
 FRAGMENTS = ("/stations/bench-1/eval/panel", "/stations/bench-1/lease")
+
+
+def test_a_page_that_is_opened_again_writes_nothing(browser, station):
+    browser.get("/stations/bench-1/debug/")
+    with CaptureQueriesContext(connection) as asked:
+        assert browser.get("/stations/bench-1/debug/").status_code == 200
+    assert [query["sql"] for query in asked if not query["sql"].startswith("SELECT")] == []
 
 
 @pytest.fixture

@@ -83,7 +83,7 @@ def test_an_unknown_name_is_an_error_that_lists_the_known_ones(bench, kind, know
         selectors.trial_list(TrialFilters(**{kind: "nope"}))
 
 
-@pytest.mark.parametrize("given", ["yesterday", "2026-13-01", "2026-02-30", "1"])
+@pytest.mark.parametrize("given", ["yesterday", "2026-13-01", "2026-02-30", "1", "9999-12-31T23:59:59-23:00"])
 def test_times_that_are_none_are_refused(bench, given):
     with pytest.raises(EvaError, match="since = "):
         selectors.trial_list(TrialFilters(since=given))
