@@ -4,13 +4,11 @@ import ast
 import re
 import subprocess
 import sys
-from functools import cache
-from graphlib import CycleError, TopologicalSorter
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.sources import ROOT, Sources
+
 GROUND_FLOOR = {"types", "clock", "messages", "codecs", "errors", "section", "memory"}
 # By these alone the web comes in; to read a deployment file belongs to the configuration.
 DOORS = {"messages", "bus", "config", "deployment", "kinematics", "recording", "datasets"}
@@ -18,52 +16,9 @@ FAMILY = {"control", "main", "media", "guard", "headless"}
 ROOF = FAMILY | {"lockstep", "supervisor", "ctl", "__main__"}
 
 
-def module_name(path):
-    parts = path.relative_to(ROOT).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-
-
-MODULES = {
-    module_name(path): path for folder in ("runtime", "robots") for path in (ROOT / folder).rglob("*.py")
-}
-
-
-def _is_type_checking(node):
-    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
-
-
-def _imported(node, module, path):
-    if isinstance(node, ast.Import):
-        return [alias.name for alias in node.names]
-    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    base = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
-    origin = ".".join([*base, *([node.module] if node.module else [])])
-    names = [f"{origin}.{alias.name}" for alias in node.names]
-    # What is taken from a package is a module of it, or else a name that its __init__ must have made by then.
-    return names if all(name in MODULES for name in names) else [origin, *names]
-
-
-def _walk(nodes, everywhere):
-    for node in nodes:
-        if _is_type_checking(node):
-            yield from _walk(node.orelse, everywhere)
-        elif isinstance(node, ast.Import | ast.ImportFrom):
-            yield node
-        elif everywhere or not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-            yield from _walk(ast.iter_child_nodes(node), everywhere)
-
-
-@cache
-def imports(module, everywhere=False):
-    """Full names that `module` imports when it is itself imported, or anywhere at all."""
-    tree = ast.parse(MODULES[module].read_text("utf-8"))
-    nodes = _walk(tree.body, everywhere)
-    return frozenset(name for node in nodes for name in _imported(node, module, MODULES[module]))
-
-
-def inside(module, everywhere=False):
-    """The modules of ours among them."""
-    return {name for name in imports(module, everywhere) if name in MODULES and name != module}
+SOURCES = Sources("runtime", "robots")
+MODULES = SOURCES.paths
+imports, inside = SOURCES.imports, SOURCES.inside
 
 
 def floor(module):
@@ -120,12 +75,7 @@ def test_nothing_but_the_roof_knows_the_stand_ins(module):
 
 
 def test_no_import_goes_round_in_a_circle():
-    graph = {module: inside(module) for module in MODULES}
-    try:
-        order = list(TopologicalSorter(graph).static_order())
-    except CycleError as error:
-        pytest.fail(" -> ".join(error.args[1]))
-    assert len(order) == len(MODULES)
+    assert SOURCES.circle() == []
 
 
 def behind_the_doors(path):
