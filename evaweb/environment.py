@@ -74,6 +74,17 @@ def require_driver(name: str, engine: str) -> None:
         )
 
 
+def checkout(folder: Path) -> Path:
+    """The folder of the program, which pages and scripts are read from; ImproperlyConfigured where they are not."""
+    absent = [name for name in ("templates", "static") if not (folder / name).is_dir()]
+    if absent:
+        raise ImproperlyConfigured(
+            f"{folder} has no {' and no '.join(absent)}: the web runs from a checkout of its repository "
+            "(make setup there, or pip install --editable .); runtime and robots alone also run installed"
+        )
+    return folder
+
+
 def data_dir(default: Path) -> Path:
     """The folder that holds everything of this lab; created where it is absent."""
     folder = Path(os.environ.get("EVA_DATA_DIR") or default).expanduser().absolute()

@@ -11,7 +11,7 @@ from django.core.exceptions import ImproperlyConfigured
 
 from evaweb import environment
 
-BASE_DIR = Path(__file__).parents[1]
+BASE_DIR = environment.checkout(Path(__file__).parents[1])
 DATA_DIR = environment.data_dir(BASE_DIR / "data")
 
 SECRET_KEY = environment.secret_key(DATA_DIR)

@@ -90,3 +90,18 @@ def test_a_wrong_setting_ends_the_start_with_one_sentence(tmp_path):
     assert ended.returncode == 1
     assert ended.stderr.startswith("cannot start: EVA_LOG_LEVEL = 'LOUD'; allowed:")
     assert "Traceback" not in ended.stderr
+
+
+def test_the_web_runs_from_a_checkout():
+    assert environment.checkout(ROOT) == ROOT
+
+
+def test_without_its_pages_the_web_does_not_start_and_says_how_it_would(tmp_path):
+    (tmp_path / "static").mkdir()
+    with pytest.raises(ImproperlyConfigured, match="has no templates: the web runs from a checkout"):
+        environment.checkout(tmp_path)
+    (tmp_path / "static").rmdir()
+    with pytest.raises(
+        ImproperlyConfigured, match="has no templates and no static: .*pip install --editable"
+    ):
+        environment.checkout(tmp_path)
