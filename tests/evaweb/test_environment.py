@@ -102,6 +102,6 @@ def test_without_its_pages_the_web_does_not_start_and_says_how_it_would(tmp_path
         environment.checkout(tmp_path)
     (tmp_path / "static").rmdir()
     with pytest.raises(
-        ImproperlyConfigured, match="has no templates and no static: .*pip install --editable"
+        ImproperlyConfigured, match=r"has no templates and no static: .*pip install --editable"
     ):
         environment.checkout(tmp_path)
