@@ -2,7 +2,7 @@
 
 const BAD = new Set(["estopped", "family_died", "policy_failed", "recording_failed", "source_failed", "displaced"]);
 const WARN = new Set(["refused", "word_refused", "refusals", "starved", "chunk_dropped", "ik_unreached", "not_journalled", "unmeasured"]);
-const HOLDER = /\bweb:([^\s:]+):[A-Za-z0-9_-]+/g; // a page of a person: the person is enough
+const HOLDER = /\bweb:([^\s:]+):([A-Za-z0-9_-]{1,4})[A-Za-z0-9_-]*/g; // a page of a person
 
 /** The kind in words. */
 export function kindWords(kind) {
@@ -13,7 +13,7 @@ export function kindWords(kind) {
 export function sentence({ kind, text }) {
   if (kind === "setup" && text === "idle") return "the set-up is over";
   const said = kind === "state" ? text.replace(/^\w+ -> \w+/, (change) => change.replaceAll("_", " ")) : text;
-  return said.replaceAll(" -> ", " → ").replace(HOLDER, "$1");
+  return said.replaceAll(" -> ", " → ").replace(HOLDER, "$1 (page $2)");
 }
 
 /** "bad" for what endangers robot or record, "warn" for what a person should have seen, else "". */

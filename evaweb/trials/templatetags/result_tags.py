@@ -57,6 +57,12 @@ def _short(value: Any) -> str:
 
 
 @register.filter
+def spaced(name: str) -> str:
+    """A name of the code in words: over_plate, over plate."""
+    return name.replace("_", " ")
+
+
+@register.filter
 def tone(status: str) -> str:
     """The colour of a trial's status, by the name the style sheets have for it."""
     return TrialStatus(status).tone

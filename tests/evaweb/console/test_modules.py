@@ -288,7 +288,7 @@ def test_an_event_is_said_in_words_with_its_weight() -> None:
         ["state", "running → holding: halted", "warn"],
         ["state", "running → faulted: e-stop", "bad"],
         ["command", "run by ann: accepted", ""],
-        ["command", "run by bob: refused, ann holds the lease", "warn"],
+        ["command", "run by bob: refused, ann (page 6b9c) holds the lease", "warn"],
         ["source frames lost", "source: frames lost (3 so far)", "warn"],
         ["recording failed", "the disk is full", "bad"],
         ["setup", "the set-up is over", ""],
