@@ -397,7 +397,7 @@ def test_the_holder_stops_over_the_socket_and_it_is_written_down_later(live, ann
         other = await Page(live.name, bob).open()
         await other.say(type=kind, uuid=str(uuid4()), epoch=lease.epoch)
         refused = await other.told("ack")
-        assert (refused["status"], refused["reason"]) == ("refused", "web:ann:p1 holds the lease")
+        assert (refused["status"], refused["reason"]) == ("refused", "ann holds the lease")
         await other.close()
         assert runtime.session.state == "running"
         page = await Page(live.name, ann).open()
