@@ -14,7 +14,7 @@ export class EStop {
   #waiting = new Map(); // uuid -> timer
   #note = document.getElementById("estop-note");
   #area = document.getElementById("estop-area");
-  #rest = this.#note.innerHTML;
+  #rest = this.#note.dataset.rest;
   #faulted = false;
 
   constructor(store, socket) {
@@ -24,6 +24,7 @@ export class EStop {
     window.addEventListener("keydown", (event) => this.#key(event), { capture: true });
     window.addEventListener("keyup", (event) => this.#keyUp(event), { capture: true });
     store.on("snapshot", () => this.#latched());
+    this.#area.dataset.ready = ""; // estop_early.js leaves it to us
   }
 
   /** Press it; `why` is what was pressed. */

@@ -293,3 +293,52 @@ def test_an_event_is_said_in_words_with_its_weight() -> None:
         ["recording failed", "the disk is full", "bad"],
         ["setup", "the set-up is over", ""],
     ]
+
+
+EARLY = """
+const source = (await import("node:fs")).readFileSync(new URL(given.module), "utf8");
+const listeners = {}, posted = [];
+const part = (id) => ({ dataset: {}, innerHTML: "at rest", addEventListener: (kind, act) => (listeners[id] = act) });
+const parts = Object.fromEntries(["estop-area", "estop-note", "estop", "outcome"].map((id) => [id, part(id)]));
+parts["estop-area"].dataset.address = "/estop";
+const document = { getElementById: (id) => parts[id], querySelector: () => ({ value: "token" }) };
+const window = { addEventListener: (kind, act) => (listeners[kind] = act) };
+const fetch = async (address, { body }) => {
+  posted.push([address, JSON.parse(body).why]);
+  return { ok: given.status === 200, status: given.status, json: async () => ({ status: given.said }) };
+};
+const quiet = { error() {} };
+new Function("document", "window", "fetch", "console", "setTimeout", source)(document, window, fetch, quiet, () => {});
+const settled = () => new Promise((resolve) => setTimeout(resolve, 5));
+const shown = () => [parts["estop-area"].dataset.kind, parts["estop-note"].textContent];
+"""
+
+
+def test_the_e_stop_works_before_and_without_the_modules() -> None:
+    given = {"module": (MODULES / "estop_early.js").as_uri(), "status": 200, "said": "accepted"}
+    body = """
+    listeners.estop();
+    await settled();
+    const first = shown();
+    listeners.keydown({ code: "Escape", preventDefault() {}, target: {} });
+    listeners.keydown({ code: "Space", preventDefault() {}, target: { closest: () => true } });  // typed
+    parts["estop-area"].dataset.ready = "";
+    listeners.estop();
+    return { first, posted, rest: parts["estop-note"].dataset.rest };
+    """
+    found = run("words.js", EARLY + body, given)
+
+    assert found["first"] == ["stopped", "E-stop acknowledged: the robot is held."]
+    assert found["posted"] == [
+        ["/estop", "button on the page, before it had started"],
+        ["/estop", "Escape on the page, before it had started"],
+    ]
+    assert found["rest"] == "at rest"
+
+
+@pytest.mark.parametrize(("status", "said"), [(409, "failed"), (200, "unknown"), (403, None)])
+def test_an_early_e_stop_that_failed_says_to_use_the_hardware_stop(status: int, said: str | None) -> None:
+    given = {"module": (MODULES / "estop_early.js").as_uri(), "status": status, "said": said}
+    found = run("words.js", EARLY + "listeners.estop(); await settled(); return shown();", given)
+
+    assert found == ["failed", "USE THE HARDWARE STOP"]

@@ -486,6 +486,15 @@ def test_page_and_fragment_are_the_same_in_every_state(
     assert fragment.strip() in page
 
 
+def test_the_e_stop_of_a_station_needs_no_module(browser: Client, ada: User, station: Station) -> None:
+    html = text_of(browser, "/stations/bench-1/debug/")
+
+    assert 'data-address="/api/v1/stations/bench-1/estop"' in html
+    script = re.search(r'<script src="[^"]*console/estop_early.js"></script>', html)
+    assert script
+    assert html.index('id="estop"') < script.start() < html.index("console/station.js")
+
+
 # --- lease -------------------------------------------------------------------------------------------------
 
 

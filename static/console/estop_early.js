@@ -1,0 +1,46 @@
+// The e-stop before the page's modules run, and where they never do: a page that looks as if it could stop the
+// robot must be able to. By plain HTTP; a classic script, because a module that fails takes all others with it.
+(() => {
+  const LATE_MS = 8000; // by then the modules have taken over, or something is wrong with them
+  const TIMEOUT_MS = 2500;
+  const area = document.getElementById("estop-area");
+  const note = document.getElementById("estop-note");
+  note.dataset.rest = note.innerHTML;
+  const alone = () => !("ready" in area.dataset); // estop.js says when it is there
+
+  function say(kind, text) {
+    area.dataset.kind = kind;
+    note.textContent = text;
+  }
+
+  async function press(why) {
+    say("pressed", "E-stop pressed …");
+    try {
+      const token = document.querySelector('input[name="csrfmiddlewaretoken"]').value;
+      const answer = await fetch(area.dataset.address, {
+        method: "POST",
+        headers: { "Content-Type": "application/json", "X-CSRFToken": token },
+        body: JSON.stringify({ why: `${why} on the page, before it had started` }),
+        redirect: "error",
+        signal: AbortSignal.timeout(TIMEOUT_MS),
+      });
+      const { status } = await answer.json();
+      if (!answer.ok || !["accepted", "done"].includes(status)) throw new Error(`HTTP ${answer.status}, ${status}`);
+      say("stopped", "E-stop acknowledged: the robot is held.");
+    } catch (error) {
+      console.error(error);
+      say("failed", "USE THE HARDWARE STOP");
+    }
+  }
+
+  document.getElementById("estop").addEventListener("click", () => alone() && press("button"));
+  window.addEventListener("keydown", (event) => {
+    const typing = event.code === "Space" && event.target.closest?.("input, textarea, select");
+    if (!alone() || event.repeat || typing || !["Escape", "Space"].includes(event.code)) return;
+    event.preventDefault();
+    press(event.code);
+  });
+  setTimeout(() => {
+    if (alone()) document.getElementById("outcome").textContent = "This page has not started: reload it. Its e-stop works.";
+  }, LATE_MS);
+})();
