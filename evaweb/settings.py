@@ -103,17 +103,9 @@ def _database() -> dict[str, object]:
 DATABASES = {"default": _database()}
 DEFAULT_AUTO_FIELD = "django.db.models.BigAutoField"
 
-# --- what web processes tell each other --------------------------------------------------------------------
+# --- broker ------------------------------------------------------------------------------------------------
 
-REDIS_URL = os.environ.get("REDIS_URL", "")
-CHANNEL_LAYERS = {
-    "default": {
-        "BACKEND": "channels_redis.core.RedisChannelLayer",
-        "CONFIG": {"hosts": [REDIS_URL]},
-    }
-    if REDIS_URL
-    else {"BACKEND": "channels.layers.InMemoryChannelLayer"}
-}
+REDIS_URL = os.environ.get("REDIS_URL", "")  # of evaweb.celery; without it a folder of the data folder serves
 
 # --- static files ------------------------------------------------------------------------------------------
 
