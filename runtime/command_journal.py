@@ -37,7 +37,7 @@ class CommandJournal:
         for line in whole.split(b"\n")[-REMEMBERED:]:
             try:
                 row = json.loads(line)
-                answers[row["uuid"]] = Ack(**row["ack"])
+                answers.setdefault(row["uuid"], Ack(**row["ack"]))
             except (ValueError, KeyError, TypeError):
                 continue  # damaged, or the rest of a line that begins before the tail
         return answers

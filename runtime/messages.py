@@ -208,6 +208,7 @@ class Ack:
     boot: str = ""
     sequence: int = 0
     data: Mapping[str, Any] = field(default_factory=dict)
+    kind: str = ""  # of the command that this answers
 
 
 Message = (

@@ -174,11 +174,17 @@ class Session:
         return [*commands, "estop"]
 
     def handle(self, command: Command) -> Ack:
-        """The answer to `command`; repeated uuids get the first answer again."""
+        """The answer to `command`; repeated uuids get the first answer again.
+
+        A uuid that was another command's is no repetition: a stop is obeyed all the same, the rest refused.
+        """
         if not command.uuid:  # all such commands would be repetitions of each other
             return self._ack(command, "refused", "a command needs a uuid of its own")
-        if command.uuid in self._answers:
-            return self._answers[command.uuid]
+        first = self._answers.get(command.uuid)
+        if first is not None and first.kind in ("", command.kind):
+            return first
+        if first is not None and command.kind not in STOPPING:
+            return self._ack(command, "refused", f"its uuid was given to the command {first.kind!r} before")
         refusal, told = self._refusal(command), None
         if not refusal:
             try:
@@ -187,7 +193,7 @@ class Session:
                 refusal = str(error)
         ack = self._ack(command, "refused" if refusal else "accepted", refusal, told)
         if command.kind != "lease_renew":  # a stream, not a discrete command: nothing to repeat
-            self._answers[command.uuid] = ack
+            self._answers.setdefault(command.uuid, ack)
             if len(self._answers) > ANSWERS_KEPT:
                 del self._answers[next(iter(self._answers))]
         return ack
@@ -294,8 +300,9 @@ class Session:
     def _ack(self, command: Command, status: AckStatus, reason: str, told: Told | None = None) -> Ack:
         held = self._lease.current(self._now())
         lease = {"epoch": held.epoch, "holder": held.holder} if held else {}
+        data = {**(told or {}), **lease}
         return Ack(
-            command.uuid, status, reason, self.allowed(), self._boot, self.sequence, {**(told or {}), **lease}
+            command.uuid, status, reason, self.allowed(), self._boot, self.sequence, data, command.kind
         )
 
 

@@ -22,6 +22,7 @@ from evaweb.errors import EvaError
 
 log = logging.getLogger(__name__)
 _MOST_RESTARTS, _RESTART_WINDOW_S = 5, 60.0
+_REST_S = 30.0
 _LONGEST_LOG = 20_000_000  # bytes, beyond which a log starts anew and the old one is kept beside it
 
 
@@ -52,6 +53,7 @@ class _Child:
     log: IO[bytes]
     addresses: Mapping[str, Any] = field(default_factory=dict)
     restarts: deque[float] = field(default_factory=deque)
+    rests_until: float = 0.0
 
 
 class Processes:
@@ -66,7 +68,7 @@ class Processes:
 
     def start(self, program: Program, ready_s: float = 60.0) -> Mapping[str, Any]:
         """Start it; returns the addresses that it announces, {} where it announces none."""
-        child = _Child(program, *self._spawn(program, program.arguments))
+        child = _Child(program, *self._spawn(program, program.arguments, program.announces))
         self._children[program.name] = child
         if program.announces:
             child.addresses = self._announcement(child, ready_s)
@@ -77,11 +79,15 @@ class Processes:
         return {name: child.process.pid for name, child in self._children.items()}
 
     def watch(self) -> None:
-        """Restart what has died; LabError where one dies too often."""
+        """Restart what has died, without waiting for it.
+
+        What dies too often rests a while between two starts: it must not take a station with it that runs.
+        """
+        now = time.monotonic()
         for child in self._children.values():
             code = child.process.poll()
-            if code is not None:
-                self._restart(child, code)
+            if code is not None and now >= child.rests_until:
+                self._restart(child, code, now)
 
     def end(self) -> None:
         """Cut the lifelines in reverse order, wait for each; one that does not end in its time is killed."""
@@ -99,7 +105,7 @@ class Processes:
         self._children.clear()
 
     def _spawn(
-        self, program: Program, arguments: tuple[str, ...]
+        self, program: Program, arguments: tuple[str, ...], heard: bool
     ) -> tuple[subprocess.Popen[bytes], IO[bytes]]:
         path = self._logs / f"{program.name}.log"
         if path.exists() and path.stat().st_size > _LONGEST_LOG:
@@ -108,7 +114,7 @@ class Processes:
         process = subprocess.Popen(
             ["nice", "-n", str(program.nice), sys.executable, *arguments, "--lifeline"],
             stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE if program.announces else output,
+            stdout=subprocess.PIPE if heard else output,
             stderr=output,
             env=self._environment,
             cwd=self._folder,
@@ -142,18 +148,25 @@ class Processes:
         lines = path.read_text("utf-8", "replace").strip().splitlines()
         return f"{lines[-1] if lines else 'it said nothing'} (see {path})"
 
-    def _restart(self, child: _Child, code: int) -> None:
-        program, now = child.program, time.monotonic()
-        child.restarts.append(now)
-        while child.restarts[0] < now - _RESTART_WINDOW_S:
+    def _restart(self, child: _Child, code: int, now: float) -> None:
+        """Start it again where it was; what it announces is known and goes to its log."""
+        program = child.program
+        while child.restarts and child.restarts[0] < now - _RESTART_WINDOW_S:
             child.restarts.popleft()
-        if len(child.restarts) > _MOST_RESTARTS:
-            raise LabError(
-                f"{program.name} ended with {code} for the {len(child.restarts)}th time in a minute: {self._why(child)}"
+        if len(child.restarts) >= _MOST_RESTARTS:
+            child.rests_until = now + _REST_S
+            child.restarts.clear()
+            log.error(
+                "%s ended with %d, %d times within a minute: next try in %d s; %s",
+                program.name,
+                code,
+                _MOST_RESTARTS + 1,
+                _REST_S,
+                self._why(child),
             )
+            return
+        child.restarts.append(now)
         log.error("%s ended with %d: restarting it", program.name, code)
         child.log.close()
         arguments = program.again(child.addresses) if program.again else program.arguments
-        child.process, child.log = self._spawn(program, arguments)
-        if program.announces:
-            child.addresses = self._announcement(child, 60.0)
+        child.process, child.log = self._spawn(program, arguments, heard=False)

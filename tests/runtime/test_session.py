@@ -287,6 +287,18 @@ def test_a_repeated_uuid_gets_the_first_answer_and_is_not_carried_out_again():
     assert bench.session.state is S.READY
 
 
+def test_a_stop_under_the_uuid_of_a_run_is_obeyed_and_any_other_command_refused():
+    bench = Bench(S.READY)
+    bench.give("run", uuid="same")
+    assert bench.give("halt", uuid="same").status == "accepted"
+    assert bench.session.state is S.HOLDING
+    answer = bench.give("resume", uuid="same")
+    assert (answer.status, answer.reason) == ("refused", "its uuid was given to the command 'run' before")
+    assert bench.session.state is S.HOLDING
+    assert bench.give("stop", uuid="same").status == "accepted"
+    assert bench.session.state is S.READY
+
+
 def test_a_repeated_refusal_is_the_same_refusal():
     bench = Bench(S.IDLE)
     command = bench.command("run")

@@ -35,13 +35,29 @@ def test_what_dies_is_started_again_where_it_was(processes):
     eventually(lambda: not alive(before), 20, "its end")
     processes.watch()
     assert processes.pids()["one"] != before
-    assert processes._children["one"].addresses == {"url": "here here first"}
+    written = processes._logs / "one.log"
+    eventually(lambda: "here here first" in written.read_text(), 20, "it announces itself again")
 
 
-def test_what_dies_too_often_ends_the_lab_with_its_last_words(processes):
+def test_what_dies_too_often_rests_and_takes_nobody_with_it(processes, caplog):
     processes.start(Program("one", ("-c", "raise SystemExit('the disk is on fire')")))
-    with pytest.raises(LabError, match="one ended with 1 for the 6th time in a minute: the disk is on fire"):
-        eventually(processes.watch, 20, "giving up")
+    processes.start(Program("two", ("-c", WAITS)))
+    two = processes.pids()["two"]
+
+    def rests():
+        processes.watch()
+        return (
+            "one ended with 1, 6 times within a minute: next try in 30 s; the disk is on fire" in caplog.text
+        )
+
+    eventually(rests, 20, "it rests")
+    one = processes.pids()["one"]
+    processes.watch()
+    assert processes.pids() == {"one": one, "two": two}
+    processes._children["one"].rests_until = 0.0
+    processes.watch()
+    assert processes.pids()["one"] != one
+    assert processes.pids()["two"] == two
 
 
 def test_a_program_that_does_not_start_is_named_with_what_it_said(processes):
