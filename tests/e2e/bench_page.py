@@ -33,6 +33,10 @@ class BenchPage:
     def reaches(self, word, seconds=60):
         eventually(lambda: word in self.state(), seconds, f"the status bar says {word}, not {self.state()}")
 
+    def at_rest(self):
+        """The page shows a station that can be set up."""
+        eventually(lambda: self.state() in ("IDLE", "READY"), 60, "the status bar says IDLE or READY")
+
     def take(self):
         self.page.click("[data-lease=claim]")
         self.page.locator("[data-lease-when=mine]").wait_for()

@@ -14,6 +14,15 @@ def demo(tmp_path_factory):
     assert lab.end() == 0, (lab.folder / "demo.log").read_text()[-2000:]
 
 
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory):
+    """A lab with more people and a dead checkpoint, for modules that leave its station in order."""
+    lab = Demo(tmp_path_factory.mktemp("shared"), EVA_JOB_STALE_S="6").start().people()
+    yield lab
+    if lab.runs:
+        assert lab.end() == 0, (lab.folder / "demo.log").read_text()[-2000:]
+
+
 @pytest.fixture(scope="module")
 def browser():
     if not (shutil.which("chromium") or Path(CHROMIUM).exists()):

@@ -18,6 +18,15 @@ ROOT = Path(__file__).parents[2]
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
 NO_CHROMIUM = "Debian's chromium is not installed (apt-get install chromium)"
 STATION = "bench-1"
+DEAD = "dead-policy"
+_MORE = f"""
+import json
+from evaweb.lab.seed import demo_checkpoint, demo_login
+from evaweb.roles import Role
+people = [demo_login(username="ann", role=Role.OPERATOR), demo_login(username="visitor", role=Role.VIEWER)]
+demo_checkpoint(name="{DEAD}", description="", policy={{"url": "ws://127.0.0.1:1"}})
+print(json.dumps({{login.username: login.password for login in people}}))
+"""
 WIDE, TABLET = {"width": 1440, "height": 900}, {"width": 1024, "height": 768}
 
 
@@ -53,6 +62,15 @@ class Demo:
         self.url, self.passwords, self.pids = found["url"], found["passwords"], found["pids"]
         return self
 
+    def people(self):
+        """Add an operator, a viewer, and a checkpoint that nobody serves; returns itself."""
+        self.passwords |= json.loads(self.python(_MORE))
+        return self
+
+    @property
+    def runs(self):
+        return self.child.poll() is None
+
     def pid(self, word):
         """The program of the lab that has `word` among its arguments, as it runs now."""
         own = psutil.Process(self.child.pid).children()
@@ -61,8 +79,8 @@ class Demo:
         return found[0]
 
     def everyone(self):
-        """All that runs for this lab."""
-        return [child.pid for child in psutil.Process(self.child.pid).children(recursive=True)]
+        """All processes of this lab, but for the one that we started."""
+        return psutil.Process(self.child.pid).children(recursive=True)
 
     def python(self, program):
         """What a Python program says that runs in this lab's Django, beside its own processes."""
@@ -87,11 +105,16 @@ class Demo:
 
     def end(self, number=signal.SIGINT):
         """End it as a person would; returns the exit code."""
-        if self.child.poll() is None:
+        if self.runs:
             self.child.send_signal(number)
         code = self.child.wait(60)
         self.output.close()
         return code
+
+
+def left(processes):
+    """Those that have not ended."""
+    return [process for process in processes if process.is_running() and alive(process.pid)]
 
 
 def environment(data):

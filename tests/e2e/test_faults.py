@@ -14,29 +14,16 @@ import pytest
 
 from runtime.client import StationClient
 from tests.e2e.bench_page import BenchPage
-from tests.e2e.lab import STATION, WIDE, Demo
+from tests.e2e.lab import DEAD, STATION, WIDE
 from tests.e2e.remote import SKILLED, page_of, refusal, tidy, visitor
 from tests.processes import eventually
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
-DEAD = "dead-policy"
-_MORE = f"""
-import json
-from evaweb.lab.seed import demo_checkpoint, demo_login
-from evaweb.roles import Role
-people = [demo_login(username="ann", role=Role.OPERATOR), demo_login(username="visitor", role=Role.VIEWER)]
-demo_checkpoint(name="{DEAD}", description="", policy={{"url": "ws://127.0.0.1:1"}})
-print(json.dumps({{login.username: login.password for login in people}}))
-"""
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory):
-    """A lab with a second operator, a viewer, and a checkpoint that nobody serves."""
-    lab = Demo(tmp_path_factory.mktemp("demo"), EVA_JOB_STALE_S="6").start()
-    lab.passwords |= json.loads(lab.python(_MORE))
-    yield lab
-    assert lab.end() == 0, (lab.folder / "demo.log").read_text()[-2000:]
+def demo(shared):
+    return shared
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +176,8 @@ def test_while_the_database_is_locked_pictures_go_on_and_the_e_stop_works(demo, 
 def test_an_unknown_checkpoint_is_refused_with_what_there_is(bench):
     sentence = refusal(lambda: bench.prepare(checkpoint="pick-place-1M"))
     assert "HTTP 404" in sentence
-    assert "pick-place-1M" in sentence
+    assert "'pick-place-1M' does not exist; there are:" in sentence
+    assert SKILLED in sentence
 
 
 def test_a_policy_that_nobody_serves_ends_the_set_up_with_its_address(bench):
@@ -241,7 +229,7 @@ def window(browser, demo, people):
 def commanding(window, station):
     """Its Eval page, which has the station."""
     window.open(f"/stations/{STATION}/eval/")
-    eventually(lambda: window.state() in ("IDLE", "READY"), 60, "the page shows a station at rest")
+    window.at_rest()
     window.take()
     return window
 
@@ -265,7 +253,7 @@ def test_a_page_outlives_the_web_and_says_meanwhile_that_nothing_is_known(demo, 
         commanding.reaches("NO CONNECTION")
         assert "nothing is known" in page.locator("#situation").inner_text().lower()
         assert page.locator("[data-prepare]").get_attribute("aria-disabled") == "true"
-    eventually(lambda: commanding.state() in ("IDLE", "READY"), 60, "the page shows the station again")
+    commanding.at_rest()
     commanding.cameras_live()
     commanding.take_again()
     assert page.locator("[data-prepare]").get_attribute("aria-disabled") == "false"

@@ -5,31 +5,21 @@ import signal
 import subprocess
 import sys
 
-import psutil
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from evaweb.lab.visitor import Visitor
-from tests.e2e.lab import ROOT, STATION, Demo
+from tests.e2e.lab import ROOT, STATION, left
 from tests.e2e.remote import page_of, refusal, tidy, visitor
-from tests.processes import alive, eventually
+from tests.processes import eventually
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
-_VIEWER = """
-import json
-from evaweb.lab.seed import demo_login
-from evaweb.roles import Role
-print(json.dumps(demo_login(username="visitor", role=Role.VIEWER).password))
-"""
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory):
-    lab = Demo(tmp_path_factory.mktemp("demo")).start()
-    lab.passwords["visitor"] = json.loads(lab.python(_VIEWER))
-    yield lab
-    lab.end()
+def demo(shared):
+    return shared
 
 
 def dial(demo, origin, cookie=""):
@@ -93,10 +83,9 @@ def test_ctrl_c_ends_everything_and_a_second_start_keeps_trials_under_new_passwo
         first = page.prepare()
     operator.post(f"trials/{first}/abandon", {"reason": "the lab is closed"})
     everyone, old = demo.everyone(), demo.passwords["operator"]
-    assert set(demo.pids.values()) <= set(everyone)
     assert len(everyone) > len(demo.pids)
     assert demo.end(signal.SIGINT) == 0
-    assert [pid for pid in everyone if alive(pid)] == []
+    assert left(everyone) == []
 
     demo.start()
     assert demo.passwords["operator"] != old
@@ -111,11 +100,7 @@ def test_ctrl_c_ends_everything_and_a_second_start_keeps_trials_under_new_passwo
 
 
 def test_the_end_of_all_follows_from_the_kill_of_the_supervisor(demo):
-    everyone = [psutil.Process(pid) for pid in demo.everyone()]
+    everyone = demo.everyone()
     assert len(everyone) > len(demo.pids)
     assert demo.end(signal.SIGKILL) == -signal.SIGKILL
-    eventually(lambda: not [child for child in everyone if lives(child)], 20, "all processes have ended")
-
-
-def lives(process):
-    return process.is_running() and alive(process.pid)
+    eventually(lambda: not left(everyone), 20, "all processes have ended")
