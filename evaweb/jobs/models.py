@@ -38,7 +38,10 @@ class Job(models.Model):
 
     class Meta:
         ordering = ("-created_at",)
-        indexes = [models.Index(fields=("status", "queue", "created_at"))]
+        indexes = [
+            models.Index(fields=("status", "queue", "created_at")),
+            models.Index(fields=("-finished_at",)),
+        ]
         constraints = [
             models.UniqueConstraint(
                 fields=("key",), condition=models.Q(status="queued"), name="job_one_waiting_per_key"

@@ -223,6 +223,10 @@ class Trial(models.Model):
 
     class Meta:
         ordering = ("-prepared_at",)
+        indexes = [
+            models.Index(fields=("station", "-changed_at")),
+            models.Index(fields=("station", "-prepared_at")),
+        ]
         constraints = [
             models.UniqueConstraint(
                 fields=(
