@@ -33,7 +33,7 @@ class CommandJournal:
         whole, _, torn = content.rpartition(b"\n")
         if torn:  # by a kill: its command was never answered
             self._file.truncate(size - len(torn))
-        answers = {}
+        answers: dict[str, Ack] = {}
         for line in whole.split(b"\n")[-REMEMBERED:]:
             try:
                 row = json.loads(line)

@@ -223,10 +223,6 @@ class Trial(models.Model):
 
     class Meta:
         ordering = ("-prepared_at",)
-        indexes = [
-            models.Index(fields=("station", "-changed_at")),
-            models.Index(fields=("station", "-prepared_at")),
-        ]
         constraints = [
             models.UniqueConstraint(
                 fields=(
@@ -249,6 +245,8 @@ class Trial(models.Model):
         indexes = [
             models.Index(fields=("status", "scene", "checkpoint")),
             models.Index(fields=("station", "status")),
+            models.Index(fields=("station", "-changed_at")),
+            models.Index(fields=("station", "-prepared_at")),
         ]
 
     def __str__(self) -> str:
