@@ -15,7 +15,8 @@ from pydantic import AfterValidator, ValidationError, field_validator
 from evaweb.api.answers import FAILURES, Failure
 from evaweb.api.trials import TrialDetail
 from evaweb.errors import EvaError, StationGone
-from evaweb.stations import commands, leases, selectors
+from evaweb.stations import commands, leases, selectors, stops
+from evaweb.stations.holders import who
 from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
 from evaweb.stations.wire import wire_to
 from evaweb.trials import selectors as trial_selectors
@@ -62,7 +63,7 @@ class LeaseOut(Schema):
         lease = selectors.lease_open(station=station)
         return {
             "holder": lease.holder if lease else "",
-            "user": leases.who(lease.holder) if lease else "",
+            "user": who(lease.holder) if lease else "",
             "epoch": lease.epoch if lease else 0,
             "granted_at": lease.granted_at if lease else None,
             "requests": [RequestOut.of(asked) for asked in selectors.request_list(station=station)],
@@ -156,7 +157,7 @@ class EStopIn(Schema):
     @field_validator("why", mode="before")
     @classmethod
     def _any_words(cls, given: Any) -> str:
-        return commands.spoken(given) if isinstance(given, str) and given else "pressed"
+        return stops.spoken(given) if isinstance(given, str) and given else "pressed"
 
 
 class TrialIn(Schema):
@@ -242,7 +243,7 @@ def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
     """Stop the robot now; anybody who is logged in. To the wire first, and nobody waits for the row."""
     given = given or EStopIn()
     identity = given.uuid or uuid4()
-    answer = commands.estop(station=name, username=request.auth.get_username(), why=given.why, uuid=identity)
+    answer = stops.estop(station=name, username=request.auth.get_username(), why=given.why, uuid=identity)
     _note_estop(request, name, given.why, identity, answer)
     said = {name: getattr(answer, name) for name in ("status", "reason", "allowed", "data")}
     return Status(_HTTP[answer.status], {"uuid": identity, **said})
@@ -275,7 +276,7 @@ def _command_out(row: Command) -> dict[str, Any]:
     return {"uuid": row.pk, **{name: getattr(row, name) for name in ("status", "reason", "allowed", "data")}}
 
 
-def _note_estop(request: HttpRequest, name: str, why: str, uuid: UUID, answer: commands.Answer) -> None:
+def _note_estop(request: HttpRequest, name: str, why: str, uuid: UUID, answer: stops.Answer) -> None:
     """Write the press down where the database has the station; it is done already, whatever comes of this."""
     try:
         found = Station.objects.filter(name=name).first()

@@ -28,7 +28,7 @@ from evaweb.console.mailbox import Mailbox
 from evaweb.console.requests import BadRequest, Credit, EStop, Events, Renew, Request, Stop, Watch
 from evaweb.errors import NotFound, StationGone
 from evaweb.roles import Role, role_of
-from evaweb.stations import commands, leases
+from evaweb.stations import commands, leases, stops
 from evaweb.stations.geometry import facts_of
 from evaweb.stations.models import Station
 from evaweb.stations.selectors import station_get
@@ -160,7 +160,7 @@ class StationConsumer(AsyncWebsocketConsumer):
     async def _press(self, request: EStop) -> None:
         """Press and say what came of it; then write it down."""
         name, why, uuid = self._station.name, request.why, request.uuid
-        press = partial(commands.estop, station=name, username=self._username, why=why, uuid=uuid)
+        press = partial(stops.estop, station=name, username=self._username, why=why, uuid=uuid)
         answer = await asyncio.get_running_loop().run_in_executor(_presses, press)
         self._acknowledge("estop", uuid, answer)
         note = partial(commands.estop_noted, why=why, uuid=uuid, answer=answer)
@@ -169,13 +169,13 @@ class StationConsumer(AsyncWebsocketConsumer):
     async def _stop(self, request: Stop) -> None:
         """Stop or halt and say what came of it; then write it down."""
         given = {"kind": request.kind, "page": self._page, "epoch": request.epoch, "uuid": request.uuid}
-        stop = partial(commands.stop, station=self._station.name, username=self._username, **given)
+        stop = partial(stops.stop, station=self._station.name, username=self._username, **given)
         answer = await asyncio.get_running_loop().run_in_executor(_stops, stop)
         self._acknowledge(request.kind, request.uuid, answer)
         note = partial(commands.stop_noted, answer=answer, **given)
         await _in_database(note, user=self._user, station=self._station)
 
-    def _acknowledge(self, kind: str, uuid: UUID, answer: commands.Answer) -> None:
+    def _acknowledge(self, kind: str, uuid: UUID, answer: stops.Answer) -> None:
         said = {"kind": kind, "uuid": str(uuid), "status": answer.status.value, "reason": answer.reason}
         self._say({"type": "ack", **said})
 

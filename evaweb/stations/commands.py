@@ -6,11 +6,9 @@ A row first, then the wire, then the answer. The stopping commands go to the wir
 from __future__ import annotations
 
 import logging
-import re
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import Any
 from uuid import UUID, uuid4
@@ -23,7 +21,9 @@ from evaweb.errors import Conflict, EvaError, StationGone
 from evaweb.frames import plain
 from evaweb.lock_wait import lock_wait
 from evaweb.roles import Role, require
+from evaweb.stations.holders import holder_of
 from evaweb.stations.models import Command, CommandStatus, Station
+from evaweb.stations.stops import Answer, answer_of, estop, spoken, stopped
 from evaweb.stations.wire import NoAnswer, wire_to
 from runtime import messages
 from runtime.bus import CodecError
@@ -31,11 +31,7 @@ from runtime.bus import CodecError
 log = logging.getLogger(__name__)
 STOPPING = ("stop", "halt", "estop")  # never stale; the runtime has the same list
 KINDS = ("setup", "run", "stop", "halt", "resume", "home", "release", "record_start", "record_stop", "estop")
-HARDWARE_STOP = "USE THE HARDWARE STOP"
-_HOLDER = re.compile(r"\bweb:([^:\s]+):[A-Za-z0-9_-]+")
-_ESTOP_S = 1.0  # what a person waits for before the page turns red
 _UNANSWERED = (CommandStatus.PRESSED, CommandStatus.UNKNOWN)
-_LONGEST_WHY = 240  # characters
 _NOTE_S = 0.5  # for which the answer to a stopping command is kept by its row; then the row is written later
 _later = ThreadPoolExecutor(2, "note")
 _LONG_AGO = 0.0  # on the runtime's clock: a command that must not be carried out any more
@@ -45,26 +41,6 @@ class NotSent(EvaError):
     """The command was not sent, because it could not be written down."""
 
     status = 503
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What became of a command; `allowed` names the commands that would be accepted now."""
-
-    status: CommandStatus
-    reason: str = ""
-    allowed: list[str] = field(default_factory=list)
-    data: dict[str, Any] = field(default_factory=dict)
-
-
-def holder_of(username: str, page: str) -> str:
-    """The name under which a page holds a lease."""
-    return f"web:{username}:{page}"
-
-
-def readable(reason: str) -> str:
-    """A sentence of the runtime with people's names where it names their pages."""
-    return _HOLDER.sub(r"\1", reason)
 
 
 def identity_of(given: UUID | str | None) -> UUID:
@@ -113,36 +89,10 @@ def issue(
     return _stop(row) if kind in STOPPING else _give(row)
 
 
-def spoken(why: str) -> str:
-    """The beginning of it, with nothing in it that cannot be sent or kept: no press is lost for its words."""
-    return why[:_LONGEST_WHY].encode("utf-8", "replace").decode().replace("\x00", "")
-
-
-def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
-    """Press the e-stop of the station of that name; for any user, and without the database."""
-    command = messages.Command(str(uuid), "estop", {"why": spoken(why)}, user=username, holder=username)
-    try:
-        answer = _answer_of(wire_to(station).urgent(command, "guard", "estop", _estop_s()))
-    except NoAnswer as fault:
-        answer = Answer(CommandStatus.UNKNOWN, f"{HARDWARE_STOP}: {fault}")
-    except StationGone as fault:
-        answer = Answer(CommandStatus.FAILED, f"{HARDWARE_STOP}: {fault}")
-    if answer.status is CommandStatus.REFUSED:
-        return Answer(CommandStatus.FAILED, f"{HARDWARE_STOP}: {answer.reason}", answer.allowed, answer.data)
-    return answer
-
-
 def estop_noted(*, user: Any, station: Station, why: str, uuid: UUID | str, answer: Answer) -> Command:
     """The row of an e-stop that was pressed."""
     row = Command(uuid=identity_of(uuid), station=station, user=user, kind="estop", args={"why": spoken(why)})
     return _noted(row, answer)
-
-
-def stop(*, kind: str, station: str, username: str, page: str, epoch: int, uuid: UUID | str) -> Answer:
-    """Stop or halt, without the database: the runtime itself knows who has the lease."""
-    holder = holder_of(username, page)
-    command = messages.Command(str(uuid), kind, user=username, holder=holder, epoch=epoch)
-    return _stopped(command, station)
 
 
 def stop_noted(
@@ -165,7 +115,7 @@ def settle(*, row: Command) -> Command:
     if row.kind in STOPPING or row.status not in _UNANSWERED or age < timedelta(seconds=_patience_s()):
         return row
     try:
-        answer = _answer_of(wire_to(row.station.name).request(_message(row, valid_until=_LONG_AGO)))
+        answer = answer_of(wire_to(row.station.name).request(_message(row, valid_until=_LONG_AGO)))
     except StationGone:
         return row
     _put(row, answer)
@@ -224,7 +174,7 @@ def _asked(row: Command, waited: float) -> Answer:
         late = f"not sent: the database took {waited:.0f} s to write it down; look at the robot, press again"
         return Answer(CommandStatus.FAILED, late)
     try:
-        return _answer_of(wire_to(row.station.name).request(_message(row), expires=True))
+        return answer_of(wire_to(row.station.name).request(_message(row), expires=True))
     except NoAnswer as fault:
         return Answer(CommandStatus.UNKNOWN, str(fault))
     except StationGone as fault:
@@ -235,17 +185,7 @@ def _stop(row: Command) -> Command:
     if row.kind == "estop":
         why, username = str(row.args.get("why", "pressed")), row.user.get_username()
         return _noted(row, estop(station=row.station.name, username=username, why=why, uuid=row.uuid))
-    return _noted(row, _stopped(_message(row), row.station.name))
-
-
-def _stopped(command: messages.Command, station: str) -> Answer:
-    try:
-        timeout = settings.EVA_COMMAND_TIMEOUT_S
-        return _answer_of(wire_to(station).urgent(command, "main", "commands", timeout))
-    except NoAnswer as fault:
-        return Answer(CommandStatus.UNKNOWN, f"{fault}; the e-stop goes another way")
-    except StationGone as fault:
-        return Answer(CommandStatus.FAILED, str(fault))
+    return _noted(row, stopped(_message(row), row.station.name))
 
 
 def _noted(row: Command, answer: Answer) -> Command:
@@ -324,14 +264,6 @@ def _message(row: Command, valid_until: float = float("inf")) -> messages.Comman
     )
 
 
-def _answer_of(ack: messages.Ack) -> Answer:
-    return Answer(CommandStatus(ack.status), readable(ack.reason), list(ack.allowed), plain(ack.data))
-
-
 def _patience_s() -> float:
     """After this time nobody waits for an answer any more [s]."""
     return settings.EVA_COMMAND_TIMEOUT_S + 1.0
-
-
-def _estop_s() -> float:
-    return min(_ESTOP_S, settings.EVA_COMMAND_TIMEOUT_S)

@@ -18,7 +18,7 @@ from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.roles import Role, require
-from evaweb.stations.commands import holder_of, readable
+from evaweb.stations.holders import holder_of, readable, who
 from evaweb.stations.models import Lease, LeaseRequest, Station
 from evaweb.stations.wire import wire_to
 from runtime import messages
@@ -133,11 +133,6 @@ def notice(*, station: Station, boot: str, held: Mapping[str, Any]) -> bool:
         if not holder:
             return last is not None and _end(last, _why_over(last, boot))
         return _record(station, holder, epoch, boot, _why_over(last, boot) if last else "")[1]
-
-
-def who(holder: str) -> str:
-    """A holder's name as people know it."""
-    return holder.split(":")[1] if holder.startswith("web:") else holder
 
 
 def _why_over(lease: Lease, boot: str) -> str:

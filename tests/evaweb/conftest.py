@@ -80,7 +80,7 @@ def bench(db: None) -> builders.Bench:
 def wire(monkeypatch: pytest.MonkeyPatch) -> builders.Wire:
     """What stands where wires to runtimes stand."""
     made = builders.Wire()
-    places = ("stations.commands", "stations.leases", "api.stations", "trials.bench")
+    places = ("stations.commands", "stations.stops", "stations.leases", "api.stations", "trials.bench")
     for place in places:
         monkeypatch.setattr(f"evaweb.{place}.wire_to", lambda name: made)
     return made

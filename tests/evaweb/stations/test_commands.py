@@ -9,9 +9,10 @@ import pytest
 from django.db import OperationalError
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
-from evaweb.stations import commands, leases
-from evaweb.stations.commands import HARDWARE_STOP, NotSent, issue, settle
+from evaweb.stations import commands, leases, stops
+from evaweb.stations.commands import NotSent, issue, settle
 from evaweb.stations.models import Command, CommandStatus, Station
+from evaweb.stations.stops import HARDWARE_STOP
 from runtime.session import COMMANDS, STOPPING
 
 pytestmark = pytest.mark.django_db
@@ -69,7 +70,7 @@ def test_a_press_is_not_lost_for_its_words(held, runtime):
     row = issue(kind="estop", args={"why": "\ud800\x00" + "x" * 999}, **held)
     assert row.status == CommandStatus.DONE
     assert runtime.pressed[0].args["why"].startswith("?x")
-    answer = commands.estop(station=held["station"].name, username="ann", why="\udfff", uuid=uuid4())
+    answer = stops.estop(station=held["station"].name, username="ann", why="\udfff", uuid=uuid4())
     assert answer.status == CommandStatus.DONE
 
 
@@ -235,25 +236,6 @@ def test_an_estop_that_is_not_obeyed_says_use_the_hardware_stop(live, vera, runt
     row = issue(user=vera, station=live, kind="estop")
     assert row.status == CommandStatus.FAILED
     assert row.reason.startswith(HARDWARE_STOP)
-
-
-def test_an_estop_without_answer_says_use_the_hardware_stop(runtime):
-    runtime.mute = True
-    answer = commands.estop(station=runtime.name, username="ann", why="smoke", uuid=uuid4())
-    assert answer.status == CommandStatus.UNKNOWN
-    assert answer.reason.startswith(HARDWARE_STOP)
-
-
-def test_an_estop_where_nothing_runs_says_use_the_hardware_stop():
-    answer = commands.estop(station="nowhere", username="ann", why="smoke", uuid=uuid4())
-    assert answer.status == CommandStatus.FAILED
-    assert answer.reason.startswith(HARDWARE_STOP)
-
-
-def test_the_estop_touches_no_database(runtime, django_assert_num_queries):
-    with django_assert_num_queries(0):
-        answer = commands.estop(station=runtime.name, username="ann", why="smoke", uuid=uuid4())
-    assert answer.status == CommandStatus.DONE
 
 
 def test_what_is_no_uuid_is_refused(live, ann):

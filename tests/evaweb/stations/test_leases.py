@@ -11,6 +11,7 @@ from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.stations import leases
+from evaweb.stations.holders import who
 from evaweb.stations.models import Lease, LeaseRequest
 from evaweb.stations.selectors import lease_open, request_list
 from evaweb.stations.wire import wire_to
@@ -257,7 +258,7 @@ def test_the_lease_of_a_terminal_is_written_down(live, runtime):
     assert notice(live, runtime)
     lease = lease_open(station=live)
     assert (lease.holder, lease.user) == ("terminal:eve@bench", None)
-    assert leases.who(lease.holder) == "terminal:eve@bench"
+    assert who(lease.holder) == "terminal:eve@bench"
 
 
 def test_a_terminal_that_took_a_free_station_ends_the_row_of_the_one_before(live, runtime, ann):

@@ -65,7 +65,7 @@ def lab(tmp_path, monkeypatch, db):
     """A lab around a whole station in lockstep."""
     monkeypatch.setattr(doorbell, "ring", lambda queue: True)
     made = Lab(builders.bench("bench"), Lockstep(plan(tmp_path, simulated=True)))
-    for place in ("evaweb.stations.commands", "evaweb.trials.bench"):
+    for place in ("evaweb.stations.commands", "evaweb.stations.stops", "evaweb.trials.bench"):
         monkeypatch.setattr(f"{place}.wire_to", lambda name: Direct(made.station))
     return made
 

@@ -1,0 +1,22 @@
+"""Names of those who hold a lease: web:USER:PAGE for a page, any other for a terminal or a script."""
+
+from __future__ import annotations
+
+import re
+
+_PAGE = re.compile(r"\bweb:([^:\s]+):[A-Za-z0-9_-]+")
+
+
+def holder_of(username: str, page: str) -> str:
+    """The name under which a page holds a lease."""
+    return f"web:{username}:{page}"
+
+
+def who(holder: str) -> str:
+    """A holder's name as people know it."""
+    return holder.split(":")[1] if holder.startswith("web:") else holder
+
+
+def readable(reason: str) -> str:
+    """A sentence of the runtime with people's names where it names their pages."""
+    return _PAGE.sub(r"\1", reason)

@@ -1,0 +1,41 @@
+"""None of these may touch the database: without a mark, access to it is an error."""
+
+import time
+from uuid import uuid4
+
+import pytest
+
+from evaweb.stations import stops
+from evaweb.stations.holders import readable
+from evaweb.stations.models import CommandStatus
+from evaweb.stations.stops import HARDWARE_STOP
+
+
+def test_an_estop_without_answer_says_use_the_hardware_stop(runtime):
+    runtime.mute = True
+    answer = stops.estop(station=runtime.name, username="ann", why="smoke", uuid=uuid4())
+    assert answer.status == CommandStatus.UNKNOWN
+    assert answer.reason.startswith(HARDWARE_STOP)
+
+
+def test_an_estop_where_nothing_runs_says_use_the_hardware_stop():
+    answer = stops.estop(station="nowhere", username="ann", why="smoke", uuid=uuid4())
+    assert answer.status == CommandStatus.FAILED
+    assert answer.reason.startswith(HARDWARE_STOP)
+
+
+def test_an_estop_is_obeyed(runtime):
+    answer = stops.estop(station=runtime.name, username="ann", why="smoke", uuid=uuid4())
+    assert answer.status == CommandStatus.DONE
+
+
+@pytest.mark.parametrize("kind", ["stop", "halt"])
+def test_a_refused_stop_names_who_has_the_lease(runtime, kind):
+    runtime.ready()
+    runtime.do(lambda: runtime.lease.claim("web:ann:p1", 3, time.monotonic()))
+    answer = stops.stop(kind=kind, station=runtime.name, username="bob", page="p2", epoch=1, uuid=uuid4())
+    assert (answer.status, answer.reason) == (CommandStatus.REFUSED, "ann holds the lease")
+
+
+def test_a_reason_names_people_and_leaves_terminals_as_they_are():
+    assert readable("web:ann:p-1 holds the lease, eve@bench asks") == "ann holds the lease, eve@bench asks"
