@@ -1,4 +1,4 @@
-"""`make demo`: a station on this machine, with the bundled execution node and policy server beside it."""
+"""`python -m runtime.sim.demo`: a station on this machine, with stand-ins for node and policy server beside it."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class StandIns:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0 where the run went well."""
-    parser = argparse.ArgumentParser(prog="make demo", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m runtime.sim.demo", description=__doc__)
     parser.add_argument("--once", action="store_true", help="one episode, then end; else until Ctrl-C")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures of the run there")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
