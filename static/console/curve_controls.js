@@ -14,7 +14,7 @@ export async function curvePane() {
     library = (await import(config.uplot)).default;
   } catch {
     note.hidden = false;
-    note.textContent = "Curves are drawn by uPlot, which is not installed: run npm install in the project's folder and start the web server again.";
+    note.textContent = "Curves are drawn by uPlot, which is not installed: run make setup and start the lab again.";
     return { add() {}, joints() {} };
   }
   const legend = new Legend(document.getElementById("curves-legend"), (name, shown) => curves.reveal(name, shown));

@@ -15,7 +15,7 @@ export async function curvePane({ clock, address, uplot }) {
     const library = (await import(uplot).catch(() => null))?.default;
     if (library) new Pane(clock, episode, library);
     note.hidden = Boolean(library);
-    note.textContent = library ? "" : "Curves are drawn by uPlot, which is not installed: run npm install in the project's folder.";
+    note.textContent = library ? "" : "Curves are drawn by uPlot, which is not installed: run make setup and start the lab again.";
     return { held: header.held, marks: header.marks };
   } catch (error) {
     note.textContent = `No curves: ${error.message}.`;
