@@ -75,6 +75,13 @@ export class Commands {
     line.dataset.kind = kind;
   }
 
+  /** Why a score cannot be saved now: it needs no robot, but it is for who commands to give. */
+  #scoreReason() {
+    const { role, fresh, lease } = this.#store;
+    if (role === "viewer") return "a viewer watches; an administrator can make you an operator";
+    return fresh && lease === "other" ? "somebody else commands the station; ask for it" : "";
+  }
+
   /** Why `kind` cannot be given now, "" where it can. */
   reason(kind) {
     const store = this.#store;
@@ -84,7 +91,7 @@ export class Commands {
     if (store.lease === "elsewhere") return "another page of yours commands the station; take it here first";
     if (store.lease !== "mine") return "somebody else commands the station; ask for it";
     const { allowed, state } = store.snapshot;
-    if (kind && !allowed.includes(kind)) {
+    if (!allowed.includes(kind)) {
       const possible = allowed.filter((one) => one !== "estop").map(verb).join(", ") || "nothing";
       return `not while ${words(state)}; possible now: ${possible}`;
     }
@@ -96,7 +103,7 @@ export class Commands {
     for (const button of document.querySelectorAll("[data-command], [data-gate]")) {
       const kind = button.dataset.command ?? button.dataset.gate;
       const own = button.dataset.blocked ?? "";
-      setReason(button, own || this.reason(kind === "score" ? "" : kind));
+      setReason(button, own || (kind === "score" ? this.#scoreReason() : this.reason(kind)));
       if (button.dataset.onlyState) button.hidden = this.#store.snapshot?.state !== button.dataset.onlyState;
     }
   }

@@ -2,11 +2,12 @@
 
 const BAD = new Set(["estopped", "family_died", "policy_failed", "recording_failed", "source_failed", "displaced"]);
 const WARN = new Set(["refused", "word_refused", "refusals", "starved", "chunk_dropped", "ik_unreached", "not_journalled", "unmeasured"]);
+const NAMES = { estopped: "e-stop", family_died: "process ended", ik_unreached: "out of reach", truth: "bench says" };
 const HOLDER = /\bweb:([^\s:]+):([A-Za-z0-9_-]{1,4})[A-Za-z0-9_-]*/g; // a page of a person
 
 /** The kind in words. */
 export function kindWords(kind) {
-  return kind.replaceAll("_", " ");
+  return NAMES[kind] ?? kind.replaceAll("_", " ");
 }
 
 /** The sentence, with arrows as arrows and people by their names. */

@@ -279,6 +279,7 @@ def test_an_event_is_said_in_words_with_its_weight() -> None:
         {"kind": "command", "text": "run by bob: refused, web:ann:6b9c-1 holds the lease"},
         {"kind": "source_frames_lost", "text": "source: frames lost (3 so far)"},
         {"kind": "recording_failed", "text": "the disk is full"},
+        {"kind": "estopped", "text": "by ann"},
         {"kind": "setup", "text": "idle"},
     ]
     body = "return given.map((event) => [m.kindWords(event.kind), m.sentence(event), m.weight(event)])"
@@ -291,6 +292,7 @@ def test_an_event_is_said_in_words_with_its_weight() -> None:
         ["command", "run by bob: refused, ann (page 6b9c) holds the lease", "warn"],
         ["source frames lost", "source: frames lost (3 so far)", "warn"],
         ["recording failed", "the disk is full", "bad"],
+        ["e-stop", "by ann", "bad"],
         ["setup", "the set-up is over", ""],
     ]
 
