@@ -16,7 +16,6 @@ from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
 from evaweb.trials import journal, lifecycle
-from evaweb.trials.facts import trial_course
 from evaweb.trials.following import run_changed
 from evaweb.trials.lifecycle import Move
 from evaweb.trials.models import (
@@ -200,16 +199,7 @@ def trial_void(*, user: User, trial: Trial, reason: str) -> Trial:
         held = _held(trial)
         lifecycle.apply(held, Move.VOID)
         held.reason, held.voided_by, held.voided_at = why, user, timezone.now()
-        journal.append(
-            held.episode_id or held.uuid,
-            {
-                "kind": "void",
-                "trial": trial_course(held),
-                "by": user.get_username(),
-                "reason": why,
-                "at": held.voided_at.isoformat(),
-            },
-        )
+        journal.append(held.episode_id or held.uuid, journal.void_line(held))
         held.save()
         _publish(held)
     trial.refresh_from_db()
@@ -282,31 +272,12 @@ def _keep(trial: Trial, score: Score, found: Verdict) -> None:
         )
         for milestone, reached in found.reached
     ]
-    journal.append(trial.episode_id or trial.uuid, _line(trial, score, outcomes))
+    journal.append(trial.episode_id or trial.uuid, journal.score_line(score, outcomes))
     score.save()
     MilestoneOutcome.objects.bulk_create(outcomes)
     lifecycle.apply(trial, Move.SCORE)
     trial.verdict = score
     trial.save()
-
-
-def _line(trial: Trial, score: Score, outcomes: list[MilestoneOutcome]) -> dict[str, Any]:
-    milestones = [
-        {name: getattr(outcome, name) for name in ("order", "text", "points", "required", "reached")}
-        for outcome in outcomes
-    ]
-    words = {
-        name: getattr(score, name) for name in ("success", "score", "note", "failure", "reason", "source")
-    }
-    return {
-        "kind": "score",
-        "uuid": str(score.uuid),
-        "trial": trial_course(trial),
-        "rater": score.rater.get_username(),
-        "at": score.scored_at.isoformat(),
-        **words,
-        "milestones": milestones,
-    }
 
 
 def _reason_given(reason: str, when: str) -> str:
