@@ -53,8 +53,8 @@ def perform(visitor: Visitor, choice: Choice) -> Done:
     with closing(LivePage(visitor, choice.station)) as page:
         trial = start(visitor, page, choice)
         resumed = _run(page, trial, float(visitor.get(f"trials/{trial}")["time_limit_s"]))
-        scored = _score(visitor, trial)
-        episode = _published(visitor, scored["episode"])
+        episode = _published(visitor, _score(visitor, trial)["episode"])
+        scored = _whole(visitor, trial, episode)
     return Done(
         trial=trial,
         success=scored["success"],
@@ -140,9 +140,20 @@ def _score(visitor: Visitor, trial: int) -> Mapping[str, Any]:
 def _published(visitor: Visitor, episode: str) -> Mapping[str, Any]:
     found: Mapping[str, Any] = _poll(
         lambda: visitor.get(f"episodes/{episode}"),
-        lambda facts: facts["dataset_index"] is not None,
+        lambda facts: facts["dataset_index"] is not None and facts["duration_s"] is not None,
         _PUBLISHED_S,
         "waiting for the dataset",
+    )
+    return found
+
+
+def _whole(visitor: Visitor, trial: int, episode: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The trial once it is as long as its recording: until then its duration is that of the commands."""
+    found: Mapping[str, Any] = _poll(
+        lambda: visitor.get(f"trials/{trial}"),
+        lambda facts: facts["duration_s"] == episode["duration_s"],
+        _STOPPED_S,
+        "waiting for the exact duration",
     )
     return found
 
