@@ -188,7 +188,9 @@ class WebsocketLink:
     def _gone(self, error: Exception) -> PolicyError:
         if self._aborted:
             return PolicyError(f"the connection to {self._url} was closed from our side")
-        return PolicyGone(f"the policy server at {self._url} closed the connection ({error}): see that it runs")
+        return PolicyGone(
+            f"the policy server at {self._url} closed the connection ({error}): see that it runs"
+        )
 
     @contextlib.contextmanager
     def _dropping_on_error(self) -> Iterator[None]:
