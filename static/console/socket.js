@@ -8,7 +8,7 @@ const ASK_MS = 2000; // how often the server hears that this page still reads
 
 /**
  * `told(message)` hears every JSON message, `draw(frame)` every frame and returns when it is on the screen,
- * `changed(open)` that the connection is there or gone; `greet()` says what is wanted; `expected()` whether
+ * `changed(open, code)` that the connection is there or gone, with the server's code for it; `greet()` says what is wanted; `expected()` whether
  * frames should be coming.
  */
 export class LiveSocket {
@@ -57,7 +57,7 @@ export class LiveSocket {
       this.#greet();
     });
     socket.addEventListener("message", ({ data }) => this.#receive(socket, data));
-    socket.addEventListener("close", () => this.#lost(socket));
+    socket.addEventListener("close", ({ code }) => this.#lost(socket, code));
   }
 
   #receive(socket, data) {
@@ -78,9 +78,9 @@ export class LiveSocket {
     }
   }
 
-  #lost(socket) {
+  #lost(socket, code = 0) {
     if (socket !== this.#socket) return;
-    this.#changed(false);
+    this.#changed(false, code);
     const wait = WAITS_MS[Math.min(this.#tries, WAITS_MS.length - 1)];
     this.#tries += 1;
     clearTimeout(this.#timer);

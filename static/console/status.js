@@ -37,6 +37,7 @@ function drawState(store) {
 
 /** Why nothing is known, in a word and in a sentence. */
 function trouble(store) {
+  if (store.closed) return store.closed;
   if (!store.open) return { word: "no connection", reason: "The web server does not answer; this page tries again by itself." };
   if (!store.link.ok) return { word: "no station", reason: store.link.reason || "The station's runtime does not answer." };
   if (!store.snapshot) return { word: "waiting", reason: "No state has come yet." };

@@ -14,6 +14,7 @@ export class Store {
     this.facts = {}; // of the robot
     this.link = { ok: false, reason: "connecting" }; // between web and runtime
     this.open = false; // the socket to the web
+    this.closed = null; // why the web lets this page in no more, as words.js has it
   }
 
   on(names, listener) {

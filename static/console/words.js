@@ -19,6 +19,12 @@ export const ADVICE = {
   },
 };
 
+/** Why the server closes the socket of a page, by its code. */
+export const CLOSED = {
+  4401: { word: "logged out", reason: "You are logged out: reload this page and log in again." },
+  4404: { word: "no such station", reason: "This station is not in the lab any more: go back to the list of stations." },
+};
+
 export const VERBS = {
   setup: "Set up",
   run: "Run",
