@@ -18,6 +18,7 @@ import { statusBar } from "./status.js";
 import { current, mark } from "./steps.js";
 import { Store } from "./store.js";
 import { TrialPanel } from "./trial.js";
+import { CLOSED } from "./words.js";
 
 const nothing = { poses() {}, bench() {}, add() {}, joints() {}, software: false };
 const CURVES = { measured: "state", raw: "raw", planned: "smoothed", commanded: "executed" }; // of the stream, as drawn
@@ -60,6 +61,7 @@ function vectors(frame, { json, arrays }) {
 function listen(store, { events, estop, commands, lease, trial }) {
   const answers = {
     hello: ({ facts, role }) => {
+      store.closed = null;
       store.facts = facts;
       store.role = role ?? store.role;
       if (facts.joint_names?.length) panes.curves.joints(facts.joint_names);
@@ -91,8 +93,9 @@ async function start() {
   const socket = new LiveSocket(`${config.socket}?page=${store.page}`, {
     told: listen(store, { events, estop: () => parts.estop, commands: () => parts.commands, lease: () => parts.lease, trial: () => parts.trial }),
     draw: (frame) => draw(frame, store, cameras),
-    changed: (open) => {
+    changed: (open, code) => {
       store.open = open;
+      if (!open) store.closed = CLOSED[code] ?? null;
       if (!open) store.link = { ok: false, reason: "" };
       store.tell("open");
     },
