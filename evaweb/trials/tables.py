@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from difflib import get_close_matches
 from functools import cache
 from typing import Any, get_args
 
@@ -23,9 +24,9 @@ def check_policy(given: object) -> None:
     wanted = given.get("kind")
     if wanted is not None and wanted not in kinds:
         raise ValidationError(f"kind = {wanted!r}; allowed: {', '.join(kinds)}")
-    problems = [_problems(given, kinds[kind]) for kind in ([wanted] if wanted else kinds)]
-    if all(problems):
-        raise ValidationError(min(problems, key=len))
+    problems = {kind: _problems(given, kinds[kind]) for kind in ([wanted] if wanted else kinds)}
+    if all(problems.values()):
+        raise ValidationError(problems[max(problems, key=lambda kind: _likeness(given, kinds[kind]))])
 
 
 def check_bench(given: object) -> None:
@@ -66,6 +67,12 @@ def _problems(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> lis
         errors = [error for error in invalid.errors() if error["type"] != "missing"]
         return [_problem(error, config, kind) for error in errors]
     return []
+
+
+def _likeness(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> tuple[int, int]:
+    """How many keys are, or nearly are, those of this kind; of two alike, the kind with more keys."""
+    near = [key for key in given if get_close_matches(str(key), config.model_fields, n=1)]
+    return len(near), len(config.model_fields)
 
 
 def _problem(error: Any, config: type[pydantic.BaseModel], kind: str) -> str:

@@ -21,6 +21,9 @@ def test_policies_that_a_deployment_could_have_pass(policy):
         ({"kind": "openpi", "urll": "x"}, "urll: unknown key for kind 'openpi'; allowed: kind, url"),
         ({"kind": "openpi", "url": "http://x"}, "url = 'http://x': "),
         ({"nonsense": 1}, "nonsense: unknown key"),
+        ({"uri": "ws://10.0.0.1:8000"}, "uri: unknown key for kind 'openpi'; allowed: kind, url"),
+        ({"image_size": [224]}, "image_size = [224]: "),
+        ({"amplitud": 0.1}, "amplitud: unknown key for kind 'mock'; allowed: kind, amplitude"),
     ],
 )
 def test_other_policies_are_refused_with_what_is_allowed(policy, sentence):
