@@ -44,7 +44,6 @@ class BenchPage:
     def take_again(self):
         """Have the station, whether or not its lease has ended meanwhile."""
         mine, free = (self.page.locator(f"[data-lease-when={lease}]") for lease in ("mine", "free"))
-        mine.or_(free).first.wait_for()
         eventually(lambda: mine.is_visible() or free.is_visible(), 30, "the page knows who has the station")
         if not mine.is_visible():
             self.take()
