@@ -43,4 +43,4 @@ def grant(*, user: Any, role: Role) -> None:
     user.is_staff = role is Role.ADMIN  # pages of others look at it; ours look at the role
     user.save(update_fields=["is_superuser", "is_staff"])
     groups = user.groups.model.objects  # models cannot be imported before the apps are ready
-    user.groups.set(groups.filter(name=role.value))
+    user.groups.set([groups.get_or_create(name=role.value)[0]])  # also where somebody has removed the group

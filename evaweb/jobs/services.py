@@ -167,15 +167,33 @@ def _asked_anew(job: Job) -> bool:
 
 
 def sweep(*, now: datetime | None = None) -> int:
-    """Take jobs back from workers that show no sign of life; how many. Any process may do it at any time."""
+    """Take jobs back from workers that show no sign of life; how many. Any process may do it at any time.
+
+    A worker of this machine whose process is gone is not waited for.
+    """
     before = (now or timezone.now()) - timedelta(seconds=settings.EVA_JOB_STALE_S)
-    stale = Job.objects.filter(status=JobStatus.RUNNING, seen_at__lt=before)
-    return sum(_take_back(job, before) for job in stale)
+    running = Job.objects.filter(status=JobStatus.RUNNING)
+    taken = sum(
+        _take_back(job, _ours(job).filter(seen_at__lt=before)) for job in running.filter(seen_at__lt=before)
+    )
+    here = running.filter(claimed_by__startswith=f"{socket.gethostname()}:")
+    return taken + sum(_take_back(job, _ours(job)) for job in here if _worker_is_gone(job))
+
+
+def _worker_is_gone(job: Job) -> bool:
+    """Whether the process on this machine that claimed the job has ended."""
+    process = job.claimed_by.rsplit(":", 2)[1]
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return True
+    except (PermissionError, ValueError):  # somebody else's process, or a claim that names none
+        return False
+    return False
 
 
 @transaction.atomic
-def _take_back(job: Job, before: datetime) -> int:
-    row = _ours(job).filter(seen_at__lt=before)
+def _take_back(job: Job, row: QuerySet[Job]) -> int:
     silence = f"its worker {job.claimed_by} went silent in attempt {job.attempts}"
     if job.attempts >= MOST_ATTEMPTS or _asked_anew(job):
         return row.update(status=JobStatus.FAILED, error=silence, finished_at=timezone.now())

@@ -168,6 +168,9 @@ def test_a_page_that_has_no_business_here_is_closed_with_a_code(live, ann, who, 
 def test_a_page_of_another_site_is_not_let_in(live, ann):
     async def scenario():
         assert not await Page(live.name, ann, origin=b"http://evil.example").connected()
+        assert not await Page(live.name, ann, origin=b"http://localhost:9999").connected()
+        assert not await Page(live.name, ann, origin=b"http://[").connected()
+        assert not await Page(live.name, ann, origin=b"").connected()
 
     run(scenario())
 

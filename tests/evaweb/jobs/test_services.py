@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import socket
+import subprocess
 from datetime import timedelta
 
 import pytest
@@ -116,6 +119,22 @@ def test_a_killed_worker_is_swept_and_its_job_done_once_by_another(toy: Toy) -> 
     assert services.job_done(job=dead, result={"late": True}) is False
     job.refresh_from_db()
     assert job.result == {"seen": {}}, "who was thought dead must not change what the other one found"
+
+
+def test_a_worker_of_this_machine_that_has_ended_is_not_waited_for(toy: Toy) -> None:
+    job = enqueue()
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    here = socket.gethostname()
+    services.claim(queue="lab", worker=f"{here}:{os.getpid()}:alive")
+    assert services.sweep() == 0, "it is at work"
+    Job.objects.filter(pk=job.pk).update(claimed_by=f"elsewhere-than-{here}:{ended.pid}:abc")
+    assert services.sweep() == 0, "of another machine only its silence is known"
+    Job.objects.filter(pk=job.pk).update(claimed_by=f"{here}:{ended.pid}:abc")
+    assert services.sweep() == 1
+    assert services.work("lab") == 1
+    job.refresh_from_db()
+    assert (job.status, job.attempts) == (JobStatus.DONE, 2)
 
 
 def test_a_job_that_silences_every_worker_fails_in_the_end(toy: Toy) -> None:
