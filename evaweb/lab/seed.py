@@ -6,10 +6,10 @@ import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from django.contrib.auth.models import Group, User
+from django.contrib.auth.models import User
 from django.db import transaction
 
-from evaweb.roles import Role
+from evaweb.roles import Role, grant
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
 
@@ -36,9 +36,8 @@ def demo_login(*, username: str, role: Role) -> Login:
     password = fresh_password()
     user.set_password(password)
     user.is_active = True
-    user.is_staff = role is Role.ADMIN
     user.save()
-    user.groups.set(Group.objects.filter(name=role.value))
+    grant(user=user, role=role)
     return Login(username, password)
 
 

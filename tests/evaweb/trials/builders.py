@@ -20,7 +20,7 @@ BOOT = "boot-1"
 def user(name: str, role: str = "operator") -> User:
     """An account of that role; everybody's password is the name."""
     made = User.objects.create_user(name, password=name)
-    made.groups.set(Group.objects.filter(name=role))
+    made.groups.set([Group.objects.get_or_create(name=role)[0]])
     return made
 
 
