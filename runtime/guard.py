@@ -21,10 +21,11 @@ _OUTLIVES_S = 1.0  # how long it stays after control's own end, so that a press 
 class Guard:
     """Presses and releases: the flag, the disk, the answer, then the log; none delays what comes before it."""
 
-    def __init__(self, page: Page, latch: Latch, clock: Clock, period: float) -> None:
+    def __init__(self, page: Page, latch: Latch, clock: Clock, period: float, station: str = "") -> None:
         self._page = page
         self._latch = latch
         self._clock = clock
+        self._said = {"station": station}  # so that nobody takes another station's answer for his own
         self._patience = max(0.05, 2.0 * period)
         self._unsaid: list[tuple[int, str]] = []  # level and line, for after the answer
         self._releases = page.releases  # what was asked for before is void
@@ -88,12 +89,18 @@ class Guard:
             version = self._page.control.version
             doubt = self.press(command.user or command.holder or "unknown", why)
             if self.obeyed(version):
-                return Ack(command.uuid, "done", "every tick now sends the measured position" + doubt)
+                return Ack(
+                    command.uuid,
+                    "done",
+                    f"every tick now sends the measured position{doubt}",
+                    data=self._said,
+                )
             return Ack(
                 command.uuid,
                 "failed",
                 f"latched, but control has not obeyed within {self._patience * 1000:.0f} ms: "
                 f"USE THE HARDWARE STOP{doubt}",
+                data=self._said,
             )
         if command.kind == "status":
             latched = self._latch.read()
@@ -107,7 +114,7 @@ def main() -> None:
     member = join("guard")
     settings, clock = member.plan.deployment, MonotonicClock()
     server = CommandServer(zmq.Context.instance(), settings.bus.host, settings.bus.estop_port)
-    guard = Guard(member.page, Latch(settings.station_dir), clock, 1.0 / member.plan.rate)
+    guard = Guard(member.page, Latch(settings.station_dir), clock, 1.0 / member.plan.rate, settings.station)
     Endpoints(settings.station_dir).write("guard", {"estop": server.endpoint})
     while _needed(member, clock.now()):
         member.page.beat("guard", clock.now())

@@ -45,6 +45,10 @@ def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
     command = messages.Command(str(uuid), "estop", {"why": spoken(why)}, user=username, holder=username)
     try:
         answer = answer_of(wire_to(station).urgent(command, "guard", "estop", _estop_s()))
+        said = answer.data.get("station", station)
+        if said != station:  # its socket is where another station's was before that one was killed
+            reason = f"the station {said} answered instead of {station}, and was stopped"
+            return Answer(CommandStatus.FAILED, f"{HARDWARE_STOP}: {reason}", [], answer.data)
     except NoAnswer as fault:
         answer = Answer(CommandStatus.UNKNOWN, f"{HARDWARE_STOP}: {fault}")
     except StationGone as fault:

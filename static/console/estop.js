@@ -37,14 +37,14 @@ export class EStop {
   }
 
   /** An answer of the server came over the socket or by post. */
-  acknowledged({ uuid: id, status, reason }) {
+  acknowledged({ status, reason }) {
     if (status !== "accepted" && status !== "done") {
       this.#hardware(reason || `the e-stop was ${status}`);
       return;
     }
-    clearTimeout(this.#waiting.get(id));
-    this.#waiting.delete(id);
-    if (this.#waiting.size === 0) this.#show("stopped", "E-stop acknowledged: the robot is held.");
+    for (const timer of this.#waiting.values()) clearTimeout(timer); // one latch answers every press
+    this.#waiting.clear();
+    this.#show("stopped", "E-stop acknowledged: the robot is held.");
   }
 
   #unanswered(id) {

@@ -66,7 +66,7 @@ def control(page):
 
 @pytest.fixture
 def guard(page, latch, control):
-    return Guard(page, latch, control, PERIOD)
+    return Guard(page, latch, control, PERIOD, "bench-1")
 
 
 def press(guard, **changes):
@@ -151,6 +151,10 @@ def test_both_troubles_are_told_at_once(page, control, tmp_path):
     reason = press(guard).reason
     assert "within 50 ms: USE THE HARDWARE STOP" in reason
     assert "not on disk" in reason
+
+
+def test_a_press_is_answered_with_the_name_of_the_station(guard, control):
+    assert press(guard).data == {"station": "bench-1"}
 
 
 def test_what_a_control_said_before_it_died_does_not_count_for_a_new_press(guard, control):

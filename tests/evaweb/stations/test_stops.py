@@ -9,6 +9,8 @@ from evaweb.stations import stops
 from evaweb.stations.holders import readable
 from evaweb.stations.models import CommandStatus
 from evaweb.stations.stops import HARDWARE_STOP
+from evaweb.stations.wire import StationWire
+from runtime.messages import Ack
 
 
 def test_an_estop_without_answer_says_use_the_hardware_stop(runtime):
@@ -22,6 +24,16 @@ def test_an_estop_where_nothing_runs_says_use_the_hardware_stop():
     answer = stops.estop(station="nowhere", username="ann", why="smoke", uuid=uuid4())
     assert answer.status == CommandStatus.FAILED
     assert answer.reason.startswith(HARDWARE_STOP)
+
+
+def test_another_stations_answer_is_not_taken_for_ours(runtime, monkeypatch):
+    answered = Ack("u", "done", "every tick now sends the measured position", data={"station": "the-other"})
+    monkeypatch.setattr(StationWire, "urgent", lambda *args: answered)
+    answer = stops.estop(station=runtime.name, username="ann", why="smoke", uuid=uuid4())
+    assert answer.status == CommandStatus.FAILED
+    assert answer.reason.startswith(
+        f"{HARDWARE_STOP}: the station the-other answered instead of {runtime.name}"
+    )
 
 
 def test_an_estop_is_obeyed(runtime):
