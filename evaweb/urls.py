@@ -21,6 +21,15 @@ urlpatterns = [
     path("healthz", healthz),
     path("login/", auth_views.LoginView.as_view(redirect_authenticated_user=True), name="login"),
     path("logout/", auth_views.LogoutView.as_view(), name="logout"),
+    path(
+        "password/",
+        auth_views.PasswordChangeView.as_view(
+            template_name="registration/password.html",
+            success_url="/",
+            extra_context={"title": "Your password"},
+        ),
+        name="password",
+    ),
     path("admin/", admin.site.urls),
     path("api/v1/", rest),
     path("", include("evaweb.console.urls")),

@@ -13,6 +13,7 @@ from typing import Any
 from runtime.family import Plan
 from runtime.policies.base import PolicyInfo
 
+_COUNTS = ("ticks", "missed", "records_lost")
 _PACKAGES = ("eva-web", "numpy", "pyarrow", "av", "pyzmq", "msgpack")
 
 
@@ -29,6 +30,15 @@ class Run:
     held: float = 0.0  # in total
     opened: bool = False  # media is ready for it
     unrecorded: str = ""  # why its recording ended before it did
+    counted: Mapping[str, Any] = field(default_factory=dict)  # control's figures when it was asked for
+
+    def figures(self, now: Mapping[str, Any]) -> dict[str, Any]:
+        """Control's figures `now`, with what it counts counted from the beginning of this run.
+
+        A control that was restarted meanwhile counts from its own beginning.
+        """
+        since = {key: now[key] - self.counted.get(key, 0) for key in _COUNTS}
+        return {**now, **({} if min(since.values()) < 0 else since)}
 
     def begin(self, now: float) -> None:
         """Control follows: its clock starts."""

@@ -76,7 +76,7 @@ class Runs:
             manifest |= {} if asked.operator is None else {"operator": asked.operator}
         identity = str(manifest["uuid"]) if manifest else str(uuid.uuid4())
         self._tell(BeginEpisode(self._count, manifest))
-        self.open = Run(self._count, identity, self._clock.now(), limit)
+        self.open = Run(self._count, identity, self._clock.now(), limit, counted=self._figures())
         return identity if manifest else ""
 
     def opened(self, message: EpisodeOpened, running: bool) -> str:
@@ -124,7 +124,8 @@ class Runs:
         if run is not None:
             seconds = run.elapsed(self._clock.now())
             self.last = {"number": run.number, "uuid": run.uuid, "status": status, "reason": reason}
-            self._tell(EndEpisode(status, reason, {"run_seconds": seconds, "control": self._figures()}))
+            details = {"run_seconds": seconds, "control": run.figures(self._figures())}
+            self._tell(EndEpisode(status, reason, details))
         if self._alone and status != "finished":
             self._end_alone(status, reason)
 
