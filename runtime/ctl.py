@@ -6,7 +6,9 @@ import argparse
 import json
 import math
 import os
+import signal
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -85,11 +87,16 @@ def _arguments(given: argparse.Namespace) -> dict[str, Any]:
 
 def _attend(client: StationClient, kind: str, arguments: dict[str, Any]) -> int:
     """Give a lasting command and stay with it: the lease lives as long as this terminal."""
+    pressed = threading.Event()
+    # An exception out of nowhere can be lost in a destructor; a Ctrl-C that stops a robot must not be.
+    before = signal.signal(signal.SIGINT, lambda *_: pressed.set())
     try:
         client.command(kind, **arguments)
         status = client.status()
         shown = 0.0
         while status["state"] in _LASTING[kind]:
+            if pressed.is_set():
+                raise KeyboardInterrupt
             client.renew()
             if time.monotonic() - shown > 0.5:
                 shown = time.monotonic()
@@ -99,6 +106,8 @@ def _attend(client: StationClient, kind: str, arguments: dict[str, Any]) -> int:
     except KeyboardInterrupt:
         client.command("stop")
         status = client.status()
+    finally:
+        signal.signal(signal.SIGINT, before)
     print(line(status))
     return 0 if status["state"] == _GOOD_END else 1
 

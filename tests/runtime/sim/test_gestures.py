@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -62,7 +63,8 @@ def test_what_is_no_arm_stays_where_it_is(tmp_path: Path) -> None:
     shutil.copytree(robots.load("agilex_piper").folder, folder)
     file = folder / "robot.toml"
     head = '[[groups]]\nname = "head"\njoints = ["pan"]\nurdf_joints = ["joint7"]\n\n[poses.home]\n'
-    file.write_text(file.read_text().replace("[poses.home]\n", head) + "head = [0.01]\n")
+    text = file.read_text().replace("[poses.home]\n", head)
+    file.write_text(re.sub(r"(right_arm = .*\n)", r"\1head = [0.01]\n", text))
     robot = robots.load(folder)
     start = 0.5 * (robot.lower + robot.upper)
     rows = Gesture(robot).chunk(start, 30, RATE)
