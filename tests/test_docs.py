@@ -136,7 +136,9 @@ def test_no_document_names_what_is_of_one_place_only():
     made_up = ("127.0.0.1", "localhost", "host", "lab.example.org", "10.0.0.7", "gpu-3")
     for name in NAMES:
         named = set(
-            re.findall(r"(?:https?|wss?|postgres|redis)://(?:[^/\s@`]+@)?([A-Za-z0-9.-]+)", text(name))
+            re.findall(
+                r"(?:https?|wss?|postgres|redis)://(?:[^/\s@`]+@)?([A-Za-z0-9][A-Za-z0-9.-]*)", text(name)
+            )
         )
         assert not {host for host in named if host not in made_up}, name
         homes = re.findall(r"(?<![\w.])/(?:home|root|tmp)/", text(name))
