@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
@@ -61,7 +62,7 @@ class History:
         return History(boot, (*known, *fresh)[-EVENTS_KEPT:])
 
 
-class _Reader:
+class _Reader(ABC):
     """A thread that follows one socket of a station, from runtime to runtime."""
 
     def __init__(self, wire: StationWire, process: str, key: str, streams: tuple[str, ...]) -> None:
@@ -76,11 +77,11 @@ class _Reader:
         """It ends by itself within a fraction of a second."""
         self._ended.set()
 
+    @abstractmethod
     def heard(self, found: Mapping[str, Any]) -> None:
         """The newest of each stream that had something."""
-        raise NotImplementedError
 
-    def lost(self, reason: str) -> None:
+    def lost(self, reason: str) -> None:  # noqa: B027  # who reads pictures leaves it to who reads the state
         """Nothing has come for a while."""
 
     def _run(self) -> None:

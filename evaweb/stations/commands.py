@@ -222,7 +222,7 @@ def _written(row: Command) -> Command:
         else:
             return first
     except IntegrityError:  # pressed twice in the same moment: the other one has written it
-        pass
+        return _first(row) or row
     return row
 
 
