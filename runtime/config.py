@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from runtime.messages import Mode
 from runtime.plugins import variants
 from runtime.recording.settings import RecordingSettings
 from runtime.safety import SafetySettings
@@ -80,8 +81,29 @@ class RunSettings(Section):
 
     duration_s: float | None = Field(default=None, gt=0)
     """Time after which a run ends by itself [s]; until it is stopped where it is not given."""
-    mode: Literal["continuous"] = "continuous"
-    """The policy drives the robot until the run ends."""
+    mode: Mode = "continuous"
+    """"continuous": the policy drives the robot until the run ends; "step": one chunk per command; "preview":
+    each chunk is shown, then committed or cancelled; "sim": actions go to the 3D scene alone; "manual": a person
+    moves it."""
+    sim_state: Literal["live", "simulated"] = "simulated"
+    """What the policy is shown as the robot's state in "sim": the robot's own, or that of the simulated one."""
+
+
+Answer = Literal["hold", "slow", "stop"]
+
+
+class FaultSettings(Section):
+    """What a run does when its policy fails: "hold" at once; "slow": go on with what is planned, then decelerate,
+    hold, and go on by itself if it comes back in time; "stop": end the run."""
+
+    starvation: Answer = "slow"
+    """Nothing is planned for a step; after control.starvation_hold_s "slow" holds."""
+    policy_error: Answer = "hold"
+    """The policy answered with an error, or with something unusable."""
+    policy_lost: Answer = "slow"
+    """The policy did not answer in time, or its connection was lost; it is tried again with back-off."""
+    patience_s: float = Field(default=3.0, gt=0)
+    """Longest time without an answer before "slow" holds, also for a strategy that waits [s]."""
 
 
 class RecordingChoice(RecordingSettings):
@@ -146,6 +168,8 @@ class Deployment(Section):
     """Name of a folder in robots/, or a path to such a folder."""
     task: str = ""
     """The instruction given to the policy."""
+    tasks: list[str] = Field(default_factory=list)
+    """Further instructions, offered to choose from."""
     operator: str = ""
     """Who runs it, for the manifests."""
     data_dir: str | None = None
@@ -156,6 +180,7 @@ class Deployment(Section):
     control: ControlSettings = ControlSettings()
     setup: SetupSettings = SetupSettings()
     run: RunSettings = RunSettings()
+    faults: FaultSettings = FaultSettings()
     safety: SafetySettings = SafetySettings()
     recording: RecordingChoice = RecordingChoice()
     publish: PublishSettings = PublishSettings()

@@ -17,6 +17,10 @@ class PolicyError(RuntimeFault):
     """The policy server is absent, mute, gone, or answered with something unusable."""
 
 
+class PolicyLostError(PolicyError):
+    """The policy server is not there any more, or did not answer in time; it may come back."""
+
+
 class TransportError(RuntimeFault):
     """The execution node or the dataset is absent, gone, or sent something unusable."""
 

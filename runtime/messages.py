@@ -21,6 +21,7 @@ from runtime.types import Float32, Float64
 # --- main -> control ---------------------------------------------------------------------------------------
 
 OrderKind = Literal["silent", "hold", "follow", "motion"]
+Mode = Literal["continuous", "step", "preview", "sim", "manual"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,19 +33,37 @@ class Order:
     run: int = 0  # the run that is open, 0 where none is; chunks of another run are ignored
     goal: Float64 | None = None  # [D] end of a "motion"
     reason: str = ""
+    mode: Mode = "continuous"  # of a "follow"
+    speed: float = 1.0  # part of the speed of motions of ours that a "motion" may use
 
 
 @dataclass(frozen=True, slots=True)
 class PostedChunk:
     """A chunk in command space at control rate, not yet merged: float64 [H, D].
 
-    Row 0 is for `observation_step`.
+    Row 0 is for `observation_step`; where it `waited`, the robot stood while the policy was asked (or while a
+    person looked), and row 0 is for the first tick that is still free.
     """
 
     chunk_id: int
     run: int
     observation_step: int
     rows: Float64
+    waited: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Tune:
+    """The strategy to go on with from the next tick on: its whole section, as in a deployment."""
+
+    strategy: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class LockGrippers:
+    """Where grippers are to stay whatever is asked of them: float64 [D], NaN for what is not locked."""
+
+    values: Float64
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +107,8 @@ class ChunkMerged:
     targets: NDArray[np.int64]
     mistimed: int
     dropped: str
+    strategy: str = ""  # the kind that merged it
+    overlap: int = 0  # steps from the arrival on that were blended with what was planned before
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +191,9 @@ class MediaReport:
     recording: str  # uuid of the open episode, "" where none is
     repeated: int
     truth: Mapping[str, Any] = field(default_factory=dict)  # of a simulated bench, as its node last said it
+    drives: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # {"enabled": bool, "faults": [str]}, {} where unsaid
 
 
 # --- clients <-> runtime -----------------------------------------------------------------------------------
@@ -214,6 +238,8 @@ class Ack:
 Message = (
     Order
     | PostedChunk
+    | Tune
+    | LockGrippers
     | NodeRequest
     | TickDone
     | ChunkMerged

@@ -89,6 +89,13 @@ class PageLayout:
                     "f4",
                     self.dim,
                 ),  # what was wanted at `step` before safety; NaN where nothing was
+                ("chunk", "i8"),  # the chunk that has the largest part in this step, -1 where none has
+                ("chunks", "i8"),  # how many chunks this step was made of
+                ("limited", "u1"),  # safety changed or refused the action of this step
+                ("waiting", "u1"),  # a run is open, nothing is planned, and that is as it should be
+                ("starved", "u1"),  # a run is open, nothing is planned, and something should be
+                ("simulated", "f4", self.dim),  # the robot of a run in simulation; NaN where there is none
+                ("locked", "f4", self.dim),  # grippers that are locked, and where; NaN for the rest
                 ("ticks", "i8"),
                 ("missed", "i8"),
                 ("refused_in_row", "i8"),

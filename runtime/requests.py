@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, JsonValue, ValidationError
 
 from runtime.errors import RuntimeFault
 from runtime.explanation import explanation
+from runtime.messages import Mode
 from runtime.section import Section
 
 LARGEST = 64 * 1024  # characters of JSON that a command may carry into a manifest
@@ -75,12 +76,68 @@ class SetUpRequest(Section):
 class RunRequest(Section):
     """`run`: `trial` is the asker's own and goes into the manifest as it is; `duration_s` ends this run [s].
 
-    Where operator or duration are absent, the deployment's own hold.
+    Where operator, duration, mode or sim_state are absent, the deployment's own hold.
     """
 
     trial: Map | None = None
     operator: Label | None = None
     duration_s: float | None = Field(default=None, gt=0)
+    mode: Mode | None = None
+    sim_state: Literal["live", "simulated"] | None = None
+
+
+class TuneRequest(Section):
+    """`tune`: another strategy or other parameters of it, another instruction; what is absent stays as it is.
+
+    `strategy` is merged into the one in force, whose parameters another `kind` keeps.
+    """
+
+    strategy: Map | None = None
+    task: Annotated[str, Field(max_length=2000)] | None = None
+
+
+Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+class Jog(Section):
+    """A step of one arm's end effector from `joints`: `translation` [m], `rotation` [rad] (a rotation vector).
+
+    Both along the arm's "base" frame, or along the end effector's own ("tool").
+    """
+
+    arm: str
+    frame: Literal["base", "tool"] = "base"
+    translation: Triple = Field(default_factory=lambda: [0.0, 0.0, 0.0])
+    rotation: Triple = Field(default_factory=lambda: [0.0, 0.0, 0.0])
+
+
+class AimRequest(Section):
+    """`aim`: where the robot would go, moving nothing.
+
+    `joints` [D] are a target, or what a jog starts from (the commanded ones where absent); `pose` is a named pose.
+    """
+
+    joints: list[float] | None = None
+    pose: str | None = None
+    jog: Jog | None = None
+
+
+class MoveRequest(Section):
+    """`move`: go to `joints` [D] or to a named `pose` on a limited path.
+
+    `speed` is the part of the speed of motions of ours that may be used.
+    """
+
+    joints: list[float] | None = None
+    pose: str | None = None
+    speed: float = Field(default=1.0, gt=0, le=1)
+
+
+class GripperRequest(Section):
+    """`gripper`: open or close one; lock one where it is, or give it back. `arm` absent: all of them."""
+
+    arm: str | None = None
+    action: Literal["open", "close", "lock", "unlock"]
 
 
 Request = TypeVar("Request", bound=Section)

@@ -52,6 +52,8 @@ class SafetySettings(Section):
     """Deceleration of a stop or a halt [rad/s2]."""
     refusals_to_hold: int = Field(default=10, ge=1)
     """Refused actions in a row that lead to holding."""
+    first_action_far: float = Field(default=0.3, gt=0)
+    """Distance of the policy's first action from the present pose that a person is warned of [rad]."""
     workspace: dict[str, WorkspaceBox] = Field(default_factory=dict)
     """Boxes by arm name; an action that leaves one is refused, never clamped."""
 

@@ -10,8 +10,16 @@ from typing import Any
 
 from runtime.errors import RuntimeFault
 from runtime.lease import Lease
-from runtime.messages import Ack, AckStatus, Command
-from runtime.requests import Nothing, RunRequest, SetUpRequest, read
+from runtime.messages import Ack, AckStatus, Command, Mode
+from runtime.requests import (
+    GripperRequest,
+    MoveRequest,
+    Nothing,
+    RunRequest,
+    SetUpRequest,
+    TuneRequest,
+    read,
+)
 from runtime.section import Section
 
 
@@ -48,11 +56,27 @@ class Happening(StrEnum):
 Told = Mapping[str, Any]  # for the data of an answer
 
 
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What the guards of commands look at, beside the state."""
+
+    mode: Mode | None = None  # of the open run
+    trial: bool = False  # the open run is one of a trial: nobody may change what is measured
+    proposed: bool = False  # a chunk is shown and waits to be committed
+    asked: bool = False  # the policy is being asked, or its answer has not reached control
+    executing: bool = False  # steps are planned
+    first_action: bool = False  # the last set-up knows the policy's first action
+
+
 class Effects(ABC):
     """What the session makes happen; implemented by main, recorded by tests.
 
     Each raises RuntimeFault to refuse, and has changed nothing then. What is returned goes into the answer.
     """
+
+    @property
+    @abstractmethod
+    def situation(self) -> Situation: ...
 
     @abstractmethod
     def begin_setup(self, asked: SetUpRequest) -> Told: ...
@@ -86,18 +110,97 @@ class Effects(ABC):
     @abstractmethod
     def stop_recording(self) -> None: ...
 
+    @abstractmethod
+    def tune(self, asked: TuneRequest) -> Told:
+        """Another strategy, other parameters, another instruction from now on."""
+
+    @abstractmethod
+    def step(self) -> None:
+        """Ask for one chunk: to be executed in the mode step, to be shown in preview."""
+
+    @abstractmethod
+    def commit(self) -> None:
+        """Execute the chunk that is shown."""
+
+    @abstractmethod
+    def cancel(self) -> None:
+        """Forget the chunk that is shown, leave the rest of the one that is executed, end a motion; hold."""
+
+    @abstractmethod
+    def move(self, asked: MoveRequest) -> Told: ...
+
+    @abstractmethod
+    def grip(self, asked: GripperRequest) -> Told: ...
+
+    @abstractmethod
+    def approach(self) -> None:
+        """Go to the policy's first action on a limited path: the one of the set-up, or the one that is shown."""
+
+
+Guard = Callable[[State, Situation], str]  # why it is not allowed just now, "" where it is
+
+
+def _always(state: State, situation: Situation) -> str:
+    return ""
+
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """A command: the states it is allowed in, the state after it, what it does, what it takes.
+    """A command: the states it is allowed in, the state after it, what it does, what it takes, its guard.
 
-    `takes` None: whatever comes with it is not looked at, because a stop is not refused for a word too many.
+    `after` None leaves the state as it is. `takes` None: whatever comes with it is not looked at, because a stop
+    is not refused for a word too many.
     """
 
     allowed: tuple[State, ...]
-    after: State | None
+    after: State | Mapping[State, State] | None
     effect: Callable[[Effects, Any], Told | None]
     takes: type[Section] | None = Nothing
+    guard: Guard = _always
+
+    def next(self, state: State) -> State | None:
+        """The state after it, None for the same."""
+        return self.after.get(state) if isinstance(self.after, Mapping) else self.after
+
+
+def _untried(state: State, situation: Situation) -> str:
+    return "the open run is one of a trial: what is measured may not be changed" if situation.trial else ""
+
+
+def _may_step(state: State, situation: Situation) -> str:
+    if situation.mode not in ("step", "preview"):
+        return f"the run's mode is {situation.mode}, and step is for step and preview"
+    if situation.proposed:
+        return "a chunk is shown: commit or cancel it first"
+    if situation.asked:
+        return "the policy is being asked"
+    return "the last chunk is still being executed" if situation.executing else ""
+
+
+def _may_commit(state: State, situation: Situation) -> str:
+    if situation.mode != "preview":
+        return f"the run's mode is {situation.mode}, and commit is for preview"
+    return "" if situation.proposed else "no chunk is shown: step first"
+
+
+def _may_cancel(state: State, situation: Situation) -> str:
+    if situation.mode in ("step", "preview", "manual"):
+        return ""
+    return f"the run's mode is {situation.mode}, and cancel is for step, preview and manual: stop or halt it"
+
+
+def _may_move(state: State, situation: Situation) -> str:
+    if situation.mode == "manual":
+        return ""
+    return f"the run's mode is {situation.mode}, and move is for manual"
+
+
+def _may_approach(state: State, situation: Situation) -> str:
+    if state is State.READY:
+        return "" if situation.first_action else "the policy's first action is not known: set up again"
+    if situation.mode != "preview":
+        return f"the run's mode is {situation.mode}, and approach is for preview"
+    return "" if situation.proposed else "no chunk is shown: step first"
 
 
 S = State
@@ -115,6 +218,22 @@ COMMANDS: dict[str, Rule] = {
     "record_start": Rule((S.IDLE, S.READY), None, lambda e, _: e.start_recording()),
     "record_stop": Rule(
         (S.DISCONNECTED, S.IDLE, S.SETTING_UP, S.READY, S.HOLDING), None, lambda e, _: e.stop_recording()
+    ),
+    "tune": Rule(
+        (S.IDLE, S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.tune(asked), TuneRequest, _untried
+    ),
+    "step": Rule((S.RUNNING,), None, lambda e, _: e.step(), guard=_may_step),
+    "commit": Rule((S.RUNNING,), None, lambda e, _: e.commit(), guard=_may_commit),
+    "cancel": Rule((S.RUNNING,), None, lambda e, _: e.cancel(), guard=_may_cancel),
+    "move": Rule((S.RUNNING,), None, lambda e, asked: e.move(asked), MoveRequest, _may_move),
+    "gripper": Rule(
+        (S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.grip(asked), GripperRequest, _untried
+    ),
+    "approach": Rule(
+        (S.READY, S.RUNNING),
+        {S.READY: S.SETTING_UP},
+        lambda e, _: e.approach(),
+        guard=_may_approach,
     ),
 }
 # While it is being set up, both stopping commands mean the same: cancel.
@@ -168,7 +287,12 @@ class Session:
 
     def allowed(self) -> list[str]:
         """The commands that would be accepted now."""
-        commands = [kind for kind, rule in COMMANDS.items() if self.state in rule.allowed]
+        situation = self._effects.situation
+        commands = [
+            kind
+            for kind, rule in COMMANDS.items()
+            if self.state in rule.allowed and not rule.guard(self.state, situation)
+        ]
         if self.state is State.SETTING_UP:
             commands.extend(CANCELLING)
         return [*commands, "estop"]
@@ -255,11 +379,13 @@ class Session:
         return ""
 
     def _not_now(self, kind: str) -> str:
-        if kind in self.allowed():
+        allowed = self.allowed()
+        if kind in allowed:
             return ""
-        return (
-            f"{kind} is not allowed while {self.state} ({self.reason}); allowed: {', '.join(self.allowed())}"
-        )
+        why = f"while {self.state} ({self.reason})"
+        if self.state in COMMANDS[kind].allowed:
+            why = f"now: {COMMANDS[kind].guard(self.state, self._effects.situation)}"
+        return f"{kind} is not allowed {why}; allowed: {', '.join(allowed)}"
 
     def _carry_out(self, command: Command) -> Told | None:
         """Do it; raises RuntimeFault where something in it, or who is to do it, refuses."""
@@ -273,9 +399,10 @@ class Session:
             rule = _CANCEL
         asked = read(command.kind, rule.takes, command.args) if rule.takes else None
         told = rule.effect(self._effects, asked)
-        if rule.after:
+        after = rule.next(self.state)
+        if after:
             reason = _CANCELLED if rule is _CANCEL else _REASONS.get(command.kind, "")
-            self._enter(rule.after, reason)
+            self._enter(after, reason)
         return told
 
     def _lease_command(self, command: Command) -> None:
@@ -313,4 +440,5 @@ _REASONS = {
     "halt": "halted by the operator: resume or stop",
     "home": "going home",
     "setup": "setting up",
+    "approach": "going to the policy's first action",
 }

@@ -13,6 +13,14 @@ Makers = tuple[tuple[int, float], ...]  # (chunk id, weight), the weights of a s
 
 
 @dataclass(frozen=True, slots=True)
+class Dims:
+    """Dimensions that do not blend as numbers do."""
+
+    switched: tuple[int, ...] = ()  # binary grippers: they switch where the new chunk switches
+    wrapping: tuple[int, ...] = ()  # angles without limits: blended on the circle
+
+
+@dataclass(frozen=True, slots=True)
 class Planned:
     """The action meant for one step: float64 [D], and the chunks it was made from."""
 

@@ -15,6 +15,8 @@ Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
 Space = Literal["joint", "eef"]
+ActionMode = Literal["absolute", "relative", "delta"]
+RelativeFrame = Literal["base", "tool"]
 EEF_WIDTH = 8  # x, y, z [m], quaternion w, x, y, z, gripper: one arm's end-effector vector
 
 _EMPTY: Mapping[str, object] = MappingProxyType({})
@@ -46,6 +48,7 @@ class Observation:
     truth: Mapping[str, Any] | None = (
         None  # what a simulated bench says of itself: JSON, never shown to a policy
     )
+    drives: Mapping[str, Any] | None = None  # {"enabled": bool, "faults": [str]} where the node reports them
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +58,10 @@ class ActionChunk:
     `actions` is float32 [H, W] in `space`: "joint" rows are [D] in group order, "eef" rows 8 per arm. `rate` is
     the rows' own rate [Hz], None where it is the control rate. `model_actions` are the rows in the model's own
     normalised space where the server returned them. `timing` holds the server's own figures [ms].
+
+    `mode` says what the numbers are: "absolute" targets; "relative" to the observation the chunk answers; "delta",
+    each row relative to the one before, the first to the observation. Grippers are absolute in every mode. `frame`
+    is that of relative poses: offsets along the arm's "base" frame, or along the observed "tool".
     """
 
     actions: Float32
@@ -62,14 +69,26 @@ class ActionChunk:
     rate: float | None = None
     model_actions: Float32 | None = None
     timing: Mapping[str, float] = field(default_factory=dict)
+    mode: ActionMode = "absolute"
+    frame: RelativeFrame = "base"
 
 
 @dataclass(frozen=True, slots=True)
 class Conditioning:
-    """What the robot is already committed to, for policies that continue their own last chunk (RTC)."""
+    """What the robot is already committed to, for policies that continue their own last chunk (RTC).
 
-    left_over: Float32  # [T, W] rows not yet consumed, in the policy's own space and rate
-    predicted_delay: int  # control steps until the answer is expected to arrive
+    Rows are in the policy's own space and at its own rate, as the server gave them.
+    """
+
+    previous: Float32  # [T, W] the chunk that is being executed, whole
+    consumed: int  # its rows that are for steps before the new observation
+    predicted_delay: int  # rows that will be consumed until the answer is expected to arrive
+    execution_horizon: int  # rows of the answer that will be executed at most
+
+    @property
+    def left_over(self) -> Float32:
+        """The rows not yet consumed [T - consumed, W]."""
+        return self.previous[self.consumed :]
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from runtime.errors import PolicyError
+from runtime.errors import PolicyError, PolicyLostError
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 _CLOSE_TIMEOUT = 0.5  # seconds for the closing handshake; a server busy with inference does not answer it
 
 
-class PolicyTimeout(PolicyError):
+class PolicyTimeout(PolicyLostError):
     """The server did not answer within the deadline; the connection is dropped."""
 
 
-class PolicyGone(PolicyError):
+class PolicyGone(PolicyLostError):
     """The server closed the connection; it may have restarted."""
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from runtime.types import Float32, Space, UInt8
 
-ControlSource = Literal["none", "hold", "motion", "policy", "teleop", "estop"]
+ControlSource = Literal["none", "hold", "motion", "policy", "teleop", "estop", "sim"]
 Status = Literal["finished", "interrupted", "failed"]
 
 
@@ -73,6 +73,8 @@ class RawChunk:
     delay: int  # arrival_step - observation_step
     mistimed: int = 0  # steps by which k_max shifted it
     inference_ms: float = float("nan")
+    strategy: str = ""  # the kind that merged it
+    overlap: int = 0  # steps from the arrival on that were blended with what was planned before
 
 
 Record = Row | ExecutedTick | RawChunk

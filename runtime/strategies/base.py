@@ -5,12 +5,38 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from runtime.section import Section
 from runtime.timeline import Makers, Timeline
 from runtime.types import Float64
+
+BlendShape = Literal["linear", "cosine", "exponential"]
+
+
+class StrategyParameters(Section):
+    """The one set of parameters of all strategies; each module's `USES` names those that mean something to it."""
+
+    execution_horizon: int | None = Field(default=None, ge=1)
+    """Rows of each chunk that may be executed, counted from its observation; all of them where it is not given."""
+    inference_rate: float | None = Field(default=None, gt=0)
+    """Requests per second [Hz]; back to back where it is not given."""
+    k_max: int | None = Field(default=None, ge=0)
+    """Most rows that may be dropped as stale; beyond it the chunk is shifted and recorded as mistimed."""
+    blend_window: Annotated[int, Field(ge=1)] | Literal["all"] = 8
+    """Steps over which a new chunk is blended in; "all" is the whole overlap."""
+    blend_shape: BlendShape = "linear"
+    """How the old plan's weight falls over the window."""
+    ensemble_m: float = Field(default=0.01, ge=0)
+    """Decay of the weights exp(-m * rank), rank 0 the oldest chunk (ACT, arXiv 2304.13705)."""
+    ensemble_horizon: int = Field(default=8, ge=1)
+    """Most chunks that make one step; the newest are kept."""
+    delay_quantile: float = Field(default=0.9, gt=0, le=1)
+    """Quantile of recent delays that is predicted for the next answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +50,15 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """A chunk at the control loop: rows [H, D] in command space and control rate, row 0 for `observation_step`."""
+    """A chunk at the control loop: rows [H, D] in command space and control rate.
+
+    Row 0 is for `observation_step`; where it `waited` nothing of it is stale, and row 0 is for the first free step.
+    """
 
     chunk_id: int
     observation_step: int
     rows: Float64
+    waited: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,10 +76,14 @@ class Merged:
     targets: NDArray[np.int64]
     mistimed: int = 0
     dropped: str = ""
+    overlap: int = 0  # steps from arrival_step on that were blended with what was planned before
 
 
 class Query(ABC):
     """Decides when the policy is asked."""
+
+    waits: bool = False  # it asks while the robot stands, so that nothing of the answer is stale
+    continues: bool = False  # its requests carry what the robot is committed to (RTC)
 
     @abstractmethod
     def wants(self, progress: Progress) -> bool:

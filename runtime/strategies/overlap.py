@@ -7,26 +7,18 @@ the default window is shorter because "all" takes over 30 steps to follow a chan
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
-from runtime.section import Section
-from runtime.strategies.base import Arrival, Merge, Merged, Progress, Query, mixed
+from runtime.strategies.base import Arrival, Merge, Merged, Progress, Query, StrategyParameters, mixed
 from runtime.timeline import Timeline, overlap_blend
 
 
-class Config(Section):
+class Config(StrategyParameters):
     """Settings of the async strategy."""
 
     kind: Literal["async"] = "async"
-    inference_rate: float | None = Field(default=None, gt=0)
-    """Requests per second [Hz]; back to back where it is not given."""
-    k_max: int | None = Field(default=None, ge=0)
-    """Most rows that may be dropped as stale; beyond it the chunk is shifted and recorded as mistimed."""
-    blend_window: Annotated[int, Field(ge=1)] | Literal["all"] = 8
-    """Steps over which a new chunk is blended in; "all" is the whole overlap."""
 
 
 class AsyncQuery(Query):

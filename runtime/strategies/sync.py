@@ -6,19 +6,15 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
-from runtime.section import Section
-from runtime.strategies.base import Arrival, Merge, Merged, Progress, Query, single
+from runtime.strategies.base import Arrival, Merge, Merged, Progress, Query, StrategyParameters, single
 from runtime.timeline import Timeline
 
 
-class Config(Section):
+class Config(StrategyParameters):
     """Settings of the sync strategy."""
 
     kind: Literal["sync"] = "sync"
-    execution_horizon: int | None = Field(default=None, ge=1)
-    """Rows of each chunk to execute before asking again; all of them where it is not given."""
 
 
 class SyncQuery(Query):
