@@ -11,6 +11,7 @@ from typing import Any
 
 from runtime.clock import Clock, MonotonicClock
 from runtime.closing import Close, at_once, in_background
+from runtime.drives import Drives
 from runtime.errors import RecordingError, RuntimeFault, TransportError
 from runtime.family import Plan, join
 from runtime.leftovers import start_repair
@@ -73,6 +74,7 @@ class Media:
         self._too_large: Counter[str] = Counter()
         self._source_failure = ""
         self._truth: Mapping[str, Any] = {}  # what a simulated bench last said of itself
+        self._drives = Drives()
         for ring in ("minutes", "ticks"):
             for _ in page.rings[ring].drain():
                 pass  # addressed to a predecessor that died
@@ -151,9 +153,15 @@ class Media:
                 self._page.pictures[camera].write(self._numbers[camera], picture)
         self._count("joints", observation.arrived)
         self._truth = observation.truth or {}
+        self._see_drives(observation)
         self._recorder.see(observation)
         self._page.publish_observation(observation, self._numbers)
         self._preview(observation)
+
+    def _see_drives(self, observation: Observation) -> None:
+        change = self._drives.see(observation.drives, observation.arrived)
+        if change:
+            self._say(Event("drives", change, observation.arrived, data=dict(self._drives.newest)))
 
     def _count(self, stream: str, arrived: float) -> None:
         self._arrivals.setdefault(stream, deque(maxlen=_RATE_WINDOW)).append(arrived)
@@ -248,7 +256,9 @@ class Media:
         recorder = self._recorder
         recording = recorder.recording or self._closing_uuid  # until it is on disk
         rows, repeated = recorder.rows, recorder.repeated
-        self._tell(MediaReport(now, rates, faults, rows, recording, repeated, self._truth))
+        self._tell(
+            MediaReport(now, rates, faults, rows, recording, repeated, self._truth, self._drives.newest)
+        )
 
     def _say_truth(self) -> None:
         """How a simulated bench is left: what the episode is scored by."""

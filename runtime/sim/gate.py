@@ -1,6 +1,7 @@
 """What a careful execution node lets through: one master, finite targets within limits, a deadline.
 
-A node with a bench also takes the word "scene_reset", with `id`, `seed` and, if wanted, `positions`.
+Words that switch the drives of a simulated robot (runtime.sim.drives) are taken of anybody. A node with a bench
+also takes the word "scene_reset", with `id`, `seed` and, if wanted, `positions`.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 
 from runtime import codecs
 from runtime.errors import CodecError
+from runtime.sim import drives
 from runtime.sim.tabletop import Reset
 from runtime.types import Float64
 
@@ -30,11 +32,12 @@ _MESSAGE_LIMIT = 1024 * 1024  # bytes; a command has a few hundred
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """A message that counts: a target [D] to go to, a control word, or a wish to lay the bench anew."""
+    """A message that counts: a target [D] to go to, a control word, a wish to lay the bench anew, a switch."""
 
     target: Float64 | None = None
     control: Control | None = None
     reset: Reset | None = None
+    switch: drives.Switch | None = None
 
 
 class Gate:
@@ -55,9 +58,13 @@ class Gate:
     def judge(self, payload: bytes, arrival: float) -> Accepted | None:
         """The message if it may take effect, else None and one more in `refused`."""
         message = self._message(payload)
-        if message is None or not self._rules(message, arrival):
+        if message is None:
             return None
         word = message.get("target", "real")
+        if word in drives.WORDS:
+            return self._switch(word, message)
+        if not self._rules(message, arrival):
+            return None
         if word == "real":
             return self._target(message, arrival)
         if word in get_args(Control):
@@ -92,6 +99,14 @@ class Gate:
         self.master = name
         self._heard = arrival
         return True
+
+    def _switch(self, word: str, message: dict[Any, Any]) -> Accepted | None:
+        """Whoever stands at the robot switches its drives; that does not make them its master."""
+        switch = drives.read(word, message)
+        if switch is None:
+            self.refused["malformed"] += 1
+            return None
+        return Accepted(switch=switch)
 
     def _reset(self, message: dict[Any, Any]) -> Accepted | None:
         name, seed, positions = (message.get(key) for key in ("id", "seed", "positions"))

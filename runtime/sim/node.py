@@ -2,8 +2,9 @@
 
 Each tick: take the newest command, move the plant, publish one observation. Beyond the plain protocol it
 says its frame number (`seq`), colour order (`encoding`), whom it obeys (`master`), what it `refused`, by
-reason, and whether it is `holding` because nobody commands it. With `--bench tabletop` there is something to
-touch, which the word "scene_reset" lays anew and of which the field `truth` says how it really is.
+reason, whether it is `holding` because nobody commands it, and how its `drives` are. With `--bench tabletop`
+there is something to touch, which the word "scene_reset" lays anew and of which the field `truth` says how it
+really is.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from runtime.clock import Clock, MonotonicClock
 from runtime.errors import RuntimeFault, SetupError
 from runtime.sim import standin, surroundings
 from runtime.sim.bench import BenchError
+from runtime.sim.drives import Drives
 from runtime.sim.gate import Accepted, Gate
 from runtime.sim.gestures import Gesture
 from runtime.sim.plant import Plant, poses
@@ -53,6 +55,7 @@ class Node:
         self._options = options
         self._clock = clock
         self._plant = Plant(robot, start=_start(robot, options.start_pose))
+        self._drives = Drives(not options.drives_disabled, options.drive_fault)
         self._gate = Gate(robot, options.deadline, bench=options.bench != "none")
         self._surroundings = surroundings.surroundings(robot, options)
         self._leader = Gesture(robot, options.seed)
@@ -107,6 +110,8 @@ class Node:
                 self._control(accepted)
             elif accepted is not None and accepted.reset is not None:
                 self._lay(accepted.reset)
+            elif accepted is not None and accepted.switch is not None:
+                self._drives.obey(accepted.switch)
             elif accepted is not None:
                 newest = accepted.target
         if newest is not None and self._leader_phase is not None:
@@ -142,7 +147,9 @@ class Node:
 
     def _move(self, seconds: float) -> None:
         silent = self._gate.silent(self._clock.now())
-        if self._leader_phase is not None:
+        if not self._drives.enabled:
+            self._plant.hold()
+        elif self._leader_phase is not None:
             self._leader_phase += self._leader.turn(seconds)
             self._plant.target = self._leader.towards(self._leader_phase, self._plant.target, seconds)
         elif silent and not self._holding:
@@ -179,6 +186,7 @@ class Node:
             message["hil_error"] = self._hil_error
         message |= {"proto": 1, "seq": self._sequence, "encoding": "bgr", "holding": self._holding}
         message |= {"refused": dict(self._gate.refused), "master": self._gate.master or ""}
+        message["drives"] = self._drives.said()
         truth = self._surroundings.truth()
         return message if truth is None else message | {"truth": truth}
 
@@ -238,6 +246,14 @@ def parser() -> argparse.ArgumentParser:
     line.add_argument(
         "--malformed-every", type=int, default=0, metavar="N", help="fault: each Nth message is cut"
     )
+    line.add_argument(
+        "--drive-fault",
+        action="append",
+        default=[],
+        metavar="TEXT",
+        help="fault: said of the drives, which are off",
+    )
+    line.add_argument("--drives-disabled", action="store_true", help="fault: the drives are off")
     line.add_argument(
         "--clock-offset", type=float, default=0.0, metavar="S", help="added to the node's clock"
     )

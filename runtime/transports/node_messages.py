@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 Encoding = Literal["bgr", "rgb"]
 TRUTH_LIMIT = 16 * 1024  # bytes; it goes into snapshots ten times a second
+DRIVE_FAULTS_LIMIT = 64  # of one message
+DRIVE_FAULT_LENGTH = 200
 Part = TypeVar("Part")
 _JSON: TypeAdapter[dict[str, JsonValue]] = TypeAdapter(
     dict[str, JsonValue], config=ConfigDict(strict=True, allow_inf_nan=False)
@@ -49,7 +51,8 @@ class NodeStatus:
 class NodeFrame:
     """One complete observation as sent: `stamp` in the node's own clock [s], pictures in its own `encoding`.
 
-    `truth` is what a simulated bench says of itself, as JSON. `remarks` are (fault, text) of optional parts that
+    `truth` is what a simulated bench says of itself, as JSON. `drives` is {"enabled": bool, "faults": [str]}, None
+    where the node does not say. `remarks` are (fault, text) of optional parts that
     were left out because they are unusable.
     """
 
@@ -63,6 +66,7 @@ class NodeFrame:
     sequence: int | None
     status: NodeStatus
     truth: Mapping[str, Any] | None = None
+    drives: Mapping[str, Any] | None = None
     remarks: tuple[tuple[str, str], ...] = ()
 
 
@@ -91,6 +95,7 @@ class NodeMessages:
             sequence=_sequence(message),
             status=_status(message),
             truth=self._optional(remarks, "truth", _truth, message.get("truth")),
+            drives=self._optional(remarks, "drives", _drives, message.get("drives")),
             remarks=tuple(remarks),
         )
 
@@ -218,6 +223,24 @@ def _truth(name: str, given: object) -> Mapping[str, Any]:
     if not isinstance(success, bool):
         raise MessageRefused("malformed", f"{name}.success is {success!r:.80}; expected true or false")
     return truth
+
+
+def _drives(name: str, given: object) -> Mapping[str, Any]:
+    """Whether the drives are on, and what is wrong with them; further keys are left out."""
+    if not isinstance(given, dict):
+        raise MessageRefused("malformed", f"{name} is a {type(given).__name__}; expected a map")
+    enabled, faults = given.get("enabled"), given.get("faults", [])
+    if not isinstance(enabled, bool):
+        raise MessageRefused("malformed", f"{name}.enabled is {enabled!r:.80}; expected true or false")
+    if not isinstance(faults, list) or not all(isinstance(fault, str) for fault in faults):
+        raise MessageRefused("malformed", f"{name}.faults is {faults!r:.80}; expected a list of sentences")
+    if len(faults) > DRIVE_FAULTS_LIMIT or any(len(fault) > DRIVE_FAULT_LENGTH for fault in faults):
+        raise MessageRefused(
+            "malformed",
+            f"{name}.faults are {len(faults)} of at most {max(map(len, faults))} characters; "
+            f"expected at most {DRIVE_FAULTS_LIMIT} of {DRIVE_FAULT_LENGTH}",
+        )
+    return {"enabled": enabled, "faults": list(faults)}
 
 
 def _sequence(message: Mapping[Any, Any]) -> int | None:

@@ -175,6 +175,7 @@ class NodeSource(Source):
 
         `frozen_<camera>` counts how often that camera's picture stayed the same for too long.
         `truth_ignored` is 1 where a node that is not declared simulated says what only a simulated one can know.
+        `drives_unusable` counts messages whose drive state could not be read.
         Commands that the node itself refused appear as `node_refused.<reason>`.
         """
         with self._changed:
@@ -381,6 +382,7 @@ def _observation(
         reported_action=frame.action,
         reported_action_eef=frame.action_eef,
         truth=frame.truth,
+        drives=frame.drives,
     )
 
 

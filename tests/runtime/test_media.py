@@ -540,3 +540,19 @@ def test_a_log_that_cannot_take_the_truth_ends_the_episode_once(desk: Desk) -> N
     desk.media.pump(0.0)
     closed = desk.told(EpisodeClosed)
     assert [(message.status, message.reason) for message in closed] == [("failed", "disk full while mark")]
+
+
+def test_drives_are_reported_and_their_changes_are_events_of_the_episode(desk: Desk) -> None:
+    desk.receive(1)
+    assert desk.told(MediaReport)[-1].drives == {}
+    desk.begin()
+    off = {"enabled": False, "faults": ["axis 2 is hot"]}
+    for sequence in (2, 3):
+        desk.source.waiting.append(desk.observation(sequence, drives=off))
+        desk.clock.advance(1.0)
+        desk.media.pump(0.0)
+    messages = [decode(payload) for payload in desk.page.rings["media_events"].drain()]
+    events = [m for m in messages if isinstance(m, Event) and m.kind == "drives"]
+    assert [(e.text, e.data) for e in events] == [("drives disabled; drive fault: axis 2 is hot", off)]
+    assert [m.drives for m in messages if isinstance(m, MediaReport)][-1] == off
+    assert [event["kind"] for event in desk.journal.events] == ["drives"]

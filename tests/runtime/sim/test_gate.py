@@ -7,6 +7,7 @@ import pytest
 
 import robots
 from runtime import codecs
+from runtime.sim.drives import Switch
 from runtime.sim.gate import Gate
 from runtime.sim.tabletop import Reset
 
@@ -181,3 +182,13 @@ def test_the_bench_is_not_laid_for_a_second_client_while_the_first_commands() ->
     gate.judge(command(master="first"), 0.0)
     assert gate.judge(codecs.pack(WISH | {"master": "second"}), 0.5) is None
     assert gate.refused == {"other_master": 1}
+
+
+def test_the_drives_are_switched_by_anybody_who_does_not_become_the_master_by_it(gate: Gate) -> None:
+    gate.judge(command(master="station"), 0.0)
+    accepted = gate.judge(command(target="drives_fault", fault="hot", master="hand"), 0.1)
+    assert accepted is not None
+    assert accepted.switch == Switch(False, "hot")
+    assert (gate.master, gate.refused) == ("station", {})
+    assert gate.judge(command(target="drives_fault", fault=7), 0.2) is None
+    assert gate.refused == {"malformed": 1}

@@ -247,6 +247,47 @@ def test_a_human_in_the_loop_is_refused_with_a_reason_until_stopped(bench: Bench
     assert "hil_error" not in bench.tick()
 
 
+def test_drives_are_reported_and_off_nothing_moves(bench: Bench) -> None:
+    assert bench.tick()["drives"] == {"enabled": True, "faults": []}
+    bench.send(AWAY)
+    started = joints(bench.tick())
+    assert np.abs(started - HOME).max() > 0
+    bench.send(target="drives_fault", fault="axis 2 is hot")
+    stopped = joints(bench.tick())
+    bench.send(AWAY)
+    said = bench.tick(10)
+    assert said["drives"] == {"enabled": False, "faults": ["axis 2 is hot"]}
+    np.testing.assert_array_equal(joints(said), stopped)
+    bench.send(target="drives_enable")
+    bench.send(AWAY)
+    said = bench.tick(3)
+    assert said["drives"] == {"enabled": True, "faults": []}
+    assert np.abs(joints(said) - stopped).max() > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "drives"),
+    [
+        (["--drives-disabled"], {"enabled": False, "faults": []}),
+        (["--drive-fault", "hot", "--drive-fault", "lost"], {"enabled": False, "faults": ["hot", "lost"]}),
+    ],
+)
+def test_it_can_begin_with_drives_that_are_off(options: list[str], drives: dict[str, Any]) -> None:
+    with contextlib.closing(Bench(*options)) as made:
+        made.send(AWAY)
+        said = made.tick(3)
+        assert said["drives"] == drives
+        np.testing.assert_allclose(joints(said), HOME, atol=1e-6)
+
+
+def test_collecting_waits_while_the_drives_are_off(bench: Bench) -> None:
+    bench.send(target="collect_start")
+    bench.tick(3)
+    bench.send(target="drives_disable")
+    stopped = joints(bench.tick())
+    np.testing.assert_array_equal(joints(bench.tick(5)), stopped)
+
+
 def test_a_frozen_camera_repeats_its_first_picture() -> None:
     with contextlib.closing(Bench("--freeze-camera", "cam_high")) as bench:
         first, later = bench.tick(), bench.tick(5)

@@ -645,6 +645,42 @@ def test_a_truth_that_cannot_be_used_is_left_out_and_named(node: Node, truth: ob
         assert says in source.last_fault
 
 
+@pytest.mark.parametrize(
+    ("drives", "seen"),
+    [
+        ({"enabled": True, "faults": []}, {"enabled": True, "faults": []}),
+        ({"enabled": False, "faults": ["hot"], "more": 1}, {"enabled": False, "faults": ["hot"]}),
+        ({"enabled": False}, {"enabled": False, "faults": []}),
+        (..., None),
+    ],
+)
+def test_the_drive_state_of_any_node_is_passed_on(node: Node, drives: Any, seen: Any) -> None:
+    with listening(node) as source:
+        assert until_heard(node, source, lambda: frame(time.monotonic(), drives=drives)).drives == seen
+        assert source.faults() == {}
+
+
+@pytest.mark.parametrize(
+    ("drives", "says"),
+    [
+        (True, "drives is a bool; expected a map"),
+        ({"enabled": 1, "faults": []}, "drives.enabled is 1; expected true or false"),
+        ({"faults": []}, "drives.enabled is None; expected true or false"),
+        ({"enabled": True, "faults": "hot"}, "drives.faults is 'hot'; expected a list of sentences"),
+        ({"enabled": True, "faults": [7]}, "drives.faults is [7]; expected a list of sentences"),
+        ({"enabled": True, "faults": ["x"] * 65}, "drives.faults are 65 of at most 1 characters"),
+        ({"enabled": True, "faults": ["x" * 201]}, "expected at most 64 of 200"),
+    ],
+)
+def test_a_drive_state_that_cannot_be_used_is_left_out_and_named(node: Node, drives: Any, says: str) -> None:
+    with listening(node) as source:
+        seen = until_heard(node, source, lambda: frame(time.monotonic(), 1, drives=drives))
+        assert seen.drives is None
+        assert seen.qpos[0] == 1
+        assert set(source.faults()) == {"drives_unusable"}
+        assert says in source.last_fault
+
+
 @pytest.mark.parametrize("simulated", [True, False])
 def test_only_a_node_that_is_declared_simulated_is_told_to_reset_its_bench(simulated: bool) -> None:
     assert link.capabilities(Config(simulated=simulated)).resets_bench is simulated
