@@ -89,3 +89,34 @@ def rotation_vector(matrix: Float64) -> Float64:
     angle = 2 * np.arctan2(sine, quaternion[..., :1])
     vector: Float64 = imaginary * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
     return vector
+
+
+def quaternion_product(left: Float64, right: Float64) -> Float64:
+    """The rotation `left` after the rotation `right`, as unit quaternions [..., 4]."""
+    aw, ax, ay, az = np.moveaxis(left, -1, 0)
+    bw, bx, by, bz = np.moveaxis(right, -1, 0)
+    terms = (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+    return np.stack(terms, axis=-1)
+
+
+def slerp(start: Float64, end: Float64, part: Float64) -> Float64:
+    """Unit quaternions [..., 4] at `part` [...] of the shorter way from `start` to `end`, on the side of `start`.
+
+    Shoemake 1985; the angle by atan2, because the arc cosine of a number near 1 loses half its digits.
+    """
+    end = np.where(np.sum(start * end, axis=-1, keepdims=True) < 0, -end, end)
+    apart, along = np.linalg.norm(end - start, axis=-1), np.linalg.norm(end + start, axis=-1)
+    angle = 2 * np.arctan2(apart, along)
+    sine = np.sin(angle)
+    near = sine < 1e-9
+    safe = np.where(near, 1.0, sine)
+    before = np.where(near, 1 - part, np.sin((1 - part) * angle) / safe)
+    after = np.where(near, part, np.sin(part * angle) / safe)
+    between = before[..., None] * start + after[..., None] * end
+    quaternion: Float64 = between / np.linalg.norm(between, axis=-1, keepdims=True)
+    return quaternion

@@ -2,25 +2,39 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from robots import Robot
 from runtime.errors import PolicyError, SetupError
 from runtime.kinematics.base import IkResult, Kinematics
-from runtime.types import EEF_WIDTH, ActionChunk, Float32, Float64
+from runtime.poses import absolute, canonical, continuous_signs
+from runtime.resampling import resample
+from runtime.types import EEF_WIDTH, ActionChunk, Float32, Float64, Observation
 
 _GRIPPER = EEF_WIDTH - 1
-_SHORTEST_QUATERNION = (
-    1e-3  # a unit quaternion that a network predicts is off by per cents, never by this much
-)
+
+
+@dataclass(frozen=True, slots=True)
+class CommandRows:
+    """A chunk in command space at control rate.
+
+    `rows` float64 [H', D] are absolute joint targets; `source` int64 [H'] is the policy's row that each was made
+    from; `solved` says how well poses were met, None for a joint chunk.
+    """
+
+    rows: Float64
+    source: NDArray[np.int64]
+    solved: IkResult | None
 
 
 class Spaces:
-    """One robot's action spaces: joint rows [H, D] pass, eef rows [H, 8 * arms] become joints by kinematics.
+    """One robot's action spaces: joint rows [H, D], and eef rows [H, 8 * arms] that become joints by kinematics.
 
     An arm's vector is x, y, z [m], unit quaternion w, x, y, z, gripper, in the arm's declared frame.
-    `control_rate` [Hz] is the rate of chunks that name none.
+    `control_rate` [Hz] is the rate of commands, and of chunks that name none.
     """
 
     def __init__(self, robot: Robot, kinematics: Kinematics, control_rate: float) -> None:
@@ -30,24 +44,34 @@ class Spaces:
         self._kinematics = kinematics
         self._control_rate = control_rate
         self._grippers = np.array([arm.gripper_dim for arm in robot.arms], dtype=np.intp)
+        self._moving = np.setdiff1d(np.arange(robot.dim), robot.gripper_dims)
+        endless = np.isinf(robot.lower) & np.isinf(robot.upper)
+        self._wrapping = np.flatnonzero(endless)
+        arms = range(len(robot.arms))
+        self._quaternions = [EEF_WIDTH * arm + 3 for arm in arms]
+        self._held = [EEF_WIDTH * a + _GRIPPER for a in arms if self._grippers[a] in robot.binary_dims]
 
-    def to_command(self, chunk: ActionChunk, qpos: Float32) -> tuple[Float64, IkResult | None]:
-        """The chunk as joint rows float64 [H, D], and how well its poses were met (None for joint chunks).
+    def to_command(self, chunk: ActionChunk, observation: Observation) -> CommandRows:
+        """The chunk, which answers `observation`, as absolute joint rows at control rate.
 
-        `qpos` [D] are the joints the chunk was asked for: the first row is solved from there, each further
-        row from the one before within velocity limits. Grippers are taken from the chunk as they are; joints
-        that no arm moves (a head) keep `qpos`. Raises PolicyError for a wrong width, a number that is not
-        finite, or a quaternion without direction.
+        In this order: checked; made absolute against the observation (poses against the measured ones, else
+        those of its joints); resampled in the policy's own space; poses solved, the first row from the
+        observed joints, each further one from the row before within velocity limits; joints without limits
+        unwrapped from the observed ones on. Grippers are taken as they are; joints that no arm moves (a head)
+        stay where an eef chunk found them. Raises PolicyError for a wrong width, a number that is not finite,
+        or a quaternion without direction.
         """
         rows = self._checked(chunk)
+        rate = chunk.rate or self._control_rate
+        qpos = np.asarray(observation.qpos, dtype=np.float64)
         if chunk.space == "joint":
-            return rows, None
-        vectors = canonical(rows.reshape(len(rows), len(self._grippers), EEF_WIDTH))
-        period = 1.0 / (chunk.rate or self._control_rate)
-        result = self._kinematics.solve(vectors[..., :_GRIPPER], np.asarray(qpos, dtype=np.float64), period)
-        commands = result.q.copy()
-        commands[:, self._grippers] = vectors[..., _GRIPPER]
-        return commands, result
+            rows = self._unwrapped(self._absolute_joints(rows, chunk, qpos), qpos)
+            rows, source = resample(rows, rate, self._control_rate, self._robot.binary_dims)
+            return CommandRows(rows, source, None)
+        vectors = self._absolute_poses(rows, chunk, observation).reshape(len(rows), -1)
+        vectors, source = resample(vectors, rate, self._control_rate, self._held, self._quaternions)
+        solved = self._solved(vectors, qpos)
+        return CommandRows(self._unwrapped(self._with_grippers(solved, vectors), qpos), source, solved)
 
     def eef_of(self, q: ArrayLike, previous: ArrayLike | None = None) -> Float32:
         """End-effector vectors float32 [..., 8 * arms] that joints [..., D] and their grippers amount to.
@@ -65,8 +89,41 @@ class Spaces:
             turned = np.sum(first[:, 3:7] * before[:, 3:7], axis=-1) < 0
             first[turned, 3:7] *= -1.0
         if joints.ndim > 1:
-            vectors[..., 3:7] *= _signs(vectors[..., 3:7])
+            vectors[..., 3:7] *= continuous_signs(vectors[..., 3:7])
         return vectors.reshape(*joints.shape[:-1], -1).astype(np.float32)
+
+    def _absolute_joints(self, rows: Float64, chunk: ActionChunk, qpos: Float64) -> Float64:
+        if chunk.mode == "absolute":
+            return rows
+        moves = rows[:, self._moving]
+        rows[:, self._moving] = qpos[self._moving] + (
+            moves if chunk.mode == "relative" else moves.cumsum(axis=0)
+        )
+        return rows
+
+    def _absolute_poses(self, rows: Float64, chunk: ActionChunk, observation: Observation) -> Float64:
+        vectors = canonical(rows.reshape(len(rows), len(self._grippers), EEF_WIDTH))
+        if chunk.mode == "absolute":
+            return vectors
+        seen = self.eef_of(observation.qpos) if observation.eef is None else observation.eef
+        poses = np.asarray(seen, dtype=np.float64).reshape(1, len(self._grippers), EEF_WIDTH)
+        start = canonical(poses, f"the chunk is {chunk.mode} to an observation with")[0]
+        return absolute(vectors, start, chunk.mode, chunk.frame)
+
+    def _solved(self, vectors: Float64, qpos: Float64) -> IkResult:
+        poses = vectors.reshape(len(vectors), len(self._grippers), EEF_WIDTH)[..., :_GRIPPER]
+        return self._kinematics.solve(poses, qpos, 1.0 / self._control_rate)
+
+    def _with_grippers(self, solved: IkResult, vectors: Float64) -> Float64:
+        commands = solved.q.copy()
+        commands[:, self._grippers] = vectors[:, _GRIPPER::EEF_WIDTH]
+        return commands
+
+    def _unwrapped(self, rows: Float64, qpos: Float64) -> Float64:
+        """The rows with endless joints on the branch that is nearest to `qpos`, and without jumps from there."""
+        turning = np.concatenate([qpos[None], rows])[:, self._wrapping]
+        rows[:, self._wrapping] = np.unwrap(turning, axis=0)[1:]
+        return rows
 
     def _checked(self, chunk: ActionChunk) -> Float64:
         width = self._robot.dim if chunk.space == "joint" else self._robot.eef_dim
@@ -85,32 +142,3 @@ class Spaces:
                 f"({len(wrong)} such numbers); allowed: finite numbers"
             )
         return rows
-
-
-def canonical(vectors: Float64) -> Float64:
-    """End-effector vectors [T, arms, 8] with unit quaternions, first w >= 0, signs continuous along T.
-
-    Raises PolicyError for a quaternion that is too short to have a direction.
-    """
-    quaternions = vectors[..., 3:7]
-    norms = np.linalg.norm(quaternions, axis=-1, keepdims=True)
-    if (norms < _SHORTEST_QUATERNION).any():
-        row, arm = np.argwhere(norms[..., 0] < _SHORTEST_QUATERNION)[0]
-        raise PolicyError(
-            f"the policy answered with quaternion {quaternions[row, arm].tolist()}, arm {arm}, row {row}; "
-            f"allowed: w, x, y, z of length 1 (it is normalised from {_SHORTEST_QUATERNION:g} on)"
-        )
-    result = vectors.copy()
-    result[..., 3:7] = quaternions / norms
-    result[0, :, 3:7] *= np.where(result[0, :, 3:4] < 0, -1.0, 1.0)
-    result[..., 3:7] *= _signs(result[..., 3:7])
-    return result
-
-
-def _signs(quaternions: Float64) -> Float64:
-    """The factors +-1 [T, arms, 1] that turn each quaternion [T, arms, 4] to its predecessor's side."""
-    dots = np.sum(quaternions[1:] * quaternions[:-1], axis=-1, keepdims=True)
-    flips = np.where(dots < 0, -1.0, 1.0)
-    signs = np.ones((*quaternions.shape[:-1], 1))
-    signs[1:] = np.cumprod(flips, axis=0)
-    return signs

@@ -50,3 +50,22 @@ def test_batches_give_what_single_calls_give() -> None:
     for index in np.ndindex(3, 4):
         np.testing.assert_array_equal(together[index], rotations.quaternion_of_matrix(matrices[index]))
         np.testing.assert_allclose(vectors[index], rotations.rotation_vector(matrices[index]), atol=1e-15)
+
+
+@given(quaternions, quaternions)
+def test_a_product_of_quaternions_turns_by_the_right_one_first(left: np.ndarray, right: np.ndarray) -> None:
+    left, right = left / np.linalg.norm(left), right / np.linalg.norm(right)
+    made = rotations.matrix_of_quaternion(rotations.quaternion_product(left, right))
+    expected = rotations.matrix_of_quaternion(left) @ rotations.matrix_of_quaternion(right)
+    np.testing.assert_allclose(made, expected, atol=1e-12)
+
+
+@given(quaternions, quaternions, st.floats(0, 1))
+def test_slerp_goes_its_part_of_the_shorter_way(start: np.ndarray, end: np.ndarray, part: float) -> None:
+    start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
+    between = rotations.slerp(start, end, np.array(part))
+    assert abs(np.linalg.norm(between) - 1) < 1e-12
+    first, last, found = (Rotation.from_quat(q, scalar_first=True) for q in (start, end, between))
+    whole = (last * first.inv()).magnitude()
+    assert (found * first.inv()).magnitude() == pytest.approx(part * whole, abs=1e-6)
+    assert (last * found.inv()).magnitude() == pytest.approx((1 - part) * whole, abs=1e-6)

@@ -1,0 +1,38 @@
+"""Rows of one rate as rows of another: linear, on the arc, or held, as each number's kind wants it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robots.rotations import slerp
+from runtime.types import Float64
+
+
+def resample(
+    rows: Float64,
+    rate: float,
+    wanted_rate: float,
+    held: Sequence[int] = (),
+    quaternions: Sequence[int] = (),
+) -> tuple[Float64, NDArray[np.int64]]:
+    """`rows` [H, W] of `rate` Hz at `wanted_rate` Hz, and the row each one was made from (the one not after it).
+
+    Numbers are linear between rows; the columns `held` (binary grippers) keep their row's value, and four
+    columns from each of `quaternions` on (unit) turn on the shorter arc. The last row lasts its own period.
+    """
+    if rate == wanted_rate or not len(rows):
+        return rows, np.arange(len(rows), dtype=np.int64)
+    count = int(np.floor(len(rows) * wanted_rate / rate + 1e-9))
+    position = np.minimum(np.arange(count) * (rate / wanted_rate), len(rows) - 1)
+    lower = np.floor(position + 1e-9).astype(np.int64)
+    before, after = rows[lower], rows[np.minimum(lower + 1, len(rows) - 1)]
+    part = np.clip(position - lower, 0.0, 1.0)
+    made = before + part[:, None] * (after - before)
+    made[:, list(held)] = before[:, list(held)]
+    for first in quaternions:
+        turned = slice(first, first + 4)
+        made[:, turned] = slerp(before[:, turned], after[:, turned], part)
+    return made, lower
