@@ -121,7 +121,7 @@ class CommandIn(Schema):
     """
 
     uuid: UUID
-    kind: str
+    kind: Annotated[str, Field(description=f"One of {', '.join(commands.KINDS)}")]
     args: Annotated[dict[str, Any], AfterValidator(_no_trial), Field(default_factory=dict)]
     page: PageId
     epoch: Annotated[int, Field(ge=0, le=2**53)] = 0
@@ -223,7 +223,7 @@ def lease(request: HttpRequest, name: str, given: LeaseIn) -> Any:
     url_name="commands",
 )
 def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
-    """Setup, run, stop, halt, resume and so on; the same uuid again gets the first answer."""
+    """Set-up, run, stop, modes, strategy, motions, grippers; the same uuid again gets the first answer."""
     found = selectors.station_get(name=name)
     order = given.model_dump(exclude={"trial"})
     if given.trial is None:

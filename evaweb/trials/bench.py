@@ -71,8 +71,12 @@ def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
 
 
 def run_args(trial: Trial, user: User) -> dict[str, Any]:
-    """What goes into the manifest of the episode, and when the run ends by itself."""
-    args: dict[str, Any] = {"trial": trial_facts(trial), "operator": user.get_username()}
+    """What goes into the manifest of the episode, and when the run ends by itself; never simulated or by steps."""
+    args: dict[str, Any] = {
+        "trial": trial_facts(trial),
+        "operator": user.get_username(),
+        "mode": "continuous",
+    }
     if trial.time_limit_s is not None:
         args["duration_s"] = trial.time_limit_s
     return args

@@ -15,19 +15,22 @@ import zmq
 from runtime.bus import CommandServer, Endpoints, EventLog, Publisher
 from runtime.lease import Lease
 from runtime.messages import Ack, Command, Event
-from runtime.session import LEASE_COMMANDS, Effects, Happening, Session, State
+from runtime.session import LEASE_COMMANDS, Effects, Happening, Session, Situation, State
 
 DIM = 14
 
 
 class Effortless(Effects):
-    """Everything succeeds at once and moves nothing."""
+    """Everything succeeds at once and moves nothing; `situation` is what the test says it is."""
+
+    situation = Situation()
 
     def _nothing(self, *arguments: Any) -> Mapping[str, Any]:
         return {}
 
     begin_setup = cancel_setup = begin_run = hold = resume_run = end_run = _nothing
     go_home = release_estop = start_recording = stop_recording = _nothing
+    tune = step = commit = cancel = move = grip = approach = _nothing
 
 
 Effortless.__abstractmethods__ = frozenset()
@@ -45,6 +48,7 @@ class StandIn:
         self.commands: list[Command] = []
         self.pressed: list[Command] = []
         self.guard_says = "done"
+        self.effects = Effortless()
         self._folder = data / "stations" / name
         self._ended = threading.Event()
         self._do: list[Any] = []
@@ -56,7 +60,7 @@ class StandIn:
         self.boot = str(uuid4())
         self.events = EventLog()
         self.lease = Lease(self.ttl)
-        self.session = Session(Effortless(), self.lease, self.boot, time.monotonic)
+        self.session = Session(self.effects, self.lease, self.boot, time.monotonic)
         self._ended = threading.Event()
         self._main = CommandServer(context, "127.0.0.1", 0)
         self._guard = CommandServer(context, "127.0.0.1", 0)
@@ -90,6 +94,10 @@ class StandIn:
         """As after a set-up."""
         self.enter(Happening.CONNECTED)
         self.do(lambda: self.session._enter(State.READY, "set up"))
+
+    def situated(self, situation: Situation) -> None:
+        """Let the guards of commands see this."""
+        self.do(lambda: setattr(self.effects, "situation", situation))
 
     def do(self, work: Any) -> None:
         """Work in the thread of the runtime."""

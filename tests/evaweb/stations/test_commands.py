@@ -13,7 +13,7 @@ from evaweb.stations import commands, leases, stops
 from evaweb.stations.commands import NotSent, issue, settle
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.stations.stops import HARDWARE_STOP
-from runtime.session import COMMANDS, STOPPING
+from runtime.session import COMMANDS, STOPPING, Situation
 
 pytestmark = pytest.mark.django_db
 
@@ -48,6 +48,36 @@ def test_an_accepted_command_is_a_row_with_its_answer(held, runtime):
     assert found.holder == "web:ann:p1"
     assert found.answered_at >= found.issued_at
     assert [(c.kind, c.args, c.user) for c in runtime.commands] == [("run", {"operator": "ann"}, "ann")]
+
+
+@pytest.mark.parametrize(
+    ("kind", "args", "situation"),
+    [
+        ("tune", {"strategy": {"kind": "sync"}, "task": "wave"}, Situation()),
+        ("step", {}, Situation(mode="step")),
+        ("commit", {}, Situation(mode="preview", proposed=True)),
+        ("cancel", {}, Situation(mode="manual")),
+        ("move", {"joints": [0.1] * 14, "speed": 0.5}, Situation(mode="manual")),
+        ("gripper", {"arm": "left_arm", "action": "lock"}, Situation()),
+        ("approach", {}, Situation(mode="preview", proposed=True)),
+    ],
+)
+def test_what_a_run_by_hand_is_steered_with_arrives_with_its_arguments(held, runtime, kind, args, situation):
+    issue(kind="run", args={"mode": situation.mode or "continuous"}, **held, **seen(runtime))
+    runtime.situated(situation)
+    row = issue(kind=kind, args=args, **held, **seen(runtime))
+    assert (row.status, row.reason) == (CommandStatus.ACCEPTED, "")
+    assert [(c.kind, c.args) for c in runtime.commands[1:]] == [(kind, args)]
+
+
+@pytest.mark.parametrize(("kind", "args"), [("tune", {"task": "x"}), ("gripper", {"action": "open"})])
+def test_nobody_changes_what_a_trial_measures(held, runtime, kind, args):
+    issue(kind="run", **held, **seen(runtime))
+    runtime.situated(Situation(mode="continuous", trial=True))
+    row = issue(kind=kind, args=args, **held, **seen(runtime))
+    assert row.status == CommandStatus.REFUSED
+    assert "the open run is one of a trial" in row.reason
+    assert kind not in row.allowed
 
 
 def test_the_same_uuid_twice_is_one_command(held, runtime):

@@ -56,7 +56,7 @@ def test_an_accepted_run_begins_the_trial_and_its_episode(bench, wire):
     give(bench, trial, "setup")
     row = give(bench, trial, "run")
     args = heard(wire, "run")[0].args
-    assert (args["operator"], args["duration_s"]) == ("ann", 40)
+    assert (args["operator"], args["duration_s"], args["mode"]) == ("ann", 40, "continuous")
     assert args["trial"]["uuid"] == str(trial.uuid)
     assert {"checkpoint", "scene", "position", "number", "attempt", "evaluation", "version"} <= set(
         args["trial"]
