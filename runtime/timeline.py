@@ -6,10 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.types import Float64
 
 Makers = tuple[tuple[int, float], ...]  # (chunk id, weight), the weights of a step sum to 1
+HELD = 0  # the chunk id of a held target
+_TURN = 2.0 * np.pi
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +23,9 @@ class Dims:
     wrapping: tuple[int, ...] = ()  # angles without limits: blended on the circle
 
 
+_PLAIN = Dims()
+
+
 @dataclass(frozen=True, slots=True)
 class Planned:
     """The action meant for one step: float64 [D], and the chunks it was made from."""
@@ -28,8 +34,49 @@ class Planned:
     makers: Makers
 
 
+@dataclass(frozen=True, slots=True)
+class Laid:
+    """A chunk as it was placed: float64 [N, D], row 0 for step `first`."""
+
+    chunk_id: int
+    first: int
+    rows: Float64
+
+    @property
+    def end(self) -> int:
+        """The first step after its last row."""
+        return self.first + len(self.rows)
+
+
+@dataclass(frozen=True, slots=True)
+class Fade:
+    """Actions from `first` on that the plan is blended over from: [L, D], their makers, their weights [L]."""
+
+    first: int
+    rows: Float64
+    makers: tuple[Makers, ...]
+    weights: Float64
+    dims: Dims
+
+    def over(self, step: int, plan: Planned) -> Planned:
+        """`plan` for `step`, as far as it has taken over by then."""
+        index = step - self.first
+        if not 0 <= index < len(self.rows) or not self.weights[index] > 0.0:
+            return plan
+        weight = float(self.weights[index])
+        action = plan.action + weight * difference(self.rows[index], plan.action, self.dims.wrapping)
+        switched = list(self.dims.switched)
+        action[switched] = plan.action[switched]
+        return Planned(action, mixed(self.makers[index], plan.makers, weight))
+
+
 class Timeline:
-    """A contiguous run of planned actions from `first` on; empty where nothing is planned."""
+    """A contiguous run of planned actions from `first` on; empty where nothing is planned.
+
+    What is executed (`at`, `span`) is the strategy's own `plan` with a `fade` over it while one is under way: a
+    chunk that is merged meanwhile changes the plan, and the fade goes on. `laid` are the chunks that a strategy
+    which averages them still needs. Nothing of the past is kept once a chunk has been merged.
+    """
 
     def __init__(self, dim: int) -> None:
         self._dim = dim
@@ -40,57 +87,136 @@ class Timeline:
         self.first = 0
         self.rows: Float64 = np.empty((0, self._dim))
         self.makers: list[Makers] = []
+        self.laid: tuple[Laid, ...] = ()
+        self.fade: Fade | None = None
 
     def at(self, step: int) -> Planned | None:
-        """What is planned for `step`; None where nothing is."""
+        """What is to be executed at `step`; None where nothing is planned."""
         index = step - self.first
-        if 0 <= index < len(self.rows):
-            return Planned(self.rows[index], self.makers[index])
-        return None
+        if not 0 <= index < len(self.rows):
+            return None
+        plan = Planned(self.rows[index], self.makers[index])
+        return plan if self.fade is None else self.fade.over(step, plan)
 
     def remaining(self, step: int) -> int:
         """How many steps are planned from `step` on."""
         return max(0, self.first + len(self.rows) - max(step, self.first))
 
-    def span(self, step: int) -> tuple[Float64, list[Makers]]:
-        """Everything planned from `step` on: rows [N, D] and their makers; nothing if the plan starts later."""
+    def plan(self, step: int) -> tuple[Float64, list[Makers]]:
+        """The strategy's plan from `step` on: rows [N, D] and makers; nothing if the plan starts later."""
         index = step - self.first
         if index < 0:
             return self.rows[:0], []
         return self.rows[index:], self.makers[index:]
 
-    def replace(self, step: int, rows: Float64, makers: Sequence[Makers]) -> None:
+    def span(self, step: int) -> tuple[Float64, list[Makers]]:
+        """What is to be executed from `step` on: rows [N, D] and their makers."""
+        rows, makers = self.plan(step)
+        if self.fade is None:
+            return rows, makers
+        rows = rows.copy()
+        for index in range(min(len(rows), max(0, self.fade.first + len(self.fade.rows) - step))):
+            shown = self.fade.over(step + index, Planned(rows[index], makers[index]))
+            rows[index], makers[index] = shown.action, shown.makers
+        return rows, makers
+
+    def replace(
+        self, step: int, rows: Float64, makers: Sequence[Makers], laid: tuple[Laid, ...] = ()
+    ) -> None:
         """Let `rows` be the whole plan from `step` on; what was planned before `step` is over."""
         self.first = step
         self.rows = np.array(rows, np.float64)
         self.makers = list(makers)
+        self.laid = laid
+        if self.fade is not None and self.fade.first + len(self.fade.rows) <= step:
+            self.fade = None
+
+    def begin_fade(self, fade: Fade) -> None:
+        """Plan nothing, and let what is planned next be blended over from `fade`, and from nothing else."""
+        self.clear()
+        self.fade = fade
+
+
+def single(chunk_id: int, count: int) -> list[Makers]:
+    """The makers of `count` rows that come from one chunk alone."""
+    return [((chunk_id, 1.0),)] * count
+
+
+def mixed(old: Makers, new: Makers, weight: float) -> Makers:
+    """The makers of one step that is `weight` of `old` and the rest of `new`."""
+    shares: dict[int, float] = {}
+    for makers, part in ((old, weight), (new, 1.0 - weight)):
+        for maker, share in makers if part > 0.0 else ():
+            shares[maker] = shares.get(maker, 0.0) + share * part
+    return tuple(shares.items())
+
+
+def difference(old: Float64, new: Float64, wrapping: Sequence[int] = ()) -> Float64:
+    """old - new [..., D], in dimensions that wrap the shorter way round."""
+    apart: Float64 = old - new
+    if len(wrapping):
+        turning = list(wrapping)
+        apart[..., turning] -= _TURN * np.round(apart[..., turning] / _TURN)
+    return apart
+
+
+def on_branch(rows: Float64, before: Float64 | None, wrapping: Sequence[int]) -> Float64:
+    """`rows` [N, D] with angles that wrap made continuous, and starting within half a turn of `before` [D]."""
+    if not len(wrapping) or not len(rows):
+        return rows
+    turning = list(wrapping)
+    continuous = rows.copy()
+    continuous[:, turning] = np.unwrap(rows[:, turning], axis=0)
+    if before is not None:
+        continuous[:, turning] += _TURN * np.round((before[turning] - rows[0, turning]) / _TURN)
+    return continuous
+
+
+def fading(count: int, shape: str = "linear") -> Float64:
+    """Weights [count] of what is blended over from: 1 at the first row, 0 at the last; of one row 0.
+
+    "linear", "cosine" (no kink at either end), or "exponential": c (e^c - 1) / (e - 1) of the linear weight c,
+    the soft mask of real-time chunking (arXiv 2506.07339, eq. 5), which goes over sooner.
+    """
+    if count < 2:
+        return np.zeros(count)
+    linear = 1.0 - np.arange(count) / (count - 1)
+    if shape == "linear":
+        return linear
+    if shape == "cosine":
+        return np.asarray(0.5 - 0.5 * np.cos(np.pi * linear))
+    if shape == "exponential":
+        return np.asarray(linear * np.expm1(linear) / np.expm1(1.0))
+    raise ValueError(f"no blend shape {shape!r}; allowed: linear, cosine, exponential")
 
 
 def overlap_blend(
-    old: Float64, new: Float64, window: int | None, switched: Sequence[int] = ()
+    old: Float64, new: Float64, window: int | None, dims: Dims = _PLAIN, shape: str = "linear"
 ) -> tuple[Float64, Float64]:
     """`new` with its first rows blended over from `old`, and the weight of `old` in each blended row.
 
-    `old` [M, D] and `new` [N, D] start at the same step. L = min(M, N, window) rows are blended with
-    w_i = 1 - i / (L - 1), w = 0 for L = 1; `window` None is the whole overlap. Dimensions in `switched` (binary
-    grippers) take the new value at once. Written as new + w (old - new), so that equal inputs stay equal.
+    `old` [M, D] and `new` [N, D] start at the same step. L = min(M, N, window) rows are blended with the weights
+    of `fading`; `window` None is the whole overlap. Binary grippers take the new value at once. Written as
+    new + w (old - new), so that equal inputs stay equal.
     """
-    overlap = min(len(old), len(new), len(new) if window is None else window)
-    blended = new.copy()
-    if overlap < 2:
-        return blended, np.zeros(overlap)
-    weights = 1.0 - np.arange(overlap) / (overlap - 1)
-    blended[:overlap] += weights[:, None] * (old[:overlap] - new[:overlap])
-    blended[:, list(switched)] = new[:, list(switched)]
+    weights = fading(min(len(old), len(new), len(new) if window is None else window), shape)
+    blended, count, switched = new.copy(), len(weights), list(dims.switched)
+    blended[:count] += weights[:, None] * difference(old[:count], new[:count], dims.wrapping)
+    blended[:, switched] = new[:, switched]
     return blended, weights
 
 
 def resample(
-    rows: Float64, rate: float, control_rate: float, switched: Sequence[int] = ()
-) -> tuple[Float64, np.ndarray]:
+    rows: Float64,
+    rate: float,
+    control_rate: float,
+    switched: Sequence[int] = (),
+    wrapping: Sequence[int] = (),
+) -> tuple[Float64, NDArray[np.int64]]:
     """`rows` [H, D] of `rate` Hz at `control_rate` Hz, and the source row each one came from.
 
-    Linear between rows, the last row held for its own period; dimensions in `switched` are held, not blended.
+    Linear between rows, the last row held for its own period; dimensions in `switched` are held, not blended;
+    those in `wrapping` go the shorter way round.
     """
     if rate == control_rate or not len(rows):
         return rows, np.arange(len(rows))
@@ -99,6 +225,6 @@ def resample(
     lower = np.floor(position + 1e-9).astype(np.int64)
     upper = np.minimum(lower + 1, len(rows) - 1)
     part = np.clip(position - lower, 0.0, 1.0)[:, None]
-    resampled = rows[lower] + part * (rows[upper] - rows[lower])
+    resampled = rows[lower] + part * difference(rows[upper], rows[lower], wrapping)
     resampled[:, list(switched)] = rows[lower][:, list(switched)]
     return resampled, lower

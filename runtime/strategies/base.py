@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -12,10 +11,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from runtime.section import Section
-from runtime.timeline import Makers, Timeline
+from runtime.timeline import HELD, Dims, Fade, Makers, Timeline, fading, on_branch, single
 from runtime.types import Float64
 
 BlendShape = Literal["linear", "cosine", "exponential"]
+JOIN_WINDOW = 8  # steps over which a chunk takes over from what it does not continue
 
 
 class StrategyParameters(Section):
@@ -66,8 +66,9 @@ class Merged:
     """Where a chunk fell.
 
     `arrival_step` is the first tick not yet sent, `delay` = arrival_step - observation_step. `targets` int64 [H]
-    is the step each row was planned for, -1 where it was dropped. `mistimed` steps were shifted by k_max.
-    `dropped` says why nothing of the chunk was used, "" where something was.
+    is the step each row was planned for, -1 where it was dropped. `mistimed` is how many steps later than meant
+    its rows are executed (k_max); negative where it arrived before the step it is for. `dropped` says why nothing
+    of the chunk was used, "" where something was.
     """
 
     chunk_id: int
@@ -76,7 +77,22 @@ class Merged:
     targets: NDArray[np.int64]
     mistimed: int = 0
     dropped: str = ""
-    overlap: int = 0  # steps from arrival_step on that were blended with what was planned before
+    overlap: int = (
+        0  # steps from arrival_step on that more than one chunk makes, or a chunk and a held target
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Which rows of a chunk are used: [N, D], row 0 for step `merged.arrival_step`; none where it is dropped."""
+
+    rows: Float64
+    merged: Merged
+
+    @property
+    def first(self) -> int:
+        """The step of row 0."""
+        return self.merged.arrival_step
 
 
 class Query(ABC):
@@ -90,26 +106,79 @@ class Query(ABC):
         """Whether to ask now."""
 
 
+class Paced(Query):
+    """Asks while the robot moves: back to back, or at a rate [Hz], never with a request in flight."""
+
+    def __init__(self, inference_rate: float | None) -> None:
+        self._period = 0.0 if inference_rate is None else 1.0 / inference_rate
+
+    def wants(self, progress: Progress) -> bool:
+        return not progress.in_flight and progress.since_request >= self._period - 1e-6
+
+
 class Merge(ABC):
     """Lets a chunk join the timeline; a pure function of timeline, chunk and first free step."""
 
     waits: bool = False  # an empty timeline is this strategy's way of waiting, not starvation
 
     @abstractmethod
+    def place(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Placement:
+        """Which rows fall on which steps, or why none does; changes nothing."""
+
+    @abstractmethod
+    def lay(self, timeline: Timeline, placed: Placement) -> None:
+        """Change what is planned from `placed.first` on; never called for a chunk that is dropped."""
+
     def __call__(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Merged:
-        """Change `timeline` from `free_step` on and say where the rows went."""
+        """Change `timeline` from `free_step` on and say where the rows went; nothing is joined to."""
+        return join(self, timeline, arrival, free_step, None, Dims())
 
 
-def single(chunk_id: int, count: int) -> list[Makers]:
-    """The makers of `count` rows that come from one chunk alone."""
-    return [((chunk_id, 1.0),)] * count
+def join(
+    merge: Merge,
+    timeline: Timeline,
+    arrival: Arrival,
+    free_step: int,
+    held: Float64 | None,
+    dims: Dims,
+    *,
+    joining: bool = False,
+    commanded: Float64 | None = None,
+) -> Merged:
+    """Merge a chunk; where it does not continue what came before it, fade over from that: no strategy may jump.
+
+    `held` [D] is the target that is held because nothing was planned (starvation, a run's far first chunk): the
+    chunk takes over from it within JOIN_WINDOW steps, or its own length if it is shorter. `joining` says that the
+    strategy's kind was switched since the last chunk that was merged: the new plan takes over from the old one,
+    whose last target is held as long as needed; keep it set until a chunk is not dropped. Where neither is given
+    the strategy alone decides. Later chunks may be merged while a fade is under way: it goes on over their plan.
+    `commanded` [D] is the last target sent: angles that wrap stay on its branch where nothing is planned, and
+    `joining` starts from it. Nothing is changed where the chunk is dropped. The makers of every step sum to 1;
+    chunk id 0 (timeline.HELD) is a held target.
+    """
+    placed = merge.place(timeline, arrival, free_step)
+    if placed.merged.dropped:
+        return placed.merged
+    planned = timeline.at(free_step)
+    before = commanded if planned is None else planned.action
+    before = before if held is None else held
+    placed = replace(placed, rows=on_branch(placed.rows, before, dims.wrapping))
+    if held is not None:
+        _fade(timeline, free_step, held[None], [], min(JOIN_WINDOW, len(placed.rows)), dims)
+    elif joining and planned is not None:
+        _fade(timeline, free_step, *timeline.span(free_step), JOIN_WINDOW, dims)
+    elif joining and commanded is not None and not arrival.waited:
+        _fade(timeline, free_step, commanded[None], [], JOIN_WINDOW, dims)
+    merge.lay(timeline, placed)
+    overlap = sum(len(makers) > 1 for makers in timeline.span(free_step)[1])
+    return replace(placed.merged, overlap=overlap)
 
 
-def mixed(old: Sequence[Makers], weights: Sequence[float], chunk_id: int, count: int) -> list[Makers]:
-    """The makers of `count` rows of which the first `len(weights)` were blended over from `old`."""
-    made = single(chunk_id, count)
-    for index, weight in enumerate(weights):
-        if weight > 0.0:
-            kept = tuple((maker, share * weight) for maker, share in old[index])
-            made[index] = (*kept, (chunk_id, 1.0 - weight)) if weight < 1.0 else kept
-    return made
+def _fade(timeline: Timeline, step: int, rows: Float64, makers: list[Makers], count: int, dims: Dims) -> None:
+    """Let what is planned next take over from `rows` within `count` steps; the last row is held where they end.
+
+    Rows beyond `makers` are held targets.
+    """
+    last = np.minimum(np.arange(count), len(rows) - 1)
+    made = [*makers[:count], *single(HELD, max(0, count - len(makers)))]
+    timeline.begin_fade(Fade(step, rows[last], tuple(made), fading(count), dims))

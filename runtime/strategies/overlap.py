@@ -6,61 +6,48 @@ the default window is shorter because "all" takes over 30 steps to follow a chan
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
-import numpy as np
+from runtime.strategies.base import Arrival, Merge, Paced, Placement, Query, StrategyParameters
+from runtime.strategies.placing import place
+from runtime.timeline import Dims, Timeline, mixed, overlap_blend, single
 
-from runtime.strategies.base import Arrival, Merge, Merged, Progress, Query, StrategyParameters, mixed
-from runtime.timeline import Timeline, overlap_blend
+USES = frozenset({"execution_horizon", "inference_rate", "k_max", "blend_window", "blend_shape"})
 
 
 class Config(StrategyParameters):
-    """Settings of the async strategy."""
+    """Ask while moving; a new chunk is blended over from the rest of the old one."""
 
     kind: Literal["async"] = "async"
 
 
-class AsyncQuery(Query):
-    """Asks back to back, or at a rate, never with a request in flight."""
-
-    def __init__(self, inference_rate: float | None) -> None:
-        self._period = 0.0 if inference_rate is None else 1.0 / inference_rate
-
-    def wants(self, progress: Progress) -> bool:
-        return not progress.in_flight and progress.since_request >= self._period - 1e-6
-
-
-class AsyncMerge(Merge):
+class OverlapMerge(Merge):
     """Drops what is stale, puts every row on the step it was meant for, blends over the overlap."""
 
-    def __init__(self, k_max: int | None, window: int | None, switched: Sequence[int]) -> None:
-        self._k_max = k_max
-        self._window = window
-        self._switched = tuple(switched)
+    def __init__(self, parameters: StrategyParameters, dims: Dims) -> None:
+        self._horizon = parameters.execution_horizon
+        self._k_max = parameters.k_max
+        self._window = None if parameters.blend_window == "all" else parameters.blend_window
+        self._shape = parameters.blend_shape
+        self._dims = dims
 
-    def __call__(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Merged:
-        delay = free_step - arrival.observation_step
-        horizon = len(arrival.rows)
-        targets = np.full(horizon, -1, np.int64)
-        if delay >= horizon:
-            why = f"arrived {delay} steps after its observation, its {horizon} rows are all in the past"
-            return Merged(arrival.chunk_id, free_step, delay, targets, dropped=why)
-        stale = delay if self._k_max is None else min(delay, self._k_max)
-        new = arrival.rows[stale:]
-        old, makers = timeline.span(free_step)
-        rows, weights = overlap_blend(old, new, self._window, self._switched)
-        timeline.replace(free_step, rows, mixed(makers, weights.tolist(), arrival.chunk_id, len(rows)))
-        targets[stale:] = free_step + np.arange(horizon - stale)
-        return Merged(arrival.chunk_id, free_step, delay, targets, mistimed=delay - stale)
+    def place(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Placement:
+        return place(arrival, free_step, self._horizon, self._k_max)
+
+    def lay(self, timeline: Timeline, placed: Placement) -> None:
+        old, makers = timeline.plan(placed.first)
+        rows, weights = overlap_blend(old, placed.rows, self._window, self._dims, self._shape)
+        made = single(placed.merged.chunk_id, len(rows))
+        for index, weight in enumerate(weights.tolist()):
+            made[index] = mixed(makers[index], made[index], weight)
+        timeline.replace(placed.first, rows, made)
 
 
 def query(config: Config) -> Query:
     """The asking half."""
-    return AsyncQuery(config.inference_rate)
+    return Paced(config.inference_rate)
 
 
-def merge(config: Config, switched: Sequence[int]) -> Merge:
-    """The merging half; `switched` are the binary gripper dimensions, which never blend."""
-    window = None if config.blend_window == "all" else config.blend_window
-    return AsyncMerge(config.k_max, window, switched)
+def merge(config: Config, dims: Dims) -> Merge:
+    """The merging half; `dims` says what does not blend as numbers do."""
+    return OverlapMerge(config, dims)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
-import numpy as np
+from runtime.strategies.base import Arrival, Merge, Placement, Progress, Query, StrategyParameters
+from runtime.strategies.placing import dropped, place
+from runtime.timeline import Dims, Timeline, single
 
-from runtime.strategies.base import Arrival, Merge, Merged, Progress, Query, StrategyParameters, single
-from runtime.timeline import Timeline
+USES = frozenset({"execution_horizon"})
 
 
 class Config(StrategyParameters):
-    """Settings of the sync strategy."""
+    """Ask, execute the answer in order, ask again; the robot stands while it waits."""
 
     kind: Literal["sync"] = "sync"
 
@@ -20,25 +20,31 @@ class Config(StrategyParameters):
 class SyncQuery(Query):
     """Asks when nothing is left to execute."""
 
+    waits = True
+
     def wants(self, progress: Progress) -> bool:
         return progress.remaining == 0 and not progress.in_flight
 
 
 class SyncMerge(Merge):
-    """Anchors row 0 at the first free step: while the robot stands nothing is stale."""
+    """Executes what was asked while the robot stood, whole; refuses what was asked while it moved."""
 
     waits = True
 
     def __init__(self, execution_horizon: int | None) -> None:
         self._horizon = execution_horizon
 
-    def __call__(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Merged:
-        rows = arrival.rows[: self._horizon]
-        timeline.replace(free_step, rows, single(arrival.chunk_id, len(rows)))
-        targets = np.full(len(arrival.rows), -1, np.int64)
-        targets[: len(rows)] = free_step + np.arange(len(rows))
-        delay = free_step - arrival.observation_step
-        return Merged(arrival.chunk_id, free_step, delay, targets)
+    def place(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Placement:
+        if arrival.waited:
+            return place(arrival, free_step, self._horizon)
+        left = timeline.remaining(free_step)
+        then = (
+            f"the {left} steps still planned are finished first" if left else "the next is asked as it stands"
+        )
+        return dropped(arrival, free_step, f"asked while the robot moved, and sync waits: {then}")
+
+    def lay(self, timeline: Timeline, placed: Placement) -> None:
+        timeline.replace(placed.first, placed.rows, single(placed.merged.chunk_id, len(placed.rows)))
 
 
 def query(config: Config) -> Query:
@@ -46,6 +52,6 @@ def query(config: Config) -> Query:
     return SyncQuery()
 
 
-def merge(config: Config, switched: Sequence[int]) -> Merge:
-    """The merging half; `switched` are the binary gripper dimensions."""
+def merge(config: Config, dims: Dims) -> Merge:
+    """The merging half."""
     return SyncMerge(config.execution_horizon)

@@ -17,9 +17,9 @@ from runtime.sim.plant import Plant
 from runtime.sim.render import Renderer
 from runtime.sim.script import Answer
 from runtime.sim.tabletop import Reset, Tabletop
+from runtime.strategies import overlap
 from runtime.strategies.base import Arrival
-from runtime.strategies.overlap import AsyncMerge
-from runtime.timeline import Timeline
+from runtime.timeline import Dims, Timeline
 from runtime.types import Float64, UInt8
 
 ROBOT = robots.load("agilex_piper")
@@ -93,7 +93,7 @@ class Trial:
 
     def run(self, seconds: float = 30.0, to_the_end: bool = False) -> Outcome:
         """Ask back to back, every answer `delay` ticks late, until success or for so long."""
-        timeline, merge = Timeline(ROBOT.dim), AsyncMerge(None, 8, ())
+        timeline, merge = Timeline(ROBOT.dim), overlap.merge(overlap.Config(), Dims())
         safety = SafetyFilter(SafetySettings(), _LIMITS)
         previous, velocity = self.plant.target.copy(), np.zeros(ROBOT.dim)
         notes: list[str] = []

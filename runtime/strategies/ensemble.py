@@ -1,0 +1,79 @@
+"""`ensemble`: ask while moving; every chunk that covers a step has a say in it (ACT, arXiv 2304.13705)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from runtime.strategies.base import Arrival, Merge, Paced, Placement, Query, StrategyParameters
+from runtime.strategies.placing import place
+from runtime.timeline import Dims, Laid, Makers, Timeline, difference
+from runtime.types import Float64
+
+USES = frozenset({"inference_rate", "k_max", "ensemble_m", "ensemble_horizon"})
+
+
+class Config(StrategyParameters):
+    """Ask while moving; every chunk that covers a step has a say in it, the oldest the greatest."""
+
+    kind: Literal["ensemble"] = "ensemble"
+
+
+class EnsembleMerge(Merge):
+    """Averages, step by step, the chunks that cover it, with weights exp(-m * rank), rank 0 the oldest.
+
+    Chunks are whole, uncropped, each on the steps it was meant for; at most `horizon` of them, the newest, count.
+    The timeline keeps those that still cover something. It is the mean as the newest plus what the others differ,
+    so that equal chunks average to themselves exactly.
+    """
+
+    def __init__(self, k_max: int | None, m: float, horizon: int, dims: Dims) -> None:
+        self._k_max = k_max
+        self._m = m
+        self._horizon = horizon
+        self._dims = dims
+
+    def place(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Placement:
+        return place(arrival, free_step, k_max=self._k_max)
+
+    def lay(self, timeline: Timeline, placed: Placement) -> None:
+        step = placed.first
+        older = (
+            Laid(old.chunk_id, step, old.rows[step - old.first :]) for old in timeline.laid if old.end > step
+        )
+        laid = (*older, Laid(placed.merged.chunk_id, step, placed.rows))[-self._horizon :]
+        rows: list[Float64] = []
+        makers: list[Makers] = []
+        begin = step
+        for end in sorted({chunk.end for chunk in laid}):
+            covering = [chunk for chunk in laid if chunk.end >= end]
+            mean, made = self._average(covering, slice(begin - step, end - step))
+            rows.append(mean)
+            makers.extend([made] * (end - begin))
+            begin = end
+        timeline.replace(step, np.concatenate(rows), makers, laid)
+
+    def _average(self, chunks: Sequence[Laid], part: slice) -> tuple[Float64, Makers]:
+        """The rows `part` that `chunks`, oldest first, make together, and the weights of each."""
+        weights = np.exp(-self._m * np.arange(len(chunks)))
+        weights /= weights.sum()
+        newest = chunks[-1].rows[part]
+        mean = newest.copy()
+        for chunk, weight in zip(chunks[:-1], weights.tolist(), strict=False):
+            mean += weight * difference(chunk.rows[part], newest, self._dims.wrapping)
+        switched = list(self._dims.switched)
+        mean[:, switched] = newest[:, switched]
+        shares = zip(chunks, weights.tolist(), strict=True)
+        return mean, tuple((chunk.chunk_id, weight) for chunk, weight in shares)
+
+
+def query(config: Config) -> Query:
+    """The asking half."""
+    return Paced(config.inference_rate)
+
+
+def merge(config: Config, dims: Dims) -> Merge:
+    """The merging half; `dims` says what does not average as numbers do."""
+    return EnsembleMerge(config.k_max, config.ensemble_m, config.ensemble_horizon, dims)

@@ -1,0 +1,44 @@
+"""Which rows of a chunk fall on which steps: the one rule of every strategy."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.strategies.base import Arrival, Merged, Placement
+
+
+def place(
+    arrival: Arrival, free_step: int, horizon: int | None = None, k_max: int | None = None
+) -> Placement:
+    """Row i is for observation_step + i; rows for steps before `free_step` are stale and dropped.
+
+    The chunk is cropped to `horizon` rows. With `k_max` at most that many rows are dropped and the rest is shifted,
+    which is mistimed. A chunk that `waited` begins at `free_step` whole. One that lies in the past is dropped,
+    whatever k_max says. A chunk that is early, by an observation whose step was taken too high, begins at once.
+    """
+    delay = free_step - arrival.observation_step
+    count = len(arrival.rows) if horizon is None else min(horizon, len(arrival.rows))
+    due = 0 if arrival.waited else delay
+    if due >= count:
+        return dropped(arrival, free_step, _past(delay, count, len(arrival.rows)))
+    stale = max(0, due if k_max is None else min(due, k_max))
+    targets = np.full(len(arrival.rows), -1, np.int64)
+    targets[stale:count] = free_step + np.arange(count - stale)
+    merged = Merged(arrival.chunk_id, free_step, delay, targets, mistimed=due - stale)
+    return Placement(arrival.rows[stale:count], merged)
+
+
+def dropped(arrival: Arrival, free_step: int, why: str) -> Placement:
+    """A chunk that is not used."""
+    nowhere = np.full(len(arrival.rows), -1, np.int64)
+    delay = free_step - arrival.observation_step
+    return Placement(arrival.rows[:0], Merged(arrival.chunk_id, free_step, delay, nowhere, dropped=why))
+
+
+def _past(delay: int, count: int, rows: int) -> str:
+    used = (
+        f"its {rows} rows"
+        if count == rows
+        else f"the first {count} of its {rows} rows, its execution horizon,"
+    )
+    return f"arrived {delay} steps after its observation, {used} are all in the past"
