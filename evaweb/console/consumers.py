@@ -22,10 +22,11 @@ from channels.generic.websocket import AsyncWebsocketConsumer
 from django.db import Error
 
 from evaweb.console import requests
+from evaweb.console.aims import Aims
 from evaweb.console.hub import Room, hub
 from evaweb.console.logins import role_now
 from evaweb.console.mailbox import Mailbox
-from evaweb.console.requests import BadRequest, Credit, EStop, Events, Renew, Request, Stop, Watch
+from evaweb.console.requests import Aim, BadRequest, Credit, EStop, Events, Renew, Request, Stop, Watch
 from evaweb.errors import NotFound, StationGone
 from evaweb.roles import Role, role_of
 from evaweb.stations import commands, leases, stops
@@ -57,6 +58,7 @@ class StationConsumer(AsyncWebsocketConsumer):
         self._tasks: list[asyncio.Task[None]] = []
         self._room: Room | None = None
         self._mailbox: Mailbox | None = None
+        self._aims: Aims | None = None
         self._renewing = False
         self._errors = 0
 
@@ -98,6 +100,7 @@ class StationConsumer(AsyncWebsocketConsumer):
         self._username = self._user.get_username()
         hello = {"station": station.name, "user": self._username, "role": role, "page": self._page}
         self._say({"type": "hello", **hello, "facts": facts})
+        self._aims = Aims(station, self._username, role, self._say)
         self._room = hub().room(station.name, station.robot)
         self._mailbox = self._room.join(self._outbox.put_nowait)
         self._tasks = [asyncio.create_task(work) for work in (self._write(), self._follow_login(role))]
@@ -140,6 +143,7 @@ class StationConsumer(AsyncWebsocketConsumer):
     def _do(self, request: Request) -> None:
         assert self._room is not None
         assert self._mailbox is not None
+        assert self._aims is not None
         if isinstance(request, EStop):
             _go_on(self._press(request))
         elif isinstance(request, Stop):
@@ -156,6 +160,8 @@ class StationConsumer(AsyncWebsocketConsumer):
         elif isinstance(request, Events):
             self._mailbox.want_events(request.after, request.boot)
             self._room.ring()
+        elif isinstance(request, Aim) and self._aims.ask(request):
+            _go_on(self._aims.answer())
 
     async def _press(self, request: EStop) -> None:
         """Press and say what came of it; then write it down."""

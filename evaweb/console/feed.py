@@ -125,18 +125,19 @@ class _Reader(ABC):
 
 
 class _Numbers(_Reader):
-    """State, joints and events, from main."""
+    """State, joints, chunks and events, from main."""
 
     def __init__(self, feed: Feed, wire: StationWire) -> None:
-        super().__init__(wire, "main", "state", ("state", "joints", "event"))
+        super().__init__(wire, "main", "state", ("state", "joints", "chunk", "event"))
         self._feed = feed
 
     def heard(self, found: Mapping[str, Any]) -> None:
         feed = self._feed
         if feed.link != Link(True):
             feed.tell("link", Link(True))
-        if "joints" in found:
-            feed.tell("joints", found["joints"])
+        for stream in ("joints", "chunk"):
+            if stream in found:
+                feed.tell(stream, found[stream])
         if "state" in found:
             feed.tell("state", _whole(found["state"]))
         if "event" in found or self._behind():

@@ -3,57 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import time
 from collections.abc import Iterable
 from typing import Any
 from weakref import WeakKeyDictionary
 
-import numpy as np
-
 from evaweb.console import changes, parts
+from evaweb.console.encoder import Encoder
 from evaweb.console.feed import Feeds, History, Link, feeds
 from evaweb.console.mailbox import Deliver, Mailbox
 from evaweb.console.parts import Part
-from evaweb.errors import NotFound
-from evaweb.stations.geometry import Looks, looks_of
-from robots import RobotError
 
-log = logging.getLogger(__name__)
 _FLUSH_S = 1 / 40  # frames leave at most so often
 _CHANGES_S = 1.0
-_VECTORS = ("measured", "raw", "planned", "commanded")  # of the joints, as runtime.main publishes them
-
-
-class Encoder:
-    """Makes parts of what a feed tells, in the feed's own threads."""
-
-    def __init__(self, robot: str) -> None:
-        self._looks = _looks(robot)
-
-    def encode(self, stream: str, content: Any) -> list[Part]:
-        """The parts that `content` of a stream is shown as."""
-        now = time.monotonic()
-        if stream == "state":
-            return [parts.facts(stream, content, now)]
-        if stream == "joints":
-            return self._joints(content, now)
-        if stream.startswith("camera/"):
-            return [parts.picture(stream, content, now)]
-        return []
-
-    def _joints(self, content: dict[str, Any], now: float) -> list[Part]:
-        vectors = {name: np.asarray(content[name]) for name in _VECTORS if name in content}
-        measured, commanded = vectors["measured"], vectors["commanded"]
-        words = {key: content[key] for key in content if key not in vectors}
-        made = [parts.numbers("joints", words, vectors, now)]
-        rows = (
-            [measured, commanded] if content.get("engaged") and np.isfinite(commanded).all() else [measured]
-        )
-        if self._looks and np.isfinite(measured).all() and measured.shape == (self._looks.robot.dim,):
-            poses = self._looks.poses(np.stack(rows))
-            made.append(parts.array("poses", poses if len(rows) > 1 else poses[0], now))
-        return made
 
 
 class Room:
@@ -183,12 +145,3 @@ def hub() -> LiveHub:
     """The hub of the running event loop."""
     loop = asyncio.get_running_loop()
     return _hubs.setdefault(loop, LiveHub(loop))
-
-
-def _looks(robot: str) -> Looks | None:
-    """None: the robot is not drawn, and the log says why."""
-    try:
-        return looks_of(robot)
-    except (NotFound, RobotError) as error:
-        log.error("no 3D scene: %s", error)
-        return None

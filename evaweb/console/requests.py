@@ -11,7 +11,7 @@ from uuid import UUID, uuid4
 
 from evaweb.errors import EvaError
 
-STREAMS = ("state", "joints", "poses")
+STREAMS = ("state", "joints", "recent", "poses", "chunk")
 PAGE = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _LONGEST_WHY = 240
 
@@ -64,7 +64,15 @@ class Events:
     boot: str
 
 
-Request = Watch | Credit | Renew | EStop | Stop | Events
+@dataclass(frozen=True, slots=True)
+class Aim:
+    """Where the robot would go with these arguments of the runtime's `aim`; the answer has the page's own `id`."""
+
+    id: int
+    args: Mapping[str, Any]
+
+
+Request = Watch | Credit | Renew | EStop | Stop | Events | Aim
 
 
 def parse(text: str, cameras: Collection[str]) -> Request:
@@ -94,6 +102,13 @@ def _whole(said: Mapping[str, Any], key: str) -> int:
     value = said.get(key)
     if type(value) is not int or not 0 <= value <= 2**53:
         raise BadRequest(f"{key} = {value!r:.40}; allowed: a whole number from 0 on")
+    return value
+
+
+def _map(said: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = said.get(key)
+    if not isinstance(value, dict):
+        raise BadRequest(f"{key} = {value!r:.40}; allowed: a map")
     return value
 
 
@@ -129,4 +144,5 @@ _READ: dict[str, Callable[[Mapping[str, Any]], Request]] = {
     "stop": _stop("stop"),
     "halt": _stop("halt"),
     "events": lambda said: Events(_whole(said, "after"), _text(said, "boot", "")),
+    "aim": lambda said: Aim(_whole(said, "id"), _map(said, "args")),
 }

@@ -48,6 +48,19 @@ class Looks:
         found = np.swapaxes(self.scene.poses(np.asarray(q, np.float64)), -1, -2)
         return found.reshape(*found.shape[:-2], 16).astype(np.float32)
 
+    def tips(self, links: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Where the fingertips are for parts at `links` [..., P, 16]: float32 [..., arms, 3], in the world [m]."""
+        arms = [arm for arm in self.robot.arms if arm.tip is not None]
+        found = np.empty((*links.shape[:-2], len(arms), 3), np.float32)
+        for index, arm in enumerate(arms):
+            part = links[..., self.carrier(arm), :].reshape(*links.shape[:-2], 4, 4)  # its columns as rows
+            found[..., index, :] = (arm.tip[:, 3] @ part)[..., :3]
+        return found
+
+    def carrier(self, arm: robots.Group) -> int:
+        """The part that carries an arm's fingertips."""
+        return self.scene.part(f"{arm.name}/{arm.eef_link}")
+
     def facts(self) -> dict[str, Any]:
         """Names of joints and cameras, and the robot's title."""
         return {
@@ -104,7 +117,7 @@ def _tips(looks: Looks) -> list[dict[str, Any]]:
     return [
         {
             "group": arm.name,
-            "part": looks.scene.part(f"{arm.name}/{arm.eef_link}"),
+            "part": looks.carrier(arm),
             "pose": arm.tip.T.ravel().tolist(),
         }
         for arm in looks.robot.arms

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -48,6 +49,8 @@ class StandIn:
         self.commands: list[Command] = []
         self.pressed: list[Command] = []
         self.guard_says = "done"
+        self.aims: list[Command] = []
+        self.aim_says = Ack("", "done", data={"joints": [0.2] * DIM, "reached": True})
         self.effects = Effortless()
         self._folder = data / "stations" / name
         self._ended = threading.Event()
@@ -105,6 +108,10 @@ class StandIn:
         self._do.append((work, done))
         assert done.wait(10)
 
+    def publish(self, stream: str, content: Mapping[str, Any]) -> None:
+        """Publish it once."""
+        self.do(lambda: self._streams.publish(stream, content))
+
     def snapshot(self) -> dict[str, Any]:
         held = self.lease.current(time.monotonic())
         return {
@@ -158,6 +165,9 @@ class StandIn:
         if command.kind == "events_since":
             rows = self.events.since(command.args["number"])
             return Ack(command.uuid, "done", boot=self.boot, data={"events": rows})
+        if command.kind == "aim":
+            self.aims.append(command)
+            return replace(self.aim_says, uuid=command.uuid)
         if command.kind not in LEASE_COMMANDS:
             self.commands.append(command)
         before = self.session.state

@@ -522,3 +522,74 @@ def test_a_station_with_an_unknown_robot_can_be_stopped_all_the_same(live, ann, 
         await _written()
 
     run(scenario())
+
+
+def test_an_operator_aims_over_the_socket_and_nothing_is_commanded(live, ann, runtime):
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        await page.say(type="aim", id=5, args={"pose": "home"})
+        found = await page.told("aimed")
+        assert (found["id"], found["ok"], found["reached"], len(found["links"])) == (5, True, True, 20 * 16)
+        await page.close()
+
+    run(scenario())
+    assert runtime.commands == []
+    assert not Command.objects.exists()
+
+
+def test_a_viewer_aims_at_nothing(live, vera, runtime):
+    async def scenario():
+        page = await Page(live.name, vera).open()
+        await page.say(type="aim", id=5, args={"pose": "home"})
+        assert not (await page.told("aimed"))["ok"]
+        await page.close()
+
+    run(scenario())
+    assert runtime.aims == []
+
+
+def test_an_aim_that_hangs_keeps_no_stop_and_no_command_waiting(live, ann, runtime):
+    lease = leases.claim(user=ann, station=live, page="p1")
+    runtime.swallows.add("aim")
+    runtime.ready()
+    runtime.do(lambda: runtime.session._enter(State.RUNNING, ""))
+
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        await page.say(type="aim", id=1, args={})
+        given = {"user": ann, "station": live, "page": "p1", "epoch": lease.epoch, "boot": runtime.boot}
+        row = await asyncio.to_thread(_given, kind="stop", **given)
+        assert row.status == CommandStatus.ACCEPTED
+        await page.say(type="renew", epoch=lease.epoch)
+        assert (await page.told("renewed"))["ok"]
+        assert all(text["type"] != "aimed" for text in page.texts)
+        late = await page.told("aimed")
+        assert "has not answered aim in time" in late["reason"]
+        await page.close()
+
+    run(scenario())
+
+
+def _given(**command):
+    try:
+        return commands.issue(**command)
+    finally:
+        connections.close_all()
+
+
+def test_the_chunk_and_every_sample_of_the_joints_are_shown(live, ann, runtime):
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        await page.say(type="watch", streams=["recent", "chunk"])
+        frame = await page.shown(lambda streams: "recent" in streams)
+        assert frame.array("recent", "executed").shape[1] == 14
+        rows = [[0.1] * 14] * 3
+        await asyncio.to_thread(
+            runtime.publish, "chunk", {"chunk": 4, "state": "merged", "targets": [-1, 7, 8], "rows": rows}
+        )
+        frame = await page.shown(lambda streams: "chunk" in streams)
+        assert frame.header["streams"]["chunk"]["json"]["targets"] == [-1, 7, 8]
+        assert frame.array("chunk", "tips").shape == (3, 2, 3)
+        await page.close()
+
+    run(scenario())

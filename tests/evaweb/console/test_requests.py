@@ -9,7 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaweb.console.requests import BadRequest, Credit, EStop, Events, Renew, Stop, Watch, parse
+from evaweb.console.requests import (
+    Aim,
+    BadRequest,
+    Credit,
+    EStop,
+    Events,
+    Renew,
+    Stop,
+    Watch,
+    parse,
+)
 
 CAMERAS = ("cam_high", "cam_left_wrist")
 
@@ -27,6 +37,8 @@ def test_requests_are_read():
     assert said(type="stop", uuid=str(uuid), epoch=4) == Stop("stop", uuid, 4)
     assert said(type="halt", uuid=str(uuid), epoch=4) == Stop("halt", uuid, 4)
     assert said(type="events", after=7) == Events(7, "")
+    assert said(type="watch", streams=["recent", "chunk"]) == Watch(("recent", "chunk"))
+    assert said(type="aim", id=3, args={"pose": "home"}) == Aim(3, {"pose": "home"})
     assert said(type="events", after=7, boot="b") == Events(7, "b")
 
 
@@ -35,7 +47,7 @@ def test_requests_are_read():
     [
         (
             {"type": "jump"},
-            "type 'jump' is unknown; allowed: watch, credit, renew, estop, stop, halt, events",
+            "type 'jump' is unknown; allowed: watch, credit, renew, estop, stop, halt, events, aim",
         ),
         ({"type": "watch", "streams": "state"}, "streams = 'state'; allowed: a list of state, joints"),
         ({"type": "watch", "streams": ["camera/none"]}, "camera/cam_left_wrist"),
@@ -44,6 +56,8 @@ def test_requests_are_read():
         ({"type": "renew", "epoch": True}, "epoch = True"),
         ({"type": "events", "after": -1}, "after = -1"),
         ({"type": "events", "after": 0, "boot": 5}, "boot = 5; allowed: a text"),
+        ({"type": "aim", "id": 1}, "args = None; allowed: a map"),
+        ({"type": "aim", "id": -1, "args": {}}, "id = -1; allowed: a whole number"),
         ({"type": ["watch"]}, "is unknown"),
     ],
 )

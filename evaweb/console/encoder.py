@@ -1,0 +1,79 @@
+"""What a station publishes as parts of frames: made once for all who watch, in the feed's own threads."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaweb.console import parts
+from evaweb.console.chunks import chunk_part
+from evaweb.console.parts import Part
+from evaweb.console.recent import Recent
+from evaweb.errors import NotFound
+from evaweb.stations.geometry import Looks, looks_of
+from robots import RobotError
+
+log = logging.getLogger(__name__)
+_VECTORS = ("measured", "raw", "planned", "commanded", "simulated")  # of the joints, as the runtime has them
+
+
+class Encoder:
+    """Makes parts of what a feed tells."""
+
+    def __init__(self, robot: str) -> None:
+        self._looks = _looks(robot)
+        self._recent = Recent()
+
+    def encode(self, stream: str, content: Any) -> list[Part]:
+        """The parts that `content` of a stream is shown as."""
+        now = time.monotonic()
+        if stream == "state":
+            return [parts.facts(stream, content, now)]
+        if stream == "joints":
+            return self._joints(content, now)
+        if stream == "chunk":
+            return [chunk_part(content, self._looks, now)]
+        if stream.startswith("camera/"):
+            return [parts.picture(stream, content, now)]
+        return []
+
+    def _joints(self, content: Mapping[str, Any], now: float) -> list[Part]:
+        vectors = {name: np.asarray(content[name], np.float32) for name in _VECTORS if name in content}
+        words = {key: content[key] for key in content if key not in vectors}
+        made = [parts.numbers("joints", words, vectors, now), self._recent.with_one_more(vectors, words, now)]
+        if self._looks and _drawable(vectors["measured"], self._looks):
+            rows = shown_rows(vectors, engaged=bool(content.get("engaged")))
+            poses = self._looks.poses(rows)
+            made.append(parts.array("poses", poses if len(rows) > 1 else poses[0], now))
+        return made
+
+
+def shown_rows(vectors: Mapping[str, NDArray[Any]], *, engaged: bool) -> NDArray[np.float32]:
+    """The joints of each robot that is drawn: measured; commanded; of a run in simulation the simulated one.
+
+    float32 [1, 2 or 3, D]. Where nothing is commanded but something is simulated the second row is NaN.
+    """
+    measured, commanded = vectors["measured"], vectors["commanded"]
+    sent = engaged and bool(np.isfinite(commanded).all())
+    simulated = vectors.get("simulated")
+    if simulated is not None and simulated.shape == measured.shape and np.isfinite(simulated).all():
+        return np.stack([measured, commanded if sent else np.full_like(measured, np.nan), simulated])
+    return np.stack([measured, commanded]) if sent else measured[None]
+
+
+def _drawable(joints: NDArray[Any], looks: Looks) -> bool:
+    return joints.shape == (looks.robot.dim,) and bool(np.isfinite(joints).all())
+
+
+def _looks(robot: str) -> Looks | None:
+    """None: the robot is not drawn, and the log says why."""
+    try:
+        return looks_of(robot)
+    except (NotFound, RobotError) as error:
+        log.error("no 3D scene: %s", error)
+        return None

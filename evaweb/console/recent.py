@@ -1,0 +1,67 @@
+"""The last samples of the joints: a page that draws fewer frames than samples come is shown all of them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaweb.console import parts
+from evaweb.console.parts import Part
+
+SAMPLES = 12  # at the 30 a second that the runtime publishes: no gap down to three frames a second
+_CURVES = ("measured", "raw", "planned", "executed")
+_COLUMNS = {
+    "step": -1,
+    "chunk": -1,
+    "chunks": 0,
+    "limited": False,
+}  # beside the curves, and what absence means
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sample:
+    time: float
+    curves: tuple[NDArray[np.float32], ...]
+    columns: tuple[Any, ...]
+
+
+class Recent:
+    """Makes stream `recent`: the newest samples in columns, oldest first, `t` on this process's clock [s].
+
+    Arrays float32 [K, D]: `measured`; `raw`, what the newest chunk wants; `planned`, what was made of all
+    chunks; `executed`, what was sent to the robot, or in simulation to the simulated one. NaN where there is
+    none. Beside them per sample: `step`, the leading `chunk` (-1: none, 0: the held target), how many `chunks`
+    made the step, whether safety `limited` it. The samples of one part overlap with those of the part before.
+    """
+
+    def __init__(self) -> None:
+        self._samples: deque[_Sample] = deque(maxlen=SAMPLES)
+
+    def with_one_more(
+        self, vectors: Mapping[str, NDArray[Any]], words: Mapping[str, Any], now: float
+    ) -> Part:
+        """The stream after the sample of this moment."""
+        curves = tuple(_curve(name, vectors, words) for name in _CURVES)
+        if self._samples and self._samples[-1].curves[0].shape != curves[0].shape:
+            self._samples.clear()  # another robot
+        self._samples.append(
+            _Sample(now, curves, tuple(words.get(key, absent) for key, absent in _COLUMNS.items()))
+        )
+        columns = {key: [sample.columns[i] for sample in self._samples] for i, key in enumerate(_COLUMNS)}
+        arrays = {name: np.stack([s.curves[i] for s in self._samples]) for i, name in enumerate(_CURVES)}
+        return parts.numbers("recent", {"t": [s.time for s in self._samples], **columns}, arrays, now)
+
+
+def _curve(name: str, vectors: Mapping[str, NDArray[Any]], words: Mapping[str, Any]) -> NDArray[np.float32]:
+    nothing = np.full_like(vectors["measured"], np.nan)
+    if name != "executed":
+        return vectors.get(name, nothing)
+    simulated = vectors.get("simulated", nothing)
+    if np.isfinite(simulated).all():
+        return simulated
+    return vectors["commanded"] if words.get("engaged") else nothing
