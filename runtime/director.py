@@ -7,12 +7,17 @@ import uuid
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from runtime import deployment
+from runtime.asking import Asking
 from runtime.bus import EventLog
 from runtime.clock import Clock
-from runtime.errors import RuntimeFault
+from runtime.commitment import Commitment
+from runtime.errors import PolicyLostError, RuntimeFault
 from runtime.family import Plan
-from runtime.inference import Inference, InferenceSettings, Runner
+from runtime.grippers import Grippers
+from runtime.inference import Inference, Patience, Strategy
 from runtime.lease import Lease
 from runtime.messages import (
     Ack,
@@ -27,12 +32,24 @@ from runtime.messages import (
 )
 from runtime.orders import Orders
 from runtime.page import Page
-from runtime.requests import RunRequest, SetUpRequest
+from runtime.requests import (
+    AimRequest,
+    GripperRequest,
+    MoveRequest,
+    RunRequest,
+    SetUpRequest,
+    TuneRequest,
+    read,
+)
 from runtime.run import Provenance, Run
+from runtime.runner import Runner
 from runtime.runs import Runs
-from runtime.session import LEASE_COMMANDS, Effects, Happening, Session, State, Told
-from runtime.setup import SetUp
+from runtime.session import LEASE_COMMANDS, Effects, Happening, Session, Situation, State, Told
+from runtime.setup import SetUp, first_action
+from runtime.sight import Sight, SightSettings
 from runtime.snapshot import View, control_figures, facts, snapshot
+from runtime.targets import Targets, told
+from runtime.types import Float64
 from runtime.watch import Watch
 
 log = logging.getLogger(__name__)
@@ -55,16 +72,16 @@ class Director(Effects):
         self._orders = Orders(page)
         self.media_report = MediaReport(0.0, {}, {}, 0, "", 0)
         self.spaces = plan.spaces()
-        self.inference = Inference(
-            plan.new_policy(clock),
-            plan.strategy.query(settings.strategy),
-            self.spaces,
-            page,
-            self._orders,
-            runner,
-            clock,
-            _inference_settings(plan),
+        asking = Asking(
+            plan.new_policy(clock), settings.task, self.spaces, _sight(plan, page, clock), runner, clock
         )
+        patience = Patience(settings.control.starvation_hold_s, settings.faults.patience_s)
+        self.inference = Inference(
+            asking, _strategy(plan), page, self._orders, clock, patience, Commitment(plan.rate)
+        )
+        self.grippers = Grippers(plan, page)
+        self.targets = Targets(plan, self.spaces, plan.kinematics())
+        self._tuned = False  # since the last set-up
         self.setup = SetUp(plan, self.inference, self._orders, page, clock, lambda: self.media_report)
         self._watch = Watch(plan, page, self.lease, clock)
         provenance = Provenance(plan, self.boot)
@@ -109,6 +126,7 @@ class Director(Effects):
                 setup=self.setup,
                 runs=self.runs,
                 media=self.media_report,
+                grippers=self.grippers,
                 estop=self._watch.estop,
                 boot=self.boot,
                 now=self.clock.now(),
@@ -130,6 +148,10 @@ class Director(Effects):
         told = replace(self.runs.provenance, plan=plan, checkpoint=checkpoint, bench=reset or {})
         self.runs.provenance = told
         self.inference.exchange(policy, plan.deployment.task)
+        self.inference.tune(_strategy(plan), plan.deployment.task)
+        self._orders.tune(plan.deployment.strategy.model_dump())
+        self._lock(np.full(plan.robot.dim, np.nan))
+        self._tuned = False
         self.setup.begin(reset)
         return {"bench": reset["id"]} if reset else {}
 
@@ -148,7 +170,106 @@ class Director(Effects):
 
     def begin_run(self, asked: RunRequest) -> Told:
         self._require_family()
+        if asked.trial is not None:
+            self._require_comparable(asked)
+        if (asked.mode or self.plan.deployment.run.mode) == "manual":
+            self._require_robot("run in the mode manual")
         return {"episode": self.runs.begin(self.setup.info, asked)}
+
+    def _require_comparable(self, asked: RunRequest) -> None:
+        """What a trial measures is what was set up: nothing by hand, nothing tuned, the policy on the robot."""
+        mode = asked.mode or self.plan.deployment.run.mode
+        if mode != "continuous":
+            raise RuntimeFault(f"a trial runs in the mode continuous, and {mode} was asked for")
+        if self._tuned:
+            raise RuntimeFault("strategy or task were tuned since the set-up: set up again for a trial")
+        if not np.isnan(self.grippers.locks).all():
+            raise RuntimeFault("a gripper is locked: unlock it, or set up again for a trial")
+
+    def _require_robot(self, what: str) -> None:
+        if not self.plan.capabilities.moves_robot:
+            raise RuntimeFault(f"{what}: transport {self.plan.deployment.transport.kind!r} moves no robot")
+
+    # --- effects: what a person does within a run ------------------------------------------------------------
+
+    @property
+    def situation(self) -> Situation:
+        run, control = self.runs.open, self.page.control.read()
+        return Situation(
+            mode=run.mode if run else None,
+            trial=run is not None and run.trial,
+            proposed=self.inference.proposal is not None,
+            asked=self.inference.asked,
+            executing=int(control["remaining"]) > 0,
+            first_action=self.setup.first_action is not None and self.plan.capabilities.moves_robot,
+        )
+
+    def tune(self, asked: TuneRequest) -> Told:
+        if asked.strategy is None and asked.task is None:
+            raise RuntimeFault("tune: nothing to change; allowed: strategy, task")
+        now = self.plan.deployment
+        wanted = {**now.strategy.model_dump(), **(asked.strategy or {})}
+        task = now.task if asked.task is None else asked.task
+        resolved = deployment.changed(self.plan.resolved, {"strategy": wanted, "task": task}, "tune")
+        plan = replace(self.plan, resolved=resolved)
+        strategy = _strategy(plan)
+        info = self.setup.info
+        if strategy.query.continues and info is not None and info.supports_rtc is False:
+            raise RuntimeFault(
+                f"tune: the policy {info.name!r} does not continue a chunk that it is given (RTC)"
+            )
+        self._orders.tune(plan.deployment.strategy.model_dump())
+        self.plan, self._tuned = plan, True
+        self.runs.provenance = replace(self.runs.provenance, plan=plan)
+        self.inference.tune(strategy, task)
+        data = {"strategy": plan.deployment.strategy.model_dump(), "task": task, "hash": resolved.digest}
+        text = f"strategy {plan.deployment.strategy.kind}, task {task!r}"
+        self.say(Event("tuned_to", text, self.clock.now(), data=data))
+        return {"strategy": data["strategy"], "task": task}
+
+    def step(self) -> None:
+        self.inference.step()
+
+    def commit(self) -> None:
+        self.inference.commit()
+
+    def cancel(self) -> None:
+        self.runs.cancel()
+
+    def move(self, asked: MoveRequest) -> Told:
+        start = self._commanded()
+        goal = self.targets.goal(asked, start)
+        self.runs.move(goal, asked.speed)
+        return {"duration_s": self.targets.duration(start, goal, asked.speed)}
+
+    def grip(self, asked: GripperRequest) -> Told:
+        self._require_robot("gripper")
+        run = self.runs.open
+        free = run is None or run.mode == "manual" or self.session.state is State.HOLDING
+        grip = self.grippers.asked(asked, free)
+        self._lock(grip.locks)
+        if grip.goal is not None:
+            self.runs.move(grip.goal, 1.0)
+        return {"grippers": self.grippers.told()}
+
+    def approach(self) -> None:
+        self._require_robot("approach")
+        proposal = self.inference.proposal
+        if self.session.state is State.READY:
+            self.setup.begin_approach()
+        elif proposal is not None:
+            self.targets.check_path(self._commanded(), proposal.rows[0])
+            self.runs.approach(proposal.rows[0])
+
+    def _commanded(self) -> Float64:
+        """Where the robot was told to be, or where it is measured as long as nothing was told."""
+        status = self.page.control.read()
+        known = status["commanded"] if status["engaged"] else self.page.observation.read()["qpos"]
+        return np.array(known, np.float64)
+
+    def _lock(self, locks: Float64) -> None:
+        self._orders.lock(locks)
+        self.grippers.locks = locks
 
     def hold(self, reason: str) -> None:
         self.runs.hold(reason)
@@ -201,8 +322,15 @@ class Director(Effects):
     def _hear_event(self, event: Event) -> None:
         self._log(event)  # control and media write their own events into the episode
         self.setup.heard(event)
-        evidence = self.plan.deployment.recording.on_failure == "hold"
-        if event.kind in _HOLDS or (event.kind == "recording_failed" and evidence):
+        settings = self.plan.deployment
+        if event.kind == "motion_done":
+            self.runs.arrived()
+        self.inference.tally.starved += event.kind == "starved"
+        if event.kind == "starvation" and settings.faults.starvation == "stop":
+            self._observe(Happening.RUN_FAILED, event.text)
+        elif event.kind in _HOLDS or (
+            event.kind == "recording_failed" and settings.recording.on_failure == "hold"
+        ):
             self._observe(Happening.HELD, event.text)
         elif event.kind == "displaced":
             self._observe(Happening.DISPLACED, event.text)
@@ -229,6 +357,7 @@ class Director(Effects):
         if happening is Happening.FAMILY_DIED:
             self.say(Event("family_died", reason, self.clock.now()))
             self.runs.lost()
+            self.grippers.forget()  # a restarted control knows of no locks
         before = self.session.state
         if self.session.observe(happening, reason):
             text = f"{before} -> {self.session.state}: {reason}"
@@ -243,7 +372,7 @@ class Director(Effects):
         try:
             done = self.setup.pump()
         except RuntimeFault as error:
-            self.setup.cancel()
+            self.setup.fail()
             self._orders.give("hold")
             self._observe(Happening.SETUP_FAILED, str(error))
             return
@@ -256,14 +385,22 @@ class Director(Effects):
         try:
             answer = self.inference.pump()
         except RuntimeFault as error:
-            self.say(Event("policy_failed", str(error), self.clock.now()))
-            self._observe(Happening.HELD, str(error))
-            return
+            answer = None
+            self._answer_fault(error)
         if answer is not None:
             self.runs.note(answer)
         for note in self.inference.notes:
             self.say(note)
         self.inference.notes.clear()
+
+    def _answer_fault(self, error: RuntimeFault) -> None:
+        """Do what the deployment says of a policy that fails: hold, try again for a while, or end the run."""
+        faults, lost = self.plan.deployment.faults, isinstance(error, PolicyLostError)
+        answer = faults.policy_lost if lost else faults.policy_error
+        if answer == "slow" and self.inference.retries(error):
+            return
+        self.say(Event("policy_lost" if lost else "policy_failed", str(error), self.clock.now()))
+        self._observe(Happening.RUN_FAILED if answer == "stop" else Happening.HELD, str(error))
 
     # --- commands ------------------------------------------------------------------------------------------
 
@@ -275,6 +412,8 @@ class Director(Effects):
             )
         if command.kind == "events_since":
             return self._events_since(command)
+        if command.kind == "aim":
+            return self._aim(command)
         before, sequence = self.session.state, self.session.sequence
         ack = self.session.handle(command)
         # A lease that is kept is a stream; only its changes and refusals are worth a line.
@@ -292,19 +431,28 @@ class Director(Effects):
             return Ack(command.uuid, "refused", f"events_since number = {number!r}: must be a whole number")
         return Ack(command.uuid, "done", boot=self.boot, data={"events": self.events.since(number)})
 
+    def _aim(self, command: Command) -> Ack:
+        """Where the robot would go; nothing moves, and anybody may ask."""
+        start = self._commanded()
+        try:
+            aim = self.targets.aim(read("aim", AimRequest, command.args), start)
+        except RuntimeFault as error:
+            return Ack(command.uuid, "refused", str(error))
+        away = first_action(aim.joints, start, self.plan)["distance"]
+        data = told(aim, self.plan, away, self.targets.duration(start, aim.joints))
+        return Ack(command.uuid, "done", boot=self.boot, data=data)
+
     def close(self) -> None:
         """Let go of the policy."""
         self.inference.policy.close()
         self.inference.runner.close()
 
 
-def _inference_settings(plan: Plan) -> InferenceSettings:
-    settings = plan.deployment
-    return InferenceSettings(
-        plan.rate,
-        settings.task,
-        settings.safety.joint_age_s,
-        settings.safety.picture_age_s,
-        plan.robot.binary_dims,
-        settings.control.starvation_hold_s,
-    )
+def _sight(plan: Plan, page: Page, clock: Clock) -> Sight:
+    safety = plan.deployment.safety
+    return Sight(page, clock, SightSettings(plan.rate, safety.joint_age_s, safety.picture_age_s))
+
+
+def _strategy(plan: Plan) -> Strategy:
+    settings = plan.deployment.strategy
+    return Strategy(plan.strategy.query(settings), settings)

@@ -21,6 +21,7 @@ from runtime.config import Deployment
 from runtime.deployment import Resolved
 from runtime.errors import ConfigurationError, RuntimeFault, SetupError
 from runtime.kinematics import numeric
+from runtime.kinematics.base import Kinematics
 from runtime.page import Page, PageLayout
 from runtime.plugins import variants
 from runtime.policies.base import Policy
@@ -106,9 +107,13 @@ class Plan:
             robot.joint_names, robot.lower, robot.upper, robot.velocity, np.array(grippers), np.array(binary)
         )
 
+    def kinematics(self) -> Kinematics:
+        """Forward and inverse kinematics of the robot."""
+        return numeric.build(numeric.Config(), self.robot)
+
     def spaces(self) -> Spaces:
         """The robot's action spaces, with its kinematics."""
-        return Spaces(self.robot, numeric.build(numeric.Config(), self.robot), self.rate)
+        return Spaces(self.robot, self.kinematics(), self.rate)
 
 
 def plan(resolved: Resolved) -> Plan:

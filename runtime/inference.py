@@ -1,145 +1,68 @@
-"""From observations to chunks: when the query half says so, ask the policy and post the answer to control."""
+"""From observations to chunks during a run: when to ask, what becomes of the answer, what if there is none."""
 
 from __future__ import annotations
 
-import logging
-import math
-from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
-from weakref import WeakKeyDictionary
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from runtime.asking import Answered, Asking
+from runtime.back_off import BackOff
 from runtime.clock import Clock
-from runtime.errors import PolicyError, RuntimeFault
-from runtime.messages import ChunkMerged, Event, PolicyAnswer, PostedChunk
+from runtime.commitment import Commitment
+from runtime.errors import PolicyLostError, RuntimeFault
+from runtime.messages import ChunkMerged, Event, Mode, PolicyAnswer, PostedChunk
 from runtime.orders import Orders
 from runtime.page import Page
 from runtime.policies.base import Policy
-from runtime.spaces import Spaces
-from runtime.strategies.base import Progress, Query
-from runtime.timeline import resample
-from runtime.types import ActionChunk, Float64, Observation
+from runtime.sight import StaleObservationError
+from runtime.spaces import CommandRows
+from runtime.strategies.base import Progress, Query, StrategyParameters
+from runtime.tally import Tally
+from runtime.types import Conditioning, Float64
 
-log = logging.getLogger(__name__)
-Result = TypeVar("Result")
-
-
-class StaleObservationError(PolicyError):
-    """The newest observation is too old to ask a policy about."""
-
-
-class Runner(ABC):
-    """Where blocking calls to the policy are made, one after the other."""
-
-    @abstractmethod
-    def submit(self, call: Callable[[], Result]) -> Future[Result]:
-        """Start `call`; its result or RuntimeFault is in the future when `ready` says so."""
-
-    @abstractmethod
-    def ready(self, future: Future[Result]) -> bool: ...
-
-    @property
-    @abstractmethod
-    def busy(self) -> bool:
-        """Whether an earlier call is still being made, and another would wait behind it."""
-
-    def tick(self) -> None:  # noqa: B027  # only runners that count have something to do
-        """One control period has passed."""
-
-    def close(self) -> None:  # noqa: B027  # only runners with a thread have something to do
-        """Take no further calls."""
-
-
-def _told(call: Callable[[], Result]) -> Callable[[], Result]:
-    """`call`, with every error of a policy's own code told as a PolicyError: it must not end main."""
-
-    def telling() -> Result:
-        try:
-            return call()
-        except RuntimeFault:
-            raise
-        except Exception as error:
-            log.exception("the policy's own code failed")
-            raise PolicyError(f"the policy's own code failed: {type(error).__name__}: {error}") from error
-
-    return telling
-
-
-class ThreadRunner(Runner):
-    """One thread of its own, so that a slow policy never stops main."""
-
-    def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
-        self._newest: Future[Any] | None = None
-
-    def submit(self, call: Callable[[], Result]) -> Future[Result]:
-        future = self._pool.submit(_told(call))
-        self._newest = future
-        return future
-
-    def ready(self, future: Future[Result]) -> bool:
-        return future.done()
-
-    @property
-    def busy(self) -> bool:
-        return self._newest is not None and not self._newest.done()
-
-    def close(self) -> None:
-        self._pool.shutdown(wait=False, cancel_futures=True)
-
-
-class LockstepRunner(Runner):
-    """Calls at once and hands the result over `delay` ticks later, the same on every run."""
-
-    def __init__(self, delay: int) -> None:
-        self._delay = delay
-        self._now = 0
-        self._due: WeakKeyDictionary[Future[Any], int] = WeakKeyDictionary()
-
-    def submit(self, call: Callable[[], Result]) -> Future[Result]:
-        future: Future[Result] = Future()
-        try:
-            future.set_result(_told(call)())
-        except RuntimeFault as error:
-            future.set_exception(error)
-        self._due[future] = self._now + self._delay
-        return future
-
-    def ready(self, future: Future[Result]) -> bool:
-        return self._now >= self._due[future]
-
-    @property
-    def busy(self) -> bool:
-        return False
-
-    def tick(self) -> None:
-        self._now += 1
+ON_DEMAND: tuple[Mode, ...] = ("step", "preview")  # modes that ask when a person says so
 
 
 @dataclass(frozen=True, slots=True)
-class Answered:
-    """An inference that came back: the chunk, how long it took [s], what it was asked about."""
+class Patience:
+    """How long a run goes on without what it needs [s]."""
 
-    chunk: ActionChunk
-    seconds: float
-    observation: Observation
+    stale: float  # without a fresh observation, until waiting for one is an error
+    lost: float  # without an answer, until a policy that is tried again is given up
 
 
 @dataclass(frozen=True, slots=True)
-class InferenceSettings:
-    """What inference goes by."""
+class Strategy:
+    """The asking half of a strategy, and its parameters."""
 
-    control_rate: float
-    task: str
-    joint_age: float
-    picture_age: float
-    switched: tuple[int, ...]  # binary dimensions
-    stale_patience: float  # [s] without a fresh observation until waiting for one is an error
+    query: Query
+    parameters: StrategyParameters
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """An answer in command space, under its number."""
+
+    number: int
+    rows: Float64
+    answered: Answered
+
+
+@dataclass(frozen=True, slots=True)
+class ShownChunk:
+    """The newest chunk, for pages: `state` is "proposed", "merged" or "dropped"; targets as in ChunkMerged."""
+
+    number: int
+    run: int
+    state: str
+    observation_step: int
+    targets: NDArray[np.int64]
+    rows: Float64
+    overlap: int = 0
 
 
 class Inference:
@@ -147,112 +70,103 @@ class Inference:
 
     def __init__(
         self,
-        policy: Policy,
-        query: Query,
-        spaces: Spaces,
+        asking: Asking,
+        strategy: Strategy,
         page: Page,
         orders: Orders,
-        runner: Runner,
         clock: Clock,
-        settings: InferenceSettings,
+        patience: Patience,
+        commitment: Commitment,
     ) -> None:
-        self.policy = policy
-        self.runner = runner
-        self._query = query
-        self._spaces = spaces
+        self.asking = asking
+        self.runner = asking.runner
+        self.tally = Tally()
+        self.proposal: Made | None = None  # shown, and neither committed nor cancelled
+        self.shown: ShownChunk | None = None
+        self.rtc_warning = ""
+        self._given: Conditioning | None = None  # with the newest request
+        self._strategy = strategy
         self._page = page
         self._orders = orders
         self._clock = clock
-        self._settings = settings
+        self._patience = patience
+        self._commitment = commitment
+        self._back_off = BackOff()
         self._run = 0
-        self._fresh = True
+        self._mode: Mode = "continuous"
+        self._wanted = False  # in a mode on demand: one chunk
         self._flight: Future[Answered] | None = None
-        self._unmerged: dict[int, Float64] = {}  # by chunk: the rows that were posted
-        self._raw: tuple[np.ndarray, Float64] | None = None  # of the newest merged chunk: its steps, its rows
+        self._unmerged: dict[int, Made] = {}  # posted
         self._stale_since: float | None = None
         self._asked_at = float("-inf")
-        self.latencies: deque[float] = deque(maxlen=200)  # [s]
-        self.delays: deque[int] = deque(maxlen=200)  # control steps
-        self.notes: list[Event] = []  # for main to collect
+
+    @property
+    def policy(self) -> Policy:
+        return self.asking.policy
+
+    @property
+    def notes(self) -> list[Event]:
+        """For main to collect."""
+        return self.asking.notes
+
+    @property
+    def asked(self) -> bool:
+        """Whether the policy is being asked, or its answer has not reached the timeline."""
+        return self._wanted or self._flight is not None or bool(self._unmerged)
+
+    @property
+    def lost_for(self) -> float:
+        """How long the policy has not answered [s], 0 where it does."""
+        return self._back_off.lasts(self._clock.now())
+
+    @property
+    def retry_in(self) -> float:
+        """When it is tried again [s]."""
+        return self._back_off.waiting(self._clock.now())
+
+    @property
+    def rtc(self) -> dict[str, Any]:
+        """What was last said to a policy that continues its chunks; {} for other strategies."""
+        if not self.continues:
+            return {}
+        given = self._given
+        return {
+            "conditioned": given is not None,
+            "predicted_delay": given.predicted_delay if given else None,
+            "warning": self.rtc_warning,
+        }
+
+    @property
+    def continues(self) -> bool:
+        """Whether requests carry what the robot is committed to (RTC)."""
+        return self._strategy.query.continues
 
     def exchange(self, policy: Policy, task: str) -> None:
-        """Ask `policy`, with the instruction `task`, from now on; figures are counted anew.
-
-        Another policy takes the place of the former one, which is closed first. Calls are made one after the
-        other: the new one is reached when the last call of the former one is over, and nobody waits for that.
-        """
+        """Ask `policy`, with the instruction `task`, from now on; figures are counted anew."""
         self.pause()
-        if policy is not self.policy:
-            self.policy.close()
-            self.policy, self._fresh = policy, True
-        self._settings = replace(self._settings, task=task)
-        self.latencies.clear()
-        self.delays.clear()
+        self.asking.exchange(policy, task)
+        self.tally.forget()
+        self._back_off.forget()
 
-    # --- asking --------------------------------------------------------------------------------------------
-
-    def observe(self) -> Observation:
-        """The newest observation as the policy is shown it; PolicyError where there is none, or it is old."""
-        seen = self._page.read_observation(self._page.layout.cameras)
-        if seen is None:
-            raise PolicyError("no observation has arrived yet")
-        now, bounds = self._clock.now(), self._settings
-        for stream, captured in seen.captured.items():
-            allowed = bounds.joint_age if stream in ("joints", "eef") else bounds.picture_age
-            if not now - captured <= allowed:
-                raise StaleObservationError(f"{stream}: {now - captured:.2f} s old, allowed {allowed:g}")
-        missing = [camera for camera in self._page.layout.cameras if camera not in seen.pictures]
-        if missing:
-            raise PolicyError(f"no picture has arrived from {', '.join(missing)}")
-        return replace(seen, step=self._step_of(seen), prompt=self._settings.task)
-
-    def _step_of(self, seen: Observation) -> int:
-        """The control step that an observation is assembled for: the tick that saw it, or the next one.
-
-        While control stalls that is more than one step on: steps follow the clock, missed ticks are skipped.
-        """
-        status = self._page.control.read()
-        step, planned = int(status["step"]), float(status["planned"])
-        if seen.sequence == int(status["sequence"]):
-            return step
-        periods = (seen.arrived - planned) * self._settings.control_rate if planned else 1.0
-        return step + max(1, math.ceil(periods - 1e-6))
-
-    def ask(self) -> Future[Answered]:
-        """Send one request about the newest observation; raises PolicyError where that is too old."""
-        observation = self.observe()
-        policy, fresh, self._fresh = self.policy, self._fresh, False
-        return self.runner.submit(lambda: self._infer(policy, observation, fresh))
-
-    def _infer(self, policy: Policy, observation: Observation, fresh: bool) -> Answered:
-        if fresh:
-            policy.reset()
-        begun = self._clock.now()
-        if observation.eef is None:
-            observation = replace(observation, eef=self._spaces.eef_of(observation.qpos))
-        chunk = policy.infer(observation)
-        return Answered(chunk, self._clock.now() - begun, observation)
-
-    def command_rows(self, answered: Answered) -> tuple[Float64, np.ndarray]:
-        """The answer as rows in command space at control rate, and the policy row each was made from."""
-        rows, solved = self._spaces.to_command(answered.chunk, answered.observation.qpos)
-        if solved is not None and not solved.reached.all():
-            missed = int((~solved.reached).any(axis=1).sum())
-            worst = float(solved.position_error.max()) * 1000
-            text = (
-                f"{missed} of {len(rows)} poses are out of reach, the worst by {worst:.1f} mm: nearest taken"
-            )
-            self.notes.append(Event("ik_unreached", text, self._clock.now(), answered.observation.step))
-        rate = answered.chunk.rate or self._settings.control_rate
-        return resample(rows, rate, self._settings.control_rate, self._settings.switched)
+    def tune(self, strategy: Strategy, task: str) -> None:
+        """Go on with another strategy, other parameters, another instruction; a request in flight stays."""
+        self._strategy = strategy
+        self.asking.task = task
+        self.rtc_warning = ""
 
     # --- a run ---------------------------------------------------------------------------------------------
 
-    def begin(self, run: int, fresh: bool) -> None:
+    def begin(self, run: int, fresh: bool, mode: Mode = "continuous") -> None:
         """Ask from now on, for this run; `fresh` lets the policy forget the episode before."""
-        self._run = run
-        self._fresh = self._fresh or fresh
+        self._run, self._mode = run, mode
+        if fresh:
+            self.asking.forget()
+            self.tally.forget()
+            self.shown = None
+        self._commitment.clear()
+        self._back_off.forget()
         self._stale_since = None
+        self._wanted, self.proposal = False, None
         self._unmerged.clear()
         self._asked_at = float("-inf")
 
@@ -260,24 +174,52 @@ class Inference:
         """Stop asking; an answer still in flight is ignored."""
         self._run = 0
         self._flight = None
-        self._raw = None
+        self._wanted, self.proposal, self.shown = False, None, None
         self._unmerged.clear()
+        self._commitment.clear()
+
+    def step(self) -> None:
+        """Ask for one chunk, in a mode on demand."""
+        self._wanted = True
+
+    def commit(self) -> None:
+        """Have control execute the chunk that is shown: while a person looked the robot stood, nothing is stale."""
+        if self.proposal is not None:
+            made, self.proposal = self.proposal, None
+            self._post(made)
+
+    def cancel(self) -> None:
+        """Forget the chunk that is asked for, or shown, or under way to control."""
+        self._flight = None
+        self._wanted, self.proposal, self.shown = False, None, None
+        self._unmerged.clear()
+        self._commitment.clear()
+
+    # --- what control says -----------------------------------------------------------------------------------
 
     def merged(self, merged: ChunkMerged) -> None:
         """Control has put a chunk on the timeline, or dropped it."""
-        rows = self._unmerged.pop(merged.chunk_id, None)
-        if merged.run == self._run:
-            self.delays.append(merged.delay)
-            if rows is not None and not merged.dropped:
-                self._raw = (merged.targets, rows)
+        made = self._unmerged.pop(merged.chunk_id, None)
+        if merged.run != self._run:
+            return
+        self.tally.merged(merged)
+        self._commitment.merged(merged)
+        if made is not None:
+            state = "dropped" if merged.dropped else "merged"
+            step = made.answered.observation.step
+            self.shown = ShownChunk(
+                merged.chunk_id, merged.run, state, step, merged.targets, made.rows, merged.overlap
+            )
 
     def raw(self, step: int) -> Float64 | None:
         """What the newest chunk that control has merged wants for `step` [D]; None where it says nothing of it."""
-        if self._raw is None:
+        shown = self.shown
+        if shown is None or shown.state != "merged":
             return None
-        steps, rows = self._raw
-        meant = np.flatnonzero(steps == step)
-        return rows[meant[-1]] if len(meant) else None
+        meant = np.flatnonzero(shown.targets == step)
+        return shown.rows[meant[-1]] if len(meant) else None
+
+    # --- asking and answering --------------------------------------------------------------------------------
 
     def pump(self) -> PolicyAnswer | None:
         """Collect an answer, or ask; returns the answer, for the record. Raises PolicyError."""
@@ -287,11 +229,33 @@ class Inference:
             if not self.runner.ready(self._flight):
                 return None
             flight, self._flight = self._flight, None
-            return self._post(flight.result())
+            return self._take(flight.result())
         # A late answer of an earlier run may keep the policy busy: a request would grow old in the queue.
-        if not self.runner.busy and self._query.wants(self._progress()) and self._try_to_ask():
+        if not self.runner.busy and self._wants() and self._try_to_ask():
             return self.pump()
         return None
+
+    def retries(self, error: RuntimeFault) -> bool:
+        """Whether the policy will be tried again after `error`; False where patience is at its end."""
+        now = self._clock.now()
+        first = self._back_off.since is None
+        self._back_off.failed(now)
+        self.tally.lost += isinstance(error, PolicyLostError)
+        if self._back_off.lasts(now) > self._patience.lost:
+            return False
+        if first:
+            kind = "policy_lost" if isinstance(error, PolicyLostError) else "policy_failed"
+            self._note(kind, f"{error}; trying again for {self._patience.lost:g} s")
+        return True
+
+    def _wants(self) -> bool:
+        if self._back_off.waiting(self._clock.now()):
+            return False
+        return self._wanted if self._mode in ON_DEMAND else self._strategy.query.wants(self._progress())
+
+    def _progress(self) -> Progress:
+        remaining = int(self._page.control.read()["remaining"])
+        return Progress(remaining, bool(self._unmerged), self._clock.now() - self._asked_at)
 
     def _try_to_ask(self) -> bool:
         """Ask; True where the answer is there at once.
@@ -300,29 +264,68 @@ class Inference:
         answer there is nothing to judge, so a gap that lasts is an error here too.
         """
         now = self._clock.now()
+        waited = self._mode in ON_DEMAND or self._strategy.query.waits
         try:
-            flight = self.ask()
+            flight = self.asking.ask(waited, self._committed if self.continues else None)
         except StaleObservationError:
             if self._stale_since is None:
                 self._stale_since = now
-            if now - self._stale_since > self._settings.stale_patience:
+            if now - self._stale_since > self._patience.stale:
                 raise
             return False
         self._stale_since, self._asked_at, self._flight = None, now, flight
         return self.runner.ready(flight)
 
-    def _progress(self) -> Progress:
-        remaining = int(self._page.control.read()["remaining"])
-        return Progress(remaining, bool(self._unmerged), self._clock.now() - self._asked_at)
-
-    def _post(self, answered: Answered) -> PolicyAnswer:
-        rows, source = self.command_rows(answered)
-        number = self._orders.next_chunk()
-        step = answered.observation.step
-        self._orders.post(PostedChunk(number, self._run, step, rows))
-        self._unmerged[number] = rows
-        self.latencies.append(answered.seconds)
-        chunk = answered.chunk
-        return PolicyAnswer(
-            number, self._run, step, chunk.actions, chunk.space, source, answered.seconds * 1000.0
+    def _committed(self, step: int) -> Conditioning | None:
+        parameters = self._strategy.parameters
+        found = self._commitment.conditioning(
+            step, list(self.tally.delays)[-50:], parameters.delay_quantile, parameters.execution_horizon
         )
+        warning = self._commitment.warning
+        if warning and warning != self.rtc_warning:
+            self._note("rtc_warning", warning)
+        self.rtc_warning, self._given = warning, found
+        return found
+
+    def _take(self, answered: Answered) -> PolicyAnswer:
+        self._recovered()
+        step, chunk = answered.observation.step, answered.chunk
+        made_rows = self.asking.command_rows(answered)
+        made = Made(self._orders.next_chunk(), made_rows.rows, answered)
+        self._wanted = False
+        self.tally.answered(answered.seconds)
+        self._commitment.answered(made.number, chunk, step, answered.waited)
+        if self._mode == "preview":
+            self.proposal = made
+            nowhere = np.full(len(made.rows), -1, np.int64)
+            self.shown = ShownChunk(made.number, self._run, "proposed", step, nowhere, made.rows)
+        else:
+            self._post(made)
+        return self._record(made, made_rows)
+
+    def _record(self, made: Made, rows: CommandRows) -> PolicyAnswer:
+        answered = made.answered
+        return PolicyAnswer(
+            made.number,
+            self._run,
+            answered.observation.step,
+            answered.chunk.actions,
+            answered.chunk.space,
+            rows.source,
+            answered.seconds * 1000.0,
+        )
+
+    def _post(self, made: Made) -> None:
+        answered = made.answered
+        self._orders.post(
+            PostedChunk(made.number, self._run, answered.observation.step, made.rows, answered.waited)
+        )
+        self._unmerged[made.number] = made
+
+    def _recovered(self) -> None:
+        if self._back_off.since is not None:
+            self._note("policy_back", f"the policy answers again after {self.lost_for:.1f} s")
+        self._back_off.forget()
+
+    def _note(self, kind: str, text: str) -> None:
+        self.notes.append(Event(kind, text, self._clock.now()))

@@ -15,11 +15,11 @@ from runtime.director import Director
 from runtime.errors import SetupError
 from runtime.family import Plan
 from runtime.guard import Guard
-from runtime.inference import LockstepRunner
 from runtime.latch import Latch
 from runtime.media import Media, make_recorder
 from runtime.messages import Ack, Command
 from runtime.page import Page
+from runtime.runner import LockstepRunner
 from runtime.session import State
 
 log = logging.getLogger(__name__)

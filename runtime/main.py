@@ -13,10 +13,11 @@ from runtime.clock import MonotonicClock
 from runtime.command_journal import CommandJournal
 from runtime.director import Director
 from runtime.family import join
-from runtime.inference import ThreadRunner
+from runtime.inference import ShownChunk
 from runtime.messages import Event
+from runtime.runner import ThreadRunner
 
-_NOT_JOURNALLED = ("status", "events_since", "lease_renew")
+_NOT_JOURNALLED = ("status", "events_since", "aim", "lease_renew")
 
 
 class Service:
@@ -33,6 +34,7 @@ class Service:
         Endpoints(settings.station_dir).write("main", endpoints)
         self._due: dict[str, float] = {}
         self._told = 0
+        self._shown: ShownChunk | None = None
         self._unjournalled = ""
 
     def serve(self, timeout: float) -> None:
@@ -58,6 +60,7 @@ class Service:
         self._every("state", 0.1, now, main.snapshot)
         self._every("joints", 1 / 30, now, self._joints)
         self._every("poses", 1 / 30, now, self._poses)
+        self._publish_chunk(now)
         for event in main.events.since(self._told):
             self._streams.publish("event", event)
         self._told = main.events.newest
@@ -67,10 +70,34 @@ class Service:
             self._due[stream] = now + period
             self._streams.publish(stream, content())
 
+    def _publish_chunk(self, now: float) -> None:
+        """The newest chunk when there is another one, and once a second for who comes late."""
+        shown = self._main.inference.shown
+        if shown is not self._shown or (shown is not None and now >= self._due.get("chunk", 0.0)):
+            self._shown = shown
+            self._due["chunk"] = now + 1.0
+            self._streams.publish("chunk", {"chunk": 0} if shown is None else self._chunk(shown))
+
+    def _chunk(self, shown: ShownChunk) -> dict[str, Any]:
+        """Rows float32 [H, D], poses float32 [H, 8 * arms], the step each row is for (-1: none)."""
+        return {
+            "chunk": shown.number,
+            "run": shown.run,
+            "state": shown.state,
+            "observation_step": shown.observation_step,
+            "step": int(self._main.page.control.read()["step"]),
+            "targets": shown.targets,
+            "rows": shown.rows.astype(np.float32),
+            "poses": self._main.spaces.eef_of(shown.rows),
+            "overlap": shown.overlap,
+        }
+
     def _joints(self) -> dict[str, Any]:
         """One control step joint by joint, float32 [D] each: NaN in `planned` and `raw` where there is none.
 
-        `raw` is what the newest chunk wants for the step, `planned` what was made of all chunks before safety.
+        `raw` is what the newest chunk wants for the step, `planned` what was made of all chunks before safety,
+        `simulated` where the robot of a run in simulation was told to be. `chunk` has the largest part in the step
+        (-1: none), `chunks` made it, safety has `limited` it.
         """
         status, seen = self._main.page.control.read(), self._main.page.observation.read()
         step = int(status["step"])
@@ -83,6 +110,10 @@ class Service:
             "planned": status["smoothed"].copy() if ticked else nothing,
             "commanded": status["commanded"].copy(),
             "engaged": bool(status["engaged"]),
+            "simulated": status["simulated"].copy() if ticked else nothing,
+            "chunk": int(status["chunk"]) if ticked else -1,
+            "chunks": int(status["chunks"]),
+            "limited": bool(status["limited"]),
         }
 
     def _poses(self) -> np.ndarray:

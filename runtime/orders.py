@@ -7,7 +7,17 @@ from collections.abc import Mapping
 from typing import Any
 
 from runtime.errors import RuntimeFault
-from runtime.messages import Message, NodeRequest, Order, OrderKind, PostedChunk, encode
+from runtime.messages import (
+    LockGrippers,
+    Message,
+    Mode,
+    NodeRequest,
+    Order,
+    OrderKind,
+    PostedChunk,
+    Tune,
+    encode,
+)
 from runtime.page import Page
 from runtime.types import Float64
 
@@ -22,11 +32,20 @@ class Orders:
         self._number = int(page.control.read()["order"])
         self._chunk = 0
 
-    def give(self, kind: OrderKind, *, run: int = 0, goal: Float64 | None = None, reason: str = "") -> int:
+    def give(
+        self,
+        kind: OrderKind,
+        *,
+        run: int = 0,
+        goal: Float64 | None = None,
+        reason: str = "",
+        mode: Mode = "continuous",
+        speed: float = 1.0,
+    ) -> int:
         """Tell control what to do; returns the order's number, which control's status shows once obeyed."""
         self._number += 1
         try:
-            self._push(Order(self._number, kind, run, goal, reason))
+            self._push(Order(self._number, kind, run, goal, reason, mode, speed))
         except RuntimeFault as error:
             log.error("order %s is lost: %s", kind, error)  # main goes on: it notices that control hangs
         return self._number
@@ -43,6 +62,14 @@ class Orders:
     def post(self, chunk: PostedChunk) -> None:
         """Hand a chunk over, unmerged."""
         self._push(chunk)
+
+    def tune(self, strategy: Mapping[str, Any]) -> None:
+        """Have control merge by another strategy, or other parameters of it, from its next tick on."""
+        self._push(Tune(strategy))
+
+    def lock(self, values: Float64) -> None:
+        """Lock grippers at these values [D]; NaN for what is not locked."""
+        self._push(LockGrippers(values))
 
     def ask_node(self, word: str, data: Mapping[str, Any]) -> None:
         """Have control pass a control word on to the node."""

@@ -62,6 +62,7 @@ class SetUpRequest(Section):
     """
 
     policy: Map | None = None
+    strategy: Map | None = None
     task: Annotated[str, Field(max_length=2000)] | None = None
     checkpoint: Checkpoint | None = None
     bench: BenchRequest | None = None
@@ -69,7 +70,7 @@ class SetUpRequest(Section):
     @property
     def changes(self) -> dict[str, Any]:
         """The tables that go on top of the deployment."""
-        wanted = {"policy": self.policy, "task": self.task}
+        wanted = {"policy": self.policy, "strategy": self.strategy, "task": self.task}
         return {key: value for key, value in wanted.items() if value is not None}
 
 
@@ -100,9 +101,9 @@ Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
 class Jog(Section):
-    """A step of one arm's end effector from `joints`: `translation` [m], `rotation` [rad] (a rotation vector).
+    """A step of one arm's end effector: `translation` [m], `rotation` roll, pitch, yaw [rad] about fixed axes.
 
-    Both along the arm's "base" frame, or along the end effector's own ("tool").
+    Both along the axes of the arm's "base" frame, or of the end effector itself ("tool").
     """
 
     arm: str

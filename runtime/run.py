@@ -11,10 +11,17 @@ from importlib.metadata import version
 from typing import Any
 
 from runtime.family import Plan
+from runtime.messages import Mode
 from runtime.policies.base import PolicyInfo
+from runtime.revision import revision
 
 _COUNTS = ("ticks", "missed", "records_lost")
 _PACKAGES = ("eva-web", "numpy", "pyarrow", "av", "pyzmq", "msgpack")
+
+
+def installed_versions() -> dict[str, str]:
+    """Of Python, of us, and of what decides how a run comes out or how it is written down."""
+    return {"python": platform.python_version()} | {package: version(package) for package in _PACKAGES}
 
 
 @dataclass(slots=True)
@@ -25,6 +32,9 @@ class Run:
     uuid: str
     asked: float
     duration_s: float | None = None  # after which it ends by itself
+    mode: Mode = "continuous"
+    trial: bool = False  # it is one of a trial
+    approaching: bool = False  # a motion to the chunk that is shown
     begun: float | None = None  # control follows
     held_since: float | None = None
     held: float = 0.0  # in total
@@ -72,12 +82,11 @@ class Provenance:
         default_factory=dict
     )  # as the one who asked for the set-up named it
     bench: Mapping[str, Any] = field(default_factory=dict)  # how a simulated one was asked to be laid out
-    versions: dict[str, str] = field(
-        default_factory=lambda: {"python": platform.python_version()} | {p: version(p) for p in _PACKAGES}
-    )
+    versions: dict[str, str] = field(default_factory=installed_versions)
+    git: Mapping[str, Any] = field(default_factory=revision)  # {} where the runtime runs from no checkout
 
-    def manifest(self, mode: str, info: PolicyInfo | None) -> dict[str, Any]:
-        """The manifest of a new episode, without what only media knows."""
+    def manifest(self, mode: str, info: PolicyInfo | None, sim_state: str = "") -> dict[str, Any]:
+        """The manifest of a new episode, without what only media knows; `sim_state` where the mode is sim."""
         settings = self.plan.deployment
         return {
             "uuid": str(uuid.uuid4()),
@@ -91,6 +100,7 @@ class Provenance:
             "duration_s": None,
             "kind": settings.recording.kind,
             "mode": mode,
+            **({"sim_state": sim_state} if mode == "sim" else {}),
             "strategy": settings.strategy.kind,
             "policy": {"kind": settings.policy.kind, "name": info.name, "metadata": dict(info.metadata)}
             if info
@@ -98,5 +108,6 @@ class Provenance:
             "configuration": dict(self.plan.resolved.tree),
             "configuration_hash": self.plan.resolved.digest,
             "versions": self.versions,
+            "git": dict(self.git),
             "asked_wall": time.time(),
         }

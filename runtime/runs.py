@@ -25,6 +25,7 @@ from runtime.page import Page
 from runtime.policies.base import PolicyInfo
 from runtime.requests import RunRequest
 from runtime.run import Provenance, Run
+from runtime.types import Float64
 
 log = logging.getLogger(__name__)
 
@@ -69,14 +70,25 @@ class Runs:
         settings = self._plan.deployment
         self._count += 1
         limit = settings.run.duration_s if asked.duration_s is None else asked.duration_s
+        mode = asked.mode or settings.run.mode
+        sim_state = asked.sim_state or settings.run.sim_state
         manifest = None
         if settings.recording.enabled:
-            manifest = self.provenance.manifest(settings.run.mode, info)
+            manifest = self.provenance.manifest(mode, info, sim_state)
             manifest |= {"trial": asked.trial or {}, "duration_s": limit}
             manifest |= {} if asked.operator is None else {"operator": asked.operator}
         identity = str(manifest["uuid"]) if manifest else str(uuid.uuid4())
         self._tell(BeginEpisode(self._count, manifest))
-        self.open = Run(self._count, identity, self._clock.now(), limit, counted=self._figures())
+        self._inference.asking.sight.simulated = mode == "sim" and sim_state == "simulated"
+        self.open = Run(
+            self._count,
+            identity,
+            self._clock.now(),
+            limit,
+            mode,
+            asked.trial is not None,
+            counted=self._figures(),
+        )
         return identity if manifest else ""
 
     def opened(self, message: EpisodeOpened, running: bool) -> str:
@@ -119,12 +131,14 @@ class Runs:
     def end(self, status: str, reason: str) -> None:
         """Decelerate, hold, close what is open; a recording alone only where it is interrupted."""
         self._inference.pause()
+        self._inference.asking.sight.simulated = False
         self._orders.give("hold", reason=reason)
         run, self.open = self.open, None
         if run is not None:
             seconds = run.elapsed(self._clock.now())
             self.last = {"number": run.number, "uuid": run.uuid, "status": status, "reason": reason}
-            details = {"run_seconds": seconds, "control": run.figures(self._figures())}
+            policy = self._inference.tally.figures()
+            details = {"run_seconds": seconds, "control": run.figures(self._figures()), "policy": policy}
             self._tell(EndEpisode(status, reason, details))
         if self._alone and status != "finished":
             self._end_alone(status, reason)
@@ -134,8 +148,42 @@ class Runs:
         self._follow(run, fresh=True)
 
     def _follow(self, run: Run, fresh: bool) -> None:
-        self._orders.give("follow", run=run.number)
-        self._inference.begin(run.number, fresh)
+        run.approaching = False
+        if run.mode == "manual":
+            self._orders.give("hold", run=run.number)
+        else:
+            self._orders.give("follow", run=run.number, mode=run.mode)
+            self._inference.begin(run.number, fresh, run.mode)
+
+    # --- by a person, within a run ---------------------------------------------------------------------------
+
+    def move(self, goal: Float64, speed: float) -> None:
+        """Go to `goal` on a limited path, within the open run where there is one."""
+        self._orders.give("motion", run=self.open.number if self.open else 0, goal=goal, speed=speed)
+
+    def cancel(self) -> None:
+        """Leave what is planned or under way, and stand; the run goes on."""
+        if self.open is not None:
+            self._inference.cancel()
+            self._stand(self.open)
+
+    def approach(self, goal: Float64) -> None:
+        """Go to where the chunk that is shown begins."""
+        if self.open is not None:
+            self.open.approaching = True
+            self.move(goal, 1.0)
+
+    def arrived(self) -> None:
+        """Control has come to the end of a motion: an open run that asked for it stands and waits again."""
+        if self.open is not None and self.open.approaching:
+            self._stand(self.open)
+
+    def _stand(self, run: Run) -> None:
+        run.approaching = False
+        if run.mode == "manual":
+            self._orders.give("hold", run=run.number)
+        else:
+            self._orders.give("follow", run=run.number, mode=run.mode)
 
     # --- recordings ----------------------------------------------------------------------------------------
 

@@ -10,16 +10,18 @@ from typing import Any
 
 import numpy as np
 
+from runtime.asking import Answered
 from runtime.clock import Clock
 from runtime.errors import PolicyError, SetupError
 from runtime.family import Plan
-from runtime.inference import Answered, Inference
+from runtime.inference import Inference
 from runtime.messages import Event, MediaReport
 from runtime.motion import Trajectory
 from runtime.orders import Orders
 from runtime.page import Page
 from runtime.policies.base import PolicyInfo
 from runtime.requests import BenchRequest
+from runtime.types import Float64
 
 _SETTLE_S = 2.0  # for the arm to follow the last target of a motion
 _ARRIVED_RAD = 0.1
@@ -37,6 +39,7 @@ class Stage(StrEnum):
     SETTLE = "waiting for the arm to arrive"
     RESET = "resetting the bench"
     WARM_UP = "warming up the policy"
+    APPROACH = "approaching the policy's first action"
 
 
 class SetUp:
@@ -60,7 +63,10 @@ class SetUp:
         self.stage = Stage.IDLE
         self.info: PolicyInfo | None = None
         self.validated = ""
-        self._homing_only = False
+        self.first_action: Float64 | None = None  # [D] of the newest validated answer
+        self.stages: dict[Stage, float] = {}  # those that were entered, and when
+        self.failed: Stage | None = None
+        self._motion_only = ""  # what a motion alone amounts to, "" in a whole set-up
         self._reset: dict[str, Any] | None = None  # of the bench, that has been asked for
 
     @property
@@ -70,7 +76,7 @@ class SetUp:
     @property
     def outcome(self) -> str:
         """What came of it, in one sentence."""
-        return f"at the pose {self._plan.deployment.setup.pose!r}" if self._homing_only else self.validated
+        return self._motion_only or self.validated
 
     def reset_of(self, bench: BenchRequest | None) -> dict[str, Any] | None:
         """What the node is to be told to reset its bench; SetupError where it has none, or has done that already."""
@@ -91,15 +97,33 @@ class SetUp:
     def begin(self, reset: dict[str, Any] | None) -> None:
         """Start from the first stage; `reset` as by `reset_of`."""
         self._reset = reset
-        self.info, self.validated = None, ""
-        self._homing_only = False
+        self.info, self.validated, self.first_action = None, "", None
+        self._motion_only = ""
+        self._start()
         self._connection = self._inference.runner.submit(self._inference.policy.connect)
         self._enter(Stage.CONNECT)
 
     def begin_homing(self) -> None:
         """Only go to the pose."""
-        self._homing_only = True
-        self._go()
+        self._motion_only = f"at the pose {self._plan.deployment.setup.pose!r}"
+        self._start()
+        self._go_home()
+
+    def begin_approach(self) -> None:
+        """Only go to where the policy's first action would have the robot; RuntimeFault where that is not known."""
+        if self.first_action is None:
+            raise SetupError("approach: the policy's first action is not known: set up again")
+        self._motion_only = "at the policy's first action"
+        self._start()
+        self._go(self.first_action, "the policy's first action", Stage.APPROACH)
+
+    def _start(self) -> None:
+        self.stages, self.failed = {}, None
+
+    def fail(self) -> None:
+        """What it was doing has failed."""
+        self.failed = self.stage
+        self.cancel()
 
     def cancel(self) -> None:
         """Stop where it is; a call to the policy that is under way is cut off."""
@@ -109,7 +133,7 @@ class SetUp:
 
     def heard(self, event: Event) -> None:
         """Control's events: the one that says that the motion is done."""
-        if self.stage is Stage.HOME and event.kind == "motion_done":
+        if self.stage in (Stage.HOME, Stage.APPROACH) and event.kind == "motion_done":
             self._enter(Stage.SETTLE)
         elif event.kind == "word_refused":
             self._word_refused = event.text
@@ -119,10 +143,11 @@ class SetUp:
         if self.stage is Stage.CONNECT:
             if self._inference.runner.ready(self._connection):
                 self.info = self._connection.result()
+                self._check_rtc(self.info)
                 self._enter(Stage.OBSERVE)
         elif self.stage is Stage.OBSERVE:
             return self._observe()
-        elif self.stage is Stage.HOME:
+        elif self.stage in (Stage.HOME, Stage.APPROACH):
             self._wait_for_motion()
         elif self.stage is Stage.SETTLE:
             return self._settle()
@@ -135,6 +160,21 @@ class SetUp:
     def _enter(self, stage: Stage) -> None:
         self.stage = stage
         self._since = self._clock.now()
+        self.stages[stage] = self._since
+
+    def _check_rtc(self, info: PolicyInfo) -> None:
+        """A server that drops the conditioning without a word looks healthy, and does something else."""
+        if self._inference.continues and info.supports_rtc is False:
+            raise SetupError(
+                f"strategy 'rtc': the policy {info.name!r} does not continue a chunk that it is given; allowed: "
+                "another strategy, or a server and policy.rtc that do"
+            )
+
+    def _check_drives(self) -> None:
+        drives = self._media().drives
+        if self._plan.capabilities.moves_robot and drives.get("enabled") is False:
+            faults = ", ".join(map(str, drives.get("faults", ()))) or "no fault named"
+            raise SetupError(f"the robot says that its drives are disabled ({faults}): enable them")
 
     def _waited(self) -> float:
         return self._clock.now() - self._since
@@ -143,7 +183,8 @@ class SetUp:
         settings = self._plan.deployment.setup
         try:
             self._require_family()
-            self._inference.observe()
+            self._check_drives()
+            self._inference.asking.observe()
         except (PolicyError, SetupError) as error:
             if self._waited() > settings.observation_timeout_s:
                 raise SetupError(
@@ -151,7 +192,7 @@ class SetUp:
                 ) from None
             return False
         if settings.home and self._plan.capabilities.moves_robot:
-            self._go()
+            self._go_home()
         else:
             self._start_reset()
         return False
@@ -163,11 +204,15 @@ class SetUp:
             if not self._page.alive(process, self._clock.now(), within):
                 raise SetupError(f"the process {process} gives no sign of life")
 
-    def _go(self) -> None:
-        self._goal = self._plan.robot.poses[self._plan.deployment.setup.pose]
+    def _go_home(self) -> None:
+        pose = self._plan.deployment.setup.pose
+        self._go(self._plan.robot.poses[pose], f"the pose {pose!r}", Stage.HOME)
+
+    def _go(self, goal: Float64, where: str, stage: Stage) -> None:
+        self._goal, self._where = goal, where
         self._allowed = self._motion_time() + _SETTLE_S
-        self._orders.give("motion", goal=np.array(self._goal, np.float64))
-        self._enter(Stage.HOME)
+        self._orders.give("motion", goal=np.array(goal, np.float64))
+        self._enter(stage)
 
     def _motion_time(self) -> float:
         """How long the motion to the goal takes from where control will start it [s]."""
@@ -175,14 +220,13 @@ class SetUp:
         start = status["commanded"] if status["engaged"] else self._page.observation.read()["qpos"]
         safety, limits = self._plan.deployment.safety, self._plan.limits
         velocity = limits.velocity * safety.motion_velocity_scale
-        acceleration = np.full(len(velocity), safety.motion_acceleration)
+        acceleration = safety.motion_acceleration * limits.reach
         return Trajectory(np.array(start, np.float64), self._goal, velocity, acceleration).duration
 
     def _wait_for_motion(self) -> None:
         self._require_family()
         if self._waited() > self._allowed:
-            pose = self._plan.deployment.setup.pose
-            raise SetupError(f"control has not come to the pose {pose!r} within {self._allowed:.1f} s")
+            raise SetupError(f"control has not come to {self._where} within {self._allowed:.1f} s")
 
     def _settle(self) -> bool:
         measured = np.array(self._page.observation.read()["qpos"], np.float64)
@@ -191,13 +235,12 @@ class SetUp:
         worst = int(error.argmax())
         if error[worst] > _ARRIVED_RAD:
             if self._waited() > _SETTLE_S:
-                pose = self._plan.deployment.setup.pose
                 raise SetupError(
-                    f"the arm did not arrive: {limits.names[worst]} is {error[worst]:.2f} rad from the pose "
-                    f"{pose!r}; is it blocked, or is another program commanding it?"
+                    f"the arm did not arrive: {limits.names[worst]} is {error[worst]:.2f} rad from "
+                    f"{self._where}; is it blocked, or is another program commanding it?"
                 )
             return False
-        if self._homing_only:
+        if self._motion_only:
             self.stage = Stage.IDLE
             return True
         self._start_reset()
@@ -246,7 +289,7 @@ class SetUp:
 
     def _warm_up(self) -> bool:
         if self._asked is None:
-            self._asked = self._inference.ask()
+            self._asked = self._inference.asking.ask()
             return False
         if not self._inference.runner.ready(self._asked):
             return False
@@ -259,11 +302,19 @@ class SetUp:
         return True
 
     def _validate(self, answered: Answered) -> None:
-        rows, _ = self._inference.command_rows(answered)
-        limits = self._plan.limits
-        away = np.where(limits.grippers, 0.0, np.abs(rows[0] - answered.observation.qpos))
-        worst = int(away.argmax())
+        self.first_action = self._inference.asking.command_rows(answered).rows[0]
+        first = first_action(self.first_action, np.asarray(answered.observation.qpos, np.float64), self._plan)
+        far = ": far, approach it or start elsewhere" if first["far"] else ""
         self.validated = (
             f"{len(answered.chunk.actions)} rows in {answered.seconds * 1000:.0f} ms, the first at most "
-            f"{away[worst]:.3f} rad away ({limits.names[worst]})"
+            f"{first['distance']:.3f} rad away ({first['joint']}){far}"
         )
+
+
+def first_action(action: Float64, joints: Float64, plan: Plan) -> dict[str, Any]:
+    """How far an action [D] is from `joints` [D]: {"distance" rad, "joint", "far"}; grippers do not count."""
+    limits = plan.limits
+    away = np.where(limits.grippers, 0.0, np.abs(action - joints))
+    worst = int(away.argmax())
+    far = bool(away[worst] > plan.deployment.safety.first_action_far)
+    return {"distance": float(away[worst]), "joint": limits.names[worst], "far": far}

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from runtime.family import Plan
+from runtime.grippers import Grippers
 from runtime.inference import Inference
 from runtime.lease import Lease
-from runtime.messages import MediaReport
+from runtime.messages import MediaReport, Mode
 from runtime.page import Page
+from runtime.plugins import variants
 from runtime.runs import Runs
-from runtime.session import Session
-from runtime.setup import SetUp
+from runtime.session import Session, State
+from runtime.setup import SetUp, Stage, first_action
+from runtime.tally import quantile
+from runtime.types import Float64
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +35,7 @@ class View:
     setup: SetUp
     runs: Runs
     media: MediaReport
+    grippers: Grippers
     estop: str
     boot: str
     now: float
@@ -50,7 +55,15 @@ def snapshot(view: View) -> dict[str, Any]:
         "state": str(session.state),
         "reason": session.reason,
         "allowed": session.allowed(),
+        "mode": view.runs.open.mode if view.runs.open else settings.run.mode,
+        "sim_state": "simulated" if view.inference.asking.sight.simulated else "live",
+        "phase": _phase(view),
         "stage": str(view.setup.stage),
+        "stages": _stages(view),
+        "first_action": _first_action(view),
+        "proposal": _proposal(view),
+        "grippers": view.grippers.told(),
+        "drives": dict(view.media.drives),
         "validated": view.setup.validated,
         "task": settings.task,
         "checkpoint": dict(view.runs.provenance.checkpoint),
@@ -59,6 +72,7 @@ def snapshot(view: View) -> dict[str, Any]:
         "transport": settings.transport.kind,
         "policy": {"kind": settings.policy.kind, **_inference(view)},
         "strategy": settings.strategy.kind,
+        "tuning": settings.strategy.model_dump(),
         "lease": _lease(view),
         "estop": view.estop,
         "run": _run(view),
@@ -88,7 +102,13 @@ def facts(plan: Plan) -> dict[str, Any]:
         "lower": robot.lower.tolist(),
         "upper": robot.upper.tolist(),
         "home": robot.poses[plan.deployment.setup.pose].tolist(),
+        "velocity": robot.velocity.tolist(),
+        "binary_dims": list(robot.binary_dims),
         "poses": sorted(robot.poses),
+        "tasks": list(dict.fromkeys(filter(None, [plan.deployment.task, *plan.deployment.tasks]))),
+        "strategies": {kind: sorted(module.USES) for kind, module in variants("runtime.strategies").items()},
+        "modes": list(get_args(Mode)),
+        "moves_robot": plan.capabilities.moves_robot,
         "cameras": list(plan.cameras),
         "rate": plan.rate,
         "fps": plan.fps,
@@ -120,10 +140,15 @@ def _run(view: View) -> dict[str, Any]:
 
 
 def _inference(view: View) -> dict[str, Any]:
-    latencies, delays = view.inference.latencies, view.inference.delays
+    tally = view.inference.tally
+    latencies, delays = tally.latencies, tally.delays
     return {
         "name": view.setup.info.name if view.setup.info else "",
-        "answers": len(latencies),
+        "answers": tally.answers,
+        **tally.newest(),
+        "lost": view.inference.lost_for > 0,
+        "retry_in_s": view.inference.retry_in,
+        "rtc": view.inference.rtc,
         "latency_p50_ms": quantile(latencies, 50) * 1000,
         "latency_p90_ms": quantile(latencies, 90) * 1000,
         "delay_p50": quantile(delays, 50),
@@ -131,9 +156,69 @@ def _inference(view: View) -> dict[str, Any]:
     }
 
 
-def quantile(values: Sequence[float], percent: float) -> float:
-    """The percentile of `values`, NaN where there are none."""
-    return float(np.percentile(np.array(values), percent)) if values else math.nan
+def _phase(view: View) -> str:
+    """What a run that goes on is doing, in one word; "" where none does."""
+    run, control = view.runs.open, view.page.control.read()
+    if run is None or view.session.state is not State.RUNNING:
+        return ""
+    moving = bytes(control["behaviour"]) == b"motion"
+    states = (
+        ("approaching", run.approaching),
+        ("moving", moving),
+        ("proposed", view.inference.proposal is not None),
+        ("executing", int(control["remaining"]) > 0),
+        ("starved", bool(control["starved"])),
+        ("asking", view.inference.asked),
+    )
+    return next((word for word, holds in states if holds), "waiting")
+
+
+_SETUP_STAGES = (Stage.CONNECT, Stage.OBSERVE, Stage.HOME, Stage.SETTLE, Stage.RESET, Stage.WARM_UP)
+
+
+def _stages(view: View) -> list[dict[str, Any]]:
+    """The stages of the newest set-up in their order: what is done, what goes on and for how long, what failed."""
+    setup = view.setup
+    entered = setup.stages
+    names = _SETUP_STAGES if Stage.CONNECT in entered or not entered else tuple(entered)
+    told = []
+    for stage in names:
+        since = entered.get(stage)
+        later = [
+            at for other, at in entered.items() if since is not None and other is not stage and at >= since
+        ]
+        if stage is setup.stage:
+            state = "active"
+        elif stage is setup.failed:
+            state = "failed"
+        elif since is not None:
+            state = "done"
+        else:
+            state = "waiting" if setup.active or not entered else "skipped"
+        seconds = 0.0 if since is None else (min(later) if later else view.now) - since
+        told.append({"name": str(stage), "state": state, "seconds": seconds if state != "waiting" else 0.0})
+    return told
+
+
+def _first_action(view: View) -> dict[str, Any]:
+    """How far the policy's first action is from where the robot is now; {} where it is not known."""
+    if view.setup.first_action is None:
+        return {}
+    return first_action(view.setup.first_action, _joints(view), view.plan)
+
+
+def _proposal(view: View) -> dict[str, Any]:
+    """The chunk that is shown and waits to be committed."""
+    made = view.inference.proposal
+    if made is None:
+        return {}
+    first = first_action(made.rows[0], _joints(view), view.plan)
+    age = view.now - made.answered.observation.captured.get("joints", view.now)
+    return {"chunk": made.number, "rows": len(made.rows), "age_s": age, **first}
+
+
+def _joints(view: View) -> Float64:
+    return np.array(view.page.observation.read()["qpos"], np.float64)
 
 
 def control_figures(page: Page, rate: float) -> dict[str, Any]:
@@ -149,6 +234,7 @@ def control_figures(page: Page, rate: float) -> dict[str, Any]:
         "missed": int(status["missed"]),
         "lateness_p50_ms": float(status["lateness_p50"]) * 1000,
         "lateness_p99_ms": float(status["lateness_p99"]) * 1000,
+        "lateness_p999_ms": float(status["lateness_p999"]) * 1000,
         "lateness_max_ms": float(status["lateness_max"]) * 1000,
         "scheduling": bytes(status["scheduling"]).decode(),
         "records_lost": int(status["records_lost"]),

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import mmap
 import threading
-import weakref
 from concurrent.futures import Future
 from typing import Any
 
@@ -11,16 +10,22 @@ import pytest
 
 from runtime.clock import VirtualClock
 from runtime.errors import PolicyError
-from runtime.inference import Inference, InferenceSettings, LockstepRunner, Runner, ThreadRunner
+from runtime.asking import Asking
+from runtime.commitment import Commitment
+from runtime.inference import Inference, Patience, Strategy
 from runtime.messages import ChunkMerged, PolicyAnswer, PostedChunk, decode
 from runtime.orders import Orders
 from runtime.page import Page, PageLayout
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.spaces import Spaces
+from runtime.runner import LockstepRunner, Runner, ThreadRunner
+from runtime.sight import Sight, SightSettings
+from runtime.spaces import CommandRows, Spaces
 from runtime.strategies import overlap, sync
 from runtime.types import ActionChunk, Conditioning, Float32, Observation
 
 RATE = 30.0
+ASYNC = Strategy(overlap.query(overlap.Config()), overlap.Config())
+SYNC = Strategy(sync.query(sync.Config()), sync.Config())
 PICTURE = np.zeros((5, 5, 3), np.uint8)
 
 
@@ -61,33 +66,40 @@ class FakeSpaces(Spaces):
     def __init__(self) -> None:
         pass
 
-    def to_command(self, chunk: ActionChunk, qpos: Float32) -> Any:
+    def to_command(self, chunk: ActionChunk, observation: Observation) -> CommandRows:
         if not np.isfinite(chunk.actions).all():
             raise PolicyError("the policy answered with nan")
-        return chunk.actions.astype(np.float64), None
+        rows = chunk.actions.astype(np.float64)
+        return CommandRows(rows, np.arange(len(rows)), None)
 
     def eef_of(self, q: Any, previous: Any = None) -> Float32:
         return np.full(8, q[0], np.float32)
 
 
+def _async(**parameters: Any) -> Strategy:
+    config = overlap.Config(**parameters)
+    return Strategy(overlap.query(config), config)
+
+
 class Desk:
     """Inference with everything around it under the test's hand; media and control are played by it."""
 
-    def __init__(self, runner: Runner | None = None, query: Any = None) -> None:
+    def __init__(self, runner: Runner | None = None, strategy: Strategy | None = None) -> None:
         layout = PageLayout(2, 8, ("cam",), 300)
         self.page = Page(layout, mmap.mmap(-1, Page.size(layout)))
         self.clock = VirtualClock(100.0)
         self.policy = FakePolicy()
         self.runner = runner or LockstepRunner(0)
+        sight = Sight(self.page, self.clock, SightSettings(RATE, 0.2, 0.5))
+        self.asking = Asking(self.policy, "pick", FakeSpaces(), sight, self.runner, self.clock)
         self.inference = Inference(
-            self.policy,
-            query or overlap.query(overlap.Config()),
-            FakeSpaces(),
+            self.asking,
+            strategy or ASYNC,
             self.page,
             Orders(self.page),
-            self.runner,
             self.clock,
-            InferenceSettings(RATE, "pick", 0.2, 0.5, (), 1.0),
+            Patience(stale=1.0, lost=3.0),
+            Commitment(RATE),
         )
         self.sequence = 0
 
@@ -131,26 +143,26 @@ def desk() -> Desk:
 
 
 def test_an_observation_that_control_has_seen_is_of_the_step_that_saw_it(desk: Desk) -> None:
-    assert desk.inference.observe().step == 7
+    assert desk.asking.observe().step == 7
 
 
 def test_a_newer_observation_is_of_the_next_step(desk: Desk) -> None:
     desk.clock.advance(0.02)
     desk.observe()
-    assert desk.inference.observe().step == 8
+    assert desk.asking.observe().step == 8
 
 
 def test_while_control_stalls_an_observation_is_of_the_step_that_will_see_it(desk: Desk) -> None:
     desk.clock.advance(14.5 / RATE)
     desk.observe()
-    assert desk.inference.observe().step == 22
+    assert desk.asking.observe().step == 22
 
 
 def test_an_observation_that_arrived_just_before_a_tick_that_missed_it_is_of_the_next_step(
     desk: Desk,
 ) -> None:
     desk.observe(arrived=desk.clock.now() - 0.001)
-    assert desk.inference.observe().step == 8
+    assert desk.asking.observe().step == 8
 
 
 def test_the_policy_is_shown_the_task_the_pictures_and_poses(desk: Desk) -> None:
@@ -176,24 +188,24 @@ def test_what_is_too_old_is_named_and_not_shown_to_the_policy(
     desk = Desk()
     desk.observe(captured={name: 100.0 + offset for name, offset in captured.items()})
     with pytest.raises(PolicyError, match=sentence):
-        desk.inference.ask()
+        desk.asking.ask()
     assert desk.policy.calls == []
 
 
 def test_pictures_may_be_older_than_joints(desk: Desk) -> None:
     desk.observe(captured={"joints": 100.0, "cam": 99.6})
-    assert desk.inference.observe().captured["cam"] == 99.6
+    assert desk.asking.observe().captured["cam"] == 99.6
 
 
 def test_without_an_observation_or_a_picture_it_says_what_is_missing() -> None:
     desk = Desk()
     with pytest.raises(PolicyError, match="no observation has arrived yet"):
-        desk.inference.observe()
+        desk.asking.observe()
     now = desk.clock.now()
     bare = Observation(1, now, {"joints": now}, np.zeros(2, np.float32), {})
     desk.page.publish_observation(bare, {})
     with pytest.raises(PolicyError, match="no picture has arrived from cam"):
-        desk.inference.observe()
+        desk.asking.observe()
 
 
 def test_an_answer_is_posted_unmerged_with_the_step_of_its_observation(desk: Desk) -> None:
@@ -206,16 +218,6 @@ def test_an_answer_is_posted_unmerged_with_the_step_of_its_observation(desk: Des
     assert answer.source_rows.tolist() == [0, 1, 2, 3]
 
 
-def test_a_chunk_of_another_rate_is_resampled_and_says_which_row_made_which(desk: Desk) -> None:
-    desk.policy.answer = ActionChunk(np.arange(6, dtype=np.float32).reshape(3, 2), rate=15.0)
-    answer = desk.inference.pump()
-    (chunk,) = desk.posted()
-    assert chunk.rows[:, 0].tolist() == [0, 1, 2, 3, 4, 4]
-    assert answer is not None
-    assert answer.source_rows.tolist() == [0, 0, 1, 1, 2, 2]
-    assert len(answer.actions) == 3  # the record has them as the policy gave them
-
-
 def test_nothing_is_asked_while_an_answer_is_not_merged_yet(desk: Desk) -> None:
     desk.inference.pump()
     for _ in range(3):
@@ -224,7 +226,7 @@ def test_nothing_is_asked_while_an_answer_is_not_merged_yet(desk: Desk) -> None:
     desk.merged(1)
     desk.inference.pump()
     assert desk.policy.calls.count("infer") == 2
-    assert list(desk.inference.delays) == [3]
+    assert list(desk.inference.tally.delays) == [3]
 
 
 def test_a_dropped_chunk_is_followed_by_a_new_query(desk: Desk) -> None:
@@ -244,7 +246,7 @@ def test_nothing_is_asked_while_a_request_is_in_flight() -> None:
 
 
 def test_sync_asks_only_when_nothing_is_left_to_execute() -> None:
-    desk = Desk(query=sync.query(sync.Config())).going()
+    desk = Desk(strategy=SYNC).going()
     desk.ticked(7, remaining=2)
     assert desk.inference.pump() is None
     desk.ticked(9, remaining=0)
@@ -252,7 +254,7 @@ def test_sync_asks_only_when_nothing_is_left_to_execute() -> None:
 
 
 def test_async_keeps_its_rate() -> None:
-    desk = Desk(query=overlap.query(overlap.Config(inference_rate=5.0))).going()
+    desk = Desk(strategy=_async(inference_rate=5.0)).going()
     asked = []
     for step in range(30):
         desk.observe()
@@ -279,7 +281,7 @@ def test_a_pause_drops_the_answer_that_is_still_in_flight() -> None:
 
 def test_what_control_says_of_another_run_is_not_counted(desk: Desk) -> None:
     desk.merged(1, run=9)
-    assert list(desk.inference.delays) == []
+    assert list(desk.inference.tally.delays) == []
 
 
 def test_the_policy_is_reset_once_per_run_and_before_its_first_inference(desk: Desk) -> None:
@@ -338,46 +340,6 @@ def test_a_gap_in_the_observations_is_waited_out_and_an_error_where_it_lasts(des
         desk.inference.pump()
 
 
-def test_lockstep_hands_every_result_over_the_same_number_of_ticks_later() -> None:
-    runner = LockstepRunner(2)
-    first = runner.submit(lambda: 1)
-    runner.tick()
-    second = runner.submit(lambda: 2)
-    ready = []
-    for _ in range(3):
-        ready.append((runner.ready(first), runner.ready(second)))
-        runner.tick()
-    assert ready == [(False, False), (True, False), (True, True)]
-    assert first.result() + second.result() == 3
-
-
-def test_lockstep_keeps_no_result_that_nobody_waits_for() -> None:
-    runner = LockstepRunner(5)
-    kept = weakref.ref(runner.submit(lambda: 1))
-    assert kept() is None
-
-
-def test_a_thread_of_its_own_makes_one_call_after_the_other() -> None:
-    runner = ThreadRunner()
-    gate, order = threading.Event(), []
-
-    def slow() -> str:
-        gate.wait(10)
-        order.append("slow")
-        return threading.current_thread().name
-
-    first = runner.submit(slow)
-    second = runner.submit(lambda: order.append("quick"))
-    assert not runner.ready(first)
-    assert not runner.ready(second)
-    gate.set()
-    second.result(10)
-    assert first.result(10) != threading.current_thread().name
-    assert order == ["slow", "quick"]
-    assert runner.ready(first)
-    runner.close()
-
-
 def test_a_slow_policy_in_its_thread_never_stops_the_caller() -> None:
     desk = Desk(ThreadRunner()).going()
     desk.policy.open.clear()
@@ -391,14 +353,6 @@ def test_a_slow_policy_in_its_thread_never_stops_the_caller() -> None:
     assert desk.inference.pump() is not None
     assert desk.policy.calls == ["reset", "infer"]
     desk.runner.close()
-
-
-def test_an_error_in_the_thread_is_told_as_a_policy_error() -> None:
-    runner = ThreadRunner()
-    future = runner.submit(lambda: 1 // 0)
-    with pytest.raises(PolicyError, match="ZeroDivisionError"):
-        future.result(10)
-    runner.close()
 
 
 def test_an_answer_that_the_former_policy_gives_late_is_never_used() -> None:
@@ -435,7 +389,7 @@ def test_a_call_whose_turn_comes_after_the_exchange_is_still_the_former_policys(
 
     desk.runner.submit = submit  # type: ignore[method-assign]
     former, other = desk.policy, FakePolicy()
-    desk.inference.ask()
+    desk.asking.ask()
     desk.inference.exchange(other, "place")
     calls[0]()
     assert former.calls == ["close", "reset", "infer"]
@@ -444,11 +398,11 @@ def test_a_call_whose_turn_comes_after_the_exchange_is_still_the_former_policys(
 
 def test_the_same_policy_is_neither_closed_nor_told_to_forget_by_a_new_task(desk: Desk) -> None:
     desk.inference.pump()
-    assert desk.inference.latencies
+    assert desk.inference.tally.latencies
     desk.inference.exchange(desk.policy, "place")
     assert desk.policy.calls == ["reset", "infer"]
-    assert (len(desk.inference.latencies), len(desk.inference.delays)) == (0, 0)
-    desk.inference.ask()
+    assert (len(desk.inference.tally.latencies), len(desk.inference.tally.delays)) == (0, 0)
+    desk.asking.ask()
     assert desk.policy.calls == ["reset", "infer", "infer"]
     assert desk.policy.seen[-1].prompt == "place"
 

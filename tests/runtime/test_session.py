@@ -10,7 +10,7 @@ from runtime.errors import RuntimeFault
 from runtime.lease import Lease
 from runtime.messages import Ack, Command
 from runtime.requests import BenchRequest, RunRequest, SetUpRequest
-from runtime.session import COMMANDS, HAPPENINGS, STOPPING, Effects, Happening, Session, State
+from runtime.session import COMMANDS, HAPPENINGS, STOPPING, Effects, Happening, Session, Situation, State
 
 S, H = State, Happening
 EFFECTS = {
@@ -23,21 +23,55 @@ EFFECTS = {
     "release": "release_estop",
     "record_start": "start_recording",
     "record_stop": "stop_recording",
+    "tune": "tune",
+    "step": "step",
+    "commit": "commit",
+    "cancel": "cancel",
+    "move": "move",
+    "gripper": "grip",
+    "approach": "approach",
 }
+ARGUMENTS = {"gripper": {"action": "open"}}  # where one is needed
 # Written out a second time, so that a change of the table is a decision and not a slip.
 ALLOWED = {
     S.DISCONNECTED: {"record_stop", "estop"},
-    S.IDLE: {"setup", "record_start", "record_stop", "estop"},
+    S.IDLE: {"setup", "record_start", "record_stop", "tune", "estop"},
     S.SETTING_UP: {"stop", "halt", "record_stop", "estop"},
-    S.READY: {"setup", "run", "stop", "home", "record_start", "record_stop", "estop"},
-    S.RUNNING: {"stop", "halt", "estop"},
-    S.HOLDING: {"stop", "halt", "resume", "record_stop", "estop"},
+    S.READY: {"setup", "run", "stop", "home", "record_start", "record_stop", "tune", "gripper", "estop"},
+    S.RUNNING: {"stop", "halt", "tune", "gripper", "estop"},
+    S.HOLDING: {"stop", "halt", "resume", "record_stop", "tune", "gripper", "estop"},
     S.FAULTED: {"release", "estop"},
 }
+ON_DEMAND = ("step", "preview")
+# What a situation adds while a run goes on or the station is ready, and what it takes away.
+GUARDED = {
+    "step": (S.RUNNING, lambda s: s.mode in ON_DEMAND and not (s.proposed or s.asked or s.executing)),
+    "commit": (S.RUNNING, lambda s: s.mode == "preview" and s.proposed),
+    "cancel": (S.RUNNING, lambda s: s.mode in (*ON_DEMAND, "manual")),
+    "move": (S.RUNNING, lambda s: s.mode == "manual"),
+}
+SITUATIONS = [
+    Situation(*fields)
+    for fields in product((None, "continuous", "step", "preview", "sim", "manual"), *[(False, True)] * 5)
+]
+
+
+def allowed_in(state, situation):
+    """What may be given, said in another way than by the table."""
+    found = set(ALLOWED[state])
+    if situation.trial:
+        found -= {"tune", "gripper"}
+    found |= {kind for kind, (where, holds) in GUARDED.items() if state is where and holds(situation)}
+    committable = situation.mode == "preview" and situation.proposed
+    if (state is S.READY and situation.first_action) or (state is S.RUNNING and committable):
+        found.add("approach")
+    return found
 
 
 class Recorded(Effects):
     """Remembers what was asked for; refuses what it is told to."""
+
+    situation = Situation()
 
     def __init__(self):
         self.done, self.refuse = [], set()
@@ -80,6 +114,30 @@ class Recorded(Effects):
     def stop_recording(self):
         self._do("stop_recording")
 
+    def tune(self, asked):
+        self._do("tune", asked)
+        return {"task": "wave"}
+
+    def step(self):
+        self._do("step")
+
+    def commit(self):
+        self._do("commit")
+
+    def cancel(self):
+        self._do("cancel")
+
+    def move(self, asked):
+        self._do("move", asked)
+        return {"duration_s": 1.5}
+
+    def grip(self, asked):
+        self._do("grip", asked)
+        return {"grippers": {}}
+
+    def approach(self):
+        self._do("approach")
+
 
 class Bench:
     """A session with a lease held by anna, in any state."""
@@ -113,34 +171,57 @@ class Bench:
 
 
 @pytest.mark.parametrize("state", State)
-def test_the_allowed_commands_of_a_state_are_those_of_the_table(state):
-    assert set(Bench(state).session.allowed()) == ALLOWED[state]
-    cancelling = {"stop", "halt"} if state is S.SETTING_UP else set()
-    table = {kind for kind, rule in COMMANDS.items() if state in rule.allowed}
-    assert ALLOWED[state] == table | cancelling | {"estop"}
+def test_what_is_allowed_in_a_state_is_what_its_guards_say_in_every_situation(state):
+    bench = Bench(state)
+    for situation in SITUATIONS:
+        bench.effects.situation = situation
+        assert set(bench.session.allowed()) == allowed_in(state, situation), situation
 
 
 @pytest.mark.parametrize(("kind", "state"), list(product(COMMANDS, State)))
-def test_a_command_is_carried_out_exactly_where_the_table_allows_it(kind, state):
-    bench = Bench(state)
-    sequence = bench.session.sequence
-    ack = bench.give(kind)
-    if kind not in ALLOWED[state]:
-        assert ack.status == "refused"
-        assert ack.reason.startswith(f"{kind} is not allowed while {state} (")
-        assert set(ack.allowed) == ALLOWED[state]
-        assert bench.session.state is state
-        assert bench.session.sequence == sequence
-        assert bench.effects.done == []
-        return
+def test_a_command_is_carried_out_exactly_where_table_and_guards_allow_it(kind, state):
     cancels = state is S.SETTING_UP and kind in ("stop", "halt")
-    after = S.IDLE if cancels else COMMANDS[kind].after or state
-    assert (ack.status, ack.reason) == ("accepted", "")
-    assert bench.names == ["cancel_setup" if cancels else EFFECTS[kind]]
-    assert bench.session.state is after
-    assert set(ack.allowed) == ALLOWED[after]
-    assert ack.sequence == bench.session.sequence
-    assert (bench.session.sequence > sequence) == (cancels or COMMANDS[kind].after is not None)
+    for situation in SITUATIONS:
+        bench = Bench(state)
+        bench.effects.situation = situation
+        sequence = bench.session.sequence
+        ack = bench.give(kind, args=ARGUMENTS.get(kind, {}))
+        if kind not in allowed_in(state, situation):
+            assert ack.status == "refused"
+            assert ack.reason.startswith(f"{kind} is not allowed ")
+            assert f"allowed: {', '.join(ack.allowed)}" in ack.reason
+            assert set(ack.allowed) == allowed_in(state, situation)
+            assert bench.session.state is state
+            assert bench.session.sequence == sequence
+            assert bench.effects.done == []
+            continue
+        after = S.IDLE if cancels else COMMANDS[kind].next(state) or state
+        assert (ack.status, ack.reason) == ("accepted", "")
+        assert bench.names == ["cancel_setup" if cancels else EFFECTS[kind]]
+        assert bench.session.state is after
+        assert ack.sequence == bench.session.sequence
+        assert (bench.session.sequence > sequence) == (cancels or COMMANDS[kind].next(state) is not None)
+
+
+def test_a_refusal_names_the_state_or_what_the_guard_says():
+    bench = Bench(S.IDLE)
+    assert bench.give("step").reason.startswith("step is not allowed while idle (")
+    bench = Bench(S.RUNNING)
+    bench.effects.situation = Situation(mode="preview", proposed=True)
+    assert "a chunk is shown: commit or cancel it first" in bench.give("step").reason
+    bench.effects.situation = Situation(mode="continuous", trial=True)
+    assert "one of a trial" in bench.give("tune").reason
+
+
+def test_going_to_the_first_action_is_a_set_up_of_its_own_but_within_a_run_the_run_goes_on():
+    bench = Bench(S.READY)
+    bench.effects.situation = Situation(first_action=True)
+    bench.give("approach")
+    assert bench.session.state is S.SETTING_UP
+    bench = Bench(S.RUNNING)
+    bench.effects.situation = Situation(mode="preview", proposed=True)
+    bench.give("approach")
+    assert bench.session.state is S.RUNNING
 
 
 @pytest.mark.parametrize(("kind", "state"), [(k, s) for s in State for k in sorted(ALLOWED[s] - {"estop"})])
@@ -150,7 +231,7 @@ def test_an_effect_that_refuses_is_the_reason_and_nothing_changes(kind, state):
     name = "cancel_setup" if cancels else EFFECTS[kind]
     bench.effects.refuse = {name}
     sequence, reason = bench.session.sequence, bench.session.reason
-    ack = bench.give(kind)
+    ack = bench.give(kind, args=ARGUMENTS.get(kind, {}))
     assert (ack.status, ack.reason) == ("refused", f"cannot {name}")
     assert (bench.session.state, bench.session.sequence, bench.session.reason) == (state, sequence, reason)
 
@@ -169,8 +250,9 @@ def test_the_arguments_of_a_command_reach_its_effect_checked():
 def test_an_argument_that_a_command_does_not_take_is_the_reason_and_nothing_is_done(kind):
     state = COMMANDS[kind].allowed[0]
     bench = Bench(state)
+    bench.effects.situation = next(s for s in SITUATIONS if kind in allowed_in(state, s))
     sequence = bench.session.sequence
-    ack = bench.give(kind, args={"colour": "blue"})
+    ack = bench.give(kind, args=ARGUMENTS.get(kind, {}) | {"colour": "blue"})
     assert ack.status == "refused"
     assert ack.reason.startswith((f"{kind}: colour = 'blue': unknown key", f"{kind} takes no arguments"))
     assert (bench.session.state, bench.session.sequence, bench.effects.done) == (state, sequence, [])

@@ -1,0 +1,32 @@
+"""When to try again what has failed: soon at first, then less and less often."""
+
+from __future__ import annotations
+
+_FIRST_S, _LONGEST_S = 0.1, 2.0
+
+
+class BackOff:
+    """Doubles the wait with every failure; a success forgets them. Times are the caller's clock [s]."""
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing has failed."""
+        self._failures = 0
+        self._due = float("-inf")
+        self.since: float | None = None  # the first of the failures in a row
+
+    def failed(self, now: float) -> None:
+        """Once more."""
+        self.since = now if self.since is None else self.since
+        self._due = now + min(_LONGEST_S, _FIRST_S * 2.0**self._failures)
+        self._failures += 1
+
+    def waiting(self, now: float) -> float:
+        """For how long nothing is to be tried [s]; 0 where it may be."""
+        return max(0.0, self._due - now)
+
+    def lasts(self, now: float) -> float:
+        """How long it has been failing [s]."""
+        return 0.0 if self.since is None else now - self.since

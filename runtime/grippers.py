@@ -1,0 +1,80 @@
+"""Grippers by hand: open, close, lock where they are, give back; beside whatever moves the arms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from robots.robot import Group
+from runtime.errors import RuntimeFault
+from runtime.family import Plan
+from runtime.page import Page
+from runtime.requests import GripperRequest
+from runtime.types import Float64
+
+
+@dataclass(frozen=True, slots=True)
+class Grip:
+    """What a request amounts to: locks float64 [D] (NaN: free), and where grippers are to move, None for nowhere."""
+
+    locks: Float64
+    goal: Float64 | None
+
+
+class Grippers:
+    """The locks in force, and what requests make of them."""
+
+    def __init__(self, plan: Plan, page: Page) -> None:
+        self._groups = [group for group in plan.robot.groups if group.gripper is not None]
+        self._page = page
+        self._robot = plan.robot.name
+        self.locks: Float64 = np.full(plan.robot.dim, np.nan)
+
+    def forget(self) -> None:
+        """Nothing is locked."""
+        self.locks = np.full(len(self.locks), np.nan)
+
+    def asked(self, request: GripperRequest, free: bool) -> Grip:
+        """`free`: nothing else moves the arms, so that a gripper can be moved; else opening and closing lock it there.
+
+        Raises RuntimeFault where the robot has no such gripper.
+        """
+        chosen = self._chosen(request.arm)
+        commanded = np.array(self._page.control.read()["commanded"], np.float64)
+        locks, goal = self.locks.copy(), commanded.copy()
+        for group in chosen:
+            dim, gripper = group.gripper_dim, group.gripper
+            assert dim is not None
+            assert gripper is not None
+            if request.action == "unlock":
+                locks[dim] = np.nan
+            elif request.action == "lock":
+                locks[dim] = commanded[dim]
+            else:
+                goal[dim] = gripper.open if request.action == "open" else gripper.close
+                if not free or not np.isnan(locks[dim]):
+                    locks[dim] = goal[dim]
+        moves = free and request.action in ("open", "close")
+        return Grip(locks, goal if moves else None)
+
+    def _chosen(self, name: str | None) -> list[Group]:
+        if name is None and self._groups:
+            return self._groups
+        chosen = [group for group in self._groups if group.name == name]
+        if not chosen:
+            names = ", ".join(group.name for group in self._groups) or "none"
+            raise RuntimeFault(f"gripper: arm = {name!r}; {self._robot} has grippers on {names}")
+        return chosen
+
+    def told(self) -> dict[str, Any]:
+        """For a snapshot: where each one is told to be, and whether it is locked."""
+        commanded = self._page.control.read()["commanded"]
+        return {
+            group.name: {
+                "locked": not bool(np.isnan(self.locks[group.gripper_dim])),
+                "at": float(commanded[group.gripper_dim]),
+            }
+            for group in self._groups
+        }

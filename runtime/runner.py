@@ -1,0 +1,103 @@
+"""Where blocking calls to a policy are made: a thread beside main, or counted out in lockstep."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
+
+from runtime.errors import PolicyError, RuntimeFault
+
+log = logging.getLogger(__name__)
+Result = TypeVar("Result")
+
+
+class Runner(ABC):
+    """Where blocking calls to the policy are made, one after the other."""
+
+    @abstractmethod
+    def submit(self, call: Callable[[], Result]) -> Future[Result]:
+        """Start `call`; its result or RuntimeFault is in the future when `ready` says so."""
+
+    @abstractmethod
+    def ready(self, future: Future[Result]) -> bool: ...
+
+    @property
+    @abstractmethod
+    def busy(self) -> bool:
+        """Whether an earlier call is still being made, and another would wait behind it."""
+
+    def tick(self) -> None:  # noqa: B027  # only runners that count have something to do
+        """One control period has passed."""
+
+    def close(self) -> None:  # noqa: B027  # only runners with a thread have something to do
+        """Take no further calls."""
+
+
+def _told(call: Callable[[], Result]) -> Callable[[], Result]:
+    """`call`, with every error of a policy's own code told as a PolicyError: it must not end main."""
+
+    def telling() -> Result:
+        try:
+            return call()
+        except RuntimeFault:
+            raise
+        except Exception as error:
+            log.exception("the policy's own code failed")
+            raise PolicyError(f"the policy's own code failed: {type(error).__name__}: {error}") from error
+
+    return telling
+
+
+class ThreadRunner(Runner):
+    """One thread of its own, so that a slow policy never stops main."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
+        self._newest: Future[Any] | None = None
+
+    def submit(self, call: Callable[[], Result]) -> Future[Result]:
+        future = self._pool.submit(_told(call))
+        self._newest = future
+        return future
+
+    def ready(self, future: Future[Result]) -> bool:
+        return future.done()
+
+    @property
+    def busy(self) -> bool:
+        return self._newest is not None and not self._newest.done()
+
+    def close(self) -> None:
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+class LockstepRunner(Runner):
+    """Calls at once and hands the result over `delay` ticks later, the same on every run."""
+
+    def __init__(self, delay: int) -> None:
+        self._delay = delay
+        self._now = 0
+        self._due: WeakKeyDictionary[Future[Any], int] = WeakKeyDictionary()
+
+    def submit(self, call: Callable[[], Result]) -> Future[Result]:
+        future: Future[Result] = Future()
+        try:
+            future.set_result(_told(call)())
+        except RuntimeFault as error:
+            future.set_exception(error)
+        self._due[future] = self._now + self._delay
+        return future
+
+    def ready(self, future: Future[Result]) -> bool:
+        return self._now >= self._due[future]
+
+    @property
+    def busy(self) -> bool:
+        return False
+
+    def tick(self) -> None:
+        self._now += 1

@@ -1,0 +1,71 @@
+"""The newest observation as a policy is shown it: not too old, of one tick, with its instruction."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from runtime.clock import Clock
+from runtime.errors import PolicyError
+from runtime.page import Page
+from runtime.types import Observation
+
+
+class StaleObservationError(PolicyError):
+    """The newest observation is too old to ask a policy about."""
+
+
+@dataclass(frozen=True, slots=True)
+class SightSettings:
+    """What may be shown: ages in seconds, the control rate in Hz."""
+
+    control_rate: float
+    joint_age: float
+    picture_age: float
+
+
+class Sight:
+    """Reads the page; `simulated` shows the joints of the simulated robot in place of the real one's."""
+
+    def __init__(self, page: Page, clock: Clock, settings: SightSettings) -> None:
+        self._page = page
+        self._clock = clock
+        self._settings = settings
+        self.simulated = False
+
+    def now(self, prompt: str) -> Observation:
+        """The newest observation; PolicyError where there is none, or it is old."""
+        seen = self._page.read_observation(self._page.layout.cameras)
+        if seen is None:
+            raise PolicyError("no observation has arrived yet")
+        now, bounds = self._clock.now(), self._settings
+        for stream, captured in seen.captured.items():
+            allowed = bounds.joint_age if stream in ("joints", "eef") else bounds.picture_age
+            if not now - captured <= allowed:
+                raise StaleObservationError(f"{stream}: {now - captured:.2f} s old, allowed {allowed:g}")
+        missing = [camera for camera in self._page.layout.cameras if camera not in seen.pictures]
+        if missing:
+            raise PolicyError(f"no picture has arrived from {', '.join(missing)}")
+        shown = replace(seen, step=self._step_of(seen), prompt=prompt)
+        return self._of_the_simulated_robot(shown) if self.simulated else shown
+
+    def _step_of(self, seen: Observation) -> int:
+        """The control step that an observation is assembled for: the tick that saw it, or the next one.
+
+        While control stalls that is more than one step on: steps follow the clock, missed ticks are skipped.
+        """
+        status = self._page.control.read()
+        step, planned = int(status["step"]), float(status["planned"])
+        if seen.sequence == int(status["sequence"]):
+            return step
+        periods = (seen.arrived - planned) * self._settings.control_rate if planned else 1.0
+        return step + max(1, math.ceil(periods - 1e-6))
+
+    def _of_the_simulated_robot(self, shown: Observation) -> Observation:
+        """Its joints; what only a real robot measures is left out. Before its first tick it stands where that does."""
+        joints = np.array(self._page.control.read()["simulated"], np.float32)
+        if not np.isfinite(joints).all():
+            return shown
+        return replace(shown, qpos=joints, qvel=None, effort=None, eef=None)

@@ -1,0 +1,158 @@
+"""Where a person wants the robot: named poses, joints, steps of an end effector, all checked before anything moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from robots.rotations import matrix_of_quaternion, matrix_of_rpy, quaternion_of_matrix
+from runtime.errors import RuntimeFault
+from runtime.family import Plan
+from runtime.kinematics.base import Kinematics
+from runtime.motion import Trajectory
+from runtime.requests import AimRequest, Jog, MoveRequest
+from runtime.spaces import Spaces
+from runtime.types import EEF_WIDTH, Float32, Float64
+
+_SAMPLES = 64  # of a path, for the workspace box
+_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Aim:
+    """A target float64 [D] within the limits, its poses float32 [8 * arms], and what became of the wish.
+
+    `clipped` names the joints that a limit has moved; errors are those of a jog's pose, 0 where none was asked for.
+    """
+
+    joints: Float64
+    poses: Float32
+    clipped: tuple[str, ...]
+    reached: bool = True
+    position_error: float = 0.0  # [m]
+    rotation_error: float = 0.0  # [rad]
+
+
+class Targets:
+    """Turns what a person asks for into joint targets of one robot."""
+
+    def __init__(self, plan: Plan, spaces: Spaces, kinematics: Kinematics) -> None:
+        self._plan = plan
+        self._spaces = spaces
+        self._kinematics = kinematics
+
+    def aim(self, asked: AimRequest, commanded: Float64) -> Aim:
+        """Where it would go; RuntimeFault for a pose, an arm or a number of joints that the robot has not."""
+        start = self._wanted("aim", asked.joints, asked.pose, commanded)
+        if asked.jog is None:
+            return self._clipped(start)
+        return self._jogged(asked.jog, start)
+
+    def goal(self, asked: MoveRequest, commanded: Float64) -> Float64:
+        """The end of a motion from `commanded`, checked all the way: RuntimeFault says what is wrong with it."""
+        if asked.joints is None and asked.pose is None:
+            raise RuntimeFault(
+                f"move: say joints or a pose; poses of {self._plan.robot.name}: {self._poses()}"
+            )
+        goal = self._wanted("move", asked.joints, asked.pose, commanded)
+        aimed = self._clipped(goal)
+        if aimed.clipped:
+            limits = self._plan.limits
+            worst = limits.names.index(aimed.clipped[0])
+            raise RuntimeFault(
+                f"move: {limits.names[worst]} = {goal[worst]:.4f}; allowed: {limits.lower[worst]:g} to "
+                f"{limits.upper[worst]:g}"
+            )
+        self.check_path(commanded, goal)
+        return goal
+
+    def duration(self, start: Float64, goal: Float64, speed: float = 1.0) -> float:
+        """How long a motion of ours takes [s]."""
+        safety, limits = self._plan.deployment.safety, self._plan.limits
+        velocity = limits.velocity * safety.motion_velocity_scale * speed
+        return Trajectory(start, goal, velocity, safety.motion_acceleration * limits.reach).duration
+
+    def check_path(self, start: Float64, goal: Float64) -> None:
+        """RuntimeFault where the straight way in joints leaves a workspace box that it begins in."""
+        boxes = self._plan.deployment.safety.workspace
+        if not boxes:
+            return
+        way = start + np.linspace(0.0, 1.0, _SAMPLES)[:, None] * (goal - start)
+        poses = self._spaces.eef_of(way).reshape(_SAMPLES, -1, EEF_WIDTH)
+        for index, arm in enumerate(self._plan.robot.arms):
+            if arm.name not in boxes:
+                continue
+            box, points = boxes[arm.name], poses[:, index, :3]
+            inside = ((points >= box.lower) & (points <= box.upper)).all(axis=1)
+            if inside[0] and not inside.all():
+                raise RuntimeFault(f"{arm.name} would leave the workspace box on its way")
+
+    def _wanted(
+        self, what: str, joints: Sequence[float] | None, pose: str | None, commanded: Float64
+    ) -> Float64:
+        robot = self._plan.robot
+        if joints is not None and pose is not None:
+            raise RuntimeFault(f"{what}: joints and the pose {pose!r}; allowed: one of the two")
+        if pose is not None:
+            if pose not in robot.poses:
+                raise RuntimeFault(f"{what}: pose = {pose!r}; {robot.name} has {self._poses()}")
+            return np.array(robot.poses[pose], np.float64)
+        if joints is None:
+            return commanded.copy()
+        if len(joints) != robot.dim:
+            raise RuntimeFault(f"{what}: {len(joints)} joints; {robot.name} has {robot.dim}")
+        return np.array(joints, np.float64)
+
+    def _poses(self) -> str:
+        return ", ".join(sorted(self._plan.robot.poses))
+
+    def _clipped(self, joints: Float64) -> Aim:
+        limits = self._plan.limits
+        allowed = np.clip(joints, limits.lower, limits.upper)
+        moved = np.flatnonzero(np.abs(allowed - joints) > _TOLERANCE)
+        return Aim(allowed, self._spaces.eef_of(allowed), tuple(limits.names[i] for i in moved))
+
+    def _jogged(self, jog: Jog, start: Float64) -> Aim:
+        arms = [arm.name for arm in self._plan.robot.arms]
+        if jog.arm not in arms:
+            raise RuntimeFault(f"aim: jog.arm = {jog.arm!r}; {self._plan.robot.name} has {', '.join(arms)}")
+        index = arms.index(jog.arm)
+        poses = self._kinematics.forward(start)
+        poses[index] = _stepped(poses[index], jog)
+        solved = self._kinematics.solve(poses[None], start)
+        aimed = self._clipped(solved.q[0])
+        return Aim(
+            aimed.joints,
+            aimed.poses,
+            aimed.clipped,
+            bool(solved.reached[0].all()),
+            float(solved.position_error[0, index]),
+            float(solved.rotation_error[0, index]),
+        )
+
+
+def _stepped(pose: Float64, jog: Jog) -> Float64:
+    """The pose [7] (x, y, z, qw, qx, qy, qz) after the step."""
+    turn, shift = matrix_of_rpy(*jog.rotation), np.array(jog.translation, np.float64)
+    here = matrix_of_quaternion(pose[3:])
+    there = here @ turn if jog.frame == "tool" else turn @ here
+    way = here @ shift if jog.frame == "tool" else shift
+    return np.concatenate([pose[:3] + way, quaternion_of_matrix(there)])
+
+
+def told(aim: Aim, plan: Plan, distance: float, duration: float) -> dict[str, Any]:
+    """The aim as an answer to a client: joints, poses, errors in mm and degrees."""
+    return {
+        "joints": aim.joints.tolist(),
+        "poses": aim.poses.tolist(),
+        "reached": aim.reached,
+        "position_error_mm": aim.position_error * 1000,
+        "rotation_error_deg": float(np.degrees(aim.rotation_error)),
+        "clipped": list(aim.clipped),
+        "distance": distance,
+        "duration_s": duration,
+        "robot": plan.robot.name,
+    }
