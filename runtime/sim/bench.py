@@ -32,6 +32,21 @@ class BenchError(RuntimeFault):
 
 
 @dataclass(frozen=True, slots=True)
+class Belt:
+    """A belt along x: where it lies, and where beside a block that rides on it fingertips are to be [m].
+
+    The block's centre rides between both ends of `x` at `y`. `beside` is from the block's foot to the place of
+    the fingertips: nearer to the arms, so that no arm hides the block from the camera above, and clear of it.
+    """
+
+    x: tuple[float, float] = (-0.10, 0.30)
+    y: float = 0.34
+    width: float = 0.08
+    beside: tuple[float, float, float] = (0.0, -0.07, 0.08)
+    colour: Colour = (70, 74, 80)
+
+
+@dataclass(frozen=True, slots=True)
 class Bench:
     """Sizes [m] and colours (red, green, blue; 0 to 255) of everything on the table.
 
@@ -47,6 +62,7 @@ class Bench:
     plate_colour: Colour = (226, 234, 244)
     plate_rim_colour: Colour = (58, 104, 190)
     block_colours: tuple[Colour, ...] = ((226, 74, 22), (40, 150, 70), (150, 70, 170), (235, 190, 40))
+    belt: Belt | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,8 +3,8 @@
 Each tick: take the newest command, move the plant, publish one observation. Beyond the plain protocol it
 says its frame number (`seq`), colour order (`encoding`), whom it obeys (`master`), what it `refused`, by
 reason, whether it is `holding` because nobody commands it, and how its `drives` are. With `--bench tabletop`
-there is something to touch, which the word "scene_reset" lays anew and of which the field `truth` says how it
-really is.
+or `conveyor` there is something to touch, which the word "scene_reset" lays anew and of which the field `truth`
+says how it really is.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from threading import Event
 
     from robots import Robot
+    from runtime.sim.surroundings import Surroundings
 
 _QUEUED_FRAMES = 4
 _DRAINED_COMMANDS = 1000  # per tick; a flood must not stop the publishing
@@ -44,9 +45,14 @@ _NO_LEADER = "the simulated node has no leader arm"
 
 
 class Node:
-    """One robot behind two sockets; `open`, then `tick` at the rate, then `close`."""
+    """One robot behind two sockets; `open`, then `tick` at the rate, then `close`.
 
-    def __init__(self, robot: Robot, options: argparse.Namespace, clock: Clock) -> None:
+    Who has its messages without sockets calls `exchange` instead. `around` stands in for what the options name.
+    """
+
+    def __init__(
+        self, robot: Robot, options: argparse.Namespace, clock: Clock, around: Surroundings | None = None
+    ) -> None:
         known = [camera.key for camera in robot.cameras]
         for key in (options.freeze_camera, options.drop_camera):
             if key is not None and key not in known:
@@ -57,7 +63,7 @@ class Node:
         self._plant = Plant(robot, start=_start(robot, options.start_pose))
         self._drives = Drives(not options.drives_disabled, options.drive_fault)
         self._gate = Gate(robot, options.deadline, bench=options.bench != "none")
-        self._surroundings = surroundings.surroundings(robot, options)
+        self._surroundings = around or surroundings.surroundings(robot, options)
         self._leader = Gesture(robot, options.seed)
         self._leader_phase: float | None = None  # None unless it collects
         self._hil_error = ""
@@ -76,9 +82,18 @@ class Node:
 
     def tick(self, seconds: float) -> None:
         """Obey, move for `seconds`, publish."""
-        self._obey()
+        self._publish(self.exchange(self._commands(), seconds))
+
+    def exchange(self, payloads: Sequence[bytes], seconds: float) -> bytes:
+        """Obey what has come and move for `seconds`; returns the observation that is then to be published."""
+        self._obey(payloads)
         self._move(seconds)
-        self._publish()
+        every = self._options.malformed_every
+        payload = codecs.pack(self._observation())
+        if every and self._sequence % every == every - 1:
+            payload = _GARBAGE
+        self._sequence += 1
+        return payload
 
     def close(self) -> None:
         """Release the sockets; safe to call twice."""
@@ -101,10 +116,10 @@ class Node:
             raise SetupError(f"cannot bind {endpoint}: {error}") from error
         return socket
 
-    def _obey(self) -> None:
+    def _obey(self, payloads: Sequence[bytes]) -> None:
         """Judge everything that has come; of the targets only the newest counts."""
         newest = None
-        for payload in self._commands():
+        for payload in payloads:
             accepted = self._gate.judge(payload, self._clock.now())
             if accepted is not None and accepted.control is not None:
                 self._control(accepted)
@@ -157,13 +172,8 @@ class Node:
         self._holding = silent and self._leader_phase is None
         self._surroundings.move(self._plant, seconds)
 
-    def _publish(self) -> None:
+    def _publish(self, payload: bytes) -> None:
         assert self._publisher is not None
-        every = self._options.malformed_every
-        payload = codecs.pack(self._observation())
-        if every and self._sequence % every == every - 1:
-            payload = _GARBAGE
-        self._sequence += 1
         # libzmq by itself notes only once a millisecond what was taken, and drops while a queue looks full.
         self._publisher.poll(0, zmq.POLLOUT)
         with contextlib.suppress(zmq.Again):  # nobody takes them fast enough: the next frame is newer

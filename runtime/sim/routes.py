@@ -120,6 +120,12 @@ class Planner:
             arm, [self._leg("back off", q, high), self._leg("retreat", high, self._rested(arm, q))]
         )
 
+    def hover(self, arm: Group, q: Float64, place: Place, height: float) -> Float64 | None:
+        """Joints [D] with an arm's fingertips over a place at a height, its jaws open; None where it cannot reach."""
+        tilt = _TILTS[0][1]
+        way = self._down(arm, q, place, 0.0, (height, CLEAR), (tilt, tilt))
+        return None if way is None else np.asarray(way[-1])
+
     # --- legs ----------------------------------------------------------------------------------------------
 
     def _route(self, arm: Group, q: Float64, down: Float64, over: Float64, slip: Slip) -> Route:

@@ -31,7 +31,7 @@ def parser() -> argparse.ArgumentParser:
     line.add_argument(
         "--latency-ms", "--delay-ms", type=float, default=0.0, help="time that an inference takes"
     )
-    line.add_argument("--behaviour", choices=["gesture", "pick_place"], default="gesture")
+    line.add_argument("--behaviour", choices=["gesture", "pick_place", "chase"], default="gesture")
     line.add_argument("--name", help="what the server calls its policy; the behaviour's own if not given")
     line.add_argument("--seed", type=int, default=0, help="which gesture; the chances of pick_place")
     skill = line.add_argument_group("how good pick_place is")
@@ -68,13 +68,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _script(robot: Robot, rate: float, options: argparse.Namespace) -> Script:
+    from runtime.sim.chase import Chase
     from runtime.sim.pick_place import PickPlace, Skill
 
+    if options.behaviour != "pick_place" and (options.noise or options.failure_rate):
+        raise SetupError(
+            "--noise and --failure-rate are for --behaviour pick_place; no other fails on purpose"
+        )
+    if options.behaviour == "chase":
+        return Chase(robot, options.horizon, rate, options.name)
     if options.behaviour == "gesture":
-        if options.noise or options.failure_rate:
-            raise SetupError(
-                "--noise and --failure-rate are for --behaviour pick_place; a gesture cannot fail"
-            )
         return Waving(robot, options.horizon, rate, options.seed, options.name)
     skill = Skill(options.noise / 1e3, options.failure_rate, options.seed)
     return PickPlace(robot, options.horizon, rate, skill, options.name)

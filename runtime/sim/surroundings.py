@@ -1,4 +1,4 @@
-"""What a simulated node's arms stand in: nothing but test pictures, or a bench with blocks and a plate."""
+"""What a simulated node's arms stand in: test pictures, a bench with blocks and a plate, or one with a belt."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
+from runtime.sim.conveyor import Conveyor
 from runtime.sim.pictures import Scene
 from runtime.sim.plant import Plant
 from runtime.sim.tabletop import Reset, Tabletop
@@ -14,7 +15,7 @@ from runtime.types import Float64, UInt8
 if TYPE_CHECKING:
     from robots import Robot
 
-NAMES = ("none", "tabletop")
+NAMES = ("none", "tabletop", "conveyor")
 
 
 class Surroundings(ABC):
@@ -62,16 +63,16 @@ class TestCard(Surroundings):
 
 
 class Workbench(Surroundings):
-    """The tabletop, and its pictures."""
+    """A tabletop, and its pictures."""
 
-    def __init__(self, robot: Robot, options: argparse.Namespace) -> None:
+    def __init__(self, robot: Robot, options: argparse.Namespace, tabletop: Tabletop) -> None:
         import cv2  # which no other node needs
 
         from runtime.sim.render import Renderer
 
         cv2.setNumThreads(1)  # the other cores belong to the station
-        self._tabletop = Tabletop(robot, options.seed, options.blocks)
-        self._renderer = Renderer(robot, self._tabletop.bench, options.width, options.height)
+        self._tabletop = tabletop
+        self._renderer = Renderer(robot, tabletop.bench, options.width, options.height)
 
     def move(self, plant: Plant, seconds: float) -> None:
         """The plant moves, and what its fingers touch."""
@@ -92,4 +93,8 @@ class Workbench(Surroundings):
 
 def surroundings(robot: Robot, options: argparse.Namespace) -> Surroundings:
     """Those that `options.bench` names."""
-    return Workbench(robot, options) if options.bench == "tabletop" else TestCard(robot, options)
+    if options.bench == "conveyor":
+        return Workbench(robot, options, Conveyor(robot, options.seed))
+    if options.bench == "tabletop":
+        return Workbench(robot, options, Tabletop(robot, options.seed, options.blocks))
+    return TestCard(robot, options)

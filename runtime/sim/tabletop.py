@@ -54,13 +54,13 @@ class Tabletop:
         self._plate = np.zeros(2)
         self._reached: dict[str, bool] = {}
         self._reset = Reset("", seed)
-        self._lay(layout_of(seed, None, blocks))
+        self._lay(self._reset)
 
     def reset(self, wish: Reset) -> None:
         """Lay the bench as wished; the same `id` again changes nothing. BenchError where that cannot be."""
         if wish.id == self._reset.id:
             return
-        self._lay(layout_of(wish.seed, wish.positions, self._count))
+        self._lay(wish)
         self._reset = wish
 
     def advance(self, plant: Plant, seconds: float) -> None:
@@ -88,7 +88,12 @@ class Tabletop:
             "success": self._on_plate(MARGIN_M),
         }
 
-    def _lay(self, layout: Layout) -> None:
+    def _layout(self, wish: Reset) -> Layout:
+        """Where everything is to lie; BenchError where that cannot be, and then nothing has changed."""
+        return layout_of(wish.seed, wish.positions, self._count)
+
+    def _lay(self, wish: Reset) -> None:
+        layout = self._layout(wish)
         edge = self.bench.block_edge
         self._blocks = [Block(on_table(place, self.bench), edge) for place in layout.blocks]
         self._plate = np.array(layout.plate)

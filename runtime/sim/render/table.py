@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.sim.bench import Bench, PinholeCamera
+from runtime.sim.bench import Belt, Bench, PinholeCamera
 from runtime.sim.render.painter import ahead
 from runtime.sim.render.room import draw_room
 from runtime.types import Float32, Float64, UInt8
@@ -14,6 +14,8 @@ from runtime.types import Float32, Float64, UInt8
 X, Y = (-0.80, 0.80), (-0.42, 0.86)  # m, the table's edges
 _TEXEL = 0.001  # m
 _BOARD = 0.16  # m, width of a board
+_BEYOND = 0.08  # m of belt at either end that nothing rides on
+_RAIL, _RAIL_COLOUR = 0.008, (150, 154, 160)  # m
 CORNERS = np.array([[X[0], Y[0], 0.0], [X[1], Y[0], 0.0], [X[1], Y[1], 0.0], [X[0], Y[1], 0.0]])
 
 
@@ -99,6 +101,8 @@ def _boards(bench: Bench, seed: int) -> UInt8:
         wood[row + 2 : row + 3] *= 1.05
     texture: UInt8 = np.clip(wood, 0, 255).astype(np.uint8)
     _tape(texture, bench)
+    if bench.belt is not None:
+        _roll_out(texture, bench.belt)
     return texture
 
 
@@ -123,3 +127,13 @@ def _tape(texture: UInt8, bench: Bench) -> None:
                 (left, low), (right, high) = np.sort((ends / _TEXEL).round().astype(int), axis=0).tolist()
                 patch = texture[low:high, left:right]
                 patch[:] = (patch * 0.25 + 0.75 * 236).astype(np.uint8)
+
+
+def _roll_out(texture: UInt8, belt: Belt) -> None:
+    """A belt across the table with a rail on either side, both longer than what rides on it ever goes."""
+    ends = np.array(belt.x) + (-_BEYOND, _BEYOND)
+    for half, colour in ((belt.width / 2 + _RAIL, _RAIL_COLOUR), (belt.width / 2, belt.colour)):
+        corners = np.column_stack([ends, (belt.y - half, belt.y + half)]) - (X[0], Y[0])
+        (left, low), (right, high) = (corners / _TEXEL).round().astype(int).tolist()
+        patch = texture[low:high, left:right]
+        patch[:] = np.clip(np.array(colour[::-1]) + (patch.astype(int) - 150) // 6, 0, 255)
