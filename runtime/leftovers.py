@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 from runtime.errors import RecordingError
@@ -14,10 +15,10 @@ from runtime.recording.repair import repair
 log = logging.getLogger(__name__)
 
 
-def start_repair(root: Path, station: str) -> None:
+def start_repair(root: Path, station: str, repaired: Callable[[Path], None]) -> None:
     """On a thread: what is to be received and recorded now does not wait for what was left."""
-    left = leftovers(root)
-    threading.Thread(target=repair_leftovers, args=(left, station), name="repair", daemon=True).start()
+    given = (leftovers(root), station, repaired)
+    threading.Thread(target=repair_leftovers, args=given, name="repair", daemon=True).start()
 
 
 def leftovers(root: Path) -> list[Path]:
@@ -26,10 +27,13 @@ def leftovers(root: Path) -> list[Path]:
     return [folder for folder in folders if not os.path.exists(folder / "outcome.json")]
 
 
-def repair_leftovers(folders: list[Path], station: str) -> None:
+def repair_leftovers(
+    folders: list[Path], station: str, repaired: Callable[[Path], None] = lambda folder: None
+) -> None:
     """Close what the last start of `station` left open: nobody else writes its episodes.
 
-    One that cannot be repaired is left as it is, for `python -m runtime.recording repair` and a person.
+    `repaired` hears of each one that is whole again. One that cannot be repaired is left as it is, for
+    `python -m runtime.recording repair` and a person.
     """
     for folder in folders:
         if _station_of(folder / "manifest.json") != station:
@@ -38,6 +42,8 @@ def repair_leftovers(folders: list[Path], station: str) -> None:
             report = repair(folder)
             found = report.problem or f"{report.frames} rows"
             log.warning("episode %s was left open: %s, %s", folder.name, report.verdict, found)
+            if report.verdict in ("repaired", "complete"):
+                repaired(folder)
         except RecordingError as error:
             log.error("episode %s was left open and stays as it is: %s", folder.name, error)
         except Exception:  # of a file that nobody foresaw: it must not keep the others

@@ -13,6 +13,7 @@ from runtime.clock import Clock, MonotonicClock
 from runtime.closing import Close, at_once, in_background
 from runtime.drives import Drives
 from runtime.errors import RecordingError, RuntimeFault, TransportError
+from runtime.exports import Exports
 from runtime.family import Plan, join
 from runtime.leftovers import start_repair
 from runtime.messages import (
@@ -55,6 +56,7 @@ class Media:
         clock: Clock,
         preview: Callable[[Observation], None] = lambda observation: None,
         closer: Callable[[Close], Future[Closed]] = at_once,
+        on_disk: Callable[[Path], None] = lambda folder: None,
     ) -> None:
         self._page = page
         self._source = source
@@ -62,6 +64,7 @@ class Media:
         self._clock = clock
         self._preview = preview
         self._closer = closer
+        self._on_disk = on_disk  # hears of every episode that was closed
         self._closing: Future[Closed] | None = None
         self._closing_uuid = ""
         self._waiting: BeginEpisode | None = None  # for the episode before it to be closed
@@ -239,6 +242,7 @@ class Media:
                 closed.uuid, str(closed.path), closed.status, closed.reason, closed.rows, closed.error
             )
         )
+        self._on_disk(closed.path)
 
     def _fail(self, error: RecordingError) -> None:
         log.error("recording failed: %s", error)
@@ -299,9 +303,12 @@ def main() -> None:
     plan, page = member.plan, member.page
     clock = MonotonicClock()
     page.beat("media", clock.now())
-    start_repair(plan.deployment.episodes_dir, plan.deployment.station)
+    exports = Exports(plan.deployment.data)
+    start_repair(plan.deployment.episodes_dir, plan.deployment.station, exports.start)
     source: Source = plan.transport.source(plan.deployment.transport, plan.robot, clock)
-    media = Media(page, source, make_recorder(plan, clock.now), clock, Previews(plan), in_background)
+    media = Media(
+        page, source, make_recorder(plan, clock.now), clock, Previews(plan), in_background, exports.start
+    )
     connected = False
     try:
         while not member.lifeline.cut:
@@ -318,7 +325,9 @@ def main() -> None:
                 media.end("interrupted", f"main has given no sign of life for {silent:.1f} s")
     finally:
         media.end("interrupted", "the station's supervisor ended")
+        ended = clock.now()
         media.finish(_LAST_S)
+        exports.finish(_LAST_S - (clock.now() - ended))
         source.close()
 
 

@@ -186,6 +186,8 @@ class Recorder:
                 delay=merged.delay if merged else -1,
                 mistimed=merged.mistimed if merged else 0,
                 inference_ms=answer.inference_ms,
+                strategy=merged.strategy if merged else "",
+                overlap=merged.overlap if merged else 0,
             )
         )
 

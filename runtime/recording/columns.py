@@ -95,6 +95,8 @@ def raw_columns(layout: Layout, chunks: Sequence[RawChunk]) -> dict[str, Any]:
         "delay": each([chunk.delay for chunk in chunks]),
         "mistimed": each([chunk.mistimed for chunk in chunks]),
         "inference_ms": each([chunk.inference_ms for chunk in chunks]),
+        "strategy": each([chunk.strategy for chunk in chunks]),
+        "overlap": each([chunk.overlap for chunk in chunks]),
     }
 
 

@@ -88,6 +88,8 @@ def raw_schema(layout: Layout) -> Any:
             pa.field("delay", pa.int64()),
             pa.field("mistimed", pa.int64()),
             pa.field("inference_ms", pa.float64()),
+            pa.field("strategy", pa.string()),
+            pa.field("overlap", pa.int64()),
         ]
     )
 
@@ -100,8 +102,17 @@ SCHEMAS: Mapping[str, Callable[[Layout], Any]] = {
 }
 
 
+# Columns that tables did not have from the beginning: null in those of older episodes.
+ADDED = frozenset({"strategy", "overlap"})
+
+
 def _vector(width: int) -> Any:
     return pa.list_(pa.float32(), width)
+
+
+def _before(schema: Any) -> Any:
+    """The schema without what was added since."""
+    return pa.schema([field for field in schema if field.name not in ADDED])
 
 
 class TableWriter:
@@ -171,8 +182,8 @@ def read_table(path: Path, schema: Any) -> TableRead:
     """Read an Arrow stream up to its torn tail; an absent or headless file counts as empty.
 
     A batch also ends the table where its columns contradict themselves, or where `index` of rows.arrow does
-    not go on by ones: a power cut can leave zeros in place of data. RecordingError where the file cannot be
-    read at all or has other columns than `schema`.
+    not go on by ones: a power cut can leave zeros in place of data. Columns that older files lack are null.
+    RecordingError where the file cannot be read at all or has other columns than `schema`.
     """
     try:
         data = path.read_bytes()
@@ -185,14 +196,23 @@ def read_table(path: Path, schema: Any) -> TableRead:
         stream = pa.ipc.open_stream(source)
     except (pa.ArrowInvalid, OSError):
         return TableRead(schema.empty_table(), len(data), False)
-    if not stream.schema.equals(schema):
+    if not (stream.schema.equals(schema) or stream.schema.equals(_before(schema))):
         raise RecordingError(
             f"{path} has other columns than its manifest says: {_difference(stream.schema, schema)}"
         )
     batches, end = _whole_batches(stream, source, counted=path.stem == "rows")
     mark = data[end : end + len(END_OF_STREAM)] == END_OF_STREAM
     torn = len(data) - end - (len(END_OF_STREAM) if mark else 0)
-    return TableRead(pa.Table.from_batches(batches, schema=schema), torn, mark and torn == 0)
+    table = _completed(pa.Table.from_batches(batches, schema=stream.schema), schema)
+    return TableRead(table, torn, mark and torn == 0)
+
+
+def _completed(table: Any, schema: Any) -> Any:
+    """The table with nulls in the columns of `schema` that it lacks."""
+    for field in schema:
+        if field.name not in table.column_names:
+            table = table.append_column(field, pa.nulls(table.num_rows, field.type))
+    return table.select(schema.names)
 
 
 def _whole_batches(stream: Any, source: Any, *, counted: bool) -> tuple[list[Any], int]:

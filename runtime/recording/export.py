@@ -1,0 +1,244 @@
+"""One table per run with all three streams: DATA/exports/<prompt>/<mode>/<strategy>/<run>.parquet."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import unicodedata
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from runtime.errors import RecordingError
+from runtime.recording.files import disk_fault, document, read_document, write_whole
+from runtime.recording.layout import Layout
+from runtime.recording.tables import SCHEMAS, read_table
+
+FOLDER = "exports"
+FORMAT = 1
+NO_PROMPT = "no-prompt"
+_NAME_BYTES = 120  # of a folder's name; file systems take 255
+_ROWS_TOGETHER = 1 << 16
+_VECTOR = pa.list_(pa.float32())
+
+SCHEMA = pa.schema(
+    [
+        pa.field("stream", pa.string(), nullable=False),  # raw, smoothed, executed
+        pa.field("step", pa.int64()),  # control step that the row is about; raw: null where it was dropped
+        pa.field("time", pa.float64()),  # when that step was planned [s since manifest.started_monotonic]
+        pa.field("sent", pa.float64()),  # executed: when it was sent, on the same clock
+        pa.field("chunk_id", pa.int64()),  # raw: of the row; else the chunk with the largest weight
+        pa.field("observation_step", pa.int64()),  # raw
+        pa.field("arrival_step", pa.int64()),  # raw: null where it never reached the control loop
+        pa.field("index", pa.int64()),  # raw: row of its chunk
+        pa.field("target_step", pa.int64()),  # raw: as `step`
+        pa.field("delay", pa.int64()),  # raw: arrival - observation [steps]
+        pa.field("mistimed", pa.int64()),  # raw: steps by which k_max shifted the chunk
+        pa.field("overlap", pa.int64()),  # raw: steps of the chunk that were blended with what was planned
+        pa.field("strategy", pa.string()),  # raw: the kind that merged it
+        pa.field("inference_ms", pa.float64()),  # raw
+        pa.field("space", pa.string()),  # raw: joint or eef; the other streams are joints
+        pa.field("chunk_ids", pa.list_(pa.int64())),  # smoothed: what made the step; 0 is the held target
+        pa.field("weights", pa.list_(pa.float64())),  # smoothed
+        pa.field("action", _VECTOR),  # null where nothing was sent
+        pa.field("measured", _VECTOR),  # executed: the joints that the tick saw
+        pa.field("control_source", pa.string()),  # executed
+        pa.field("changes", pa.list_(pa.string())),  # executed: what safety changed, or why it refused
+        pa.field("refused", pa.bool_()),  # executed
+    ]
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """What an export is made of."""
+
+    manifest: Mapping[str, object]
+    outcome: Mapping[str, object]
+    ticks: Any
+    smoothed: Any
+    raw: Any
+
+
+def export(folder: Path, root: Path) -> Path:
+    """Write the episode in `folder` to its place below `root`; what is there already and whole stays.
+
+    Any number of processes may do so at once. Raises RecordingError where the episode has no outcome yet, is
+    damaged, or the disk does not take it.
+    """
+    manifest = read_document(folder / "manifest.json")
+    if not (folder / "outcome.json").exists():
+        raise RecordingError(f"{folder} has no outcome.json: it is being recorded, or wants repair")
+    path = place(manifest, root)
+    with _alone(path.parent):
+        if not is_exported(folder, path):
+            write_whole(path, _content(_read(folder, manifest)))
+    return path
+
+
+def place(manifest: Mapping[str, object], root: Path) -> Path:
+    """Where the run of that manifest is exported to; RecordingError where it has no uuid of its own."""
+    prompt, mode, strategy = (manifest.get(key) for key in ("task", "mode", "strategy"))
+    run = Layout.of(manifest).uuid
+    return root / FOLDER / slug(prompt, NO_PROMPT) / slug(mode) / slug(strategy) / f"{run}.parquet"
+
+
+def is_exported(folder: Path, path: Path) -> bool:
+    """Whether `path` was written after the episode in `folder` had ended, or was repaired."""
+    try:
+        return path.stat().st_mtime_ns >= (folder / "outcome.json").stat().st_mtime_ns
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise disk_fault("looking at", path, error) from error
+
+
+def slug(text: object, empty: str = "unknown") -> str:
+    """`text` as the name of one folder: letters and digits of any script, the rest as single hyphens.
+
+    What loses anything by that, or is too long, gets a part of its hash, so that two texts never share a name.
+    """
+    words = text if isinstance(text, str) else ""
+    if not words.strip():
+        return empty
+    kept = "".join(c if c.isalnum() else " " for c in unicodedata.normalize("NFKC", words))
+    name = "-".join(kept.split()).encode()[:_NAME_BYTES].decode(errors="ignore")
+    if name.replace("-", " ") == words and name != empty:
+        return name
+    mark = hashlib.sha256(words.encode(errors="surrogatepass")).hexdigest()[:8]
+    return f"{name}-{mark}" if name else mark
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Nobody else writes into `folder` meanwhile; the kernel lets go however we end."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise disk_fault("creating", folder, error) from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _read(folder: Path, manifest: Mapping[str, object]) -> _Run:
+    layout = Layout.of(manifest)
+    tables = {
+        name: read_table(folder / f"{name}.arrow", SCHEMAS[name](layout)).table
+        for name in ("ticks", "smoothed", "raw")
+    }
+    return _Run(manifest, read_document(folder / "outcome.json"), **tables)
+
+
+def _content(run: _Run) -> bytes:
+    """The parquet file; each stream begins a row group, so that a reader of one skips the others."""
+    schema = SCHEMA.with_metadata(_metadata(run))
+    sink = pa.BufferOutputStream()
+    try:
+        with pq.ParquetWriter(sink, schema, compression="zstd") as writer:
+            for columns, rows in (
+                (_raw(run), run.raw),
+                (_smoothed(run), run.smoothed),
+                (_executed(run), run.ticks),
+            ):
+                writer.write_table(_table(columns, rows.num_rows, schema), row_group_size=_ROWS_TOGETHER)
+    except pa.ArrowException as error:
+        raise RecordingError(f"run {run.manifest.get('uuid')} cannot be exported: {error}") from error
+    content: bytes = sink.getvalue().to_pybytes()
+    return content
+
+
+def _metadata(run: _Run) -> dict[str, bytes]:
+    prompt = run.manifest.get("task")
+    return {
+        "eva.format": str(FORMAT).encode(),
+        "eva.prompt": (prompt if isinstance(prompt, str) else "").encode(errors="replace"),
+        "eva.manifest": document(run.manifest, "the manifest"),
+        "eva.outcome": document(run.outcome, "the outcome"),
+    }
+
+
+def _table(columns: Mapping[str, Any], rows: int, schema: Any) -> Any:
+    arrays = [
+        _cast(columns[field.name], field.type) if field.name in columns else pa.nulls(rows, field.type)
+        for field in schema
+    ]
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def _cast(values: Any, kind: Any) -> Any:
+    return values.cast(kind) if isinstance(values, (pa.Array, pa.ChunkedArray)) else pa.array(values, kind)
+
+
+def _raw(run: _Run) -> dict[str, Any]:
+    raw = run.raw
+    same = ("chunk_id", "observation_step", "index", "mistimed", "overlap", "inference_ms", "space", "action")
+    target = _known(raw["target_step"])
+    strategy = raw["strategy"]
+    return {name: raw[name] for name in same} | {
+        "stream": ["raw"] * raw.num_rows,
+        "step": target,
+        "target_step": target,
+        "time": _planned(run, raw["target_step"]),
+        "arrival_step": _known(raw["arrival_step"]),
+        "delay": pc.if_else(pc.less(raw["arrival_step"], 0), None, raw["delay"]),
+        "strategy": pc.if_else(pc.equal(strategy, ""), None, strategy),
+    }
+
+
+def _smoothed(run: _Run) -> dict[str, Any]:
+    smoothed = run.smoothed
+    return {
+        "stream": ["smoothed"] * smoothed.num_rows,
+        "step": smoothed["step"],
+        "time": _planned(run, smoothed["step"]),
+        "chunk_id": _owners(run, smoothed["step"]),
+        "chunk_ids": smoothed["chunk_ids"],
+        "weights": smoothed["weights"],
+        "action": smoothed["smoothed"],
+    }
+
+
+def _executed(run: _Run) -> dict[str, Any]:
+    ticks = run.ticks
+    same = ("step", "sent", "control_source", "changes", "refused")
+    return {name: ticks[name] for name in same} | {
+        "stream": ["executed"] * ticks.num_rows,
+        "time": ticks["planned"],
+        "chunk_id": _known(ticks["chunk_id"]),
+        "action": ticks["executed"],
+        "measured": ticks["qpos"],
+    }
+
+
+def _known(numbers: Any) -> Any:
+    """Null in place of -1, which stands for none."""
+    return pc.if_else(pc.less(numbers, 0), None, numbers)
+
+
+def _planned(run: _Run, steps: Any) -> Any:
+    return _at(run.ticks, "planned", steps)
+
+
+def _owners(run: _Run, steps: Any) -> Any:
+    return _known(_at(run.ticks, "chunk_id", steps))
+
+
+def _at(ticks: Any, column: str, steps: Any) -> Any:
+    """That column of the ticks of these steps; null for a step that never was."""
+    known, wanted = ticks["step"].to_numpy(), steps.to_numpy()
+    places = np.searchsorted(known, wanted)
+    found = places < len(known)
+    found[found] = known[places[found]] == wanted[found]
+    return ticks[column].take(pa.array(np.where(found, places, 0), mask=~found))

@@ -1,0 +1,56 @@
+"""Which state of the source the runtime runs from."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType
+
+from runtime import __file__ as _here
+
+_PATIENCE_S = 5.0
+_CODE = ("runtime/", "robots/", "deployments/")  # a new file there changes what runs
+
+
+@cache
+def revision() -> Mapping[str, object]:
+    """`commit` and `dirty` of our own checkout, found once; {} where we run from none, or git does not tell."""
+    return MappingProxyType(revision_of(Path(_here).resolve().parent.parent))
+
+
+def revision_of(root: Path) -> dict[str, object]:
+    """`commit` and `dirty` of the checkout whose top folder is `root`.
+
+    Dirty: a tracked file differs from the commit, or there is a new one among runtime/, robots/, deployments/.
+    """
+    top, commit = _git(root, "rev-parse", "--show-toplevel"), _git(root, "rev-parse", "HEAD")
+    changes = _git(root, "status", "--porcelain")
+    if not top or not commit or changes is None or Path(top).resolve() != root.resolve():
+        return {}  # also where an installed package lies within somebody else's checkout
+    return {"commit": commit, "dirty": any(_counts(line) for line in changes.splitlines())}
+
+
+def _counts(line: str) -> bool:
+    status, name = line[:2], line[3:].strip('"')
+    return status != "??" or name.startswith(_CODE)
+
+
+def _git(root: Path, *arguments: str) -> str | None:
+    """What git says, None where it fails; it writes nothing and follows no variables of a hook."""
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    try:
+        done = subprocess.run(
+            # The runtime may be started by another user (root, for its scheduling class) than owns the checkout.
+            ("git", "-c", f"safe.directory={root}", "-C", str(root), *arguments),
+            capture_output=True,
+            text=True,
+            timeout=_PATIENCE_S,
+            env=plain | {"GIT_OPTIONAL_LOCKS": "0"},
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
+        return None
+    return done.stdout.rstrip("\n")
