@@ -1,4 +1,7 @@
-"""`python -m runtime DEPLOYMENT`: check, run in lockstep, or start a station's family of processes."""
+"""`python -m runtime DEPLOYMENT`: check, run in lockstep, or start a station's family of processes.
+
+`--from-run UUID` takes the deployment of an earlier run from its manifest in the place of a file.
+"""
 
 from __future__ import annotations
 
@@ -9,30 +12,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from runtime import deployment, lockstep, log
-from runtime.errors import RuntimeFault
+from runtime.deployment import Resolved
+from runtime.errors import ConfigurationError, RuntimeFault
 from runtime.family import Lifeline, Plan, plan
-from runtime.session import State
+from runtime.rerun import data_folder, rerun
 from runtime.supervisor import Supervisor
+from runtime.transitions import State
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0 where all went well, 1 where the run failed, 2 where the deployment is wrong."""
-    parser = argparse.ArgumentParser(prog="python -m runtime", description=__doc__)
-    parser.add_argument("deployment", type=Path, help="a TOML file; deployments/ has examples")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
-    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends")
-    how = parser.add_mutually_exclusive_group()
-    how.add_argument(
-        "--check", action="store_true", help="print the resolved deployment and its hash, start nothing"
-    )
-    how.add_argument("--lockstep", action="store_true", help="one process on a virtual clock")
-    how.add_argument(
-        "--headless", action="store_true", help="set up, run once, publish, end; holds the lease itself"
-    )
-    given = parser.parse_args(arguments)
+    given = _parser().parse_args(arguments)
     log.start("supervisor")
     try:
-        made = plan(deployment.load(given.deployment, given.assignments))
+        made = plan(_resolved(given))
     except RuntimeFault as fault:
         print(fault, file=sys.stderr)
         return 2
@@ -47,6 +40,46 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
 
 
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m runtime", description=__doc__)
+    parser.add_argument("deployment", type=Path, nargs="?", help="a TOML file; deployments/ has examples")
+    parser.add_argument(
+        "--from-run",
+        metavar="UUID",
+        help="the deployment of that run in its place; how its uuid begins will do",
+    )
+    parser.add_argument(
+        "--data-dir",
+        type=Path,
+        metavar="DIR",
+        help="where that run lies; $EVA_DATA_DIR or ./data if not given",
+    )
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
+    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument(
+        "--check", action="store_true", help="print the resolved deployment and its hash, start nothing"
+    )
+    how.add_argument("--lockstep", action="store_true", help="one process on a virtual clock")
+    how.add_argument(
+        "--headless", action="store_true", help="set up, run once, publish, end; holds the lease itself"
+    )
+    return parser
+
+
+def _resolved(given: argparse.Namespace) -> Resolved:
+    """The deployment of the file or of the run; what differs from that run is printed."""
+    if (given.deployment is None) == (given.from_run is None):
+        raise ConfigurationError("give one of the two: a deployment file, or --from-run UUID")
+    if given.from_run is None and given.data_dir is not None:
+        raise ConfigurationError("--data-dir belongs to --from-run; for a file it is --set data_dir=DIR")
+    if given.from_run is None:
+        return deployment.load(given.deployment, given.assignments)
+    found = rerun(given.from_run, data_folder(given.data_dir), given.assignments)
+    print(*found.lines, sep="\n", flush=True)
+    return found.resolved
+
+
 def _check(made: Plan) -> int:
     print(json.dumps(dict(made.resolved.tree), indent=1))
     print(f"hash {made.resolved.digest}")
@@ -57,16 +90,20 @@ def _check(made: Plan) -> int:
 
 
 def run_in_lockstep(made: Plan) -> int:
-    """Run, print how it went, publish what ended well; returns the exit code."""
+    """Run, print how it went, export it, publish what ended well; returns the exit code."""
     done = lockstep.run(made)
     episode = done.episode
     print(f"{done.state}: {done.reason}")
     print(
         f"episode  {episode.get('path', 'none')}  {episode.get('rows', 0)} rows, {episode.get('status', '')}"
     )
+    if episode:
+        from runtime.recording.export import export
+
+        print(f"export   {export(Path(episode['path']), made.deployment.data)}")
     # A run that held was ended by nobody's judgement: it is kept, but neither published nor a success.
     well = done.state is State.READY and episode.get("status", "finished") == "finished"
-    if well and made.deployment.publish.dataset and episode:
+    if well and made.deployment.publish.dataset and episode and made.deployment.run.mode != "sim":
         from runtime.datasets.published import publish
 
         published = publish(Path(episode["path"]), made.deployment.data / made.deployment.publish.dataset)

@@ -17,7 +17,16 @@ from runtime.config import Deployment
 from runtime.errors import ConfigurationError
 from runtime.explanation import Key, explanation
 
-__all__ = ["ConfigurationError", "Deployment", "Resolved", "changed", "load", "resolve"]
+__all__ = [
+    "ConfigurationError",
+    "Deployment",
+    "Resolved",
+    "assigned",
+    "changed",
+    "digest_of",
+    "load",
+    "resolve",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +44,13 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Resolved:
     A `kind` is assigned before anything else, because a new kind replaces the table it stands in.
     """
     tree, origin = _read(path, ())
+    return assigned(tree, origin, str(path), assignments)
+
+
+def assigned(
+    tree: dict[str, Any], origin: dict[Key, str], source: str, assignments: Sequence[str]
+) -> Resolved:
+    """The deployment in `tree`, which is changed, with `key=value` assignments on top, as in `load`."""
     parsed = [(*_assignment(text), f"--set {text}") for text in assignments]
     for key, value, source in sorted(parsed, key=lambda one: one[0][-1] != "kind"):
         _put(tree, key, value, source)
@@ -42,7 +58,7 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Resolved:
         for depth in range(1, len(key)):
             origin.setdefault(key[:depth], source)
         origin[key] = source
-    return resolve(tree, origin, str(path))
+    return resolve(tree, origin, source)
 
 
 def resolve(tree: Mapping[str, Any], origin: Mapping[Key, str], source: str) -> Resolved:
@@ -54,8 +70,13 @@ def resolve(tree: Mapping[str, Any], origin: Mapping[Key, str], source: str) -> 
     except ConfigurationError as error:  # of a variant's own check, which knows no file
         raise ConfigurationError(f"{source}: {error}") from None
     canonical = deployment.model_dump(mode="json")
+    return Resolved(deployment, canonical, digest_of(canonical))
+
+
+def digest_of(canonical: Mapping[str, Any]) -> str:
+    """The hash of a deployment in its canonical form, also as it came back from a manifest."""
     text = json.dumps(canonical, sort_keys=True, separators=(",", ":"))
-    return Resolved(deployment, canonical, hashlib.sha256(text.encode()).hexdigest())
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def changed(resolved: Resolved, changes: Mapping[str, Any], source: str) -> Resolved:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SUCCESS = "next.success"
+SIMULATED = "sim"  # the mode, and the control source of its rows
 CODEC, PIXELS = "h264", "yuv420p"  # what our recorder writes
 
 
@@ -65,7 +66,23 @@ def publish(
         return _publish(journal, catalog, success)
 
 
+def never_published(manifest: Mapping[str, object]) -> str:
+    """Why no dataset may ever hold the run of that manifest, to follow its name; "" where one may."""
+    if manifest.get("mode") != SIMULATED:
+        return ""
+    return (
+        "is a run of mode sim: its actions went to a simulated robot alone, so that its pictures do not show "
+        "what they did; it is no rollout and no demonstration"
+    )
+
+
 def _require_publishable(journal: RecordedJournal, include_interrupted: bool) -> None:
+    why = never_published(journal.manifest)
+    if why:
+        raise RecordingError(f"{journal.folder} {why}")
+    invented = int((journal.scalars("control_source") == SIMULATED).sum()) if journal.frames else 0
+    if invented:
+        raise RecordingError(f"{journal.folder}: {invented} of its rows are actions of a simulated robot")
     status = journal.outcome.get("status")
     if status != "finished" and not include_interrupted:
         raise RecordingError(

@@ -1,0 +1,178 @@
+"""Starts a deployment again from the manifest of a run that it once made, and says what differs."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from runtime.deployment import Resolved, assigned, digest_of
+from runtime.errors import ConfigurationError, RecordingError
+from runtime.recording.files import read_document
+from runtime.revision import revision
+from runtime.run import installed_versions
+
+_LISTED = 8  # runs, or keys, that a sentence names
+_SHORT = 12  # characters of a hash
+_UNKNOWN = "unknown"
+_DIRTY = " with changes"
+_ABSENT = object()
+
+
+@dataclass(frozen=True, slots=True)
+class Rerun:
+    """The deployment of an earlier run, and a line about that run and about each thing that differs."""
+
+    resolved: Resolved
+    lines: tuple[str, ...]
+
+
+def rerun(run: str, data: Path, assignments: Sequence[str] = ()) -> Rerun:
+    """The deployment of the run in `data` whose uuid begins with `run`, with `key=value` assignments on top.
+
+    What was asked for with the run (mode, simulated state, duration) is part of it. What it writes goes to
+    `data`. ConfigurationError says what is missing, was altered since, or is no setting any more.
+    """
+    folder = find(run, data)
+    try:
+        manifest = read_document(folder / "manifest.json")
+    except RecordingError as error:
+        raise ConfigurationError(str(error)) from None
+    stored = _configuration(folder, manifest)
+    source = f"the configuration of run {folder.name}"
+    wanted = _wanted(deepcopy(stored), manifest, data)
+    resolved = assigned(wanted, {}, source, assignments)
+    return Rerun(resolved, tuple(_lines(folder.name, manifest, stored, resolved)))
+
+
+def find(run: str, data: Path) -> Path:
+    """The folder of the one episode in `data` whose uuid begins with `run`."""
+    episodes = data / "episodes"
+    wanted = run.strip().lower()
+    if not wanted or not set(wanted) <= set("0123456789abcdef-"):
+        raise ConfigurationError(f"--from-run {run!r}: must be the uuid of a run, or how it begins")
+    if not episodes.is_dir():
+        raise ConfigurationError(
+            f"--from-run {run}: there are no episodes in {data}; name the data folder with --data-dir"
+        )
+    found = sorted(path.name for path in episodes.glob(f"{wanted}*") if path.is_dir())
+    if not found:
+        raise ConfigurationError(
+            f"--from-run {run}: no episode in {episodes} begins so; name another data folder with --data-dir"
+        )
+    if len(found) > 1 and wanted not in found:
+        named = ", ".join(found[:_LISTED]) + (", ..." if len(found) > _LISTED else "")
+        raise ConfigurationError(f"--from-run {run}: {len(found)} episodes begin so: {named}")
+    return episodes / (wanted if wanted in found else found[0])
+
+
+def _configuration(folder: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """The stored configuration, which must be the one that its hash was made of."""
+    path = folder / "manifest.json"
+    stored, digest = manifest.get("configuration"), manifest.get("configuration_hash")
+    if not isinstance(stored, dict) or not stored:
+        raise ConfigurationError(f"{path} has no configuration: that run cannot be started again")
+    if not isinstance(digest, str) or not digest:
+        raise ConfigurationError(f"{path} has no configuration_hash: its configuration cannot be verified")
+    found = digest_of(stored)
+    if found != digest:
+        raise ConfigurationError(
+            f"{path}: configuration has the hash {_short(found)}, the run was made with {_short(digest)}: "
+            "the manifest was altered since"
+        )
+    return stored
+
+
+def _wanted(tree: dict[str, Any], manifest: Mapping[str, Any], data: Path) -> dict[str, Any]:
+    """The configuration with what the run itself was asked for; other modes (observe) are no runs."""
+    run = tree.get("run")
+    if isinstance(run, dict) and manifest.get("mode") != "observe":
+        for key in ("mode", "sim_state", "duration_s"):
+            if key in manifest and key in run:
+                run[key] = manifest[key]
+    if data_folder(tree.get("data_dir")) != data:
+        tree["data_dir"] = str(data)
+    return tree
+
+
+def data_folder(given: str | Path | None = None) -> Path:
+    """The absolute data folder that is `given`, else $EVA_DATA_DIR, else ./data."""
+    return Path(given or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
+
+
+def _lines(run: str, then: Mapping[str, Any], stored: Mapping[str, Any], now: Resolved) -> list[str]:
+    return [
+        f"run       {run}, {_described(then)}",
+        f"versions  {_versions(then.get('versions'))}",
+        f"git       {_revisions(then.get('git'))}",
+        f"hash      {_hashes(str(then['configuration_hash']), stored, now)}",
+    ]
+
+
+def _described(manifest: Mapping[str, Any]) -> str:
+    asked = manifest.get("asked_wall", manifest.get("started_wall"))
+    date = f"{datetime.fromtimestamp(asked):%Y-%m-%d %H:%M}" if isinstance(asked, int | float) else "no date"
+    told = (f"{key} {manifest[key]}" for key in ("station", "mode", "strategy") if manifest.get(key))
+    return ", ".join((date, *told, f"task {manifest.get('task', '')!r}"))
+
+
+def _versions(then: object) -> str:
+    if not isinstance(then, Mapping) or not then:
+        return "of then are not known"
+    now = installed_versions()
+    differ = [
+        f"{name} {then.get(name, 'unknown')} then, {now.get(name, 'none')} now"
+        for name in sorted({*then, *now})
+        if then.get(name) != now.get(name)
+    ]
+    return "; ".join(differ) or "the same"
+
+
+def _revisions(then: object) -> str:
+    before, now = _revision(then), _revision(revision())
+    certain = before == now and not before.endswith(_DIRTY)
+    return f"the same, {now}" if certain and now != _UNKNOWN else f"{before} then, {now} now"
+
+
+def _revision(given: object) -> str:
+    """What was changed without being committed is not known, so that it never counts as the same."""
+    if not isinstance(given, Mapping) or not given.get("commit"):
+        return _UNKNOWN
+    return _short(str(given["commit"])) + (_DIRTY if given.get("dirty") else "")
+
+
+def _hashes(then: str, stored: Mapping[str, Any], now: Resolved) -> str:
+    if then == now.digest:
+        return f"the same, {_short(then)}"
+    before, after = _leaves(stored), _leaves(now.tree)
+    differ = [
+        f"{key} {_shown(before, key)} -> {_shown(after, key)}"
+        for key in sorted({*before, *after})
+        if before.get(key, _ABSENT) != after.get(key, _ABSENT)
+    ]
+    named = "; ".join(differ[:_LISTED]) + (f"; {len(differ) - _LISTED} more" if len(differ) > _LISTED else "")
+    return f"{_short(then)} then, {_short(now.digest)} now: {named}"
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Every setting by its full key."""
+    found: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping) and value:
+            found |= _leaves(value, f"{prefix}{key}.")
+        else:
+            found[f"{prefix}{key}"] = value
+    return found
+
+
+def _shown(leaves: Mapping[str, Any], key: str) -> str:
+    return json.dumps(leaves[key]) if key in leaves else "(none)"
+
+
+def _short(digest: str) -> str:
+    return digest[:_SHORT]
