@@ -10,7 +10,7 @@ from pathlib import Path
 
 import benchmarks
 
-_NOT_BENCHMARKS = ("__main__", "report", "sleeper", "viewers")
+_NOT_BENCHMARKS = ("__main__", "report", "sleeper", "step_loop", "viewers")
 
 
 def main() -> int:

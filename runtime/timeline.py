@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runtime.types import Float64
 
@@ -204,27 +203,3 @@ def overlap_blend(
     blended[:count] += weights[:, None] * difference(old[:count], new[:count], dims.wrapping)
     blended[:, switched] = new[:, switched]
     return blended, weights
-
-
-def resample(
-    rows: Float64,
-    rate: float,
-    control_rate: float,
-    switched: Sequence[int] = (),
-    wrapping: Sequence[int] = (),
-) -> tuple[Float64, NDArray[np.int64]]:
-    """`rows` [H, D] of `rate` Hz at `control_rate` Hz, and the source row each one came from.
-
-    Linear between rows, the last row held for its own period; dimensions in `switched` are held, not blended;
-    those in `wrapping` go the shorter way round.
-    """
-    if rate == control_rate or not len(rows):
-        return rows, np.arange(len(rows))
-    count = int(np.floor(len(rows) * control_rate / rate + 1e-9))
-    position = np.minimum(np.arange(count) * (rate / control_rate), len(rows) - 1)
-    lower = np.floor(position + 1e-9).astype(np.int64)
-    upper = np.minimum(lower + 1, len(rows) - 1)
-    part = np.clip(position - lower, 0.0, 1.0)[:, None]
-    resampled = rows[lower] + part * difference(rows[upper], rows[lower], wrapping)
-    resampled[:, list(switched)] = rows[lower][:, list(switched)]
-    return resampled, lower

@@ -150,25 +150,24 @@ def join(
     `held` [D] is the target that is held because nothing was planned (starvation, a run's far first chunk): the
     chunk takes over from it within JOIN_WINDOW steps, or its own length if it is shorter. `joining` says that the
     strategy's kind was switched since the last chunk that was merged: the new plan takes over from the old one,
-    whose last target is held as long as needed; keep it set until a chunk is not dropped. Where neither is given
-    the strategy alone decides. Later chunks may be merged while a fade is under way: it goes on over their plan.
-    `commanded` [D] is the last target sent: angles that wrap stay on its branch where nothing is planned, and
-    `joining` starts from it. Nothing is changed where the chunk is dropped. The makers of every step sum to 1;
-    chunk id 0 (timeline.HELD) is a held target.
+    whose last target is held as long as needed, or from `commanded` where nothing is planned; keep it set until a
+    chunk is not dropped. Where neither is given the strategy alone decides. Chunks may be merged while a fade is
+    under way: it goes on over their plan. `commanded` [D] is the last target sent: angles that wrap stay on its
+    branch where nothing is planned. Nothing is changed where the chunk is dropped. The makers of every step sum
+    to 1; chunk id 0 (timeline.HELD) is a held target.
     """
     placed = merge.place(timeline, arrival, free_step)
     if placed.merged.dropped:
         return placed.merged
     planned = timeline.at(free_step)
-    before = commanded if planned is None else planned.action
-    before = before if held is None else held
+    standing = commanded if held is None and joining and planned is None else held
+    going_on = commanded if planned is None else planned.action
+    before = going_on if standing is None else standing
     placed = replace(placed, rows=on_branch(placed.rows, before, dims.wrapping))
-    if held is not None:
-        _fade(timeline, free_step, held[None], [], min(JOIN_WINDOW, len(placed.rows)), dims)
+    if standing is not None:
+        _fade(timeline, free_step, standing[None], [], min(JOIN_WINDOW, len(placed.rows)), dims)
     elif joining and planned is not None:
         _fade(timeline, free_step, *timeline.span(free_step), JOIN_WINDOW, dims)
-    elif joining and commanded is not None and not arrival.waited:
-        _fade(timeline, free_step, commanded[None], [], JOIN_WINDOW, dims)
     merge.lay(timeline, placed)
     overlap = sum(len(makers) > 1 for makers in timeline.span(free_step)[1])
     return replace(placed.merged, overlap=overlap)

@@ -1,0 +1,160 @@
+"""The two halves of a strategy in integer steps: a query, a delay, a merge, one action per step.
+
+What main and control do with them, in the same order, and nothing else: no process, no wire, no safety, a robot
+that is at once where it is told to be. A tick is: collect the answer or ask, merge what was posted, execute.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import ModuleType
+
+import numpy as np
+
+from runtime.strategies.base import Arrival, Merged, Progress, StrategyParameters, join
+from runtime.timeline import Dims, Makers, Timeline
+from runtime.types import Conditioning, Float64
+
+Policy = Callable[[int, Conditioning | None], Float64]  # observation step, conditioning -> rows [H, D]
+FAR = 0.05  # [rad] that a run's first action may be off without being blended in, as in control
+
+
+@dataclass(frozen=True, slots=True)
+class Executed:
+    """One step: what was sent, whose it was, and whether nothing was planned though something should have been."""
+
+    step: int
+    action: Float64
+    makers: Makers  # () where the last target was held
+    starved: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Request:
+    number: int
+    step: int
+    due: int
+    waited: bool
+    rows: Float64
+
+
+@dataclass(slots=True)
+class Log:
+    """What happened so far."""
+
+    executed: list[Executed] = field(default_factory=list)
+    merged: list[Merged] = field(default_factory=list)
+    observed: dict[int, int] = field(default_factory=dict)  # by chunk: the step it was asked about
+
+
+class StepLoop:
+    """One run. `delay` gives the ticks that request number n (from 1) takes; `rate` is the control rate [Hz]."""
+
+    def __init__(
+        self,
+        strategy: ModuleType,
+        config: StrategyParameters,
+        policy: Policy,
+        delay: Callable[[int], int],
+        rate: float,
+        start: Float64,
+        dims: Dims | None = None,
+    ) -> None:
+        self._dims = Dims() if dims is None else dims
+        self._policy = policy
+        self._delay = delay
+        self._rate = rate
+        self.commanded = np.array(start, np.float64)
+        self.timeline = Timeline(len(self.commanded))
+        self.step = 0
+        self.log = Log()
+        self._flight: _Request | None = None
+        self._number = 0
+        self._asked = -1
+        self._waiting = True  # for the first chunk: no starvation yet
+        self._starved = False
+        self._delays: deque[int] = deque(maxlen=60)
+        self._newest: tuple[int, Float64] | None = None  # merged last: observation step, rows
+        self._kind = ""
+        self._joining = False
+        self.tune(strategy, config)
+
+    def tune(self, strategy: ModuleType, config: StrategyParameters) -> None:
+        """Go on with this strategy from the next tick on."""
+        self._joining = self._joining or self._kind not in ("", strategy.__name__)
+        self._kind = strategy.__name__
+        waited = self.step > 0 and self._merge.waits
+        self._config = config
+        self._query = strategy.query(config)
+        self._merge = strategy.merge(config, self._dims)
+        if waited and not self.timeline.remaining(self.step):
+            self._waiting = True  # the robot stands by intention: the next chunk is a first one
+
+    def run(self, ticks: int) -> Log:
+        """Do so many ticks."""
+        for _ in range(ticks):
+            self.tick()
+        return self.log
+
+    def tick(self) -> None:
+        """One control period."""
+        if self._flight is None and self._query.wants(self._progress()):
+            self._flight = self._ask()
+        if self._flight is not None and self.step >= self._flight.due:
+            request, self._flight = self._flight, None
+            self._arrive(request)
+        self._execute()
+        self.step += 1
+
+    def _progress(self) -> Progress:
+        since = (self.step - self._asked) / self._rate if self._asked >= 0 else float("inf")
+        return Progress(self.timeline.remaining(self.step), False, since)
+
+    def _ask(self) -> _Request:
+        self._number += 1
+        self._asked = self.step
+        conditioning = self._conditioning() if self._query.continues else None
+        rows = self._policy(self.step, conditioning)
+        self.log.observed[self._number] = self.step
+        due = self.step + self._delay(self._number)
+        return _Request(self._number, self.step, due, self._query.waits, rows)
+
+    def _conditioning(self) -> Conditioning | None:
+        if self._newest is None:
+            return None
+        observed, rows = self._newest
+        predicted = int(np.ceil(np.quantile(self._delays, self._config.delay_quantile)))
+        horizon = self._config.execution_horizon or len(rows)
+        consumed = min(self.step - observed, len(rows))
+        return Conditioning(rows.astype(np.float32), consumed, predicted, horizon)
+
+    def _arrive(self, request: _Request) -> None:
+        arrival = Arrival(request.number, request.step, request.rows, request.waited)
+        far = self._waiting and np.abs(request.rows[0] - self.commanded).max() > FAR
+        held = self.commanded if (self._starved or far) and not self._merge.waits else None
+        merged = join(
+            self._merge,
+            self.timeline,
+            arrival,
+            self.step,
+            held,
+            self._dims,
+            joining=self._joining,
+            commanded=self.commanded,
+        )
+        self._waiting = False
+        self._delays.append(merged.delay)
+        self.log.merged.append(merged)
+        if not merged.dropped:
+            self._joining = False
+            self._newest = request.step, request.rows
+
+    def _execute(self) -> None:
+        planned = self.timeline.at(self.step)
+        self._starved = planned is None and not (self._merge.waits or self._waiting)
+        if planned is not None:
+            self.commanded = planned.action
+        makers = () if planned is None else planned.makers
+        self.log.executed.append(Executed(self.step, self.commanded, makers, self._starved))
