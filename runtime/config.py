@@ -15,6 +15,7 @@ from runtime.plugins import variants
 from runtime.recording.settings import RecordingSettings
 from runtime.safety import SafetySettings
 from runtime.section import Section
+from runtime.strategies.base import StrategyParameters
 
 
 def _variants_of(package: str) -> Any:
@@ -33,7 +34,11 @@ if TYPE_CHECKING:
 
     TransportConfig = Variant
     PolicyConfig = Variant
-    StrategyConfig = Variant
+
+    class StrategyConfig(StrategyParameters):
+        """Any strategy's section."""
+
+        kind: str
 else:
     TransportConfig = _variants_of("runtime.transports")
     PolicyConfig = _variants_of("runtime.policies")

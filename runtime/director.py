@@ -12,12 +12,13 @@ import numpy as np
 from runtime import deployment
 from runtime.asking import Asking
 from runtime.bus import EventLog
+from runtime.by_hand import ByHand
 from runtime.clock import Clock
 from runtime.commitment import Commitment
+from runtime.effects import Effects, Situation, Told
 from runtime.errors import PolicyLostError, RuntimeFault
 from runtime.family import Plan
-from runtime.grippers import Grippers
-from runtime.inference import Inference, Patience, Strategy
+from runtime.inference import Inference, Patience
 from runtime.lease import Lease
 from runtime.messages import (
     Ack,
@@ -33,23 +34,21 @@ from runtime.messages import (
 from runtime.orders import Orders
 from runtime.page import Page
 from runtime.requests import (
-    AimRequest,
     GripperRequest,
     MoveRequest,
     RunRequest,
     SetUpRequest,
     TuneRequest,
-    read,
 )
 from runtime.run import Provenance, Run
 from runtime.runner import Runner
 from runtime.runs import Runs
-from runtime.session import LEASE_COMMANDS, Effects, Happening, Session, Situation, State, Told
-from runtime.setup import SetUp, first_action
+from runtime.session import LEASE_COMMANDS, Session
+from runtime.setup import SetUp
 from runtime.sight import Sight, SightSettings
 from runtime.snapshot import View, control_figures, facts, snapshot
-from runtime.targets import Targets, told
-from runtime.types import Float64
+from runtime.transitions import Happening, State
+from runtime.tuning import strategy_of, tuned
 from runtime.watch import Watch
 
 log = logging.getLogger(__name__)
@@ -77,10 +76,8 @@ class Director(Effects):
         )
         patience = Patience(settings.control.starvation_hold_s, settings.faults.patience_s)
         self.inference = Inference(
-            asking, _strategy(plan), page, self._orders, clock, patience, Commitment(plan.rate)
+            asking, strategy_of(plan), page, self._orders, clock, patience, Commitment(plan.rate)
         )
-        self.grippers = Grippers(plan, page)
-        self.targets = Targets(plan, self.spaces, plan.kinematics())
         self._tuned = False  # since the last set-up
         self.setup = SetUp(plan, self.inference, self._orders, page, clock, lambda: self.media_report)
         self._watch = Watch(plan, page, self.lease, clock)
@@ -94,6 +91,7 @@ class Director(Effects):
             provenance,
             lambda: control_figures(page, plan.rate),
         )
+        self.by_hand = ByHand(plan, page, self._orders, self.runs, self.spaces)
         for ring in ("control_events", "media_events"):
             for _ in page.rings[ring].drain():
                 pass  # told to a predecessor that died
@@ -126,7 +124,7 @@ class Director(Effects):
                 setup=self.setup,
                 runs=self.runs,
                 media=self.media_report,
-                grippers=self.grippers,
+                grippers=self.by_hand.grippers,
                 estop=self._watch.estop,
                 boot=self.boot,
                 now=self.clock.now(),
@@ -148,9 +146,9 @@ class Director(Effects):
         told = replace(self.runs.provenance, plan=plan, checkpoint=checkpoint, bench=reset or {})
         self.runs.provenance = told
         self.inference.exchange(policy, plan.deployment.task)
-        self.inference.tune(_strategy(plan), plan.deployment.task)
+        self.inference.tune(strategy_of(plan), plan.deployment.task)
         self._orders.tune(plan.deployment.strategy.model_dump())
-        self._lock(np.full(plan.robot.dim, np.nan))
+        self.by_hand.unlock()
         self._tuned = False
         self.setup.begin(reset)
         return {"bench": reset["id"]} if reset else {}
@@ -173,7 +171,7 @@ class Director(Effects):
         if asked.trial is not None:
             self._require_comparable(asked)
         if (asked.mode or self.plan.deployment.run.mode) == "manual":
-            self._require_robot("run in the mode manual")
+            self.by_hand.require_robot("run in the mode manual")
         return {"episode": self.runs.begin(self.setup.info, asked)}
 
     def _require_comparable(self, asked: RunRequest) -> None:
@@ -183,12 +181,8 @@ class Director(Effects):
             raise RuntimeFault(f"a trial runs in the mode continuous, and {mode} was asked for")
         if self._tuned:
             raise RuntimeFault("strategy or task were tuned since the set-up: set up again for a trial")
-        if not np.isnan(self.grippers.locks).all():
+        if not np.isnan(self.by_hand.grippers.locks).all():
             raise RuntimeFault("a gripper is locked: unlock it, or set up again for a trial")
-
-    def _require_robot(self, what: str) -> None:
-        if not self.plan.capabilities.moves_robot:
-            raise RuntimeFault(f"{what}: transport {self.plan.deployment.transport.kind!r} moves no robot")
 
     # --- effects: what a person does within a run ------------------------------------------------------------
 
@@ -205,27 +199,17 @@ class Director(Effects):
         )
 
     def tune(self, asked: TuneRequest) -> Told:
-        if asked.strategy is None and asked.task is None:
-            raise RuntimeFault("tune: nothing to change; allowed: strategy, task")
-        now = self.plan.deployment
-        wanted = {**now.strategy.model_dump(), **(asked.strategy or {})}
-        task = now.task if asked.task is None else asked.task
-        resolved = deployment.changed(self.plan.resolved, {"strategy": wanted, "task": task}, "tune")
-        plan = replace(self.plan, resolved=resolved)
-        strategy = _strategy(plan)
-        info = self.setup.info
-        if strategy.query.continues and info is not None and info.supports_rtc is False:
-            raise RuntimeFault(
-                f"tune: the policy {info.name!r} does not continue a chunk that it is given (RTC)"
-            )
-        self._orders.tune(plan.deployment.strategy.model_dump())
+        plan = tuned(self.plan, asked, self.setup.info)
+        settings = plan.deployment
+        strategy = settings.strategy.model_dump()
+        self._orders.tune(strategy)
         self.plan, self._tuned = plan, True
         self.runs.provenance = replace(self.runs.provenance, plan=plan)
-        self.inference.tune(strategy, task)
-        data = {"strategy": plan.deployment.strategy.model_dump(), "task": task, "hash": resolved.digest}
-        text = f"strategy {plan.deployment.strategy.kind}, task {task!r}"
+        self.inference.tune(strategy_of(plan), settings.task)
+        data = {"strategy": strategy, "task": settings.task, "hash": plan.resolved.digest}
+        text = f"strategy {settings.strategy.kind}, task {settings.task!r}"
         self.say(Event("tuned_to", text, self.clock.now(), data=data))
-        return {"strategy": data["strategy"], "task": task}
+        return {"strategy": strategy, "task": settings.task}
 
     def step(self) -> None:
         self.inference.step()
@@ -237,39 +221,22 @@ class Director(Effects):
         self.runs.cancel()
 
     def move(self, asked: MoveRequest) -> Told:
-        start = self._commanded()
-        goal = self.targets.goal(asked, start)
-        self.runs.move(goal, asked.speed)
-        return {"duration_s": self.targets.duration(start, goal, asked.speed)}
+        return self.by_hand.move(asked)
 
     def grip(self, asked: GripperRequest) -> Told:
-        self._require_robot("gripper")
         run = self.runs.open
         free = run is None or run.mode == "manual" or self.session.state is State.HOLDING
-        grip = self.grippers.asked(asked, free)
-        self._lock(grip.locks)
-        if grip.goal is not None:
-            self.runs.move(grip.goal, 1.0)
-        return {"grippers": self.grippers.told()}
+        return self.by_hand.grip(asked, free)
 
     def approach(self) -> None:
-        self._require_robot("approach")
-        proposal = self.inference.proposal
-        if self.session.state is State.READY:
+        made, first = self.inference.proposal, self.setup.first_action
+        if self.session.state is not State.READY and made is not None:
+            self.runs.approach(self.by_hand.checked("approach", made.rows[0]))
+        elif first is not None:
+            self.by_hand.checked("approach", first)
             self.setup.begin_approach()
-        elif proposal is not None:
-            self.targets.check_path(self._commanded(), proposal.rows[0])
-            self.runs.approach(proposal.rows[0])
 
-    def _commanded(self) -> Float64:
-        """Where the robot was told to be, or where it is measured as long as nothing was told."""
-        status = self.page.control.read()
-        known = status["commanded"] if status["engaged"] else self.page.observation.read()["qpos"]
-        return np.array(known, np.float64)
-
-    def _lock(self, locks: Float64) -> None:
-        self._orders.lock(locks)
-        self.grippers.locks = locks
+    # --- effects: what goes on -------------------------------------------------------------------------------
 
     def hold(self, reason: str) -> None:
         self.runs.hold(reason)
@@ -282,8 +249,7 @@ class Director(Effects):
         self.runs.end(status, reason)
 
     def go_home(self) -> None:
-        if not self.plan.capabilities.moves_robot:
-            raise RuntimeFault(f"transport {self.plan.deployment.transport.kind!r} moves no robot")
+        self.by_hand.require_robot("home")
         self.setup.begin_homing()
 
     def release_estop(self) -> None:
@@ -357,7 +323,7 @@ class Director(Effects):
         if happening is Happening.FAMILY_DIED:
             self.say(Event("family_died", reason, self.clock.now()))
             self.runs.lost()
-            self.grippers.forget()  # a restarted control knows of no locks
+            self.by_hand.grippers.forget()  # a restarted control knows of no locks
         before = self.session.state
         if self.session.observe(happening, reason):
             text = f"{before} -> {self.session.state}: {reason}"
@@ -433,14 +399,10 @@ class Director(Effects):
 
     def _aim(self, command: Command) -> Ack:
         """Where the robot would go; nothing moves, and anybody may ask."""
-        start = self._commanded()
         try:
-            aim = self.targets.aim(read("aim", AimRequest, command.args), start)
+            return Ack(command.uuid, "done", boot=self.boot, data=self.by_hand.aim(command.args))
         except RuntimeFault as error:
             return Ack(command.uuid, "refused", str(error))
-        away = first_action(aim.joints, start, self.plan)["distance"]
-        data = told(aim, self.plan, away, self.targets.duration(start, aim.joints))
-        return Ack(command.uuid, "done", boot=self.boot, data=data)
 
     def close(self) -> None:
         """Let go of the policy."""
@@ -451,8 +413,3 @@ class Director(Effects):
 def _sight(plan: Plan, page: Page, clock: Clock) -> Sight:
     safety = plan.deployment.safety
     return Sight(page, clock, SightSettings(plan.rate, safety.joint_age_s, safety.picture_age_s))
-
-
-def _strategy(plan: Plan) -> Strategy:
-    settings = plan.deployment.strategy
-    return Strategy(plan.strategy.query(settings), settings)

@@ -83,6 +83,7 @@ class Inference:
         self.tally = Tally()
         self.proposal: Made | None = None  # shown, and neither committed nor cancelled
         self.shown: ShownChunk | None = None
+        self._planned: ShownChunk | None = None  # the newest that control has merged
         self.rtc_warning = ""
         self._given: Conditioning | None = None  # with the newest request
         self._strategy = strategy
@@ -99,6 +100,7 @@ class Inference:
         self._unmerged: dict[int, Made] = {}  # posted
         self._stale_since: float | None = None
         self._asked_at = float("-inf")
+        self._generation = 0  # of the commitment, when the newest request went out
 
     @property
     def policy(self) -> Policy:
@@ -162,7 +164,7 @@ class Inference:
         if fresh:
             self.asking.forget()
             self.tally.forget()
-            self.shown = None
+            self.shown = self._planned = None
         self._commitment.clear()
         self._back_off.forget()
         self._stale_since = None
@@ -174,7 +176,7 @@ class Inference:
         """Stop asking; an answer still in flight is ignored."""
         self._run = 0
         self._flight = None
-        self._wanted, self.proposal, self.shown = False, None, None
+        self._wanted, self.proposal, self.shown, self._planned = False, None, None, None
         self._unmerged.clear()
         self._commitment.clear()
 
@@ -191,7 +193,7 @@ class Inference:
     def cancel(self) -> None:
         """Forget the chunk that is asked for, or shown, or under way to control."""
         self._flight = None
-        self._wanted, self.proposal, self.shown = False, None, None
+        self._wanted, self.proposal, self.shown, self._planned = False, None, None, None
         self._unmerged.clear()
         self._commitment.clear()
 
@@ -210,14 +212,15 @@ class Inference:
             self.shown = ShownChunk(
                 merged.chunk_id, merged.run, state, step, merged.targets, made.rows, merged.overlap
             )
+            if not merged.dropped:
+                self._planned = self.shown
 
     def raw(self, step: int) -> Float64 | None:
         """What the newest chunk that control has merged wants for `step` [D]; None where it says nothing of it."""
-        shown = self.shown
-        if shown is None or shown.state != "merged":
+        if self._planned is None:
             return None
-        meant = np.flatnonzero(shown.targets == step)
-        return shown.rows[meant[-1]] if len(meant) else None
+        meant = np.flatnonzero(self._planned.targets == step)
+        return self._planned.rows[meant[-1]] if len(meant) else None
 
     # --- asking and answering --------------------------------------------------------------------------------
 
@@ -274,6 +277,7 @@ class Inference:
                 raise
             return False
         self._stale_since, self._asked_at, self._flight = None, now, flight
+        self._generation = self._commitment.generation
         return self.runner.ready(flight)
 
     def _committed(self, step: int) -> Conditioning | None:
@@ -294,7 +298,7 @@ class Inference:
         made = Made(self._orders.next_chunk(), made_rows.rows, answered)
         self._wanted = False
         self.tally.answered(answered.seconds)
-        self._commitment.answered(made.number, chunk, step, answered.waited)
+        self._commitment.answered(made.number, chunk, step, answered.waited, self._generation)
         if self._mode == "preview":
             self.proposal = made
             nowhere = np.full(len(made.rows), -1, np.int64)

@@ -20,7 +20,7 @@ from runtime.media import Media, make_recorder
 from runtime.messages import Ack, Command
 from runtime.page import Page
 from runtime.runner import LockstepRunner
-from runtime.session import State
+from runtime.transitions import State
 
 log = logging.getLogger(__name__)
 _HOLDER = "lockstep"

@@ -17,9 +17,10 @@ from runtime.messages import MediaReport, Mode
 from runtime.page import Page
 from runtime.plugins import variants
 from runtime.runs import Runs
-from runtime.session import Session, State
+from runtime.session import Session
 from runtime.setup import SetUp, Stage, first_action
 from runtime.tally import quantile
+from runtime.transitions import State
 from runtime.types import Float64
 
 

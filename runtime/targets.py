@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robots.rotations import matrix_of_quaternion, matrix_of_rpy, quaternion_of_matrix
 from runtime.errors import RuntimeFault
@@ -57,16 +58,19 @@ class Targets:
             raise RuntimeFault(
                 f"move: say joints or a pose; poses of {self._plan.robot.name}: {self._poses()}"
             )
-        goal = self._wanted("move", asked.joints, asked.pose, commanded)
-        aimed = self._clipped(goal)
-        if aimed.clipped:
-            limits = self._plan.limits
-            worst = limits.names.index(aimed.clipped[0])
+        return self.checked("move", self._wanted("move", asked.joints, asked.pose, commanded), commanded)
+
+    def checked(self, what: str, goal: Float64, commanded: Float64) -> Float64:
+        """`goal` [D], where limits and workspace boxes allow the way there; RuntimeFault for `what` else."""
+        limits = self._plan.limits
+        beyond = np.flatnonzero((goal < limits.lower - _TOLERANCE) | (goal > limits.upper + _TOLERANCE))
+        if len(beyond):
+            worst = int(beyond[0])
             raise RuntimeFault(
-                f"move: {limits.names[worst]} = {goal[worst]:.4f}; allowed: {limits.lower[worst]:g} to "
+                f"{what}: {limits.names[worst]} = {goal[worst]:.4f}; allowed: {limits.lower[worst]:g} to "
                 f"{limits.upper[worst]:g}"
             )
-        self.check_path(commanded, goal)
+        self._check_path(what, commanded, goal)
         return goal
 
     def duration(self, start: Float64, goal: Float64, speed: float = 1.0) -> float:
@@ -75,7 +79,7 @@ class Targets:
         velocity = limits.velocity * safety.motion_velocity_scale * speed
         return Trajectory(start, goal, velocity, safety.motion_acceleration * limits.reach).duration
 
-    def check_path(self, start: Float64, goal: Float64) -> None:
+    def _check_path(self, what: str, start: Float64, goal: Float64) -> None:
         """RuntimeFault where the straight way in joints leaves a workspace box that it begins in."""
         boxes = self._plan.deployment.safety.workspace
         if not boxes:
@@ -86,9 +90,9 @@ class Targets:
             if arm.name not in boxes:
                 continue
             box, points = boxes[arm.name], poses[:, index, :3]
-            inside = ((points >= box.lower) & (points <= box.upper)).all(axis=1)
+            inside: NDArray[np.bool_] = np.all((points >= box.lower) & (points <= box.upper), axis=1)
             if inside[0] and not inside.all():
-                raise RuntimeFault(f"{arm.name} would leave the workspace box on its way")
+                raise RuntimeFault(f"{what}: {arm.name} would leave the workspace box on its way")
 
     def _wanted(
         self, what: str, joints: Sequence[float] | None, pose: str | None, commanded: Float64

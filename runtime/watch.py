@@ -13,7 +13,7 @@ from runtime.latch import Latch
 from runtime.lease import Lease
 from runtime.page import EStop, Page
 from runtime.run import Run
-from runtime.session import Happening, State
+from runtime.transitions import Happening, State
 
 SIBLINGS = ("control", "media", "guard")
 _LINK_LOST_S = 2.0

@@ -6,11 +6,13 @@ import pytest
 
 from runtime import session as session_module
 from runtime.clock import VirtualClock
+from runtime.effects import Effects, Situation
 from runtime.errors import RuntimeFault
 from runtime.lease import Lease
 from runtime.messages import Ack, Command
 from runtime.requests import BenchRequest, RunRequest, SetUpRequest
-from runtime.session import COMMANDS, HAPPENINGS, STOPPING, Effects, Happening, Session, Situation, State
+from runtime.session import Session
+from runtime.transitions import COMMANDS, HAPPENINGS, STOPPING, Happening, State
 
 S, H = State, Happening
 EFFECTS = {

@@ -1,0 +1,81 @@
+"""What a person does with the robot itself: motions, grippers, and looking where one would go."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from runtime.errors import RuntimeFault
+from runtime.family import Plan
+from runtime.grippers import Grippers
+from runtime.orders import Orders
+from runtime.page import Page
+from runtime.requests import AimRequest, GripperRequest, MoveRequest, read
+from runtime.runs import Runs
+from runtime.setup import first_action
+from runtime.spaces import Spaces
+from runtime.targets import Targets, told
+from runtime.types import Float64
+
+
+class ByHand:
+    """Motions within limits and the workspace box, locks of grippers; raises RuntimeFault where it refuses."""
+
+    def __init__(self, plan: Plan, page: Page, orders: Orders, runs: Runs, spaces: Spaces) -> None:
+        self._plan = plan
+        self._page = page
+        self._orders = orders
+        self._runs = runs
+        self._targets = Targets(plan, spaces, plan.kinematics())
+        self.grippers = Grippers(plan, page)
+
+    def require_robot(self, what: str) -> None:
+        """Refuse where the transport moves no robot."""
+        if not self._plan.capabilities.moves_robot:
+            kind = self._plan.deployment.transport.kind
+            raise RuntimeFault(f"{what}: transport {kind!r} moves no robot")
+
+    def aim(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Where the robot would go; nothing moves."""
+        start = self._commanded()
+        aim = self._targets.aim(read("aim", AimRequest, arguments), start)
+        away = first_action(aim.joints, start, self._plan)["distance"]
+        return told(aim, self._plan, away, self._targets.duration(start, aim.joints))
+
+    def move(self, asked: MoveRequest) -> dict[str, Any]:
+        """Go there on a limited path, within the open run."""
+        start = self._commanded()
+        goal = self._targets.goal(asked, start)
+        self._runs.move(goal, asked.speed)
+        return {"duration_s": self._targets.duration(start, goal, asked.speed)}
+
+    def checked(self, what: str, goal: Float64) -> Float64:
+        """`goal` [D] where a motion there is allowed all the way."""
+        self.require_robot(what)
+        return self._targets.checked(what, goal, self._commanded())
+
+    def grip(self, asked: GripperRequest, free: bool) -> dict[str, Any]:
+        """Open, close, lock or give back; `free`: no policy moves the arms just now."""
+        self.require_robot("gripper")
+        grip = self.grippers.asked(asked, free)
+        self.lock(grip.locks)
+        if grip.goal is not None:
+            self._runs.move(grip.goal, 1.0)
+        return {"grippers": self.grippers.told()}
+
+    def unlock(self) -> None:
+        """Give all grippers back."""
+        self.lock(np.full(self._plan.robot.dim, np.nan))
+
+    def lock(self, locks: Float64) -> None:
+        """Lock grippers at these values [D], NaN for the rest."""
+        self._orders.lock(locks)
+        self.grippers.locks = locks
+
+    def _commanded(self) -> Float64:
+        """Where the robot was told to be, or where it is measured as long as nothing was told."""
+        status = self._page.control.read()
+        known = status["commanded"] if status["engaged"] else self._page.observation.read()["qpos"]
+        return np.array(known, np.float64)

@@ -1,0 +1,94 @@
+"""What a session makes happen, and what the guards of its commands look at."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from runtime.messages import Mode
+from runtime.requests import GripperRequest, MoveRequest, RunRequest, SetUpRequest, TuneRequest
+
+Told = Mapping[str, Any]  # for the data of an answer
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What the guards of commands look at, beside the state."""
+
+    mode: Mode | None = None  # of the open run
+    trial: bool = False  # the open run is one of a trial: nobody may change what is measured
+    proposed: bool = False  # a chunk is shown and waits to be committed
+    asked: bool = False  # the policy is being asked, or its answer has not reached control
+    executing: bool = False  # steps are planned
+    first_action: bool = False  # the last set-up knows the policy's first action
+
+
+class Effects(ABC):
+    """What the session makes happen; implemented by main, recorded by tests.
+
+    Each raises RuntimeFault to refuse, and has changed nothing then. What is returned goes into the answer.
+    """
+
+    @property
+    @abstractmethod
+    def situation(self) -> Situation: ...
+
+    @abstractmethod
+    def begin_setup(self, asked: SetUpRequest) -> Told: ...
+
+    @abstractmethod
+    def cancel_setup(self, reason: str) -> None: ...
+
+    @abstractmethod
+    def begin_run(self, asked: RunRequest) -> Told: ...
+
+    @abstractmethod
+    def hold(self, reason: str) -> None:
+        """Decelerate, hold, stop asking the policy; a run stays open."""
+
+    @abstractmethod
+    def resume_run(self) -> None: ...
+
+    @abstractmethod
+    def end_run(self, status: str, reason: str) -> None:
+        """Decelerate, hold, close the run and its episode; nothing to do where no run is open."""
+
+    @abstractmethod
+    def go_home(self) -> None: ...
+
+    @abstractmethod
+    def release_estop(self) -> None: ...
+
+    @abstractmethod
+    def start_recording(self) -> Told: ...
+
+    @abstractmethod
+    def stop_recording(self) -> None: ...
+
+    @abstractmethod
+    def tune(self, asked: TuneRequest) -> Told:
+        """Another strategy, other parameters, another instruction from now on."""
+
+    @abstractmethod
+    def step(self) -> None:
+        """Ask for one chunk: to be executed in the mode step, to be shown in preview."""
+
+    @abstractmethod
+    def commit(self) -> None:
+        """Execute the chunk that is shown."""
+
+    @abstractmethod
+    def cancel(self) -> None:
+        """Forget the chunk that is shown, leave the rest of the one that is executed, end a motion; hold."""
+
+    @abstractmethod
+    def move(self, asked: MoveRequest) -> Told: ...
+
+    @abstractmethod
+    def grip(self, asked: GripperRequest) -> Told: ...
+
+    @abstractmethod
+    def approach(self) -> None:
+        """Go to the policy's first action on a limited path: the one of the set-up, or the one that is shown."""

@@ -1,0 +1,185 @@
+"""Every transition of a station's session: which command is allowed when, and what follows from what happens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from runtime.effects import Effects, Situation, Told
+from runtime.requests import (
+    GripperRequest,
+    MoveRequest,
+    Nothing,
+    RunRequest,
+    SetUpRequest,
+    TuneRequest,
+)
+from runtime.section import Section
+
+
+class State(StrEnum):
+    """The session's state; one word each, the same everywhere."""
+
+    DISCONNECTED = "disconnected"
+    IDLE = "idle"
+    SETTING_UP = "setting_up"
+    READY = "ready"
+    RUNNING = "running"
+    HOLDING = "holding"
+    FAULTED = "faulted"
+
+
+class Happening(StrEnum):
+    """What the session is told of by the rest of the runtime."""
+
+    CONNECTED = "connected"  # a complete observation arrived
+    INCOMPLETE = "incomplete"  # observations arrive, but not from every camera
+    DISPLACED = "displaced"  # the arm is not where it was told to hold
+    LINK_LOST = "link_lost"  # observations have been missing for long
+    SETUP_DONE = "setup_done"
+    SETUP_FAILED = "setup_failed"
+    HELD = "held"  # control holds, for a reason of its own
+    RUN_ENDED = "run_ended"  # the run is over by itself: its time, its source
+    RUN_FAILED = "run_failed"  # it could not begin
+    LEASE_ENDED = "lease_ended"
+    ESTOPPED = "estopped"
+    RELEASED = "released"
+    FAMILY_DIED = "family_died"  # a process of the family was restarted
+
+
+Guard = Callable[[State, Situation], str]  # why it is not allowed just now, "" where it is
+
+
+def _always(state: State, situation: Situation) -> str:
+    return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A command: the states it is allowed in, the state after it, what it does, what it takes, its guard.
+
+    `after` None leaves the state as it is. `takes` None: whatever comes with it is not looked at, because a stop
+    is not refused for a word too many.
+    """
+
+    allowed: tuple[State, ...]
+    after: State | Mapping[State, State] | None
+    effect: Callable[[Effects, Any], Told | None]
+    takes: type[Section] | None = Nothing
+    guard: Guard = _always
+
+    def next(self, state: State) -> State | None:
+        """The state after it, None for the same."""
+        return self.after.get(state) if isinstance(self.after, Mapping) else self.after
+
+
+def _untried(state: State, situation: Situation) -> str:
+    return "the open run is one of a trial: what is measured may not be changed" if situation.trial else ""
+
+
+def _may_step(state: State, situation: Situation) -> str:
+    if situation.mode not in ("step", "preview"):
+        return f"the run's mode is {situation.mode}, and step is for step and preview"
+    if situation.proposed:
+        return "a chunk is shown: commit or cancel it first"
+    if situation.asked:
+        return "the policy is being asked"
+    return "the last chunk is still being executed" if situation.executing else ""
+
+
+def _may_commit(state: State, situation: Situation) -> str:
+    if situation.mode != "preview":
+        return f"the run's mode is {situation.mode}, and commit is for preview"
+    return "" if situation.proposed else "no chunk is shown: step first"
+
+
+def _may_cancel(state: State, situation: Situation) -> str:
+    if situation.mode in ("step", "preview", "manual"):
+        return ""
+    return f"the run's mode is {situation.mode}, and cancel is for step, preview and manual: stop or halt it"
+
+
+def _may_move(state: State, situation: Situation) -> str:
+    if situation.mode == "manual":
+        return ""
+    return f"the run's mode is {situation.mode}, and move is for manual"
+
+
+def _may_approach(state: State, situation: Situation) -> str:
+    if state is State.READY:
+        return "" if situation.first_action else "the policy's first action is not known: set up again"
+    if situation.mode != "preview":
+        return f"the run's mode is {situation.mode}, and approach is for preview"
+    return "" if situation.proposed else "no chunk is shown: step first"
+
+
+S = State
+_STOPPED = "stopped by the operator"
+COMMANDS: dict[str, Rule] = {
+    "setup": Rule((S.IDLE, S.READY), S.SETTING_UP, lambda e, asked: e.begin_setup(asked), SetUpRequest),
+    "run": Rule((S.READY,), S.RUNNING, lambda e, asked: e.begin_run(asked), RunRequest),
+    "stop": Rule(
+        (S.RUNNING, S.HOLDING, S.READY), S.READY, lambda e, _: e.end_run("finished", _STOPPED), None
+    ),
+    "halt": Rule((S.RUNNING, S.HOLDING), S.HOLDING, lambda e, _: e.hold("halted by the operator"), None),
+    "resume": Rule((S.HOLDING,), S.RUNNING, lambda e, _: e.resume_run()),
+    "home": Rule((S.READY,), S.SETTING_UP, lambda e, _: e.go_home()),
+    "release": Rule((S.FAULTED,), None, lambda e, _: e.release_estop()),
+    "record_start": Rule((S.IDLE, S.READY), None, lambda e, _: e.start_recording()),
+    "record_stop": Rule(
+        (S.DISCONNECTED, S.IDLE, S.SETTING_UP, S.READY, S.HOLDING), None, lambda e, _: e.stop_recording()
+    ),
+    "tune": Rule(
+        (S.IDLE, S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.tune(asked), TuneRequest, _untried
+    ),
+    "step": Rule((S.RUNNING,), None, lambda e, _: e.step(), guard=_may_step),
+    "commit": Rule((S.RUNNING,), None, lambda e, _: e.commit(), guard=_may_commit),
+    "cancel": Rule((S.RUNNING,), None, lambda e, _: e.cancel(), guard=_may_cancel),
+    "move": Rule((S.RUNNING,), None, lambda e, asked: e.move(asked), MoveRequest, _may_move),
+    "gripper": Rule(
+        (S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.grip(asked), GripperRequest, _untried
+    ),
+    "approach": Rule(
+        (S.READY, S.RUNNING),
+        {S.READY: S.SETTING_UP},
+        lambda e, _: e.approach(),
+        guard=_may_approach,
+    ),
+}
+# While it is being set up, both stopping commands mean the same: cancel.
+CANCELLING = ("stop", "halt")
+STOPPING = ("stop", "halt", "estop")  # never stale
+# What happens by itself: (happening, state) -> the state after it. Pairs that are not here change nothing.
+HAPPENINGS: dict[tuple[Happening, State], State] = {
+    (Happening.CONNECTED, S.DISCONNECTED): S.IDLE,
+    (Happening.INCOMPLETE, S.DISCONNECTED): S.DISCONNECTED,
+    (Happening.DISPLACED, S.READY): S.IDLE,
+    (Happening.LINK_LOST, S.IDLE): S.DISCONNECTED,
+    (Happening.LINK_LOST, S.READY): S.DISCONNECTED,
+    (Happening.LINK_LOST, S.SETTING_UP): S.DISCONNECTED,
+    (Happening.SETUP_DONE, S.SETTING_UP): S.READY,
+    (Happening.SETUP_FAILED, S.SETTING_UP): S.IDLE,
+    (Happening.HELD, S.RUNNING): S.HOLDING,
+    (Happening.HELD, S.SETTING_UP): S.IDLE,
+    (Happening.RUN_ENDED, S.RUNNING): S.READY,
+    (Happening.RUN_ENDED, S.HOLDING): S.READY,
+    (Happening.RUN_FAILED, S.RUNNING): S.READY,
+    (Happening.RUN_FAILED, S.HOLDING): S.READY,
+    (Happening.LEASE_ENDED, S.RUNNING): S.HOLDING,
+    (Happening.LEASE_ENDED, S.SETTING_UP): S.IDLE,
+    (Happening.RELEASED, S.FAULTED): S.IDLE,
+    **{(Happening.ESTOPPED, state): S.FAULTED for state in State if state is not S.FAULTED},
+    **{(Happening.FAMILY_DIED, state): S.IDLE for state in (S.READY, S.RUNNING, S.HOLDING, S.SETTING_UP)},
+}
+
+CANCELLED = "set-up cancelled by the operator"
+CANCEL = Rule((S.SETTING_UP,), S.IDLE, lambda e, _: e.cancel_setup(CANCELLED), None)
+REASONS = {
+    "stop": _STOPPED,
+    "halt": "halted by the operator: resume or stop",
+    "home": "going home",
+    "setup": "setting up",
+    "approach": "going to the policy's first action",
+}

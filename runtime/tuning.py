@@ -1,0 +1,36 @@
+"""Another strategy, other parameters, another instruction, on top of the plan in force."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from runtime import deployment
+from runtime.errors import RuntimeFault
+from runtime.family import Plan
+from runtime.inference import Strategy
+from runtime.policies.base import PolicyInfo
+from runtime.requests import TuneRequest
+
+
+def strategy_of(plan: Plan) -> Strategy:
+    """The asking half of a plan's strategy."""
+    settings = plan.deployment.strategy
+    return Strategy(plan.strategy.query(settings), settings)
+
+
+def tuned(plan: Plan, asked: TuneRequest, info: PolicyInfo | None) -> Plan:
+    """`plan` with what is asked; another kind keeps the parameters. RuntimeFault names what is wrong.
+
+    `info` is what the connected policy says of itself, None where none is.
+    """
+    if asked.strategy is None and asked.task is None:
+        raise RuntimeFault("tune: nothing to change; allowed: strategy, task")
+    now = plan.deployment
+    strategy = {**now.strategy.model_dump(), **(asked.strategy or {})}
+    task = now.task if asked.task is None else asked.task
+    made = replace(
+        plan, resolved=deployment.changed(plan.resolved, {"strategy": strategy, "task": task}, "tune")
+    )
+    if info is not None and info.supports_rtc is False and strategy_of(made).query.continues:
+        raise RuntimeFault(f"tune: the policy {info.name!r} does not continue a chunk that it is given (RTC)")
+    return made
