@@ -16,7 +16,7 @@ class PolicyInfo:
     name: str
     action_space: Space | None = None
     horizon: int | None = None
-    supports_rtc: bool = False
+    supports_rtc: bool | None = False  # it continues a chunk that it is given
     metadata: Mapping[str, object] = field(default_factory=dict)
 
 

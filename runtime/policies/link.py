@@ -6,6 +6,7 @@ Replies carry no id, so a connection whose answer did not come in time is droppe
 from __future__ import annotations
 
 import contextlib
+import queue
 import socket
 import threading
 import time
@@ -37,6 +38,7 @@ class WebsocketLink:
         self._connect_deadline = connect_deadline
         self._stack = contextlib.ExitStack()
         self._connection: ClientConnection | None = None
+        self._reaching: socket.socket | None = None  # its connection is being made
         self._shaking: ClientConnection | None = None  # its handshake is under way
         self._aborted = False
 
@@ -46,17 +48,20 @@ class WebsocketLink:
         return self._connection is not None
 
     def open(self) -> bytes:
-        """Connect anew and return the server's first frame; both within the connect deadline."""
+        """Connect anew and return the server's first frame; both together within the connect deadline.
+
+        PolicyLostError where nobody is there, or not yet, or not any more; PolicyError where somebody else is.
+        """
         self.drop()
         deadline = time.monotonic() + self._connect_deadline
         try:
             self._require_not_aborted()
-            self._connection = self._connect()
+            self._connection = self._connect(deadline)
         except PolicyError:
             self._require_not_aborted()
             raise
         finally:
-            self._shaking = None
+            self._reaching = self._shaking = None
         with self._dropping_on_error():
             self._require_not_aborted()
             return self._receive(self._connection, deadline, "its metadata", self._connect_deadline)
@@ -74,12 +79,14 @@ class WebsocketLink:
     def abort(self) -> None:
         """Unblock, from another thread, whoever waits here: they raise PolicyError, now and later.
 
-        Only reaching a host that does not answer at all goes on until the connect deadline.
+        Only the search for a host's address goes on until the connect deadline.
         """
         self._aborted = True
+        if self._reaching is not None:
+            _end(self._reaching)
         for connection in (self._shaking, self._connection):
             if connection is not None:
-                _shut(connection)
+                _end(connection.socket)
 
     def _require_not_aborted(self) -> None:
         if self._aborted:
@@ -89,10 +96,41 @@ class WebsocketLink:
         """End the connection without waiting for the server's consent; safe to call twice."""
         connection, self._connection = self._connection, None
         if connection is not None:
-            _shut(connection)
+            _end(connection.socket)
         self._stack.close()
 
-    def _connect(self) -> ClientConnection:
+    def _place(self) -> tuple[str, int]:
+        from websockets.exceptions import InvalidURI
+        from websockets.uri import parse_uri
+
+        try:
+            uri = parse_uri(self._url)
+        except InvalidURI as error:
+            raise PolicyError(f"{self._url} is no websocket address, e.g. ws://127.0.0.1:8000") from error
+        return uri.host, uri.port
+
+    def _reach(self, host: str, port: int, deadline: float) -> socket.socket:
+        """A TCP connection to the first address of the host that takes one; OSError of the last one else."""
+        refusal: OSError = OSError(f"{host} has no address")
+        for family, kind, protocol, _, address in _addresses(host, port, self._connect_deadline):
+            wire = socket.socket(family, kind, protocol)
+            self._reaching = wire
+            try:
+                self._require_not_aborted()
+                wire.settimeout(max(1e-3, deadline - time.monotonic()))
+                wire.connect(address)
+            except OSError as error:
+                wire.close()
+                refusal = error
+            except BaseException:
+                wire.close()
+                raise
+            else:
+                wire.settimeout(None)
+                return wire
+        raise refusal
+
+    def _connect(self, deadline: float) -> ClientConnection:
         from websockets.exceptions import InvalidStatus, InvalidURI, WebSocketException
         from websockets.sync.client import ClientConnection, connect
 
@@ -105,29 +143,31 @@ class WebsocketLink:
                 super().__init__(*arguments, **options)
                 link._shaking = self
                 if link._aborted:
-                    _shut(self)
+                    _end(self.socket)
 
         try:
+            wire = self._stack.enter_context(self._reach(*self._place(), deadline))
             return self._stack.enter_context(
                 connect(
                     self._url,
+                    sock=wire,
                     additional_headers=self._headers,
                     compression=None,
                     max_size=None,
                     # A server that computes on its event loop answers no pings.
                     ping_interval=None,
                     proxy=None,
-                    open_timeout=self._connect_deadline,
+                    open_timeout=max(1e-3, deadline - time.monotonic()),
                     close_timeout=_CLOSE_TIMEOUT,
                     create_connection=Connection,
                 )
             )
         except ConnectionRefusedError as error:
-            raise PolicyError(
+            raise PolicyLostError(
                 f"no policy server listens at {self._url}: start it, or correct policy.url"
             ) from error
         except socket.gaierror as error:
-            raise PolicyError(
+            raise PolicyLostError(
                 f"the host of {self._url} is not known: correct policy.url ({error})"
             ) from error
         except TimeoutError as error:
@@ -136,17 +176,30 @@ class WebsocketLink:
                 "the host is unreachable, or what listens there is stuck or no websocket server"
             ) from error
         except InvalidStatus as error:
-            raise PolicyError(
-                f"{self._url} refused the websocket with HTTP {error.response.status_code}: "
-                "another web server listens there, or the path or the API key is wrong; correct policy.url"
-            ) from error
-        except InvalidURI as error:
-            raise PolicyError(f"{self._url} is no websocket address, e.g. ws://127.0.0.1:8000") from error
+            raise self._refused(error.response.status_code) from error
+        except (InvalidURI, ValueError) as error:  # what websockets raises where it is told to go elsewhere
+            raise PolicyError(f"{self._url} points elsewhere ({error}): correct policy.url") from error
         except (WebSocketException, OSError, EOFError) as error:
+            if isinstance(error, OSError) or isinstance(error.__cause__, OSError | EOFError):
+                raise PolicyLostError(
+                    f"the connection to {self._url} failed ({error}): see that the policy server runs, or correct "
+                    "policy.url"
+                ) from error
             raise PolicyError(
                 f"what listens at {self._url} does not speak websocket ({error}): "
                 "check host, port and policy.kind"
             ) from error
+
+    def _refused(self, status: int) -> PolicyError:
+        """A gateway before a server that restarts says 502 to 504; whatever else is said stays so."""
+        if status in (502, 503, 504):
+            return PolicyLostError(
+                f"{self._url} has no policy server behind it at the moment (HTTP {status})"
+            )
+        return PolicyError(
+            f"{self._url} refused the websocket with HTTP {status}: "
+            "another web server listens there, or the path or the API key is wrong; correct policy.url"
+        )
 
     def _send(self, connection: ClientConnection, request: bytes, seconds: float) -> None:
         """Send, but not for ever: a server that stopped reading leaves our socket full."""
@@ -156,7 +209,7 @@ class WebsocketLink:
 
         def cut() -> None:
             fired.set()
-            _shut(connection)
+            _end(connection.socket)
 
         watchdog = threading.Timer(seconds, cut)
         watchdog.daemon = True
@@ -182,7 +235,7 @@ class WebsocketLink:
         except ConnectionClosed as error:
             raise self._gone(error) from error
         if isinstance(answer, str):
-            raise PolicyError(f"the policy server at {self._url} reports an error: {_headline(answer)}")
+            raise PolicyError(f"the policy server at {self._url} reports an error: {headline(answer)}")
         return answer
 
     def _gone(self, error: Exception) -> PolicyError:
@@ -201,13 +254,35 @@ class WebsocketLink:
             raise
 
 
-def _shut(connection: ClientConnection) -> None:
+def _end(wire: socket.socket) -> None:
     """Wake every thread that waits on this socket; it is of no use afterwards."""
     with contextlib.suppress(OSError):
-        connection.socket.shutdown(socket.SHUT_RDWR)
+        wire.shutdown(socket.SHUT_RDWR)
 
 
-def _headline(text: str) -> str:
+def _addresses(host: str, port: int, seconds: float) -> list[tuple[Any, ...]]:
+    """What the host's name stands for; TimeoutError after `seconds`, for which alone the resolver knows no end."""
+    found: queue.SimpleQueue[list[tuple[Any, ...]] | OSError] = queue.SimpleQueue()
+
+    def resolve() -> None:
+        try:
+            found.put(list(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)))
+        except OSError as error:
+            found.put(error)
+        except UnicodeError as error:
+            found.put(socket.gaierror(socket.EAI_NONAME, str(error)))
+
+    threading.Thread(target=resolve, name="resolver", daemon=True).start()
+    try:
+        addresses = found.get(timeout=seconds)
+    except queue.Empty as error:
+        raise TimeoutError(f"the name {host} was not resolved") from error
+    if isinstance(addresses, OSError):
+        raise addresses
+    return addresses
+
+
+def headline(text: str) -> str:
     """A traceback's last line first, because that is the sentence; then the whole of it."""
     lines = text.strip().splitlines() or ["(an empty text)"]
     return lines[-1] if len(lines) == 1 else f"{lines[-1].strip()}\n{text.strip()}"

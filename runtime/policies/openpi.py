@@ -19,16 +19,19 @@ from runtime import codecs
 from runtime.clock import Clock
 from runtime.errors import CodecError, ConfigurationError, PolicyError
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.policies.link import PolicyGone, PolicyTimeout, WebsocketLink
+from runtime.policies.link import WebsocketLink
 from runtime.policies.pictures import Layout, Resize, fitted, laid_out
 from runtime.policies.rows import action_rows
+from runtime.policies.rtc.async_rtc import AsyncRtc, Schedule
+from runtime.policies.rtc.base import Dialect, Plain
+from runtime.policies.rtc.prev_action import PrevAction
 from runtime.section import Section
-from runtime.types import ActionChunk, Conditioning, Float32, Observation, Space
+from runtime.types import ActionChunk, ActionMode, Conditioning, Float32, Observation, RelativeFrame, Space
 
 if TYPE_CHECKING:
     from robots import Robot
 
-Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Pixels = Annotated[int, Field(ge=8, le=4096)]
 Size = Annotated[list[Pixels], Field(min_length=2, max_length=2)]
 Dims = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
@@ -45,14 +48,28 @@ class Config(Section):
     """Where the server listens."""
     api_key_env: str | None = None
     """Environment variable with the API key; the key itself would end up in every recording's manifest."""
-    connect_deadline: Seconds = 5.0
+    connect_deadline: Positive = 5.0
     """For the connection and the server's metadata [s]."""
-    first_inference_deadline: Seconds = 120.0
-    """For the first answer after a server was reached [s]: it may have to compile its model."""
-    inference_deadline: Seconds = 2.0
-    """For every later answer [s]; after it the connection is dropped."""
+    first_inference_deadline: Positive = 120.0
+    """For the first answer after set-up [s]: the server may have to compile its model."""
+    inference_deadline: Positive = 2.0
+    """For every later answer [s], also of a server that came back; after it the connection is dropped."""
     action_space: Space = "joint"
     """What the rows of the answer are: joint targets, or 8 numbers of pose and gripper per arm."""
+    action_mode: ActionMode = "absolute"
+    """What their numbers are: targets; "relative" to the observation; or "delta", each to the row before.
+
+    Grippers are absolute in every mode. A server's own metadata key action_mode names the space, not this."""
+    relative_frame: RelativeFrame = "base"
+    """Axes of relative poses: the arm's base, or the tool as observed."""
+    action_rate: Positive | None = None
+    """Rows per second of the answer [Hz]; the control rate where it is not given."""
+    rtc: Literal["none", "prev_action", "async_rtc"] = "none"
+    """How the server is told what the robot is committed to: flat keys, or the openpi-async-rtc envelope."""
+    prefix_attention_schedule: Schedule = "exp"
+    """With async_rtc: how the weight of the rows before falls after the predicted delay."""
+    max_guidance_weight: Positive = 10.0
+    """With async_rtc: most that those rows may bend an inference."""
     observation_space: Space = "joint"
     """What is sent as state: joints, or poses."""
     cameras: dict[str, str] | None = None
@@ -82,8 +99,8 @@ class OpenpiPolicy(Policy):
     """One connection; a timed-out one is dropped, and the next `infer` opens another.
 
     Deadlines are real seconds whatever the clock, because a server on a wire knows no other. The long first
-    deadline holds again after the server has closed the connection (it may have restarted), but not after
-    a timeout: a mute server is found out quickly the second time.
+    deadline holds once after `connect`: later no `infer` takes longer than the deadlines of connection and
+    inference together, so that a server that came back mute, or compiles again, is found out quickly.
     """
 
     def __init__(self, config: Config, robot: Robot) -> None:
@@ -93,6 +110,7 @@ class OpenpiPolicy(Policy):
         self._width = _width(config.action_space, robot)
         _check_parts(config, self._state_width)
         self._headers = _headers(config)
+        self._dialect = _dialect(config)
         self._link = self._new_link()
         self._lock = threading.Lock()  # of the wire: held through every wait
         self._turning = threading.Lock()  # between open and closed: held for a moment
@@ -110,13 +128,14 @@ class OpenpiPolicy(Policy):
             return self._open()
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """The chunk; `timing` has the server's figures [ms] and our `round_trip_ms`; no conditioning."""
-        if conditioning is not None:
-            raise PolicyError(
-                "plain openpi servers drop RTC conditioning without a word; choose an RTC protocol"
-            )
-        request = codecs.pack(self.request(observation))
+        """The chunk; `timing` has the server's figures [ms] and our `round_trip_ms`.
+
+        PolicyLostError where the server is not there or does not answer: the next call opens another connection.
+        PolicyError for conditioning that the dialect `policy.rtc` cannot carry.
+        """
+        shown = self.request(observation)
         with self._lock:
+            request = codecs.pack(self._dialect.request(shown, conditioning))
             if self._closed:
                 raise PolicyError(f"the policy at {self._config.url} is closed; connect first")
             if not self._link.is_open:
@@ -124,7 +143,8 @@ class OpenpiPolicy(Policy):
             started = time.monotonic()
             reply = self._unpacked(self._exchange(request), "an answer")
             round_trip = 1e3 * (time.monotonic() - started)
-        return self._chunk(reply, round_trip)
+            result = self._result(reply)
+        return self._chunk(result, round_trip)
 
     def reset(self) -> None:
         """Nothing to forget: the protocol has no reset, and no answer depends on an earlier one."""
@@ -176,6 +196,7 @@ class OpenpiPolicy(Policy):
         metadata = self._unpacked(self._link.open(), "metadata")
         try:
             space = self._checked_space(metadata, "metadata")
+            supports_rtc = self._dialect.supported(metadata)
         except PolicyError:
             self._link.drop()
             raise
@@ -184,19 +205,22 @@ class OpenpiPolicy(Policy):
             name=str(metadata.get("name", "openpi")),
             action_space=space,
             horizon=horizon if type(horizon) is int else None,
+            supports_rtc=supports_rtc,
             metadata=metadata,
         )
 
     def _exchange(self, request: bytes) -> bytes:
         config = self._config
         seconds = config.inference_deadline if self._warm else config.first_inference_deadline
-        try:
-            answer = self._link.exchange(request, seconds)
-        except (PolicyGone, PolicyTimeout) as error:
-            self._warm = isinstance(error, PolicyTimeout)
-            raise
         self._warm = True
-        return answer
+        return self._link.exchange(request, seconds)
+
+    def _result(self, reply: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return self._dialect.result(reply)
+        except PolicyError:
+            self._link.drop()  # after an error the server closes, after another's answer all would be another's
+            raise
 
     def _unpacked(self, payload: bytes, what: str) -> dict[str, Any]:
         try:
@@ -223,6 +247,9 @@ class OpenpiPolicy(Policy):
         return ActionChunk(
             actions=action_rows("actions", reply["actions"], self._width),
             space=self._config.action_space,
+            rate=self._config.action_rate,
+            mode=self._config.action_mode,
+            frame=self._config.relative_frame,
             model_actions=None if origin is None else action_rows("origin_actions", origin),
             timing=_timing(reply) | {"round_trip_ms": round_trip},
         )
@@ -268,6 +295,12 @@ def _check_parts(config: Config, width: int) -> None:
             raise ConfigurationError(
                 f"policy.state_parts.{key} = {dims} leaves the state; allowed: 0 to {width - 1}"
             )
+
+
+def _dialect(config: Config) -> Dialect:
+    if config.rtc == "async_rtc":
+        return AsyncRtc(config.prefix_attention_schedule, config.max_guidance_weight)
+    return PrevAction() if config.rtc == "prev_action" else Plain()
 
 
 def _headers(config: Config) -> dict[str, str]:

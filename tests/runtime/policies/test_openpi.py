@@ -17,7 +17,7 @@ from websockets.sync.server import ServerConnection, serve
 import robots
 from runtime import codecs
 from runtime.clock import MonotonicClock
-from runtime.errors import ConfigurationError, PolicyError
+from runtime.errors import ConfigurationError, PolicyError, PolicyLostError
 from runtime.policies import openpi
 from runtime.policies.link import PolicyGone, PolicyTimeout, WebsocketLink
 from runtime.policies.openpi import Config, OpenpiPolicy
@@ -278,7 +278,7 @@ def test_a_layout_that_does_not_fit_the_robot_is_refused_at_once(settings: dict[
 
 
 def test_conditioning_is_refused_because_the_server_would_drop_it_silently() -> None:
-    conditioning = Conditioning(np.zeros((2, ROBOT.dim), np.float32), 1)
+    conditioning = Conditioning(np.zeros((2, ROBOT.dim), np.float32), 1, 0, 2)
     with policy_at("ws://127.0.0.1:9") as policy, pytest.raises(PolicyError, match="RTC"):
         policy.infer(observation(), conditioning)
 
@@ -291,7 +291,7 @@ def test_a_port_where_nobody_listens_is_said_to_be_empty() -> None:
         port = listener.getsockname()[1]
     with (
         policy_at(f"ws://127.0.0.1:{port}") as policy,
-        pytest.raises(PolicyError, match="no policy server listens"),
+        pytest.raises(PolicyLostError, match="no policy server listens"),
     ):
         policy.connect()
 
@@ -313,6 +313,58 @@ def test_a_web_server_that_does_not_upgrade_is_named() -> None:
         pytest.raises(PolicyError, match="HTTP 200"),
     ):
         policy.connect()
+
+
+@pytest.mark.parametrize("where", [b"http://127.0.0.1:1/", b"ws://127.0.0.1:1/"])
+def test_a_web_server_that_points_elsewhere_is_not_followed(where: bytes) -> None:
+    answer = b"HTTP/1.1 302 Found\r\nLocation: " + where + b"\r\nContent-Length: 0\r\n\r\n"
+    with (
+        raw_server(answer) as port,
+        policy_at(f"ws://127.0.0.1:{port}") as policy,
+        pytest.raises(PolicyError, match="points elsewhere"),
+    ):
+        policy.connect()
+
+
+@pytest.mark.parametrize(
+    ("answer", "lost"),
+    [
+        (b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\n\r\n", True),
+        (b"HTTP/1.1 50", True),  # the end comes in the middle
+        (b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n\r\n", False),
+        (b"SSH-2.0-OpenSSH_9.6\r\n", False),
+    ],
+)
+def test_what_may_come_back_is_told_from_what_will_never_be_a_policy_server(
+    answer: bytes, lost: bool
+) -> None:
+    with (
+        raw_server(answer) as port,
+        policy_at(f"ws://127.0.0.1:{port}") as policy,
+        pytest.raises(PolicyError) as raised,
+    ):
+        policy.connect()
+    assert isinstance(raised.value, PolicyLostError) == lost
+
+
+@pytest.mark.parametrize("host", ["nobody.invalid", "two..dots"])
+def test_a_host_that_nobody_knows_is_named(host: str) -> None:
+    with (
+        policy_at(f"ws://{host}:8000") as policy,
+        pytest.raises(PolicyLostError, match=f"the host of ws://{host}:8000 is not known"),
+    ):
+        policy.connect()
+
+
+def test_a_name_that_is_never_resolved_does_not_outlast_the_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = threading.Event()
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *given, **options: [None] * (not ended.wait(60)))
+    with (
+        policy_at("ws://slow.invalid:8000", connect_deadline=0.2) as policy,
+        pytest.raises(PolicyTimeout, match=r"within 0\.2 s"),
+    ):
+        policy.connect()
+    ended.set()
 
 
 def test_a_server_of_another_kind_is_said_not_to_speak_websocket() -> None:
@@ -508,21 +560,38 @@ def test_a_connection_that_ends_within_an_answer_is_opened_anew() -> None:
         assert row_zero_starts_at(policy.infer(observation(0.2)), 0.2)
 
 
-def test_a_server_that_came_back_is_found_again_and_given_time_to_compile() -> None:
+def test_a_server_that_came_back_is_found_again() -> None:
     server = OpenpiServer(ROBOT, Behaviour())
     url = str(server.start()["url"])
-    with policy_at(url, first_inference_deadline=10.0, inference_deadline=0.3) as policy:
+    with policy_at(url, first_inference_deadline=10.0, inference_deadline=5.0) as policy:
         policy.connect()
         policy.infer(observation())
         server.close()
         with pytest.raises(PolicyGone):
             policy.infer(observation())
-        with pytest.raises(PolicyError, match="no policy server listens"):
-            policy.infer(observation())
+        for _ in range(2):
+            with pytest.raises(PolicyLostError, match="no policy server listens"):
+                policy.infer(observation())
         port = int(url.rpartition(":")[2])
-        with contextlib.closing(OpenpiServer(ROBOT, Behaviour(latency=0.6), port)) as again:
+        with contextlib.closing(OpenpiServer(ROBOT, Behaviour(), port)) as again:
             again.start()
             assert row_zero_starts_at(policy.infer(observation(0.3)), 0.3)
+
+
+def test_during_a_run_a_server_that_came_back_mute_is_found_out_by_the_short_deadline() -> None:
+    server = OpenpiServer(ROBOT, Behaviour())
+    url = str(server.start()["url"])
+    with policy_at(url, first_inference_deadline=60.0, inference_deadline=0.2) as policy:
+        policy.connect()
+        policy.infer(observation())
+        server.close()
+        with pytest.raises(PolicyGone):
+            policy.infer(observation())
+        mute = Behaviour(fault=Fault("mute_on_infer"))
+        with contextlib.closing(OpenpiServer(ROBOT, mute, int(url.rpartition(":")[2]))) as again:
+            again.start()
+            with pytest.raises(PolicyTimeout, match=r"within 0\.2 s"):
+                policy.infer(observation())
 
 
 def test_a_server_that_stops_reading_does_not_block_the_request() -> None:
@@ -583,6 +652,39 @@ def test_close_does_not_wait_for_a_handshake_and_ends_it() -> None:
         closing.join(10)
         thread.join(10)
         assert not closing.is_alive()
+        assert not thread.is_alive()
+    assert "closed from our side" in str(errors[0])
+
+
+@contextlib.contextmanager
+def unreachable_port() -> Iterator[int]:
+    """A port whose queue is full: whoever connects gets no answer at all."""
+    with contextlib.ExitStack() as stack:
+        listener = stack.enter_context(socket.create_server(("127.0.0.1", 0), backlog=0))
+        for _ in range(8):
+            waiting = stack.enter_context(socket.socket())
+            waiting.setblocking(False)
+            waiting.connect_ex(listener.getsockname())
+        yield listener.getsockname()[1]
+
+
+def test_close_ends_the_search_for_a_host_that_does_not_answer() -> None:
+    errors: list[PolicyError] = []
+
+    def connect(policy: OpenpiPolicy) -> None:
+        try:
+            policy.connect()
+        except PolicyError as error:
+            errors.append(error)
+
+    with unreachable_port() as port, policy_at(f"ws://127.0.0.1:{port}", connect_deadline=60.0) as policy:
+        thread = threading.Thread(target=connect, args=(policy,))
+        thread.start()
+        while policy._link._reaching is None:
+            assert thread.is_alive()
+        thread.join(0.2)  # so that it does wait in the connection, and not before it
+        policy.close()
+        thread.join(10)
         assert not thread.is_alive()
     assert "closed from our side" in str(errors[0])
 

@@ -1,0 +1,1 @@
+"""How policy servers are told what the robot is committed to: one file per wire dialect."""

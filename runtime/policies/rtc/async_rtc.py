@@ -1,0 +1,100 @@
+"""The versioned envelope openpi-async-rtc, version 2: requests are numbered, errors are messages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from runtime.errors import PolicyError
+from runtime.policies.link import headline
+from runtime.policies.rtc.base import Dialect, Message
+from runtime.types import Conditioning
+
+NAME = "openpi-async-rtc"
+VERSION = 2
+Schedule = Literal["exp", "linear", "ones", "zeros"]
+
+
+class AsyncRtc(Dialect):
+    """One request at a time, each with a number of its own that the answer has to carry.
+
+    `rtc` holds what is left of the chunk before, the predicted delay, and `execution_horizon`, to this dialect
+    the end of the transition from those rows to new ones: never below the delay, never above the model's horizon.
+    """
+
+    def __init__(self, schedule: Schedule, max_guidance_weight: float) -> None:
+        self._schedule = schedule
+        self._weight = max_guidance_weight
+        self._number = -1
+        self._horizon: int | None = None
+
+    def supported(self, metadata: Mapping[str, Any]) -> bool | None:
+        """What `rtc_supported` says; PolicyError where protocol, version, codec or the word itself is wrong."""
+        said = metadata.get("async_rtc")
+        if not isinstance(said, Mapping):
+            found = ", ".join(map(str, metadata)) or "nothing"
+            raise PolicyError(
+                f"the server's metadata have no async_rtc map, only {found}: it is no {NAME} server; correct "
+                "policy.rtc or policy.url"
+            )
+        _check_version(said, "the server's async_rtc metadata")
+        codecs = said.get("image_transport_codecs", ["raw"])
+        if not isinstance(codecs, list) or "raw" not in codecs:
+            raise PolicyError(f"the server takes pictures as {codecs!r}; needed: raw")
+        supported = said.get("rtc_supported")
+        if not isinstance(supported, bool):
+            raise PolicyError(
+                f"the server's async_rtc metadata have rtc_supported {supported!r}; needed: a bool"
+            )
+        horizon = said.get("model_action_horizon")
+        self._horizon = horizon if type(horizon) is int else None
+        return supported
+
+    def request(self, observation: Message, conditioning: Conditioning | None) -> Message:
+        """The envelope for the next request."""
+        self._number += 1
+        return {
+            "protocol": NAME,
+            "protocol_version": VERSION,
+            "request_id": self._number,
+            "observation": observation,
+            "image_transport": {"codec": "raw"},
+            "rtc": None if conditioning is None else self._rtc(conditioning),
+        }
+
+    def result(self, reply: Message) -> Message:
+        """What is in the envelope; PolicyError for the server's error, another version, another request's number."""
+        _check_version(reply, "the answer")
+        if reply.get("error"):
+            raise PolicyError(f"the policy server reports an error: {headline(str(reply['error']))}")
+        number = reply.get("request_id")
+        if number != self._number:
+            raise PolicyError(
+                f"the answer has request_id {number!r}, asked was {self._number}: it is another request's"
+            )
+        result = reply.get("result")
+        if not isinstance(result, dict):
+            raise PolicyError(f"the answer has a result that is a {type(result).__name__}; expected a map")
+        return result
+
+    def _rtc(self, conditioning: Conditioning) -> Message:
+        left = conditioning.left_over
+        delay = min(conditioning.predicted_delay, len(left))
+        highest = len(conditioning.previous) if self._horizon is None else self._horizon
+        return {
+            "prev_chunk_left_over": np.ascontiguousarray(left, np.float32),
+            "inference_delay": delay,
+            "execution_horizon": max(1, delay, min(conditioning.execution_horizon, highest)),
+            "prefix_attention_schedule": self._schedule,
+            "max_guidance_weight": self._weight,
+        }
+
+
+def _check_version(message: Mapping[str, Any], where: str) -> None:
+    found = (message.get("protocol"), message.get("protocol_version"))
+    if found != (NAME, VERSION):
+        raise PolicyError(
+            f"{where} has protocol {found[0]!r} version {found[1]!r}; needed: {NAME!r} version {VERSION}"
+        )

@@ -1,0 +1,64 @@
+"""What a dialect of real-time chunking does to the messages of a policy protocol."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+from runtime.errors import PolicyError
+from runtime.types import Conditioning
+
+Message = dict[str, Any]
+
+
+class Dialect(ABC):
+    """Wraps requests and unwraps replies; one per connection's policy, for one thread.
+
+    There is no common standard. Each dialect says what it found where a server speaks another one.
+    """
+
+    @abstractmethod
+    def supported(self, metadata: Mapping[str, Any]) -> bool | None:
+        """Whether the server continues a chunk that it is given, None where its metadata do not say.
+
+        Raises PolicyError where it speaks another dialect.
+        """
+
+    @abstractmethod
+    def request(self, observation: Message, conditioning: Conditioning | None) -> Message:
+        """The message to send for an observation."""
+
+    @abstractmethod
+    def result(self, reply: Message) -> Message:
+        """The part of a reply that holds the actions; PolicyError for an error, or a reply to something else."""
+
+
+class Plain(Dialect):
+    """No RTC: servers drop keys that they do not know, so conditioning would be sent and do nothing."""
+
+    def supported(self, metadata: Mapping[str, Any]) -> bool | None:
+        """Never."""
+        refuse_envelopes(metadata, "none")
+        return False
+
+    def request(self, observation: Message, conditioning: Conditioning | None) -> Message:
+        """The observation itself; PolicyError for conditioning."""
+        if conditioning is not None:
+            raise PolicyError(
+                "plain openpi servers drop RTC conditioning without a word; choose an RTC protocol (policy.rtc)"
+            )
+        return observation
+
+    def result(self, reply: Message) -> Message:
+        """The reply itself."""
+        return reply
+
+
+def refuse_envelopes(metadata: Mapping[str, Any], configured: str) -> None:
+    """PolicyError where the server says that it takes versioned envelopes: it would answer nothing else."""
+    if "async_rtc" in metadata:
+        raise PolicyError(
+            f"the server's metadata have async_rtc, so it takes envelopes alone; policy.rtc is {configured!r}, "
+            "allowed with this server: 'async_rtc'"
+        )

@@ -1,0 +1,51 @@
+"""Two flat keys in the observation: `prev_action` and `rtc_params`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from runtime.errors import PolicyError
+from runtime.policies.rtc.base import Dialect, Message, refuse_envelopes
+from runtime.types import Conditioning, Float32
+
+NAME = "prev_action"
+
+
+class PrevAction(Dialect):
+    """`prev_action` float32 [T, W] is what is left of the chunk before, padded with its last row to its length.
+
+    `rtc_params` = {"s": rows that were removed}. Both are absent on the first request and after a reset. A server
+    that does not know them drops them without a word, and most say nothing of themselves.
+    """
+
+    def supported(self, metadata: Mapping[str, Any]) -> bool | None:
+        """What the metadata key `rtc` says (that of our bundled server), None without it."""
+        refuse_envelopes(metadata, NAME)
+        said = metadata.get("rtc")
+        if said is None:
+            return None
+        if not isinstance(said, Mapping) or not isinstance(said.get("dialect"), str):
+            raise PolicyError(f"the server's metadata have rtc = {said!r}; expected a map with a dialect")
+        return bool(said["dialect"] == NAME)
+
+    def request(self, observation: Message, conditioning: Conditioning | None) -> Message:
+        """The observation with both keys, or as it is."""
+        if conditioning is None:
+            return observation
+        return observation | {
+            "prev_action": padded(conditioning.left_over, len(conditioning.previous)),
+            "rtc_params": {"s": conditioning.consumed},
+        }
+
+    def result(self, reply: Message) -> Message:
+        """The reply itself."""
+        return reply
+
+
+def padded(rows: Float32, count: int) -> Float32:
+    """`rows` and then the last of them until there are `count`."""
+    missing = count - len(rows)
+    return np.ascontiguousarray(np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)]), np.float32)
