@@ -1,0 +1,56 @@
+"""How the policy did over a run."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from runtime.messages import ChunkMerged
+from runtime.tally import Tally, quantile
+
+
+def merged(delay: int, mistimed: int = 0, dropped: str = "") -> ChunkMerged:
+    return ChunkMerged(1, 1, 10, delay, np.zeros(4, np.int64), mistimed, dropped)
+
+
+def test_answers_delays_and_what_went_wrong_are_counted() -> None:
+    tally = Tally()
+    for milliseconds in range(1, 101):
+        tally.answered(milliseconds / 1000)
+    tally.merged(merged(3))
+    tally.merged(merged(5, mistimed=2))
+    tally.merged(merged(60, dropped="all in the past"))
+    figures = tally.figures()
+    assert (figures["answers"], figures["mistimed"], figures["dropped"]) == (100, 1, 1)
+    assert figures["latency_ms"]["p50"] == 50.5
+    assert figures["latency_ms"]["max"] == 100.0
+    assert figures["delay_steps"] == {"p50": 5.0, "p90": 49.0, "p99": 58.9, "max": 60.0}
+
+
+def test_without_a_measurement_there_is_no_figure() -> None:
+    tally = Tally()
+    assert tally.figures()["latency_ms"] is None
+    assert tally.figures()["delay_steps"] is None
+    assert tally.newest() == {"latencies_ms": [], "delays": []}
+    assert math.isnan(quantile([], 50))
+
+
+def test_a_page_is_told_the_newest_sixty_and_the_counts_go_on() -> None:
+    tally = Tally()
+    for number in range(100):
+        tally.answered(number / 1000)
+        tally.merged(merged(number))
+    told = tally.newest()
+    assert told["delays"] == list(range(40, 100))
+    assert len(told["latencies_ms"]) == 60
+    assert tally.answers == 100
+
+
+def test_a_new_run_begins_anew() -> None:
+    tally = Tally()
+    tally.answered(0.1)
+    tally.merged(merged(3, mistimed=1, dropped="x"))
+    tally.starved = tally.lost = 2
+    tally.forget()
+    assert tally.figures() == Tally().figures()
