@@ -6,12 +6,18 @@ from datetime import datetime
 from typing import Annotated, Any
 from uuid import UUID
 
+from asgiref.sync import async_to_sync
 from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema
 
 from evaweb.api.answers import FAILURES, Page, Paging
-from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.api.jobs import JobOut
+from evaweb.episodes import services
+from evaweb.episodes.exporting import CONTENT_TYPE, table_file
+from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
+from evaweb.episodes.streaming import file_answer
 from evaweb.errors import NotFound
+from evaweb.roles import Role, require
 from evaweb.stations.selectors import station_get
 
 router = Router(tags=["episodes"])
@@ -26,6 +32,8 @@ class EpisodeOut(Schema):
     status: EpisodeStatus
     reason: str
     kind: str
+    mode: str
+    strategy: str
     task: str
     robot: str
     checkpoint: str
@@ -57,6 +65,7 @@ class EpisodeDetail(EpisodeOut):
 
     configuration_hash: str
     control: dict[str, Any]
+    policy: dict[str, Any]
 
     @staticmethod
     def of(episode: Episode) -> dict[str, Any]:
@@ -65,6 +74,7 @@ class EpisodeDetail(EpisodeOut):
             **EpisodeOut.of(episode),
             "configuration_hash": episode.configuration_hash,
             "control": episode.control,
+            "policy": episode.policy,
         }
 
 
@@ -72,6 +82,7 @@ class Filters(Schema):
     """Which episodes are meant."""
 
     station: str = ""
+    mode: EpisodeMode | None = None
     status: EpisodeStatus | None = None
     dataset: Annotated[str, Field(description="Relative to the data folder")] = ""
 
@@ -82,7 +93,11 @@ def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging
     rows = Episode.objects.select_related("station", "trial").order_by("-started_at", "-created_at", "pk")
     if filters.station:
         rows = rows.filter(station=station_get(name=filters.station))
-    wanted = {"status": filters.status and filters.status.value, "dataset": filters.dataset}
+    wanted = {
+        "mode": filters.mode and filters.mode.value,
+        "status": filters.status and filters.status.value,
+        "dataset": filters.dataset,
+    }
     return paging.of(rows.filter(**{name: value for name, value in wanted.items() if value}), EpisodeOut)
 
 
@@ -91,7 +106,39 @@ def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging
 )
 def episode(request: HttpRequest, uuid: UUID) -> Any:
     """By its uuid."""
+    return EpisodeDetail.of(_found(uuid))
+
+
+_TABLE = {"schema": {"type": "string", "format": "binary"}}
+
+
+@router.get(
+    "/{uuid:uuid}/export",
+    response=FAILURES,
+    summary="Its three streams as one table",
+    url_name="episode-export",
+    openapi_extra={"responses": {200: {"description": "A parquet file", "content": {CONTENT_TYPE: _TABLE}}}},
+)
+def episode_export(request: HttpRequest, uuid: UUID) -> Any:
+    """Raw, smoothed and executed, step by step, with manifest and outcome in its metadata."""
+    path = table_file(_found(uuid).uuid)
+    return async_to_sync(file_answer)(request, path, CONTENT_TYPE, path.name)
+
+
+@router.post(
+    "/{uuid:uuid}/export",
+    response={202: JobOut, **FAILURES},
+    summary="Have the table made",
+    url_name="episode-export-asked",
+)
+def episode_export_asked(request: HttpRequest, uuid: UUID) -> Any:
+    """For an episode that its station has not exported; the job says how far it is."""
+    require(request.user, Role.OPERATOR)
+    return 202, services.export_asked(episode=_found(uuid))
+
+
+def _found(uuid: UUID) -> Episode:
     found = Episode.objects.select_related("station", "trial").filter(pk=uuid).first()
     if found is None:
         raise NotFound(f"episode {uuid} does not exist")
-    return EpisodeDetail.of(found)
+    return found

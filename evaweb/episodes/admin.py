@@ -14,8 +14,18 @@ from evaweb.episodes.models import Episode
 class EpisodeAdmin(admin.ModelAdmin):
     """The folders are the authority: rows are written by services alone."""
 
-    list_display = ("uuid", "status", "station", "kind", "checkpoint", "started_at", "frames", "dataset")
-    list_filter = ("status", "kind", "station", "checkpoint")
+    list_display = (
+        "uuid",
+        "status",
+        "station",
+        "kind",
+        "mode",
+        "checkpoint",
+        "started_at",
+        "frames",
+        "dataset",
+    )
+    list_filter = ("status", "kind", "mode", "station", "checkpoint")
     search_fields = ("uuid", "task", "checkpoint", "operator")
     list_select_related = ("station",)
     actions = ("preview_again",)

@@ -1,4 +1,4 @@
-"""The jobs of episodes: preview, publish, reconcile; and what every worker looks after."""
+"""The jobs of episodes: preview, export, publish, reconcile; and what every worker looks after."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from evaweb.episodes.reconcile import reconcile
 from evaweb.episodes.recorded import recorded_in
 from evaweb.jobs.kinds import Work, at_start, chore, job_kind
 from evaweb.jobs.services import enqueue
-from runtime.datasets.published import publish
+from runtime.datasets.published import never_published, publish
+from runtime.recording.export import export
 
 
 @job_kind("preview")
@@ -27,6 +28,13 @@ def preview(work: Work) -> Mapping[str, Any]:
     frames = make_preview(journal_folder(episode.uuid), preview_folder(episode.uuid), work.tell)
     Episode.objects.filter(uuid=episode.uuid).update(previewed_at=timezone.now())
     return {"frames": frames}
+
+
+@job_kind("export")
+def export_episode(work: Work) -> Mapping[str, Any]:
+    """Write its three streams as one parquet table, unless the station has done so; args: uuid."""
+    path = export(journal_folder(UUID(work.args["uuid"])), data_dir())
+    return {"file": str(path.relative_to(data_dir())), "bytes": path.stat().st_size}
 
 
 @job_kind("publish")
@@ -40,6 +48,9 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
     recorded = recorded_in(folder)
     if recorded.closed and not recorded.facts["frames"]:
         return {"published": False, "why": "it has no rows: its run ended before the first"}
+    why = never_published({"mode": recorded.facts.get("mode")})
+    if why:
+        return {"published": False, "why": f"it {why}"}
     success = success_of(scores_file(episode.uuid))
     if success is None and recorded.facts["status"] in (EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED):
         return {"published": False, "why": f"it is {recorded.facts['status']} and nobody has scored it"}

@@ -19,6 +19,17 @@ class EpisodeStatus(models.TextChoices):
     MISSING = "missing", "not on this disk"
 
 
+class EpisodeMode(models.TextChoices):
+    """What moved the robot: the modes of a run, and a recording of whatever went on."""
+
+    CONTINUOUS = "continuous", "continuous"
+    STEP = "step", "step by step"
+    PREVIEW = "preview", "preview"
+    SIM = "sim", "simulated robot"
+    MANUAL = "manual", "by hand"
+    OBSERVE = "observe", "observed"
+
+
 class Episode(models.Model):
     """One recorded run or demonstration."""
 
@@ -27,6 +38,8 @@ class Episode(models.Model):
     status = models.CharField(max_length=12, choices=EpisodeStatus, default=EpisodeStatus.RECORDING)
     reason = models.TextField(blank=True, help_text="Why it ended.")
     kind = models.CharField(max_length=16, default="rollout")
+    mode = models.CharField(max_length=16, choices=EpisodeMode, blank=True)
+    strategy = models.CharField(max_length=32, blank=True, help_text="With which it began.")
     task = models.TextField(blank=True)
     robot = models.CharField(max_length=63, blank=True)
     checkpoint = models.CharField(max_length=120, blank=True)
@@ -38,6 +51,7 @@ class Episode(models.Model):
     started_at = models.DateTimeField(null=True, blank=True)
     configuration_hash = models.CharField(max_length=64, blank=True)
     control = models.JSONField(default=dict, blank=True, help_text="The control loop's figures at the end.")
+    policy = models.JSONField(default=dict, blank=True, help_text="Latencies and delays of the policy.")
     previewed_at = models.DateTimeField(null=True, blank=True, help_text="Since when videos can be played.")
     dataset = models.CharField(max_length=240, blank=True, help_text="Relative to the data folder.")
     dataset_index = models.PositiveIntegerField(null=True, blank=True)

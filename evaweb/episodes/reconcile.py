@@ -82,6 +82,7 @@ def reconcile() -> Report:
             problems.append(problem)
         else:
             read.append(uuid)
+    services.exports_asked(uuids=read)
     missing = services.missing_marked()
     problems += _datasets()
     restored = _restored(read, problems)

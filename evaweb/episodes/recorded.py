@@ -40,6 +40,8 @@ def recorded_in(folder: Path) -> Recorded:
         raise RecordingError(f"{folder / 'manifest.json'} is of episode {layout.uuid}, not of {folder.name}")
     told = {
         "kind": _text(manifest, "kind", 16) or "rollout",
+        "mode": _text(manifest, "mode", 16),
+        "strategy": _text(manifest, "strategy", 32),
         "task": _text(manifest, "task"),
         "robot": _text(_table(manifest, "robot"), "name", 63),
         "checkpoint": _text(_table(manifest, "checkpoint"), "name", 120),
@@ -78,6 +80,7 @@ def _end(path: Path, outcome: Mapping[str, Any]) -> dict[str, Any]:
         "frames": frames,
         "duration_s": duration if isinstance(duration, int | float) else None,
         "control": _table(outcome, "control"),
+        "policy": _table(outcome, "policy"),
     }
 
 

@@ -39,12 +39,16 @@ def episode_get(*, uuid: UUID) -> Episode:
     return found
 
 
-def episode_list(*, station: str = "", status: str = "", words: str = "") -> QuerySet[Episode]:
+def episode_list(
+    *, station: str = "", mode: str = "", status: str = "", words: str = ""
+) -> QuerySet[Episode]:
     """The newest first; `words` are looked for in task, checkpoint, operator, scene and uuid."""
     newest = (F("started_at").desc(nulls_last=True), "-created_at")
     found = Episode.objects.select_related(*_WITH).order_by(*newest)
     if station:
         found = found.filter(station__name=station)
+    if mode:
+        found = found.filter(mode=mode)
     if status:
         found = found.filter(status=status)
     for word in words.split():

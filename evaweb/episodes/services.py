@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime, timedelta
 from typing import Any
 from uuid import UUID
@@ -11,8 +11,9 @@ from uuid import UUID
 from django.db import transaction
 from django.utils import timezone
 
+from evaweb.episodes.exporting import exported, job_key
 from evaweb.episodes.folders import journal_folder, preview_folder
-from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.recorded import CLOSED, Recorded, recorded_in
 from evaweb.errors import EvaError
 from evaweb.jobs.models import Job
@@ -31,6 +32,7 @@ def episode_opened(
     station: Station,
     uuid: UUID | str,
     kind: str = "rollout",
+    mode: str = "",
     task: str = "",
     checkpoint: str = "",
     operator: str = "",
@@ -41,6 +43,7 @@ def episode_opened(
         defaults={
             "station": station,
             "kind": kind,
+            "mode": mode,
             "task": task,
             "robot": station.robot,
             "checkpoint": checkpoint,
@@ -107,8 +110,18 @@ def preview_asked(*, episode: Episode) -> Job:
     return enqueue(kind="preview", key=f"preview:{episode.uuid}", args={"uuid": str(episode.uuid)})
 
 
-def publish_asked(*, episode: Episode) -> Job:
-    """Have the worker write the episode into its dataset, or write it anew with the score that counts now."""
+def export_asked(*, episode: Episode) -> Job:
+    """Have the worker write its three streams as one table; it leaves one alone that is there."""
+    return enqueue(kind="export", key=job_key(episode.uuid), args={"uuid": str(episode.uuid)})
+
+
+def publish_asked(*, episode: Episode) -> Job | None:
+    """Have the worker write the episode into its dataset, or write it anew with the score that counts now.
+
+    None for a run with a simulated robot, which no dataset ever holds.
+    """
+    if episode.mode == EpisodeMode.SIM:
+        return None
     return enqueue(kind="publish", key=f"publish:{episode.uuid}", args={"uuid": str(episode.uuid)})
 
 
@@ -129,6 +142,21 @@ def missing_marked() -> int:
         if status != EpisodeStatus.MISSING and not fresh and not journal_folder(uuid).is_dir():
             Episode.objects.filter(uuid=uuid).update(status=EpisodeStatus.MISSING)
     return Episode.objects.filter(status=EpisodeStatus.MISSING).count()
+
+
+def exports_asked(*, uuids: Iterable[UUID]) -> int:
+    """Have the worker export those that their station has not; how many. A damaged one has no table."""
+    asked = 0
+    for episode in Episode.objects.filter(uuid__in=list(uuids), status__in=CLOSED):
+        try:
+            missing = exported(episode.uuid) is None
+        except RecordingError as error:
+            log.warning("episode %s is not exported: %s", episode.uuid, error)
+            continue
+        if missing:
+            export_asked(episode=episode)
+            asked += 1
+    return asked
 
 
 def problem_of(uuid: UUID) -> str:

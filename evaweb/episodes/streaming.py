@@ -23,16 +23,21 @@ PIECE = 256 * 1024
 LONGEST_PART = 2 * 1024 * 1024
 
 
-async def file_answer(request: HttpRequest, path: Path, content_type: str) -> HttpResponseBase:
+async def file_answer(
+    request: HttpRequest, path: Path, content_type: str, name: str = ""
+) -> HttpResponseBase:
     """The file, the part of it that is asked for, or that the client has it already.
 
-    NotFound where there is none. `path` comes from the database, never from the client.
+    With a `name` it is one to keep, not one to show. NotFound where there is none. Neither `path` nor `name`
+    comes from the client.
     """
     if request.method not in ("GET", "HEAD"):
         return HttpResponseNotAllowed(["GET", "HEAD"])
     file = await asyncio.to_thread(_open, path)
     stat = os.fstat(file.fileno())
     answer = _answer(request, file, stat, content_type)
+    if name:
+        answer["Content-Disposition"] = f'attachment; filename="{name}"'
     if not isinstance(answer, StreamingHttpResponse):
         file.close()
     return answer

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 from uuid import UUID
 
+from asgiref.sync import sync_to_async
 from django.core.paginator import Paginator
 from django.http import HttpRequest, HttpResponse
 from django.http.response import HttpResponseBase
@@ -16,8 +17,9 @@ from django.views.decorators.http import require_GET, require_POST
 
 from evaweb.episodes import selectors, services
 from evaweb.episodes.curves import curves
+from evaweb.episodes.exporting import CONTENT_TYPE, table_file, table_of
 from evaweb.episodes.folders import THUMBNAIL, journal_folder, preview_folder, preview_video
-from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.poses import poses
 from evaweb.episodes.selectors import episode_get, stage_of
 from evaweb.episodes.streaming import file_answer
@@ -35,7 +37,7 @@ PER_PAGE = 50
 @require_GET
 def replay_list(request: HttpRequest) -> HttpResponse:
     """All episodes, the newest first."""
-    chosen = {name: request.GET.get(name, "").strip() for name in ("station", "status", "words")}
+    chosen = {name: request.GET.get(name, "").strip() for name in ("station", "mode", "status", "words")}
     page = Paginator(selectors.episode_list(**chosen), PER_PAGE).get_page(request.GET.get("page"))
     rows = [(episode, stage_of(episode=episode)) for episode in page]
     context = {
@@ -44,6 +46,7 @@ def replay_list(request: HttpRequest) -> HttpResponse:
         "chosen": chosen,
         "stations": Station.objects.all(),
         "statuses": EpisodeStatus.choices,
+        "modes": EpisodeMode.choices,
         "passing": any(stage.passing for _, stage in rows),
     }
     template = "episodes/rows.html" if request.headers.get("HX-Request") else "episodes/list.html"
@@ -59,6 +62,7 @@ def replay(request: HttpRequest, uuid: UUID) -> HttpResponse:
         "episode": episode,
         "trial": selectors.trial_of(episode=episode),
         "stage": stage,
+        "table": table_of(episode=episode),
         "config": _config(episode) if stage.name == "ready" else None,
     }
     return render(request, "episodes/replay.html", context)
@@ -73,6 +77,28 @@ def stage(request: HttpRequest, uuid: UUID) -> HttpResponse:
     if found.name == "ready":
         answer["HX-Refresh"] = "true"
     return answer
+
+
+async def export(request: HttpRequest, uuid: UUID) -> HttpResponseBase:
+    """The three streams as one table; POST has it made where it is not there."""
+    episode = await _known(uuid)
+    if request.method == "POST":
+        return await sync_to_async(_export_asked)(request, episode)
+    path = await sync_to_async(table_file)(uuid)
+    return await file_answer(request, path, CONTENT_TYPE, path.name)
+
+
+def _export_asked(request: HttpRequest, episode: Episode) -> HttpResponse:
+    require(request.user, Role.OPERATOR)
+    services.export_asked(episode=episode)
+    return table(request, episode.uuid)
+
+
+def table(request: HttpRequest, uuid: UUID) -> HttpResponse:
+    """How far the table is, as a part of the episode's page that looks again by itself."""
+    episode = episode_get(uuid=uuid)
+    context = {"episode": episode, "table": table_of(episode=episode)}
+    return render(request, "episodes/table.html", context)
 
 
 @require_POST

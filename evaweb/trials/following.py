@@ -80,6 +80,7 @@ def _episode(trial: Trial, uuid: UUID) -> Episode:
         checkpoint=trial.checkpoint.name,
         operator=trial.operator.get_username(),
         kind="rollout",
+        mode="continuous",  # as run_args asks for
     )
 
 

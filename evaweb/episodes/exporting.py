@@ -1,0 +1,67 @@
+"""The three streams of an episode as one parquet table: where it lies, and how far it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from uuid import UUID
+
+from evaweb.episodes.folders import data_dir, journal_folder
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.errors import NotFound
+from evaweb.jobs.models import JobStatus
+from evaweb.jobs.selectors import job_newest
+from runtime.recording.export import is_exported, place
+from runtime.recording.files import RecordingError, read_document
+
+CONTENT_TYPE = "application/vnd.apache.parquet"
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """How far the table of an episode is: ready, preparing, failed, absent or none; `size` in bytes."""
+
+    name: str
+    sentence: str = ""
+    size: int = 0
+
+
+def job_key(uuid: UUID) -> str:
+    """Of the job that makes the table."""
+    return f"export:{uuid}"
+
+
+def exported(uuid: UUID) -> Path | None:
+    """The table of an episode, None where it is not made yet; RecordingError where the folder is damaged."""
+    folder = journal_folder(uuid)
+    path = place(read_document(folder / "manifest.json"), data_dir())
+    return path if is_exported(folder, path) else None
+
+
+def table_file(uuid: UUID) -> Path:
+    """The table that is there; NotFound says how it can be had."""
+    try:
+        path = exported(uuid)
+    except RecordingError as error:
+        raise NotFound(f"the table of episode {uuid} cannot be had: {error}") from None
+    if path is None:
+        raise NotFound(f"the table of episode {uuid} is not made yet: POST to this address has it made")
+    return path
+
+
+def table_of(*, episode: Episode) -> Table:
+    """How far it is, from the disk and its newest job; there is none of what is still being written."""
+    if episode.status in (EpisodeStatus.RECORDING, EpisodeStatus.MISSING):
+        return Table("none")
+    try:
+        path = exported(episode.uuid)
+    except RecordingError as error:
+        return Table("failed", str(error))
+    if path is not None:
+        return Table("ready", size=path.stat().st_size)
+    job = job_newest(key=job_key(episode.uuid))
+    if job is None or job.status == JobStatus.DONE:
+        return Table("absent")
+    if job.status == JobStatus.FAILED:
+        return Table("failed", job.error)
+    return Table("preparing", job.error)
