@@ -136,7 +136,7 @@ class Director(Effects):
     # --- effects: what the session makes happen ------------------------------------------------------------
 
     def begin_setup(self, asked: SetUpRequest) -> Told:
-        plan, reset = self._changed(asked), self.setup.reset_of(asked.bench)
+        plan, reset = self._changed(asked), self.setup.bench.of(asked.bench)
         policy = self.inference.policy
         if plan.deployment.policy != self.plan.deployment.policy:
             policy = plan.new_policy(self.clock)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Callable
 from concurrent.futures import Future
 from enum import StrEnum
@@ -11,22 +10,17 @@ from typing import Any
 import numpy as np
 
 from runtime.asking import Answered
+from runtime.bench_reset import BenchReset
 from runtime.clock import Clock
 from runtime.errors import PolicyError, SetupError
 from runtime.family import Plan
+from runtime.going import Going
 from runtime.inference import Inference
 from runtime.messages import Event, MediaReport
-from runtime.motion import Trajectory
 from runtime.orders import Orders
 from runtime.page import Page
 from runtime.policies.base import PolicyInfo
-from runtime.requests import BenchRequest
 from runtime.types import Float64
-
-_SETTLE_S = 2.0  # for the arm to follow the last target of a motion
-_ARRIVED_RAD = 0.1
-_RESET_S = 3.0  # for a simulated bench to be laid out
-_REPEAT_S = 0.2  # a control word may be lost on its way
 
 
 class Stage(StrEnum):
@@ -56,10 +50,11 @@ class SetUp:
     ) -> None:
         self._plan = plan
         self._inference = inference
-        self._orders = orders
         self._page = page
         self._clock = clock
         self._media = media  # what it last reported
+        self._going = Going(plan, orders, page, clock)
+        self.bench = BenchReset(plan, orders, clock, media)
         self.stage = Stage.IDLE
         self.info: PolicyInfo | None = None
         self.validated = ""
@@ -78,24 +73,8 @@ class SetUp:
         """What came of it, in one sentence."""
         return self._motion_only or self.validated
 
-    def reset_of(self, bench: BenchRequest | None) -> dict[str, Any] | None:
-        """What the node is to be told to reset its bench; SetupError where it has none, or has done that already."""
-        if bench is None:
-            return None
-        if not self._plan.capabilities.resets_bench:
-            raise SetupError(
-                f"setup: bench with seed {bench.seed}: the transport is not declared simulated; allowed: no "
-                "bench, or a node that simulates one, with transport.simulated = true in the deployment"
-            )
-        if bench.id is not None and bench.id == self._media().truth.get("reset"):
-            raise SetupError(
-                f"setup: bench.id = {bench.id!r}: the bench was reset under this id already; allowed: an id "
-                "of its own for each reset, or none"
-            )
-        return bench.model_dump(exclude_none=True) | {"id": bench.id or str(uuid.uuid4())}
-
     def begin(self, reset: dict[str, Any] | None) -> None:
-        """Start from the first stage; `reset` as by `reset_of`."""
+        """Start from the first stage; `reset` as by `BenchReset.of`."""
         self._reset = reset
         self.info, self.validated, self.first_action = None, "", None
         self._motion_only = ""
@@ -134,9 +113,9 @@ class SetUp:
     def heard(self, event: Event) -> None:
         """Control's events: the one that says that the motion is done."""
         if self.stage in (Stage.HOME, Stage.APPROACH) and event.kind == "motion_done":
+            self._going.done()
             self._enter(Stage.SETTLE)
-        elif event.kind == "word_refused":
-            self._word_refused = event.text
+        self.bench.heard(event)
 
     def pump(self) -> bool:
         """Advance; True when done. Raises RuntimeFault where it cannot go on."""
@@ -148,11 +127,13 @@ class SetUp:
         elif self.stage is Stage.OBSERVE:
             return self._observe()
         elif self.stage in (Stage.HOME, Stage.APPROACH):
-            self._wait_for_motion()
+            self._require_family()
+            self._going.require_progress()
         elif self.stage is Stage.SETTLE:
             return self._settle()
         elif self.stage is Stage.RESET:
-            self._reset_bench()
+            if self.bench.done():
+                self._start_warm_up()
         elif self.stage is Stage.WARM_UP:
             return self._warm_up()
         return False
@@ -209,36 +190,11 @@ class SetUp:
         self._go(self._plan.robot.poses[pose], f"the pose {pose!r}", Stage.HOME)
 
     def _go(self, goal: Float64, where: str, stage: Stage) -> None:
-        self._goal, self._where = goal, where
-        self._allowed = self._motion_time() + _SETTLE_S
-        self._orders.give("motion", goal=np.array(goal, np.float64))
+        self._going.start(goal, where)
         self._enter(stage)
 
-    def _motion_time(self) -> float:
-        """How long the motion to the goal takes from where control will start it [s]."""
-        status = self._page.control.read()
-        start = status["commanded"] if status["engaged"] else self._page.observation.read()["qpos"]
-        safety, limits = self._plan.deployment.safety, self._plan.limits
-        velocity = limits.velocity * safety.motion_velocity_scale
-        acceleration = safety.motion_acceleration * limits.reach
-        return Trajectory(np.array(start, np.float64), self._goal, velocity, acceleration).duration
-
-    def _wait_for_motion(self) -> None:
-        self._require_family()
-        if self._waited() > self._allowed:
-            raise SetupError(f"control has not come to {self._where} within {self._allowed:.1f} s")
-
     def _settle(self) -> bool:
-        measured = np.array(self._page.observation.read()["qpos"], np.float64)
-        limits = self._plan.limits
-        error = np.where(limits.grippers, 0.0, np.abs(measured - self._goal))
-        worst = int(error.argmax())
-        if error[worst] > _ARRIVED_RAD:
-            if self._waited() > _SETTLE_S:
-                raise SetupError(
-                    f"the arm did not arrive: {limits.names[worst]} is {error[worst]:.2f} rad from "
-                    f"{self._where}; is it blocked, or is another program commanding it?"
-                )
+        if not self._going.arrived():
             return False
         if self._motion_only:
             self.stage = Stage.IDLE
@@ -251,36 +207,8 @@ class SetUp:
         if self._reset is None:
             self._start_warm_up()
             return
-        self._word_refused = ""
-        self._asked_node = float("-inf")
-        self._refused_before = self._refused_by_node()
+        self.bench.start(self._reset)
         self._enter(Stage.RESET)
-
-    def _reset_bench(self) -> None:
-        """Say it until the node says that it is done: what is shown to the policy from then on is the new bench."""
-        assert self._reset is not None
-        if self._media().truth.get("reset") == self._reset["id"]:
-            self._start_warm_up()
-            return
-        if self._word_refused:
-            raise SetupError(f"the bench cannot be reset: {self._word_refused}")
-        if self._waited() > _RESET_S:
-            raise SetupError(f"the bench was not reset within {_RESET_S:g} s: {self._why_not_reset()}")
-        if self._clock.now() - self._asked_node >= _REPEAT_S:
-            self._asked_node = self._clock.now()
-            self._orders.ask_node("scene_reset", self._reset)
-
-    def _why_not_reset(self) -> str:
-        if not self._media().truth:
-            return "the node says no truth of a bench; does it simulate one?"
-        before = self._refused_before
-        new = [reason for reason, count in self._refused_by_node().items() if count > before.get(reason, 0)]
-        return f"the node refused it ({', '.join(new)})" if new else "the node does not answer to it"
-
-    def _refused_by_node(self) -> dict[str, int]:
-        prefix = "node_refused."
-        faults = self._media().faults.items()
-        return {name.removeprefix(prefix): count for name, count in faults if name.startswith(prefix)}
 
     def _start_warm_up(self) -> None:
         self._left = self._plan.deployment.setup.warmup_chunks

@@ -1,0 +1,83 @@
+"""Laying out a simulated bench anew: asked of its node until the node says that it is done."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable
+from typing import Any
+
+from runtime.clock import Clock
+from runtime.errors import SetupError
+from runtime.family import Plan
+from runtime.messages import Event, MediaReport
+from runtime.orders import Orders
+from runtime.requests import BenchRequest
+
+_RESET_S = 3.0  # for a simulated bench to be laid out
+_REPEAT_S = 0.2  # a control word may be lost on its way
+
+
+class BenchReset:
+    """One reset at a time; a node that simulates no bench has none."""
+
+    def __init__(self, plan: Plan, orders: Orders, clock: Clock, media: Callable[[], MediaReport]) -> None:
+        self._plan = plan
+        self._orders = orders
+        self._clock = clock
+        self._media = media  # what it last reported
+        self._refused = ""
+
+    def of(self, bench: BenchRequest | None) -> dict[str, Any] | None:
+        """What the node is to be told; SetupError where it has no bench, or has done that already."""
+        if bench is None:
+            return None
+        if not self._plan.capabilities.resets_bench:
+            raise SetupError(
+                f"setup: bench with seed {bench.seed}: the transport is not declared simulated; allowed: no "
+                "bench, or a node that simulates one, with transport.simulated = true in the deployment"
+            )
+        if bench.id is not None and bench.id == self._media().truth.get("reset"):
+            raise SetupError(
+                f"setup: bench.id = {bench.id!r}: the bench was reset under this id already; allowed: an id "
+                "of its own for each reset, or none"
+            )
+        return bench.model_dump(exclude_none=True) | {"id": bench.id or str(uuid.uuid4())}
+
+    def start(self, reset: dict[str, Any]) -> None:
+        """Ask for it from now on."""
+        self._reset = reset
+        self._refused = ""
+        self._since = self._clock.now()
+        self._asked_at = float("-inf")
+        self._refused_before = self._refused_by_node()
+
+    def heard(self, event: Event) -> None:
+        """Control's events: the one that says that it could not pass the word on."""
+        if event.kind == "word_refused":
+            self._refused = event.text
+
+    def done(self) -> bool:
+        """Whether what the policy is shown from now on is the new bench; SetupError where it will not be."""
+        if self._media().truth.get("reset") == self._reset["id"]:
+            return True
+        now = self._clock.now()
+        if self._refused:
+            raise SetupError(f"the bench cannot be reset: {self._refused}")
+        if now - self._since > _RESET_S:
+            raise SetupError(f"the bench was not reset within {_RESET_S:g} s: {self._why_not()}")
+        if now - self._asked_at >= _REPEAT_S:
+            self._asked_at = now
+            self._orders.ask_node("scene_reset", self._reset)
+        return False
+
+    def _why_not(self) -> str:
+        if not self._media().truth:
+            return "the node says no truth of a bench; does it simulate one?"
+        before = self._refused_before
+        new = [reason for reason, count in self._refused_by_node().items() if count > before.get(reason, 0)]
+        return f"the node refused it ({', '.join(new)})" if new else "the node does not answer to it"
+
+    def _refused_by_node(self) -> dict[str, int]:
+        prefix = "node_refused."
+        faults = self._media().faults.items()
+        return {name.removeprefix(prefix): count for name, count in faults if name.startswith(prefix)}

@@ -1,0 +1,66 @@
+"""A motion of ours that a set-up waits for: sent to control, awaited there, then by the arm itself."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.clock import Clock
+from runtime.errors import SetupError
+from runtime.family import Plan
+from runtime.motion import Trajectory
+from runtime.orders import Orders
+from runtime.page import Page
+from runtime.types import Float64
+
+_SETTLE_S = 2.0  # for the arm to follow the last target of a motion
+_ARRIVED_RAD = 0.1
+
+
+class Going:
+    """One motion at a time; `where` names its goal in sentences."""
+
+    def __init__(self, plan: Plan, orders: Orders, page: Page, clock: Clock) -> None:
+        self._plan = plan
+        self._orders = orders
+        self._page = page
+        self._clock = clock
+
+    def start(self, goal: Float64, where: str) -> None:
+        """Have control go to `goal` [D]."""
+        self._goal, self._where = goal, where
+        self._allowed = self._motion_time() + _SETTLE_S
+        self._since = self._clock.now()
+        self._orders.give("motion", goal=np.array(goal, np.float64))
+
+    def require_progress(self) -> None:
+        """SetupError where control should have been there by now."""
+        if self._clock.now() - self._since > self._allowed:
+            raise SetupError(f"control has not come to {self._where} within {self._allowed:.1f} s")
+
+    def done(self) -> None:
+        """Control has sent the end of it: from now on the arm is waited for."""
+        self._since = self._clock.now()
+
+    def arrived(self) -> bool:
+        """Whether the arm is there; SetupError, naming the joint, where it does not come."""
+        measured = np.array(self._page.observation.read()["qpos"], np.float64)
+        limits = self._plan.limits
+        error = np.where(limits.grippers, 0.0, np.abs(measured - self._goal))
+        worst = int(error.argmax())
+        if error[worst] <= _ARRIVED_RAD:
+            return True
+        if self._clock.now() - self._since > _SETTLE_S:
+            raise SetupError(
+                f"the arm did not arrive: {limits.names[worst]} is {error[worst]:.2f} rad from "
+                f"{self._where}; is it blocked, or is another program commanding it?"
+            )
+        return False
+
+    def _motion_time(self) -> float:
+        """How long the motion takes from where control will start it [s]."""
+        status = self._page.control.read()
+        start = status["commanded"] if status["engaged"] else self._page.observation.read()["qpos"]
+        safety, limits = self._plan.deployment.safety, self._plan.limits
+        velocity = limits.velocity * safety.motion_velocity_scale
+        acceleration = safety.motion_acceleration * limits.reach
+        return Trajectory(np.array(start, np.float64), self._goal, velocity, acceleration).duration
