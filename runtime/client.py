@@ -55,6 +55,10 @@ class StationClient:
         ack = self._send(Command(str(uuid.uuid4()), "events_since", {"number": number}), 2.0)
         return list(ack.data["events"])
 
+    def query(self, kind: str, **arguments: Any) -> Ack:
+        """Ask what changes nothing and needs no lease; raises Refused, or TransportError."""
+        return _accepted(self._send(Command(str(uuid.uuid4()), kind, arguments, user=self.holder), 2.0))
+
     def claim(self, epoch: int = 0) -> None:
         """Take the lease where it is free (or ours); raises Refused with who holds it."""
         ack = self._command("lease_claim", 2.0, epoch=epoch)
@@ -131,9 +135,7 @@ class StationClient:
         )
         ack = self._send(command, timeout)
         self._sequence = max(self._sequence, ack.sequence)
-        if ack.status in ("refused", "failed"):
-            raise Refused(ack.reason)
-        return ack
+        return _accepted(ack)
 
     def _send(self, command: Command, timeout: float) -> Ack:
         endpoint = self._endpoints.read("main")["commands"]
@@ -147,3 +149,9 @@ class StationClient:
         if self._commands is not None:
             self._commands.close()
             self._commands = None
+
+
+def _accepted(ack: Ack) -> Ack:
+    if ack.status in ("refused", "failed"):
+        raise Refused(ack.reason)
+    return ack

@@ -11,15 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from runtime.client import StationClient
-from runtime.ctl import figure, line
-from runtime.errors import RuntimeFault
+from runtime.errors import RuntimeFault, SetupError
 from runtime.family import Plan, join
+from runtime.terminal.figures import figure, line
 
 _START_S = 30.0
 _SETUP_S = 240.0
 _CLOSE_S = 30.0
 _SHOWN_EVERY_S = 2.0
 _POLL_S = 0.05
+MODES = ("continuous", "sim")  # the others need a person
 # Events that a person who gave no command does not need to read; states are shown as they change.
 _SILENT = frozenset({"command", "setup", "motion_done", "episode_opened", "episode_closed"})
 RESULT_NAME = "headless.json"
@@ -27,6 +28,7 @@ RESULT_NAME = "headless.json"
 
 def drive(plan: Plan, client: StationClient) -> dict[str, Any]:
     """One run from start to published dataset; returns what came of it. Raises RuntimeFault with the reason."""
+    check(plan)
     attended = Attended(client)
     attended.begin()
     status = attended.run()
@@ -37,14 +39,24 @@ def drive(plan: Plan, client: StationClient) -> dict[str, Any]:
         status = attended.conclude()
         result = _result(status, how, attended.seconds)
         well = well and status["last_run"].get("status", "finished") == "finished"
+        if result["episode_path"]:
+            result |= _keep(plan, Path(result["episode_path"]), well)
     except RuntimeFault as fault:  # on top of why the run ended
         raise RuntimeFault(f"the run ended ({how}), but then: {fault}") from None
-    if well and plan.deployment.publish.dataset and result["episode_path"]:
-        result |= _publish(plan, Path(result["episode_path"]))
     print("\n".join(summary(result)), flush=True)
     if not well:
         raise RuntimeFault(f"the run did not end well: {how}; episode: {result['episode_path'] or 'none'}")
     return result
+
+
+def check(plan: Plan) -> None:
+    """Raise SetupError for a mode that needs a person."""
+    mode, station = plan.deployment.run.mode, plan.deployment.station
+    if mode not in MODES:
+        raise SetupError(
+            f"run.mode = {mode!r} needs a person; headless: {', '.join(MODES)}. Start the station without "
+            f"--headless, then python -m runtime.ctl {station} run --mode {mode}"
+        )
 
 
 class Attended:
@@ -155,6 +167,16 @@ def _of_episode(path: Path) -> dict[str, Any]:
     }
 
 
+def _keep(plan: Plan, episode: Path, well: bool) -> dict[str, Any]:
+    """Export the streams of any run; publish what ended well and moved a robot. Raises RuntimeFault."""
+    from runtime.recording.export import export
+
+    result: dict[str, Any] = {"export_path": str(export(episode, plan.deployment.data))}
+    if well and plan.deployment.publish.dataset and plan.deployment.run.mode != "sim":
+        result |= _publish(plan, episode)
+    return result
+
+
 def _publish(plan: Plan, episode: Path) -> dict[str, Any]:
     from runtime.datasets.published import publish
 
@@ -185,6 +207,8 @@ def summary(result: dict[str, Any]) -> list[str]:
         ticks = f"{safety['refused']} of {safety['ticks']} ticks refused, {safety['limited']} limited"
         rows.append(("safety", ticks))
     rows.append(("episode", result["episode_path"] or "none"))
+    if "export_path" in result:
+        rows.append(("streams", result["export_path"]))
     if "dataset_path" in result:
         place = f"episode {result['episode_index']}, {result['published_frames']} frames"
         rows.append(("dataset", f"{result['dataset_path']}  {place}"))

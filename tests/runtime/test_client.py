@@ -9,7 +9,8 @@ from runtime.errors import TransportError
 from runtime.lease import Lease
 from runtime.messages import Ack, Command
 from runtime.requests import RunRequest
-from runtime.session import Session, State
+from runtime.session import Session
+from runtime.transitions import State
 from tests.runtime.test_session import Recorded
 
 HOST = "127.0.0.1"
@@ -51,6 +52,9 @@ class Station:
             return Ack(command.uuid, "done", data=data)
         if command.kind == "events_since":
             return Ack(command.uuid, "done", data={"events": [{"number": command.args["number"] + 1}]})
+        if command.kind == "aim":
+            known = "arm" in command.args
+            return Ack(command.uuid, "done" if known else "refused", "no such arm", data={"joints": [1.0]})
         return self.session.handle(command)
 
     def kinds(self):
@@ -250,3 +254,20 @@ def test_arguments_travel_with_their_command(client, station):
     assert ack.data["episode"] == "episode-7"
     assert station.received[-1].args == {"trial": {"id": 7}, "duration_s": 20}
     assert station.effects.done == [("begin_run", RunRequest(trial={"id": 7}, duration_s=20.0))]
+
+
+def test_a_question_needs_no_lease_and_its_refusal_is_raised(client, station):
+    assert client.query("aim", arm="left").data["joints"] == [1.0]
+    with pytest.raises(Refused, match="no such arm"):
+        client.query("aim")
+    assert station.kinds() == ["aim", "aim"]
+    assert station.lease.current(station.time) is None
+
+
+def test_two_terminals_of_one_person_are_one_holder(connect, station):
+    attending, other = connect("terminal:anna@bench"), connect("terminal:anna@bench")
+    attending.command("run")
+    other.command("halt")
+    attending._renewed -= 1.0
+    attending.renew()
+    assert station.session.state is State.HOLDING

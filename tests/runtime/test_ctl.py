@@ -1,100 +1,39 @@
 import json
-import math
-from copy import deepcopy
 
 import pytest
 
 from runtime import ctl
 from runtime.client import Refused
 from runtime.errors import TransportError
-from runtime.messages import Ack
-
-STATUS = {
-    "boot": "boot-1",
-    "station": "bench-1",
-    "state": "ready",
-    "reason": "set up",
-    "stage": "idle",
-    "newest_event": 0,
-    "control": {"lateness_p99_ms": 0.5, "missed": 2},
-    "policy": {"latency_p50_ms": math.nan, "delay_p50": math.nan},
-    "link": {"rates": {"joints": 30.0}},
-    "run": {"number": 0, "elapsed": 0.0},
-    "recording": {"uuid": "", "rows": 0},
-    "lease": {"holder": ""},
-}
-
-
-def status(state="ready", **changes):
-    return deepcopy(STATUS) | {"state": state} | changes
-
-
-class Script:
-    """A station that answers as written down; a status that is an exception is raised."""
-
-    holder = "terminal:me"
-
-    def __init__(self, statuses=(), refusal=None, streams=(), events=()):
-        self.statuses, self.refusal, self.streams = list(statuses), refusal, list(streams)
-        self.events = list(events)
-        self.given, self.subscribed, self.closed = [], 0, False
-
-    def __call__(self, folder):
-        self.folder = folder
-        return self
-
-    def status(self):
-        found = self.statuses.pop(0) if len(self.statuses) > 1 else self.statuses[0]
-        if isinstance(found, BaseException):
-            raise found
-        return found
-
-    def command(self, kind, **arguments):
-        self.given.append((kind, arguments) if arguments else kind)
-        if self.refusal:
-            raise self.refusal
-
-    def renew(self):
-        self.given.append("renew")
-
-    def estop(self, why):
-        self.given.append(("estop", why))
-        return Ack(
-            "u", "failed" if self.refusal else "done", "USE THE HARDWARE STOP" if self.refusal else "ok"
-        )
-
-    def subscribe(self, *streams):
-        self.subscribed += 1
-        return self
-
-    def receive(self, timeout):
-        found = self.streams.pop(0)
-        if isinstance(found, BaseException):
-            raise found
-        return found
-
-    def events_since(self, number):
-        return [event for event in self.events if event["number"] > number]
-
-    def close(self):
-        self.closed = True
+from runtime.terminal import settling
+from runtime.terminal.keys import NoKeys
+from tests.runtime.terminal_station import AIM, Script, event, status
 
 
 @pytest.fixture
 def run(monkeypatch):
-    """Runs a command line against a script; waits take no time."""
-    monkeypatch.setattr(ctl.time, "sleep", lambda _: None)
+    """Runs a command line against a script; nobody is at the terminal, and waits take no time."""
+    monkeypatch.setattr(settling.time, "sleep", lambda _: None)
+    monkeypatch.setattr("runtime.terminal.attendance.keys", NoKeys)
     monkeypatch.setenv("EVA_DATA_DIR", "/var/eva")
 
-    def run(script, *arguments):
+    def run(script, *words):
         monkeypatch.setattr(ctl, "StationClient", script)
-        return ctl.main(["bench-1", *arguments])
+        return ctl.main(["bench-1", *words])
 
     return run
 
 
+def running(phase="waiting", step=0, **changes):
+    control = {"lateness_p99_ms": 0.5, "missed": 0, "step": step}
+    return status("running", phase=phase, control=control, mode="step", **changes)
+
+
+# --- where, and how it ends ----------------------------------------------------------------------------------
+
+
 def test_the_station_is_looked_for_in_the_data_folder(run):
-    script = Script([status()])
+    script = Script()
     assert run(script, "status") == 0
     assert str(script.folder) == "/var/eva/stations/bench-1"
     assert script.closed
@@ -102,71 +41,52 @@ def test_the_station_is_looked_for_in_the_data_folder(run):
     assert "~" not in str(script.folder)
 
 
-def test_a_status_is_one_line_or_json(run, capsys):
-    run(Script([status()]), "status")
-    assert capsys.readouterr().out == "READY: set up  tick p99 0.50 ms, 2 missed\n"
-    run(Script([status()]), "status", "--json")
-    assert json.loads(capsys.readouterr().out)["state"] == "ready"
+def test_a_refusal_is_told_and_is_no_success(run, capsys):
+    assert run(Script(refusal=Refused("anna holds the lease")), "stop") == 1
+    assert capsys.readouterr().err == "refused: anna holds the lease\n"
 
 
-def test_the_line_of_a_run_says_how_it_is_going():
-    running = status(
-        "running",
-        reason="",
-        run={"number": 1, "elapsed": 12.34},
-        recording={"uuid": "u", "rows": 370},
-        policy={"latency_p50_ms": 81.6, "delay_p50": 2.0},
-        link={"rates": {"joints": 60.0, "cam_high": 30.1, "cam_low": 14.6}},
-    )
-    assert ctl.line(running) == (
-        "RUNNING  12.3 s  370 rows  policy 82 ms, delay 2  tick p99 0.50 ms, 2 missed  cameras 15 Hz"
-    )
-    assert "SETTING_UP (warming up): set up" in ctl.line(status("setting_up", stage="warming up"))
+def test_no_answer_is_an_unknown_outcome_with_a_code_of_its_own(run, capsys):
+    assert run(Script([TransportError("station 'bench-1' is not running here")]), "status") == 3
+    assert capsys.readouterr().err == "error: station 'bench-1' is not running here\n"
 
 
-def test_a_delay_that_is_not_known_yet_is_a_dash():
-    asked = status(policy={"latency_p50_ms": 81.6, "delay_p50": math.nan})
-    assert "policy 82 ms, delay -" in ctl.line(asked)
+def test_an_interrupted_terminal_says_so(run):
+    assert run(Script([status()], streams=[KeyboardInterrupt()]), "watch") == 130
 
 
-@pytest.mark.parametrize("command", ["status", "watch"])
-def test_a_lease_is_named_where_somebody_else_holds_it(run, capsys, command):
-    theirs, mine = status(lease={"holder": "anna"}), status(lease={"holder": Script.holder})
-    run(Script([theirs], streams=[{"state": theirs}, KeyboardInterrupt()]), command)
-    assert capsys.readouterr().out.endswith("  lease: anna\n")
-    run(Script([mine], streams=[{"state": mine}, KeyboardInterrupt()]), command)
-    assert "lease" not in capsys.readouterr().out
+# --- commands ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["stop", "halt", "release"])
+@pytest.mark.parametrize("kind", ["stop", "halt", "step", "commit", "cancel"])
 def test_a_short_command_is_given_and_the_state_shown(run, capsys, kind):
-    script = Script([status()])
+    script = Script()
     assert run(script, kind) == 0
     assert script.given == [kind]
     assert "READY" in capsys.readouterr().out
 
 
-def test_a_recording_is_started_and_stopped(run):
-    script = Script([status()])
-    assert run(script, "record", "start") == 0
-    assert run(script, "record", "stop") == 0
-    assert script.given == ["record_start", "record_stop"]
-
-
-def test_a_recording_needs_to_know_what(run, capsys):
-    with pytest.raises(SystemExit):
-        run(Script([status()]), "record")
-    assert "record needs start or stop" in capsys.readouterr().err
-
-
-def test_a_refusal_is_told_and_is_no_success(run, capsys):
-    assert run(Script([status()], Refused("anna holds the lease")), "stop") == 1
-    assert capsys.readouterr().err == "refused: anna holds the lease\n"
-
-
-def test_a_station_that_is_gone_is_told_and_is_no_success(run, capsys):
-    assert run(Script([TransportError("station 'bench-1' is not running here")]), "status") == 1
-    assert capsys.readouterr().err == "error: station 'bench-1' is not running here\n"
+@pytest.mark.parametrize(
+    ("words", "given"),
+    [
+        (["setup", "--policy-url", "ws://a:1"], ("setup", {"policy": {"url": "ws://a:1"}})),
+        (["run", "--mode", "step"], ("run", {"mode": "step"})),
+        (["run"], "run"),
+        (["gripper", "open", "--arm", "left"], ("gripper", {"action": "open", "arm": "left"})),
+        (["tune", "--strategy", "sync"], ("tune", {"strategy": {"kind": "sync"}})),
+        (["move", "--pose", "home", "--speed", "0.5"], ("move", {"pose": "home", "speed": 0.5})),
+        (["move", "--joint", "a+=0.1"], ("move", {"joints": [0.2, -0.2, 0.05]})),
+        (["jog", "left", "--xyz", "0,0,10"], ("move", {"joints": AIM["joints"]})),
+        (["record", "start"], "record_start"),
+        (["record", "stop"], "record_stop"),
+        (["approach"], "approach"),
+        (["home"], "home"),
+    ],
+)
+def test_what_a_command_is_given_with_goes_along(run, words, given):
+    script = Script()
+    assert run(script, *words) == 0
+    assert script.given == [given]
 
 
 @pytest.mark.parametrize(
@@ -174,99 +94,133 @@ def test_a_station_that_is_gone_is_told_and_is_no_success(run, capsys):
     [
         ("setup", "setting_up", "ready", 0),
         ("setup", "setting_up", "idle", 1),  # it failed
-        ("home", "setting_up", "ready", 0),
-        ("home", "setting_up", "idle", 1),
         ("run", "running", "ready", 0),
         ("run", "running", "holding", 1),
         ("run", "running", "faulted", 1),
         ("resume", "running", "ready", 0),
+        ("approach", "setting_up", "idle", 1),
     ],
 )
-def test_a_lasting_command_keeps_the_lease_and_its_end_is_the_exit_code(run, kind, while_, end, code):
-    script = Script([status(while_), status(while_), status(end)])
-    assert run(script, kind) == code
-    assert script.given == [kind, "renew", "renew"]
+def test_the_end_of_a_lasting_command_is_the_exit_code(run, kind, while_, end, code):
+    first = [status("ready")] if kind == "approach" else []
+    assert run(Script([*first, status(while_), status(end)]), kind) == code
 
 
-def test_ctrl_c_stops_what_was_begun(run):
-    script = Script([status("running"), KeyboardInterrupt(), status("ready")])
-    assert run(script, "run") == 0
-    assert script.given == ["run", "renew", "stop"]
+def test_a_set_up_can_be_cancelled_and_only_a_set_up(run, capsys):
+    script = Script([status("setting_up"), status("setting_up"), status("idle")])
+    assert run(script, "setup", "--cancel") == 0
+    assert script.given == ["stop"]
+    script = Script([running()])
+    assert run(script, "setup", "--cancel") == 1
+    assert script.given == []
+    assert "no set-up to cancel: the station is running" in capsys.readouterr().err
 
 
-def test_ctrl_c_before_the_answer_stops_too(run):
-    script = Script([status("ready")], KeyboardInterrupt())
-
-    def interrupted_once(kind):
-        refusal, script.refusal = script.refusal, None
-        script.given.append(kind)
-        if refusal:
-            raise refusal
-
-    script.command = interrupted_once
-    assert run(script, "run") == 0
-    assert script.given == ["run", "stop"]
+def test_released_is_what_was_released(run, capsys):
+    script = Script([status("faulted"), status("idle")])
+    assert run(script, "release") == 0
+    assert script.given == ["release"]
+    assert "IDLE" in capsys.readouterr().out
 
 
 def test_the_estop_says_whether_it_was_obeyed(run, capsys):
     script = Script()
     assert run(script, "estop", "arm too low") == 0
     assert script.given == [("estop", "arm too low")]
-    assert run(Script(refusal=True), "estop") == 1
-    assert "failed: USE THE HARDWARE STOP" in capsys.readouterr().out
+    assert run(Script(refusal=True), "estop", "--json") == 1
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["reason"] == "USE THE HARDWARE STOP"
 
 
-def test_watching_misses_no_event_of_a_burst(run, capsys):
-    events = [{"number": n, "kind": "state", "text": f"event {n}"} for n in range(1, 6)]
+# --- waiting -------------------------------------------------------------------------------------------------
+
+
+def test_a_script_waits_for_the_end_of_what_it_asked_for(run, capsys):
+    steps = [running(step=1), running("asking", 2), running("executing", 3, newest_event=2)]
     script = Script(
-        [status(newest_event=1)],
-        streams=[{"state": status(newest_event=2)}, {"state": status(newest_event=5)}, KeyboardInterrupt()],
-        events=events,
+        [*steps, running("waiting", 4, newest_event=2), running("waiting", 9, newest_event=2)],
+        events=[event(1, "command", "step by me"), event(2, "limited", "safety slowed joint a")],
     )
-    assert run(script, "watch") == 130
-    shown = [row.strip() for row in capsys.readouterr().out.splitlines() if "event" in row]
-    assert shown == [f"state: event {n}" for n in range(2, 6)]
-
-
-def test_watching_goes_on_after_a_restart_with_the_events_of_the_new_start(run, capsys):
-    restarted = status(newest_event=1, boot="boot-2")
-    script = Script(
-        [status(newest_event=40), restarted],
-        streams=[{}, {"state": restarted}, KeyboardInterrupt()],
-        events=[{"number": 1, "kind": "state", "text": "event 1"}],
-    )
-    assert run(script, "watch", "--json") == 130
-    assert script.subscribed == 2
-    shown = [json.loads(row) for row in capsys.readouterr().out.splitlines()]
-    assert [row["text"] for row in shown if "text" in row] == ["event 1"]
+    assert run(script, "step", "--wait") == 0
+    shown = capsys.readouterr().out
+    assert "  limited: safety slowed joint a\n" in shown
+    assert "step by me" not in shown
+    assert "RUNNING (step, waiting)" in shown
 
 
 @pytest.mark.parametrize(
-    ("words", "given"),
+    ("words", "last", "says"),
     [
-        (["setup", "--policy-url", "ws://a:1"], ("setup", {"policy": {"url": "ws://a:1"}})),
-        (["setup", "--task", "fold"], ("setup", {"task": "fold"})),
-        (["run", "--duration", "2.5"], ("run", {"duration_s": 2.5})),
-        (["run"], "run"),
+        (["step"], status("holding", reason="policy lost"), "the run does not go on: holding, policy lost"),
+        (["move", "--pose", "home"], running("waiting", 9), "it was ended before its end"),
     ],
 )
-def test_what_a_command_is_given_with_goes_along(run, words, given):
-    script = Script([status()])
-    assert run(script, *words) == 0
-    assert script.given[0] == given
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["run", "--task", "fold"], "--task goes with setup, not with run"),
-        (["stop", "--policy-url", "ws://a:1"], "--policy-url goes with setup, not with stop"),
-        (["setup", "--duration", "3"], "--duration goes with run, not with setup"),
-    ],
-)
-def test_an_option_of_another_command_is_an_error_before_anything_is_sent(run, capsys, words, says):
-    script = Script([status()])
-    with pytest.raises(SystemExit):
-        run(script, *words)
+def test_what_went_wrong_meanwhile_is_no_success(run, capsys, words, last, says):
+    assert run(Script([running(step=1), running("asking", 2), last]), *words, "--wait") == 1
     assert says in capsys.readouterr().err
+
+
+def test_an_approach_within_a_run_waits_for_its_arrival(run):
+    arrived = running("proposed", 9, newest_event=1)
+    script = Script([running("proposed", 1), running("proposed", 1), running("approaching", 2), arrived])
+    script.events = [event(1, "motion_done", "arrived")]
+    assert run(script, "approach", "--wait") == 0
+    assert script.given[0] == "approach"
+
+
+# --- aims ----------------------------------------------------------------------------------------------------
+
+
+def test_an_aim_says_where_it_would_go_and_moves_nothing(run, capsys):
+    there = AIM | {"joints": [0.5, -0.2, 0.05]}
+    script = Script(aims=[there])
+    assert run(script, "aim", "--arm", "left", "--xyz", "10,0,0") == 0
     assert script.given == []
+    assert "a                        +0.1000 -> +0.5000" in capsys.readouterr().out
+    assert run(Script(aims=[there]), "aim", "--pose", "home", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == there
+
+
+def test_a_jog_that_cannot_arrive_is_not_begun_unless_the_nearest_will_do(run, capsys):
+    short = AIM | {"reached": False, "position_error_mm": 30.0, "rotation_error_deg": 1.0}
+    script = Script(aims=[short, short])
+    assert run(script, "jog", "left", "--xyz", "900,0,0") == 1
+    assert script.given == []
+    assert "refused: it cannot go there: 30.0 mm and 1.0 degrees away" in capsys.readouterr().err
+    assert run(script, "jog", "left", "--xyz", "900,0,0", "--nearest", "--speed", "0.2") == 0
+    assert script.given == [("move", {"joints": AIM["joints"], "speed": 0.2})]
+
+
+def test_an_aim_that_misses_is_no_success(run):
+    assert run(Script(aims=[AIM | {"clipped": ["b"]}]), "aim", "--pose", "home") == 1
+
+
+# --- what is shown -------------------------------------------------------------------------------------------
+
+
+def test_a_status_is_a_page_or_json(run, capsys):
+    run(Script(), "status")
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[0] == "READY: set up  tick p99 0.50 ms, 2 missed"
+    assert "  drives    not reported by the node" in shown
+    run(Script(), "status", "--json")
+    assert json.loads(capsys.readouterr().out)["state"] == "ready"
+
+
+def test_every_outcome_can_be_had_as_json(run, capsys):
+    run(Script([status()]), "halt", "--json")
+    assert json.loads(capsys.readouterr().out)["state"] == "ready"
+
+
+def test_a_tuning_is_shown_with_and_without_a_change(run, capsys):
+    script = Script()
+    assert run(script, "tune", "--show") == 0
+    assert script.given == []
+    assert "ensemble_m 0.01 (nothing to async)" in capsys.readouterr().out
+    assert run(script, "tune", "--task", "stack", "--json") == 0
+    assert script.given == [("tune", {"task": "stack"})]
+    assert json.loads(capsys.readouterr().out)["strategy"]["kind"] == "async"
+
+
+def test_events_are_listed(run, capsys):
+    assert run(Script(events=[event(1, "drives", "drives disabled")]), "events") == 0
+    assert "drives: drives disabled" in capsys.readouterr().out

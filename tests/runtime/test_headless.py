@@ -6,14 +6,17 @@ from types import SimpleNamespace
 import pytest
 
 from runtime import headless
-from runtime.errors import RecordingError, RuntimeFault, TransportError
+from runtime.errors import RecordingError, RuntimeFault, SetupError, TransportError
 from runtime.headless import drive, summary
+from runtime.recording import export
 
 STATUS = {
     "boot": "boot-1",
     "state": "idle",
     "reason": "",
     "stage": "idle",
+    "mode": "continuous",
+    "phase": "executing",
     "newest_event": 0,
     "run": {"number": 0, "elapsed": 0.0},
     "last_run": {},
@@ -26,6 +29,7 @@ STATUS = {
         "latency_p90_ms": 95.0,
         "delay_p50": 3.0,
         "delay_max": 4,
+        "lost": False,
     },
     "lease": {"holder": "headless"},
     "link": {"rates": {"joints": 30.0, "cam_high": 30.0}},
@@ -79,8 +83,9 @@ def clock(monkeypatch):
 
 @pytest.fixture
 def plan(tmp_path):
-    publish = SimpleNamespace(dataset=None)
-    return SimpleNamespace(deployment=SimpleNamespace(publish=publish, data=tmp_path))
+    publish, run = SimpleNamespace(dataset=None), SimpleNamespace(mode="continuous")
+    settings = SimpleNamespace(publish=publish, data=tmp_path, run=run, station="bench-1")
+    return SimpleNamespace(deployment=settings)
 
 
 @pytest.fixture(autouse=True)
@@ -89,6 +94,24 @@ def files(monkeypatch):
     found = {"duration_s": 8.0, "safety": {"ticks": 240, "refused": 0, "limited": 2}}
     monkeypatch.setattr(headless, "_of_episode", lambda path: found)
     return found
+
+
+@pytest.fixture(autouse=True)
+def kept(monkeypatch):
+    """What was exported and published, in this order."""
+    done = []
+
+    def exported(episode, root):
+        done.append("export")
+        return root / "exports" / episode.name
+
+    def published(plan, episode):
+        done.append("publish")
+        return {"dataset_path": "/data/datasets/demo", "episode_index": 4, "published_frames": 240}
+
+    monkeypatch.setattr(export, "export", exported)
+    monkeypatch.setattr(headless, "_publish", published)
+    return done
 
 
 def a_good_run(*events):
@@ -117,7 +140,7 @@ def test_a_run_is_set_up_run_and_its_end_on_disk_waited_for(plan, capsys):
     )
     assert result["run_seconds"] == 8.0
     shown = capsys.readouterr().out
-    assert "RUNNING  8.0 s" in shown
+    assert "RUNNING (continuous, executing)  8.0 s" in shown
     assert "/data/episodes/one" in shown
 
 
@@ -212,6 +235,50 @@ def test_an_episode_that_cannot_be_read_is_no_success(plan, monkeypatch):
         drive(plan, a_good_run())
 
 
+@pytest.mark.parametrize(
+    ("mode", "dataset", "done"),
+    [
+        ("continuous", None, ["export"]),
+        ("continuous", "demo", ["export", "publish"]),
+        ("sim", "demo", ["export"]),  # it moved no robot
+    ],
+)
+def test_every_run_is_exported_and_what_moved_a_robot_is_published(plan, kept, mode, dataset, done):
+    plan.deployment.run.mode, plan.deployment.publish.dataset = mode, dataset
+    result = drive(plan, a_good_run())
+    assert kept == done
+    assert result["export_path"] == str(plan.deployment.data / "exports" / "one")
+    assert ("dataset_path" in result) is ("publish" in done)
+
+
+def test_a_run_that_did_not_end_well_is_exported_and_not_published(plan, kept):
+    plan.deployment.publish.dataset = "demo"
+    station = a_good_run()
+    station.statuses[-1] = station.statuses[-1] | {"last_run": FINISHED | {"status": "failed"}}
+    with pytest.raises(RuntimeFault, match="did not end well"):
+        drive(plan, station)
+    assert kept == ["export"]
+
+
+def test_an_export_that_fails_is_told_on_top_of_how_the_run_ended(plan, monkeypatch):
+    def full(episode, root):
+        raise RecordingError("the disk is full")
+
+    monkeypatch.setattr(export, "export", full)
+    with pytest.raises(RuntimeFault, match=r"ended \(the run's 8 s are over\), but then: the disk is full"):
+        drive(plan, a_good_run())
+
+
+@pytest.mark.parametrize("mode", ["step", "preview", "manual"])
+def test_a_mode_that_needs_a_person_is_refused_before_anything_is_done(plan, mode):
+    plan.deployment.run.mode = mode
+    station = Station(status("idle"))
+    says = f"run.mode = '{mode}' needs a person; headless: continuous, sim.*ctl bench-1 run --mode {mode}"
+    with pytest.raises(SetupError, match=says):
+        drive(plan, station)
+    assert station.given == []
+
+
 def test_the_summary_says_how_it_went():
     result = {
         "ended": "the run's 8 s are over",
@@ -223,6 +290,7 @@ def test_the_summary_says_how_it_went():
         "policy": STATUS["policy"],
         "control": STATUS["control"],
         "safety": {"ticks": 240, "refused": 3, "limited": 2},
+        "export_path": "/data/exports/fold/continuous/async/one.parquet",
         "dataset_path": "/data/datasets/demo",
         "episode_index": 4,
         "published_frames": 240,
@@ -236,5 +304,6 @@ def test_the_summary_says_how_it_went():
         "  control   30 Hz, ticks late by p99 0.25 ms, 1 missed",
         "  safety    3 of 240 ticks refused, 2 limited",
         "  episode   /data/episodes/one",
+        "  streams   /data/exports/fold/continuous/async/one.parquet",
         "  dataset   /data/datasets/demo  episode 4, 240 frames",
     ]

@@ -1,0 +1,74 @@
+"""Where the robot is to go: what was said on the command line as joints, and what a target means for a person."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from runtime.client import StationClient
+from runtime.errors import RuntimeFault
+
+_STILL = 5e-4  # a joint that changes by less is not worth a line [rad, or the gripper's unit]
+
+
+def wanted(client: StationClient, given: argparse.Namespace) -> dict[str, Any]:
+    """What to aim at, as the arguments of `aim`; raises RuntimeFault for a joint that the robot has not."""
+    arm = getattr(given, "arm", None)
+    if arm is not None:
+        return {"jog": _jog(given, arm)}
+    if given.pose is not None:
+        return {"pose": given.pose}
+    if given.joints is not None:
+        return {"joints": given.joints}
+    status = client.status()
+    commanded = client.query("aim").data["joints"]
+    return {"joints": _changed(status["facts"]["joint_names"], commanded, given.joint)}
+
+
+def _jog(given: argparse.Namespace, arm: str) -> dict[str, Any]:
+    millimetres, degrees = given.xyz or [0.0] * 3, given.rpy or [0.0] * 3
+    return {
+        "arm": arm,
+        "frame": given.frame,
+        "translation": [part / 1000 for part in millimetres],
+        "rotation": [math.radians(part) for part in degrees],
+    }
+
+
+def _changed(
+    names: Sequence[str], commanded: Sequence[float], changes: Sequence[tuple[str, str, float]]
+) -> list[float]:
+    joints = dict(zip(names, commanded, strict=True))
+    for name, how, value in changes:
+        if name not in joints:
+            raise RuntimeFault(f"joint {name!r} is none of the robot's; it has {', '.join(names)}")
+        joints[name] = {"=": value, "+": joints[name] + value, "-": joints[name] - value}[how]
+    return list(joints.values())
+
+
+def lines(
+    aim: Mapping[str, Any], commanded: Sequence[float], names: Sequence[str], speed: float
+) -> list[str]:
+    """An answer to `aim` for a person: each joint that would move, how far, how long, and what is not as wished."""
+    told = [
+        f"  {name:<24} {now:+.4f} -> {then:+.4f}"
+        for name, now, then in zip(names, commanded, aim["joints"], strict=True)
+        if abs(then - now) >= _STILL
+    ]
+    told = told or ["  no joint would move"]
+    told.append(f"  at most {aim['distance']:.3f} rad, in up to {aim['duration_s'] / speed:.1f} s")
+    short = shortcoming(aim)
+    return [*told, f"  NOT AS ASKED: {short}"] if short else told
+
+
+def shortcoming(aim: Mapping[str, Any]) -> str:
+    """Why the aim is not what was asked for, "" where it is."""
+    parts = []
+    if aim["clipped"]:
+        parts.append(f"stopped by the limits of {', '.join(aim['clipped'])}")
+    if not aim["reached"]:
+        error = f"{aim['position_error_mm']:.1f} mm and {aim['rotation_error_deg']:.1f} degrees"
+        parts.append(f"{error} away from the pose")
+    return "; ".join(parts)

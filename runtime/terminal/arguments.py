@@ -1,0 +1,51 @@
+"""What goes with a command over the bus, from what was said on the command line; what was not said stays out."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import Any
+
+
+def arguments(given: argparse.Namespace) -> dict[str, Any]:
+    """The arguments of a command that needs nothing of the station to be known."""
+    build = _BUILDERS.get(given.command)
+    return {} if build is None else _said(build(given))
+
+
+def _setup(given: argparse.Namespace) -> dict[str, Any]:
+    policy = dict(given.policy or []) | _said({"url": given.policy_url})
+    return {
+        "policy": policy or None,
+        "strategy": None if given.strategy is None else {"kind": given.strategy},
+        "task": given.task,
+        "checkpoint": None
+        if given.checkpoint is None
+        else {"id": given.checkpoint, "name": given.checkpoint},
+        "bench": None if given.bench_seed is None else {"seed": given.bench_seed},
+    }
+
+
+def _run(given: argparse.Namespace) -> dict[str, Any]:
+    return {
+        "mode": given.mode,
+        "sim_state": given.sim_state,
+        "duration_s": given.duration,
+        "operator": given.operator,
+    }
+
+
+def _gripper(given: argparse.Namespace) -> dict[str, Any]:
+    return {"action": given.action, "arm": given.arm}
+
+
+def _tune(given: argparse.Namespace) -> dict[str, Any]:
+    strategy = dict(given.set or []) | _said({"kind": given.strategy})
+    return {"strategy": strategy or None, "task": given.task}
+
+
+_BUILDERS = {"setup": _setup, "run": _run, "gripper": _gripper, "tune": _tune}
+
+
+def _said(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}

@@ -1,0 +1,104 @@
+"""Stays with a command that goes on: the lease lives as long as this terminal, Ctrl-C stops."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+import threading
+import time
+from typing import Any
+
+from runtime.client import Refused, StationClient
+from runtime.terminal.figures import away, line
+from runtime.terminal.keys import Keys, NoKeys, keys
+
+# Commands that go on after they were accepted, and the states in which they do.
+LASTING = {
+    "setup": ("setting_up",),
+    "home": ("setting_up",),
+    "approach": ("setting_up",),
+    "run": ("running",),
+    "resume": ("running",),
+}
+_KEYS = {"\n": "step", "c": "commit", "x": "cancel", "q": "stop"}
+_KEYED = {  # what the keys are, by the mode of the run
+    "step": "Enter: next chunk, x: cancel, q: stop",
+    "preview": "Enter: next chunk, c: commit, x: cancel, q: stop",
+    "manual": "x: end the motion, q: stop; move, jog and gripper from another terminal",
+}
+_LOOK_S = 0.05
+_SHOW_S = 0.5
+
+
+def attend(client: StationClient, kind: str, arguments: dict[str, Any]) -> dict[str, Any]:
+    """Give a lasting command and stay until it is over; returns the status then."""
+    pressed = threading.Event()
+    # An exception out of nowhere can be lost in a destructor; a Ctrl-C that stops a robot must not be.
+    before = signal.signal(signal.SIGINT, lambda *_: pressed.set())
+    try:
+        client.command(kind, **arguments)
+        status = client.status()
+        with _keys_of(kind, status) as keyboard:
+            progress = _Steady() if isinstance(keyboard, NoKeys) else _Keyed(status["mode"])
+            while status["state"] in LASTING[kind]:
+                if pressed.is_set():
+                    raise KeyboardInterrupt
+                client.renew()
+                progress.show(status)
+                _press(client, keyboard.key(_LOOK_S))
+                status = client.status()
+            return status
+    except KeyboardInterrupt:
+        client.command("stop")
+        return client.status()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _keys_of(kind: str, status: dict[str, Any]) -> Keys:
+    """The keyboard of a run that a person drives, where there is one."""
+    if "running" not in LASTING[kind] or status["mode"] not in _KEYED:
+        return NoKeys()
+    return keys()
+
+
+def _press(client: StationClient, key: str) -> None:
+    """Do what a key means, if anything; a refusal is told, and the run goes on."""
+    if key not in _KEYS:
+        return
+    try:
+        client.command(_KEYS[key])
+    except Refused as refusal:
+        print(f"refused: {refusal}", file=sys.stderr, flush=True)
+
+
+class _Steady:
+    """A line of figures now and then."""
+
+    def __init__(self) -> None:
+        self._shown = -math.inf
+
+    def show(self, status: dict[str, Any]) -> None:
+        if time.monotonic() - self._shown > _SHOW_S:
+            self._shown = time.monotonic()
+            print(line(status), flush=True)
+
+
+class _Keyed(_Steady):
+    """A line whenever something else goes on, with the keys where the run waits for one."""
+
+    def __init__(self, mode: str) -> None:
+        super().__init__()
+        self._keys = _KEYED[mode]
+        self._last: tuple[Any, ...] = ()
+
+    def show(self, status: dict[str, Any]) -> None:
+        now = (status["state"], status["phase"], status["proposal"].get("chunk"))
+        if now == self._last:
+            return
+        self._last = now
+        print(line(status), flush=True)
+        if status["phase"] in ("waiting", "proposed"):
+            what = away(status["proposal"], "the chunk that is shown")
+            print(f"  {what + '  ' if what else ''}[{self._keys}]", flush=True)

@@ -1,0 +1,256 @@
+"""What can be said on the command line of `python -m runtime.ctl`: one subcommand per command."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+from collections.abc import Sequence
+from typing import Any, get_args
+
+from runtime.messages import Mode
+
+_TRIPLES = (
+    "--xyz",
+    "--rpy",
+    "--joints",
+)  # their numbers may begin with a minus, which argparse takes for an option
+
+
+def parse(words: Sequence[str]) -> argparse.Namespace:
+    """What was said; ends the process with exit code 2 and a sentence where it is nothing that there is."""
+    top, commands = _parser()
+    given, unknown = top.parse_known_args(_joined(words))
+    if unknown:
+        command = commands[given.command]
+        options = sorted(
+            o for action in command._actions for o in action.option_strings if o.startswith("--")
+        )
+        command.error(f"{given.command} does not take {' '.join(unknown)}; it takes {', '.join(options)}")
+    _check(given, commands[given.command])
+    return given
+
+
+def _joined(words: Sequence[str]) -> list[str]:
+    joined: list[str] = []
+    for word in words:
+        if joined and joined[-1] in _TRIPLES:
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
+def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+    top = argparse.ArgumentParser(
+        prog="python -m runtime.ctl",
+        description="Commands and watches a station from a terminal.",
+        epilog="exit codes: 0 done, 1 refused or failed, 2 misspelt, 3 no answer in time: outcome unknown, 130 Ctrl-C",
+        allow_abbrev=False,
+    )
+    top.add_argument(
+        "--data-dir", default=os.environ.get("EVA_DATA_DIR") or "data", help="where stations lie"
+    )
+    top.add_argument("station")
+    commands: dict[str, argparse.ArgumentParser] = {}
+    lines = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name, (says, takes) in _COMMANDS.items():
+        line = lines.add_parser(name, help=says, description=says, allow_abbrev=False)
+        line.add_argument("--data-dir", default=argparse.SUPPRESS, help="where stations lie")
+        line.add_argument("--json", action="store_true", help="say the outcome as JSON")
+        takes(line)
+        commands[name] = line
+    return top, commands
+
+
+def _check(given: argparse.Namespace, command: argparse.ArgumentParser) -> None:
+    """What argparse cannot say of options that go together."""
+    if given.command == "tune" and not (given.show or given.strategy or given.set or given.task is not None):
+        command.error("tune needs --strategy, --set, --task or --show")
+    if given.command == "setup" and given.cancel and _setup_says_more(given):
+        command.error("setup --cancel takes nothing else")
+    if given.command == "jog" and given.xyz is None and given.rpy is None:
+        command.error("jog needs --xyz, --rpy or both")
+
+
+def _setup_says_more(given: argparse.Namespace) -> bool:
+    said = (given.policy_url, given.policy, given.strategy, given.task, given.checkpoint, given.bench_seed)
+    return any(value is not None for value in said)
+
+
+# --- what each command takes -------------------------------------------------------------------------------
+
+
+def _nothing(line: argparse.ArgumentParser) -> None:
+    pass
+
+
+def _setup(line: argparse.ArgumentParser) -> None:
+    line.add_argument("--policy-url", metavar="URL", help="another server than the deployment's")
+    line.add_argument("--policy", type=_setting, nargs="+", action="extend", metavar="KEY=VALUE")
+    line.add_argument("--strategy", metavar="KIND", help="another strategy than the deployment's")
+    line.add_argument("--task", metavar="TEXT", help="another instruction than the deployment's")
+    line.add_argument("--checkpoint", metavar="NAME", help="which one is behind the policy, for the manifest")
+    line.add_argument("--bench-seed", type=int, metavar="N", help="lay a simulated bench out anew")
+    line.add_argument("--cancel", action="store_true", help="end the set-up that goes on")
+
+
+def _run(line: argparse.ArgumentParser) -> None:
+    line.add_argument("--mode", choices=get_args(Mode), help="else the deployment's")
+    line.add_argument(
+        "--sim-state", choices=["live", "simulated"], help="what the policy sees in the mode sim"
+    )
+    line.add_argument("--duration", type=_finite, metavar="S", help="seconds after which it ends by itself")
+    line.add_argument("--operator", metavar="NAME", help="who runs it, for the manifest")
+
+
+def _waits(line: argparse.ArgumentParser) -> None:
+    line.add_argument("--wait", action="store_true", help="until the run waits again, and say how it went")
+
+
+def _target(line: argparse.ArgumentParser, *more: str) -> Any:
+    """The ways to say where to go, of which there may be one; also the group, for who has one more."""
+    group = line.add_mutually_exclusive_group(required=True)
+    group.add_argument("--pose", metavar="NAME", help="a pose of the robot")
+    group.add_argument(
+        "--joints", type=_numbers, metavar="A,B,...", help="all joints [rad, or the gripper's unit]"
+    )
+    group.add_argument(
+        "--joint",
+        type=_joint,
+        nargs="+",
+        action="extend",
+        metavar="NAME=VALUE",
+        help="these joints, the others as commanded; NAME+=VALUE and NAME-=VALUE from where it is commanded",
+    )
+    return group
+
+
+def _step_of_an_arm(line: argparse.ArgumentParser) -> None:
+    line.add_argument("--xyz", type=_triple, metavar="MM,MM,MM", help="along the axes of the frame")
+    line.add_argument("--rpy", type=_triple, metavar="DEG,DEG,DEG", help="roll, pitch, yaw about them")
+    line.add_argument("--frame", choices=["base", "tool"], default="base", help="whose axes (default: base)")
+
+
+def _speed(line: argparse.ArgumentParser) -> None:
+    line.add_argument("--speed", type=_finite, metavar="PART", help="of the speed of such motions, up to 1")
+
+
+def _move(line: argparse.ArgumentParser) -> None:
+    _target(line)
+    _speed(line)
+    _waits(line)
+
+
+def _jog(line: argparse.ArgumentParser) -> None:
+    line.add_argument("arm")
+    _step_of_an_arm(line)
+    _speed(line)
+    _waits(line)
+    line.add_argument("--nearest", action="store_true", help="go as near as it can where it cannot go there")
+
+
+def _aim(line: argparse.ArgumentParser) -> None:
+    _target(line).add_argument("--arm", help="a step of this arm, as by jog")
+    _step_of_an_arm(line)
+
+
+def _gripper(line: argparse.ArgumentParser) -> None:
+    line.add_argument("action", choices=["open", "close", "lock", "unlock"])
+    line.add_argument("--arm", help="this one alone")
+    _waits(line)
+
+
+def _tune(line: argparse.ArgumentParser) -> None:
+    line.add_argument("--strategy", metavar="KIND", help="another strategy")
+    line.add_argument("--set", type=_setting, nargs="+", action="extend", metavar="KEY=VALUE")
+    line.add_argument("--task", metavar="TEXT", help="another instruction")
+    line.add_argument("--show", action="store_true", help="what is in force")
+
+
+def _record(line: argparse.ArgumentParser) -> None:
+    line.add_argument("what", choices=["start", "stop"])
+
+
+def _estop(line: argparse.ArgumentParser) -> None:
+    line.add_argument("why", nargs="?", default="pressed in a terminal")
+
+
+def _events(line: argparse.ArgumentParser) -> None:
+    line.add_argument("--since", type=int, default=0, metavar="N", help="those after event N")
+    line.add_argument("--last", type=int, metavar="N", help="the newest N of them")
+    line.add_argument("--kind", nargs="+", action="extend", metavar="KIND", help="of these kinds alone")
+
+
+_COMMANDS = {
+    "setup": ("connect the policy, home, warm up, check an answer", _setup),
+    "run": ("open a run and attend it", _run),
+    "step": ("ask for one chunk (modes step, preview)", _waits),
+    "commit": ("execute the chunk that is shown (mode preview)", _waits),
+    "cancel": ("forget the chunk that is shown, end a motion (modes step, preview, manual)", _waits),
+    "move": ("go to joints or to a pose (mode manual)", _move),
+    "jog": ("move an end effector by a step (mode manual)", _jog),
+    "aim": ("say where it would go, and move nothing", _aim),
+    "gripper": ("open, close, lock or unlock grippers", _gripper),
+    "tune": ("another strategy, other parameters, another instruction, also while it runs", _tune),
+    "approach": ("go to the policy's first action on a limited path", _waits),
+    "home": ("drive to the pose of the set-up", _nothing),
+    "stop": ("decelerate, hold, close the run; while setting up: cancel", _nothing),
+    "halt": ("decelerate and hold; the run stays open", _nothing),
+    "resume": ("go on with the run that is held, and attend it", _nothing),
+    "release": ("unlatch the e-stop", _nothing),
+    "estop": ("the software e-stop; needs no lease", _estop),
+    "record": ("an episode without a policy", _record),
+    "status": ("how the station is", _nothing),
+    "watch": ("figures and events as they come", _nothing),
+    "events": ("what has happened", _events),
+}
+
+
+# --- values ------------------------------------------------------------------------------------------------
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"{text} was given; allowed: finite numbers")
+    return number
+
+
+def _numbers(text: str) -> list[float]:
+    return [_finite(part) for part in text.split(",")]
+
+
+def _triple(text: str) -> list[float]:
+    numbers = _numbers(text)
+    if len(numbers) != 3:
+        raise argparse.ArgumentTypeError(f"{text} has {len(numbers)} numbers; allowed: three, as 10,0,-5")
+    return numbers
+
+
+def _joint(text: str) -> tuple[str, str, float]:
+    """(name, "=" or "+" or "-", value)."""
+    name, found, value = text.partition("=")
+    how = name[-1:] if name[-1:] in ("+", "-") else ""
+    name = name[: len(name) - len(how)]
+    if not (found and name):
+        raise argparse.ArgumentTypeError(f"{text} was given; allowed: NAME=VALUE, NAME+=VALUE, NAME-=VALUE")
+    return name, how or "=", _finite(value)
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    """(key, value): JSON where it is some, else a word; "none" is no value."""
+    key, found, value = text.partition("=")
+    if not (found and key):
+        raise argparse.ArgumentTypeError(f"{text} was given; allowed: KEY=VALUE")
+    if value == "none":
+        return key, None
+    try:
+        return key, json.loads(value, parse_constant=_no_constant)
+    except ValueError:
+        return key, value
+
+
+def _no_constant(name: str) -> None:
+    raise ValueError(f"{name} is no JSON")

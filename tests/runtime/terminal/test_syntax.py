@@ -1,0 +1,99 @@
+import pytest
+
+from runtime.terminal import syntax
+from runtime.terminal.syntax import parse
+
+
+def said(*words):
+    return parse(["bench-1", *words])
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        *(
+            "setup",
+            "run",
+            "step",
+            "commit",
+            "cancel",
+            "approach",
+            "home",
+            "stop",
+            "halt",
+            "resume",
+            "release",
+        ),
+        *("estop", "status", "watch", "events"),
+    ],
+)
+def test_a_command_needs_no_more_than_its_word(command):
+    given = said(command)
+    assert (given.station, given.command, given.json) == ("bench-1", command, False)
+
+
+def test_every_command_of_the_session_can_be_said():
+    from runtime.transitions import COMMANDS
+
+    words = {"record" if kind.startswith("record_") else kind for kind in COMMANDS}
+    assert words <= set(syntax._COMMANDS)
+
+
+def test_the_data_folder_can_be_said_before_and_after_the_command(monkeypatch):
+    monkeypatch.setenv("EVA_DATA_DIR", "/var/eva")
+    assert said("status").data_dir == "/var/eva"
+    assert said("status", "--data-dir", "/a").data_dir == "/a"
+    assert parse(["--data-dir", "/a", "bench-1", "status"]).data_dir == "/a"
+
+
+def test_numbers_may_begin_with_a_minus():
+    assert said("move", "--joints", "-0.1,0.2,-1e-3").joints == [-0.1, 0.2, -1e-3]
+    jog = said("jog", "left", "--xyz", "-10,0,5", "--rpy=-1,0,0", "--frame", "tool")
+    assert (jog.arm, jog.xyz, jog.rpy, jog.frame) == ("left", [-10, 0, 5], [-1, 0, 0], "tool")
+
+
+def test_joints_are_set_or_changed_by_name():
+    given = said("move", "--joint", "a=0.5", "b+=0.1", "--joint", "c-=0.2")
+    assert given.joint == [("a", "=", 0.5), ("b", "+", 0.1), ("c", "-", 0.2)]
+
+
+def test_settings_are_json_where_they_are_some_else_words():
+    given = said("tune", "--set", "k_max=3", "blend_window=all", "--set", "inference_rate=none", "x=NaN")
+    assert dict(given.set) == {"k_max": 3, "blend_window": "all", "inference_rate": None, "x": "NaN"}
+    assert dict(said("setup", "--policy", "kind=openpi", 'url="ws://a:1"').policy) == {
+        "kind": "openpi",
+        "url": "ws://a:1",
+    }
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["dance"], "invalid choice: 'dance'"),
+        (["run", "--task", "fold"], "run does not take --task fold; it takes --data-dir, --duration, "),
+        (
+            ["stop", "--policy-url", "ws://a:1"],
+            "stop does not take --policy-url ws://a:1; it takes --data-dir",
+        ),
+        (["run", "--mode", "dance"], "choose from"),
+        (["run", "--duration", "nan"], "nan was given; allowed: finite numbers"),
+        (["record"], "required: what"),
+        (["move"], "one of the arguments --pose --joints --joint is required"),
+        (["move", "--pose", "home", "--joints", "1,2"], "not allowed with"),
+        (["move", "--joint", "a"], "a was given; allowed: NAME=VALUE, NAME+=VALUE, NAME-=VALUE"),
+        (["move", "--joint", "+=1"], "+=1 was given; allowed: NAME=VALUE"),
+        (["move", "--joints", "1,x"], "invalid"),
+        (["jog", "left"], "jog needs --xyz, --rpy or both"),
+        (["jog", "left", "--xyz", "1,2"], "1,2 has 2 numbers; allowed: three, as 10,0,-5"),
+        (["aim"], "one of the arguments --pose --joints --joint --arm is required"),
+        (["tune"], "tune needs --strategy, --set, --task or --show"),
+        (["tune", "--set", "k_max"], "k_max was given; allowed: KEY=VALUE"),
+        (["setup", "--cancel", "--task", "fold"], "setup --cancel takes nothing else"),
+        (["gripper", "squeeze"], "choose from"),
+    ],
+)
+def test_what_cannot_be_said_is_answered_with_what_can(capsys, words, says):
+    with pytest.raises(SystemExit) as ended:
+        said(*words)
+    assert ended.value.code == 2
+    assert says in capsys.readouterr().err
