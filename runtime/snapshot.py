@@ -108,6 +108,7 @@ def facts(plan: Plan) -> dict[str, Any]:
         "poses": sorted(robot.poses),
         "tasks": list(dict.fromkeys(filter(None, [plan.deployment.task, *plan.deployment.tasks]))),
         "strategies": {kind: sorted(module.USES) for kind, module in variants("runtime.strategies").items()},
+        "strategy": plan.deployment.strategy.model_dump(),
         "modes": list(get_args(Mode)),
         "moves_robot": plan.capabilities.moves_robot,
         "cameras": list(plan.cameras),

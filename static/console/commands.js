@@ -3,8 +3,9 @@
 import { post, RequestFailed } from "../site/api.js";
 import { uuid } from "../site/identity.js";
 import { config } from "./config.js";
+import { whyNot } from "./reasons.js";
 import { answered, STOPPING, Stops } from "./stops.js";
-import { verb, words } from "./words.js";
+import { verb } from "./words.js";
 
 const STOP_ADVICE = "Press it again; if the robot still moves, press E-STOP.";
 
@@ -12,6 +13,7 @@ const STOP_ADVICE = "Press it again; if the robot still moves, press E-STOP.";
 export class Commands {
   #store;
   #pending = new Set();
+  #givers = new Map(); // kind -> function that says its arguments
   #stops;
 
   constructor(store, socket) {
@@ -25,6 +27,11 @@ export class Commands {
     store.on(["snapshot", "link", "open", "second"], () => this.gate());
     document.body.addEventListener("htmx:afterSettle", () => this.gate());
     this.gate();
+  }
+
+  /** Let `args()` say what goes with every command `kind` that is pressed on this page. */
+  provide(kind, args) {
+    this.#givers.set(kind, args);
   }
 
   /** Send one command; resolves to the answer, or null where it was not accepted (and says why on the page). */
@@ -90,19 +97,14 @@ export class Commands {
     if (store.lease === "free") return "take the station first";
     if (store.lease === "elsewhere") return "another page of yours commands the station; take it here first";
     if (store.lease !== "mine") return "somebody else commands the station; ask for it";
-    const { allowed, state } = store.snapshot;
-    if (!allowed.includes(kind)) {
-      const possible = allowed.filter((one) => one !== "estop").map(verb).join(", ") || "nothing";
-      return `not while ${words(state)}; possible now: ${possible}`;
-    }
-    return "";
+    return whyNot(kind, store.snapshot);
   }
 
   /** Enable and disable every button that gives a command; a disabled one says why. */
   gate() {
     for (const button of document.querySelectorAll("[data-command], [data-gate]")) {
       const kind = button.dataset.command ?? button.dataset.gate;
-      const own = button.dataset.blocked ?? "";
+      const own = "settling" in button.dataset ? "it has just come up: look, then press again" : (button.dataset.blocked ?? "");
       setReason(button, own || (kind === "score" ? this.#scoreReason() : this.reason(kind)));
       if (button.dataset.onlyState) button.hidden = this.#store.snapshot?.state !== button.dataset.onlyState;
     }
@@ -119,7 +121,7 @@ export class Commands {
     if (this.#pending.has(kind) && !STOPPING.includes(kind)) return;
     this.#pending.add(kind);
     button.dataset.pressed = "";
-    await this.give(kind, argsOf(button), trial || null);
+    await this.give(kind, { ...this.#givers.get(kind)?.(), ...argsOf(button) }, trial || null);
     delete button.dataset.pressed;
     this.#pending.delete(kind);
   }
@@ -132,9 +134,12 @@ export function setReason(button, reason) {
   if (button.title !== reason) button.title = reason;
 }
 
-/** Arguments that a button takes from fields: data-arg-NAME="selector"; an empty field is left out. */
+/**
+ * Arguments that a button has of its own, data-args as JSON, and that it takes from fields:
+ * data-arg-NAME="selector"; an empty field is left out.
+ */
 function argsOf(button) {
-  const args = {};
+  const args = JSON.parse(button.dataset.args ?? "{}");
   for (const { name, value } of button.attributes) {
     if (!name.startsWith("data-arg-")) continue;
     const field = document.querySelector(value);

@@ -5,21 +5,28 @@ const FIXED = [
   ["Space", "E-stop, outside text fields"],
   ["?", "These keys, and away with them"],
 ];
-const TYPING = 'input:not([type="checkbox"]):not([type="radio"]), textarea, select, [contenteditable="true"]';
+const TEXTS = 'input:not([type="checkbox"], [type="radio"], [type="range"], [type="number"]), textarea, [contenteditable="true"]';
+const STOPS = '[data-command="stop"], [data-command="halt"], [data-command="cancel"]';
+const SCROLLED = 'select, input[type="range"], input[type="radio"], #events'; // they go by arrows of their own
+const CAPS = { arrowleft: "←", arrowright: "→", arrowup: "↑", arrowdown: "↓", pageup: "PgUp", pagedown: "PgDn", shift: "⇧" };
 
 function usable(element) {
   return element.checkVisibility();
 }
 
-function keyOf(event) {
-  const key = event.key.toLowerCase();
-  return event.ctrlKey ? `ctrl+${key}` : key;
+/** The names under which a press may be known: with Shift first the key with it, then the key alone. */
+export function namesOf({ key: pressed, ctrlKey, shiftKey }) {
+  const key = pressed.toLowerCase();
+  if (ctrlKey) return [`ctrl+${key}`];
+  const shifted = shiftKey && (/^[a-z]$/.test(key) || key in CAPS);
+  return shifted ? [`shift+${key}`, key] : [key];
 }
 
-function label(key) {
+/** A key as it stands on a keyboard. */
+export function label(key) {
   return key
     .split("+")
-    .map((part) => part[0].toUpperCase() + part.slice(1))
+    .map((part) => CAPS[part] ?? part[0].toUpperCase() + part.slice(1))
     .join(" + ");
 }
 
@@ -50,24 +57,46 @@ function show(dialog) {
   dialog.querySelector("button").focus();
 }
 
-/** Listen for keys; text fields keep theirs, but for those with Ctrl. */
+/** What is pressed with it: the first that is on the page and visible. */
+function meant(event) {
+  for (const name of namesOf(event)) {
+    const element = [...document.querySelectorAll(`[data-key="${CSS.escape(name)}"]`)].find(usable);
+    if (element) return element;
+  }
+  return null;
+}
+
+/** Fields keep what they are typed with: numbers their digits, lists their letters but for those that stop. */
+function kept(event, element) {
+  const field = event.target;
+  if (!field.closest || event.ctrlKey) return false;
+  if (field.closest(TEXTS)) return true;
+  if (field.closest('input[type="number"]')) return !/^[a-z]$/i.test(event.key);
+  if (field.closest("select") && !element?.matches(STOPS)) return true;
+  return /^(Arrow|Page)/.test(event.key) && Boolean(field.closest(SCROLLED));
+}
+
+function press(element) {
+  const written = element.matches('select, textarea, input:not([type="checkbox"], [type="radio"])');
+  if (!written) element.click();
+  else if (!element.disabled) element.focus();
+}
+
+/** Listen for keys. */
 export function keyboard() {
   const dialog = document.getElementById("keys");
   document.querySelector("[data-open-keys]")?.addEventListener("click", () => show(dialog));
   window.addEventListener("keydown", (event) => {
-    if (event.altKey || event.metaKey || event.repeat) return;
-    if (event.target.closest?.(TYPING) && !event.ctrlKey) return;
-    const key = keyOf(event);
-    if (key === "?") {
+    if (event.altKey || event.metaKey || event.repeat || event.defaultPrevented) return;
+    const element = meant(event);
+    if (kept(event, element)) return;
+    if (event.key === "?") {
       if (dialog.open) dialog.close();
       else show(dialog);
       return;
     }
-    const candidates = [...document.querySelectorAll(`[data-key="${CSS.escape(key)}"]`)];
-    const element = candidates.find(usable);
     if (!element) return;
     event.preventDefault();
-    if (element.matches('input[type="search"], input[type="text"]')) element.focus();
-    else element.click();
+    press(element);
   });
 }

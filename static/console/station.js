@@ -3,16 +3,19 @@
 import { drafts } from "../site/drafts.js";
 import { quietFragments } from "../site/fragments.js";
 import { pageId } from "../site/identity.js";
+import { byHand } from "./by_hand.js";
 import { Cameras } from "./cameras.js";
 import { Commands } from "./commands.js";
 import { config } from "./config.js";
 import { curvePane } from "./curve_controls.js";
 import { figures } from "./debug.js";
+import { draw, panes } from "./drawing.js";
 import { EStop } from "./estop.js";
 import { Events } from "./events.js";
 import { keyboard } from "./keys.js";
 import { LeaseControls } from "./lease.js";
 import { scenePane } from "./scene_pane.js";
+import { setUp } from "./setup.js";
 import { LiveSocket } from "./socket.js";
 import { statusBar } from "./status.js";
 import { current, mark } from "./steps.js";
@@ -20,45 +23,7 @@ import { Store } from "./store.js";
 import { TrialPanel } from "./trial.js";
 import { CLOSED } from "./words.js";
 
-const nothing = { poses() {}, bench() {}, add() {}, joints() {}, software: false };
-const CURVES = { measured: "state", raw: "raw", planned: "smoothed", commanded: "executed" }; // of the stream, as drawn
-const SOFTWARE_FRAME_MS = 80; // a browser without a graphics card shares the processor with the robot's programs
-
-/** The panes that need time to load; until then their data goes nowhere. */
-const panes = { scene: nothing, curves: nothing };
-
-function onScreen() {
-  return new Promise((resolve) => requestAnimationFrame(resolve));
-}
-
-/** Draw one frame; resolves when it is on the screen, which earns the next one. */
-async function draw(frame, store, cameras) {
-  const { streams, t } = frame.header;
-  const showPictures = await cameras.prepare(frame);
-  await onScreen();
-  showPictures();
-  if (streams.state) store.setSnapshot(streams.state.json);
-  if (streams.joints) panes.curves.add(t, vectors(frame, streams.joints));
-  if (streams.poses) panes.scene.poses(frame.numbers(streams.poses), streams.poses.shape.length > 2 ? streams.poses.shape[0] : 1);
-  if (panes.scene.software) await pace();
-}
-
-let due = 0; // when the next frame may be asked for, on this page's clock [ms]
-
-function pace() {
-  const now = performance.now();
-  due = Math.max(now, due + SOFTWARE_FRAME_MS);
-  return new Promise((resolve) => setTimeout(resolve, due - now));
-}
-
-function vectors(frame, { json, arrays }) {
-  const found = {};
-  for (const [kind, place] of Object.entries(arrays)) found[CURVES[kind]] = frame.numbers(place);
-  if (json?.engaged === false) delete found.executed; // nothing is being sent
-  return found;
-}
-
-function listen(store, { events, estop, commands, lease, trial }) {
+function listen(store, { events, estop, commands, lease, trial, hand }) {
   const answers = {
     hello: ({ facts, role }) => {
       store.closed = null;
@@ -73,6 +38,7 @@ function listen(store, { events, estop, commands, lease, trial }) {
     },
     events: (news) => events.add(news),
     ack: (ack) => (ack.kind === "estop" ? estop() : commands()).acknowledged(ack),
+    aimed: (answer) => hand()?.aimed(answer), // which tells "eva:aimed" what is to be shown of it
     renewed: (answer) => lease().renewed(answer),
     changed: ({ what }) => {
       if (what.includes("lease")) window.htmx.trigger("#lease", "eva:lease");
@@ -91,7 +57,7 @@ async function start() {
   const cameras = new Cameras(store);
   const parts = {};
   const socket = new LiveSocket(`${config.socket}?page=${store.page}`, {
-    told: listen(store, { events, estop: () => parts.estop, commands: () => parts.commands, lease: () => parts.lease, trial: () => parts.trial }),
+    told: listen(store, { events, estop: () => parts.estop, commands: () => parts.commands, lease: () => parts.lease, trial: () => parts.trial, hand: () => parts.hand }),
     draw: (frame) => draw(frame, store, cameras),
     changed: (open, code) => {
       store.open = open;
@@ -100,7 +66,7 @@ async function start() {
       store.tell("open");
     },
     greet: ({ again = false } = {}) => {
-      if (!again) socket.send({ type: "watch", streams: ["state", "joints", "poses", ...cameras.streams] });
+      if (!again) socket.send({ type: "watch", streams: ["state", "joints", "recent", "poses", "chunk", ...cameras.streams] });
       socket.send({ type: "events", after: events.newest, boot: events.boot });
     },
     expected: () => store.link.ok,
@@ -112,14 +78,16 @@ async function start() {
   parts.commands = commands;
   parts.lease = new LeaseControls(store, socket, commands);
   if (config.page === "eval") parts.trial = new TrialPanel(store, commands);
+  if (config.page === "debug") parts.hand = byHand(store, socket, commands);
+  setUp(store);
   figures(store);
   store.on(["snapshot", "second"], () => steps(store));
   document.body.addEventListener("htmx:afterSettle", () => steps(store));
   steps(store);
   setInterval(() => store.tell("second"), 500);
   store.on("snapshot", (snapshot) => snapshot.truth && panes.scene.bench(snapshot.truth));
-  scenePane().then((pane) => Object.assign(panes, { scene: pane }));
-  curvePane().then((pane) => Object.assign(panes, { curves: pane }));
+  scenePane(store).then((pane) => Object.assign(panes, { scene: pane }));
+  curvePane(store).then((pane) => Object.assign(panes, { curves: pane }));
 }
 
 function steps(store) {

@@ -12,6 +12,7 @@ export class Store {
     this.snapshot = null; // the station's state as it last came
     this.snapshotAt = -Infinity; // when, on this page's clock [ms]
     this.facts = {}; // of the robot
+    this.joints = null; // {step, engaged, measured, commanded, simulated, ...} as they last came
     this.link = { ok: false, reason: "connecting" }; // between web and runtime
     this.open = false; // the socket to the web
     this.closed = null; // why the web lets this page in no more, as words.js has it
@@ -38,6 +39,11 @@ export class Store {
     this.snapshot = snapshot;
     this.snapshotAt = performance.now();
     this.tell("snapshot", snapshot);
+  }
+
+  setJoints(joints) {
+    this.joints = joints;
+    this.tell("joints", joints);
   }
 
   /** Seconds since the state came; a state older than this page can bear is not the state. */

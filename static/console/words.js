@@ -36,6 +36,13 @@ export const VERBS = {
   record_start: "Start recording",
   record_stop: "End recording",
   estop: "E-stop",
+  tune: "Apply",
+  step: "Next chunk",
+  commit: "Commit",
+  cancel: "Cancel",
+  move: "Send",
+  gripper: "Gripper",
+  approach: "Approach",
 };
 
 export function words(state) {

@@ -1,0 +1,19 @@
+// The controls of the Debug page, put together.
+
+import { Aim } from "./aim.js";
+import { ManualPanel } from "./manual_panel.js";
+import { ModePanel } from "./mode_panel.js";
+import { panels } from "./panels.js";
+import { robotPanel } from "./robot_panel.js";
+import { TuningPanel } from "./tuning_panel.js";
+
+/** Returns {aimed(answer)}, which hears what the station says of targets. */
+export function byHand(store, socket, commands) {
+  const aim = new Aim((message) => socket.send(message));
+  const shown = panels(document.getElementById("hand"));
+  new ModePanel(store, commands, (mode) => shown.open(mode === "manual" ? "manual" : "policy"));
+  new TuningPanel(store, commands);
+  new ManualPanel(store, commands, aim);
+  robotPanel(store, commands);
+  return { aimed: (answer) => aim.answered(answer) };
+}

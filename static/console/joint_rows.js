@@ -1,0 +1,86 @@
+// A slider and a number for each joint of a group, within its limits.
+
+import { stepOf, within } from "./targets.js";
+
+export class JointRows {
+  #list = document.getElementById("joints");
+  #template = document.getElementById("joint-row").content;
+  #rows = []; // {joint, slider, number, row}
+  #typed;
+
+  /** `typed(index, value, said)` hears what a person set; `said` tells what was clipped. */
+  constructor(typed) {
+    this.#typed = typed;
+  }
+
+  build(joints) {
+    this.#rows = joints.map((joint) => this.#row(joint));
+    this.#list.replaceChildren(...this.#rows.map(({ row }) => row));
+  }
+
+  /** Where the target is; a field that is being typed in is left alone. */
+  show(target) {
+    for (const { joint, slider, number } of this.#rows) {
+      const value = target[joint.index];
+      if (document.activeElement !== slider || slider.valueAsNumber !== value) slider.value = value;
+      if (document.activeElement !== number) number.value = value.toFixed(3);
+    }
+  }
+
+  /** Where the robot is: a mark on each track. */
+  now(measured) {
+    for (const { joint, row } of this.#rows) {
+      const at = (measured[joint.index] - joint.lower) / (joint.upper - joint.lower);
+      row.style.setProperty("--now", Math.min(1, Math.max(0, at)).toFixed(4));
+    }
+  }
+
+  /** Go to the next slider, or with -1 to the one before, from the one that has the focus. */
+  focus(by) {
+    const at = this.#rows.findIndex(({ slider }) => slider === document.activeElement);
+    const count = this.#rows.length;
+    this.#rows[at < 0 ? (by > 0 ? 0 : count - 1) : (at + by + count) % count]?.slider.focus();
+  }
+
+  #row(joint) {
+    const row = this.#template.cloneNode(true).firstElementChild;
+    const [label, slider, number] = [row.querySelector("label"), ...row.querySelectorAll("input")];
+    const step = stepOf(joint);
+    Object.assign(slider, { id: `joint-${joint.index}`, min: joint.lower, max: joint.upper, step: "any" });
+    Object.assign(number, { step, min: joint.lower, max: joint.upper });
+    label.htmlFor = slider.id;
+    label.textContent = joint.gripper ? "gripper" : joint.name;
+    row.title = `${joint.full}: ${joint.lower} to ${joint.upper}`;
+    slider.setAttribute("aria-label", joint.full);
+    number.setAttribute("aria-label", `${joint.full}, as a number`);
+    slider.addEventListener("input", () => this.#set(joint, slider.valueAsNumber, number));
+    slider.addEventListener("keydown", (event) => this.#arrow(event, joint, slider, number));
+    number.addEventListener("input", () => this.#type(joint, number.valueAsNumber, slider));
+    number.addEventListener("change", () => this.#set(joint, number.valueAsNumber, number, slider));
+    return { joint, slider, number, row };
+  }
+
+  #set(joint, given, number, slider = null) {
+    if (!Number.isFinite(given)) return;
+    const { value, said } = within(joint, given);
+    number.value = value.toFixed(3);
+    if (slider) slider.value = value;
+    this.#typed(joint.index, value, said);
+  }
+
+  /** What is being typed counts at once, and is put in order when the field is left. */
+  #type(joint, given, slider) {
+    if (!Number.isFinite(given)) return;
+    const { value, said } = within(joint, given);
+    slider.value = value;
+    this.#typed(joint.index, value, said);
+  }
+
+  /** Arrows go by one step, with Shift by ten: a slider's own steps would be too coarse, or not round. */
+  #arrow(event, joint, slider, number) {
+    const sign = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[event.key];
+    if (!sign || event.ctrlKey || event.altKey || event.metaKey) return;
+    event.preventDefault();
+    this.#set(joint, slider.valueAsNumber + sign * stepOf(joint) * (event.shiftKey ? 10 : 1), number, slider);
+  }
+}

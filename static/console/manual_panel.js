@@ -1,0 +1,203 @@
+// Moving by hand: a target made with sliders, numbers, named poses and steps of the hand, shown as a ghost, and sent.
+
+import { JointRows } from "./joint_rows.js";
+import { groups, handAt, jog, start, verdict } from "./targets.js";
+
+export class ManualPanel {
+  #store;
+  #commands;
+  #aim;
+  #groups = [];
+  #group = 0;
+  #target = null; // [D] where the robot would be sent
+  #pose = ""; // the named pose that the target is, as long as nobody changes it
+  #edited = false; // else the target follows the robot
+  #rows;
+  #steps = Promise.resolve(); // steps of the hand, one after the other
+  #poses = document.getElementById("pose");
+  #speed = document.getElementById("speed");
+
+  constructor(store, commands, aim) {
+    this.#store = store;
+    this.#commands = commands;
+    this.#aim = aim;
+    this.#rows = new JointRows((index, value, said) => this.#typed(index, value, said));
+    document.getElementById("panel-manual").addEventListener("click", (event) => this.#clicked(event));
+    document.getElementById("jog-settings").addEventListener("submit", (event) => event.preventDefault());
+    this.#poses.addEventListener("change", () => this.#toPose());
+    this.#speed.addEventListener("change", () => this.#look());
+    commands.provide("move", () => this.#move());
+    store.on("snapshot", (snapshot) => this.#follow(snapshot));
+    store.on("joints", () => this.#fromRobot());
+    document.addEventListener("eva:panel", () => this.#look());
+    this.how("joints");
+  }
+
+  /** Move by "joints" or by steps of the "hand". */
+  how(name) {
+    for (const button of document.querySelectorAll("[data-how]")) button.setAttribute("aria-pressed", String(button.dataset.how === name));
+    for (const panel of document.querySelectorAll("[data-how-panel]")) panel.hidden = panel.dataset.howPanel !== name;
+  }
+
+  #clicked(event) {
+    const { how, group, jog: step, target } = event.target.closest("button")?.dataset ?? {};
+    if (how) this.how(how);
+    else if (group) this.#choose(Number(group));
+    else if (step) this.#jog(step[0], step[1] === "+" ? 1 : -1, "turn" in event.target.closest("button").dataset);
+    else if (target === "robot") this.reset();
+    else if (target === "next" || target === "previous") this.#rows.focus(target === "next" ? 1 : -1);
+  }
+
+  #move() {
+    const speed = Number(this.#speed.value);
+    return this.#pose ? { pose: this.#pose, speed } : { joints: this.#target, speed };
+  }
+
+  /** The target is where the robot is, and goes with it. */
+  reset() {
+    this.#edited = false;
+    this.#pose = "";
+    this.#poses.selectedIndex = 0;
+    this.#aim.clear();
+    this.#fromRobot();
+    this.#say("The target is where the robot is.");
+  }
+
+  #follow({ facts, state, mode, run }) {
+    if (facts?.joint_names && !this.#groups.length) this.#build(facts);
+    const elsewhere = state === "setting_up" || state === "faulted" || (run?.number && mode !== "manual");
+    if (elsewhere && this.#edited) this.reset(); // what was meant for another moment is not sent by accident
+    const send = document.querySelector('[data-command="move"]');
+    send.dataset.blocked = this.#edited ? "" : "the target is where the robot is: move a slider, take a step, or choose a pose";
+  }
+
+  #build(facts) {
+    this.#groups = groups(facts);
+    const poses = (facts.poses ?? []).map((name) => new Option(name));
+    const none = new Option(poses.length ? "choose" : "none named", "");
+    none.disabled = true;
+    this.#poses.replaceChildren(none, ...poses);
+    this.#poses.disabled = !poses.length;
+    this.#poses.selectedIndex = 0;
+    this.#choose(0);
+    this.#fromRobot();
+    this.#say("The target is where the robot is.");
+  }
+
+  #choose(group) {
+    this.#group = group;
+    const next = (group + 1) % this.#groups.length;
+    document.getElementById("groups").replaceChildren(...this.#groups.map(({ name }, index) => groupButton(name, index, group, next)));
+    this.#rows.build(this.#groups[group].joints);
+    const hand = this.#arm !== undefined;
+    document.querySelector('[data-target="no-hand"]').hidden = hand;
+    for (const button of document.querySelectorAll("[data-jog]")) button.setAttribute("aria-disabled", String(!hand));
+    this.#show();
+    if (this.#edited) this.#look();
+    else part("at").textContent = "";
+  }
+
+  get #arm() {
+    const { name } = this.#groups[this.#group];
+    return this.#store.snapshot.facts.arms.find((arm) => arm === name);
+  }
+
+  #fromRobot() {
+    const { joints } = this.#store;
+    if (!joints || !this.#groups.length) return;
+    this.#rows.now(joints.measured);
+    if (this.#edited) return;
+    this.#target = start(joints);
+    this.#show();
+  }
+
+  #show() {
+    if (this.#target) this.#rows.show(this.#target);
+  }
+
+  #typed(index, value, said) {
+    if (!this.#target) return;
+    this.#target[index] = value;
+    this.#changed();
+    this.#look(said);
+  }
+
+  #changed(pose = "") {
+    this.#edited = true;
+    this.#pose = pose;
+    if (!pose) this.#poses.selectedIndex = 0;
+    this.#follow(this.#store.snapshot);
+    this.#commands.gate();
+  }
+
+  /** Ask where the target is, and show it, as long as this panel is shown. */
+  #look(said = "") {
+    if (!this.#edited) return;
+    if (document.getElementById("panel-manual").hidden) this.#aim.clear();
+    else this.#aim.follow({ joints: this.#target }, (answer) => this.#heard(answer, said));
+  }
+
+  #heard(answer, said = "") {
+    const { text, weight } = verdict(answer, Number(this.#speed.value));
+    this.#say(`${text} ${said}`.trim(), said ? "warn" : weight);
+    part("at").textContent = handAt(answer.poses, this.#store.snapshot.facts.arms.indexOf(this.#arm));
+  }
+
+  async #toPose() {
+    const pose = this.#poses.value;
+    const answer = await this.#aim.ask({ pose });
+    if (answer.ok) this.#take(answer.joints, pose);
+    this.#heard(answer);
+  }
+
+  #jog(axis, sign, turned) {
+    const settings = document.getElementById("jog-settings").elements;
+    const [mm, degrees] = [Number(settings.mm.value), Number(settings.degrees.value)];
+    if (this.#arm === undefined || !this.#target) return;
+    const step = jog({ arm: this.#arm, frame: settings.frame.value, axis, sign, turned, mm, degrees });
+    this.#steps = this.#steps.then(() => this.#stepped(step));
+  }
+
+  /** A step that cannot be reached leaves the target where it was, and its ghost too. */
+  async #stepped(step) {
+    const answer = await this.#aim.ask({ joints: this.#target, jog: step });
+    const reached = answer.ok && answer.reached !== false;
+    if (reached) this.#take(answer.joints);
+    this.#heard(answer);
+    if (!reached && this.#edited) await this.#aim.ask({ joints: this.#target });
+    else if (!reached) this.#aim.clear();
+  }
+
+  #take(joints, pose = "") {
+    this.#target = [...joints];
+    this.#changed(pose);
+    this.#show();
+  }
+
+  #say(text, weight = "") {
+    const line = part("said");
+    line.textContent = text;
+    line.dataset.weight = weight;
+  }
+}
+
+function part(name) {
+  return document.querySelector(`[data-target="${name}"]`);
+}
+
+/** The key V stands on the group that it chooses. */
+function groupButton(name, index, chosen, next) {
+  const button = document.createElement("button");
+  Object.assign(button, { type: "button", className: "segment" });
+  button.dataset.group = index;
+  button.setAttribute("aria-pressed", String(index === chosen));
+  const text = document.createElement("span");
+  text.textContent = name.replaceAll("_", " ");
+  button.append(text);
+  if (index !== next || next === chosen) return button;
+  Object.assign(button.dataset, { key: "v", keyText: "Next arm" });
+  const cap = document.createElement("kbd");
+  cap.textContent = "V";
+  button.append(" ", cap);
+  return button;
+}

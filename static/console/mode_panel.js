@@ -1,0 +1,122 @@
+// The step "Run" of the Debug page: which mode, the one big button of the moment, what is going on.
+
+import { distance, labels, MODES, phase, primary, proposed, SEEN, shown } from "./modes.js";
+
+const SETTLE_MS = 600; // a button that took the place of another is not yet pressed by the hand that pressed that one
+const POLICY_MODES = ["sim", "step", "preview", "continuous"];
+
+export class ModePanel {
+  #store;
+  #commands;
+  #form = document.getElementById("mode");
+  #chosen = "";
+  #primary = "run";
+  #changed = -Infinity;
+  #picked;
+
+  /** `picked(mode)` hears what a person chose. */
+  constructor(store, commands, picked) {
+    this.#store = store;
+    this.#commands = commands;
+    this.#picked = picked;
+    this.#chosen = this.#form.elements.mode.value; // as a draft had it
+    this.#form.addEventListener("submit", (event) => event.preventDefault());
+    this.#form.addEventListener("change", (event) => this.#choose(event));
+    commands.provide("run", () => this.#runs());
+    store.on(["snapshot", "second"], () => this.draw());
+    this.draw();
+  }
+
+  /** The mode that is shown: of the open run, or of the next one. */
+  get mode() {
+    return this.#form.elements.mode.value;
+  }
+
+  #choose({ target }) {
+    if (target.name === "mode") {
+      this.#chosen = target.value;
+      this.#picked(target.value);
+    }
+    this.draw();
+  }
+
+  #runs() {
+    const mode = this.mode;
+    return mode === "sim" ? { mode, sim_state: this.#form.elements.sim_state.value } : { mode };
+  }
+
+  draw() {
+    const { snapshot } = this.#store;
+    const open = Boolean(snapshot?.run?.number);
+    const offered = snapshot?.facts?.modes;
+    const mode = shown({ open, mode: snapshot?.mode, offered }, this.#chosen);
+    this.#drawChoice(mode, open, offered);
+    this.#drawPrimary(snapshot ?? {}, mode);
+    write("line", MODES[mode] ?? "");
+    write("phase", snapshot && this.#store.fresh ? phase({ ...snapshot, rate: snapshot.facts?.rate }) : "");
+    this.#drawNote(snapshot, mode, open);
+    this.#drawFar(snapshot, mode, open);
+  }
+
+  #drawChoice(mode, open, offered) {
+    for (const radio of this.#form.elements.mode) {
+      radio.checked = radio.value === mode;
+      refuse(radio, open ? "the run is open: stop it first" : offered && !offered.includes(radio.value) ? "this station has no such mode" : "");
+    }
+    part("seen").hidden = mode !== "sim";
+    for (const radio of this.#form.elements.sim_state) {
+      if (open && mode === "sim") radio.checked = radio.value === this.#store.snapshot.sim_state;
+      refuse(radio, open ? "the run is open: stop it first" : "");
+    }
+  }
+
+  #drawPrimary(snapshot, mode) {
+    const now = primary({ ...snapshot, mode: snapshot.mode ?? mode });
+    if (now !== this.#primary) {
+      this.#primary = now;
+      this.#changed = performance.now();
+      setTimeout(() => this.draw(), SETTLE_MS + 20);
+    }
+    const settling = performance.now() - this.#changed < SETTLE_MS;
+    for (const button of document.querySelectorAll("[data-primary]")) {
+      button.hidden = button.dataset.primary !== now;
+      button.toggleAttribute("data-settling", settling);
+    }
+    for (const [name, text] of Object.entries(labels(snapshot.mode || mode))) write(name, text);
+    this.#commands.gate();
+  }
+
+  #drawNote(snapshot, mode, open) {
+    const running = open && this.#store.fresh;
+    let text = "";
+    if (running && mode === "sim") text = `Simulated: the real robot holds still. ${SEEN[snapshot.sim_state] ?? ""}`;
+    else if (running && mode === "preview") text = proposed(snapshot.proposal);
+    write("note", text);
+    part("note").hidden = !text;
+    part("note").dataset.kind = mode;
+  }
+
+  /** A first action far from the present pose: a warning, and a choice. */
+  #drawFar(snapshot, mode, open) {
+    const proposal = open && mode === "preview" ? snapshot.proposal : null;
+    const before = !open && snapshot?.state === "ready" && POLICY_MODES.includes(mode) && mode !== "sim" ? snapshot.first_action : null;
+    const far = [proposal, before].find((one) => one?.far);
+    part("far").hidden = !far;
+    if (far) write("far-text", proposal ? `This chunk begins ${distance(far)}.` : `The policy's first action is ${distance(far)}: approach it slowly first, or run from here.`);
+  }
+}
+
+function part(name) {
+  return document.querySelector(`[data-mode="${name}"]`);
+}
+
+function write(name, text) {
+  const element = part(name);
+  if (element.textContent !== text) element.textContent = text;
+}
+
+function refuse(radio, reason) {
+  radio.disabled = Boolean(reason);
+  const label = radio.closest("label");
+  if (label.title !== reason) label.title = reason;
+}

@@ -1,0 +1,73 @@
+// The modes of a run in words: what each does, what can be pressed in it next, what it is doing just now.
+
+import { words } from "./words.js";
+
+/** In the order of the keys that choose them. */
+export const MODES = {
+  sim: "The policy drives a simulated robot in 3D. The real one is sent nothing of it.",
+  step: "Each press asks the policy once and moves the robot by one chunk.",
+  preview: "Each press shows a chunk as a ghost. Commit moves the robot, Cancel forgets it.",
+  continuous: "The policy drives the robot until Stop.",
+  manual: "You move the robot. The policy is not asked.",
+};
+
+/** What the policy sees in the mode sim, to be said while it runs. */
+export const SEEN = {
+  simulated: "The policy sees the simulated robot's joints and the live cameras.",
+  live: "The policy sees the real robot's joints, which do not follow it, and the live cameras.",
+};
+
+/** The command of the one big button at this moment, "" where none is wanted; `key` of its label in LABELS. */
+export function primary({ state, mode, proposal }) {
+  if (state === "holding") return "resume";
+  if (state !== "running") return "run";
+  if (mode === "step") return "step";
+  if (mode === "preview") return proposal?.chunk ? "commit" : "step";
+  return mode === "manual" ? "move" : "run";
+}
+
+/** Names of buttons that mean something else in each mode. */
+export function labels(mode) {
+  return {
+    step: mode === "preview" ? "Show next" : "Next chunk",
+    cancel: mode === "manual" ? "Hold here" : "Cancel",
+  };
+}
+
+const PHASES = {
+  asking: "asking the policy",
+  waiting: "waiting for you",
+  proposed: "a chunk is shown",
+  moving: "moving",
+  approaching: "going to the policy's first action",
+  starved: "nothing planned: slowing down",
+};
+
+/** What the run is doing, in words; "" where nothing is open. */
+export function phase({ state, phase: now, control, rate }) {
+  if (!now || !["running", "setting_up", "holding"].includes(state)) return "";
+  if (now !== "executing") return PHASES[now] ?? words(now);
+  const left = control?.remaining ?? 0;
+  return left > 0 && rate ? `executing, ${(left / rate).toFixed(1)} s planned` : "executing";
+}
+
+/** How far a chunk's first row, or the policy's first action, is from where the robot is commanded. */
+export function distance({ distance: far, joint }) {
+  if (!Number.isFinite(far)) return "";
+  return `${far.toFixed(2)} rad away${joint ? ` (${joint})` : ""}`;
+}
+
+/** The chunk that is shown, in a sentence. */
+export function proposed(proposal) {
+  if (!proposal?.chunk) return "";
+  const from = distance(proposal);
+  const age = Number.isFinite(proposal.age_s) ? `, shown for ${proposal.age_s.toFixed(0)} s` : "";
+  return `Chunk ${proposal.chunk}: ${proposal.rows} steps${from && `, begins ${from}`}${age}.`;
+}
+
+/** The mode to begin with: the one of the run that is open, what was chosen, what the station does by itself. */
+export function shown({ open, mode, offered }, chosen) {
+  if (open && mode) return mode;
+  const wanted = [chosen, mode, "continuous"].find((one) => one && (!offered?.length || offered.includes(one)));
+  return wanted ?? offered[0];
+}

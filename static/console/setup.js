@@ -1,0 +1,55 @@
+// The set-up: its stages while it goes on, and which one failed.
+
+import { duration, words } from "./words.js";
+
+const MARKS = { done: "✓", active: "▸", waiting: "·", failed: "✕", skipped: "–" };
+
+/** Whether the stages are to be shown: while they go on, and after one failed until the next try. */
+export function unfinished({ state, stages = [] }) {
+  return state === "setting_up" || (state === "idle" && stages.some((stage) => stage.state === "failed"));
+}
+
+/** Seconds of a stage in words; nothing for one that has not begun. */
+export function spent({ state, seconds }) {
+  if (!Number.isFinite(seconds) || state === "waiting" || state === "skipped") return "";
+  return seconds < 60 ? `${seconds.toFixed(1)} s` : duration(seconds);
+}
+
+/** Keeps lists with data-stages and the buttons beside them true. */
+export function setUp(store) {
+  const draw = () => {
+    const { snapshot } = store;
+    if (!snapshot) return;
+    const stages = unfinished(snapshot) ? (snapshot.stages ?? []) : [];
+    for (const list of document.querySelectorAll("[data-stages]")) {
+      list.hidden = !stages.length;
+      fill(list, stages);
+    }
+    const failed = stages.some((stage) => stage.state === "failed");
+    for (const name of document.querySelectorAll("[data-set-up-name]")) name.textContent = failed ? "Try again" : "Set up";
+    for (const button of document.querySelectorAll("[data-hidden-state]")) button.hidden = snapshot.state === button.dataset.hiddenState;
+  };
+  store.on("snapshot", draw);
+  document.body.addEventListener("htmx:afterSettle", draw);
+}
+
+function fill(list, stages) {
+  while (list.children.length > stages.length) list.lastElementChild.remove();
+  while (list.children.length < stages.length) list.append(row());
+  stages.forEach((stage, index) => {
+    const item = list.children[index];
+    item.dataset.state = stage.state;
+    const texts = [MARKS[stage.state] ?? "·", words(stage.name), stage.state === "skipped" ? "skipped" : spent(stage)];
+    texts.forEach((text, place) => {
+      const cell = item.children[place];
+      if (cell.textContent !== text) cell.textContent = text;
+    });
+  });
+}
+
+function row() {
+  const item = document.createElement("li");
+  item.className = "stage-row";
+  item.append(...["stage-mark", "stage-name", "stage-time"].map((name) => Object.assign(document.createElement("span"), { className: name })));
+  return item;
+}

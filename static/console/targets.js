@@ -1,0 +1,60 @@
+// Where a person wants the robot to go: joints by group, within their limits, and what the station said of it.
+
+const ENDLESS = 2 * Math.PI; // a joint without a limit is offered one turn each way
+
+/** Joints of `facts` in groups, in order: [{name, joints: [{index, name, lower, upper, gripper}]}]. */
+export function groups({ joint_names: names = [], lower = [], upper = [], gripper_dims: grippers = [] }) {
+  const found = new Map();
+  names.forEach((full, index) => {
+    const dot = full.indexOf(".");
+    const group = dot < 0 ? "joints" : full.slice(0, dot);
+    if (!found.has(group)) found.set(group, []);
+    const joint = { index, name: full.slice(dot + 1), full, gripper: grippers.includes(index) };
+    found.get(group).push({ ...joint, lower: lower[index] ?? -ENDLESS, upper: upper[index] ?? ENDLESS });
+  });
+  return [...found].map(([name, joints]) => ({ name, joints }));
+}
+
+/** The step of a joint's field: a five-hundredth of its range, as a round decimal. */
+export function stepOf({ lower, upper }) {
+  return 10 ** Math.round(Math.log10((upper - lower) / 500));
+}
+
+/** A value within the joint's limits: {value, said}, where `said` tells what was clipped. */
+export function within({ lower, upper, full }, value) {
+  const clipped = Math.min(upper, Math.max(lower, value));
+  if (clipped === value) return { value, said: "" };
+  return { value: clipped, said: `${full} ends at ${clipped.toFixed(3)}` };
+}
+
+/** Where the robot is, or is told to be: the target to begin with; null where nothing is known. */
+export function start({ measured, commanded, engaged } = {}) {
+  const from = engaged && commanded ? commanded : measured;
+  return from ? [...from] : null;
+}
+
+const VERY_NEAR_M = 0.001;
+
+/** What the station said of a target, in a sentence with its weight: {text, weight}. */
+export function verdict({ ok, reason, distance, duration_s: seconds, reached, clipped = [], position_error_mm: mm, rotation_error_deg: deg }, speed) {
+  if (!ok) return { text: reason || "the station did not say where that is", weight: "warn" };
+  if (reached === false) return { text: `Out of reach: the nearest is ${mm.toFixed(0)} mm and ${deg.toFixed(1)}° off.`, weight: "warn" };
+  const limited = clipped.length ? ` Limited: ${clipped.join(", ")}.` : "";
+  if (distance < VERY_NEAR_M) return { text: `The robot is there.${limited}`, weight: limited ? "warn" : "" };
+  return { text: `${distance.toFixed(2)} rad from the robot, ${(seconds / speed).toFixed(1)} s.${limited}`, weight: limited ? "warn" : "" };
+}
+
+/** Position [mm] of the hand of arm number `index` in the poses of an answer, in words; "" where there is none. */
+export function handAt(poses, index) {
+  const at = poses?.slice(8 * index, 8 * index + 3) ?? [];
+  if (at.length < 3) return "";
+  return ["x", "y", "z"].map((axis, place) => `${axis} ${(1000 * at[place]).toFixed(0)}`).join("  ") + " mm";
+}
+
+/** The arguments of a jog: `axis` x, y, z with `sign`, by `mm`, or turned by `degrees` where `turned`. */
+export function jog({ arm, frame, axis, sign, turned, mm, degrees }) {
+  const along = ["x", "y", "z"].map((one) => (one === axis ? sign : 0));
+  const part = turned ? "rotation" : "translation";
+  const size = turned ? (degrees * Math.PI) / 180 : mm / 1000;
+  return { arm, frame, [part]: along.map((one) => one * size) };
+}
