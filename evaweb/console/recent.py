@@ -15,19 +15,14 @@ from evaweb.console.parts import Part
 
 SAMPLES = 12  # at the 30 a second that the runtime publishes: no gap down to three frames a second
 _CURVES = ("measured", "raw", "planned", "executed")
-_COLUMNS = {
-    "step": -1,
-    "chunk": -1,
-    "chunks": 0,
-    "limited": False,
-}  # beside the curves, and what absence means
+_SAID = {"step": -1, "chunk": -1, "chunks": 0, "limited": False}  # and what their absence means
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sample:
     time: float
     curves: tuple[NDArray[np.float32], ...]
-    columns: tuple[Any, ...]
+    columns: Mapping[str, Any]
 
 
 class Recent:
@@ -36,7 +31,8 @@ class Recent:
     Arrays float32 [K, D]: `measured`; `raw`, what the newest chunk wants; `planned`, what was made of all
     chunks; `executed`, what was sent to the robot, or in simulation to the simulated one. NaN where there is
     none. Beside them per sample: `step`, the leading `chunk` (-1: none, 0: the held target), how many `chunks`
-    made the step, whether safety `limited` it. The samples of one part overlap with those of the part before.
+    made the step, whether safety `limited` it, whether the robot that executed was `simulated`. The samples of
+    one part overlap with those of the part before.
     """
 
     def __init__(self) -> None:
@@ -46,22 +42,25 @@ class Recent:
         self, vectors: Mapping[str, NDArray[Any]], words: Mapping[str, Any], now: float
     ) -> Part:
         """The stream after the sample of this moment."""
-        curves = tuple(_curve(name, vectors, words) for name in _CURVES)
-        if self._samples and self._samples[-1].curves[0].shape != curves[0].shape:
+        sample = _sample(vectors, words, now)
+        if self._samples and self._samples[-1].curves[0].shape != sample.curves[0].shape:
             self._samples.clear()  # another robot
-        self._samples.append(
-            _Sample(now, curves, tuple(words.get(key, absent) for key, absent in _COLUMNS.items()))
-        )
-        columns = {key: [sample.columns[i] for sample in self._samples] for i, key in enumerate(_COLUMNS)}
-        arrays = {name: np.stack([s.curves[i] for s in self._samples]) for i, name in enumerate(_CURVES)}
-        return parts.numbers("recent", {"t": [s.time for s in self._samples], **columns}, arrays, now)
+        self._samples.append(sample)
+        columns = {key: [one.columns[key] for one in self._samples] for key in sample.columns}
+        arrays = {name: np.stack([one.curves[i] for one in self._samples]) for i, name in enumerate(_CURVES)}
+        return parts.numbers("recent", {"t": [one.time for one in self._samples], **columns}, arrays, now)
 
 
-def _curve(name: str, vectors: Mapping[str, NDArray[Any]], words: Mapping[str, Any]) -> NDArray[np.float32]:
+def _sample(vectors: Mapping[str, NDArray[Any]], words: Mapping[str, Any], now: float) -> _Sample:
     nothing = np.full_like(vectors["measured"], np.nan)
-    if name != "executed":
-        return vectors.get(name, nothing)
     simulated = vectors.get("simulated", nothing)
-    if np.isfinite(simulated).all():
-        return simulated
-    return vectors["commanded"] if words.get("engaged") else nothing
+    in_simulation = bool(np.isfinite(simulated).all())
+    sent = vectors["commanded"] if words.get("engaged") else nothing
+    curves = (
+        vectors["measured"],
+        vectors.get("raw", nothing),
+        vectors.get("planned", nothing),
+        simulated if in_simulation else sent,
+    )
+    said = {key: words.get(key, absent) for key, absent in _SAID.items()}
+    return _Sample(now, curves, {**said, "simulated": in_simulation})

@@ -3,11 +3,14 @@
 import { config } from "./config.js";
 import { Legend } from "./curve_legend.js";
 import { Curves } from "./curves.js";
+import { MarkLegend } from "./mark_legend.js";
+import { Tags } from "./tags.js";
+import { duration } from "./words.js";
 
 const KEY = `eva-joint-${config.station}`;
 
-/** The pane of the curves; resolves to {add(t, vectors), joints(names)}. */
-export async function curvePane() {
+/** The pane of the curves; resolves to {add(samples), joints(names)}. */
+export async function curvePane(store) {
   const note = document.getElementById("curves-note");
   let library;
   try {
@@ -17,16 +20,23 @@ export async function curvePane() {
     note.textContent = "Curves are drawn by uPlot, which is not installed: run make setup and start the lab again.";
     return { add() {}, joints() {} };
   }
-  const legend = new Legend(document.getElementById("curves-legend"), (name, shown) => curves.reveal(name, shown));
-  const curves = new Curves({ element: document.getElementById("curves"), library, legend, names: config.joints });
+  const place = document.getElementById("curves-legend");
+  const legend = new Legend(place, (name, shown) => curves.reveal(name, shown));
+  const markLegend = new MarkLegend(place);
+  const curves = new Curves({ element: document.getElementById("curves"), library, legend, markLegend, names: config.joints });
   const select = joints(curves, config.joints);
   document.getElementById("joint-next").addEventListener("click", () => {
     select.selectedIndex = (select.selectedIndex + 1) % Math.max(1, select.options.length);
     select.dispatchEvent(new Event("change"));
   });
   pauseButton(curves);
+  const tags = new Tags(document.querySelector(".curves-pane"), "curves-tags");
+  store.on("second", () => {
+    tags.show("paused", curves.paused && `paused ${duration(curves.pausedFor)} ago; the data goes on`);
+    tags.show("simulated", curves.simulated && "executed: the simulated robot's");
+  });
   return {
-    add: (t, vectors) => curves.add(t, vectors),
+    add: (samples) => curves.add(samples),
     joints: (names) => {
       curves.joints(names);
       if (names.join() !== [...select.options].map((option) => option.text).join()) joints(curves, names);

@@ -1,6 +1,8 @@
 // Curves of one joint over the last seconds: where it is, what the policy wants, what was planned, what was sent.
 
-import { KINDS, axes, blank, series, spread } from "./curve_kinds.js";
+import { KINDS, axes, series, spread } from "./curve_kinds.js";
+import { marks, sampleAt } from "./curve_marks.js";
+import { Paint } from "./curve_paint.js";
 import { keep } from "./decimate.js";
 import { Trace } from "./trace.js";
 
@@ -8,22 +10,30 @@ const SECONDS = 20;
 const ROWS = 60 * (SECONDS + 2);
 const GAP_S = 0.5; // without news for so long: a gap, not a line
 const DRAW_MS = 100;
+const NO_MARKS = { seams: [], bands: [], limits: [] };
 
 export class Curves {
   #element;
   #plot = null;
-  #library = null;
+  #paint = null;
+  #library;
   #legend;
+  #markLegend;
   #trace = null;
   #names = [];
   #joint = 0;
-  #frozen = null;
+  #frozen = null; // the trace as it was when it was paused
+  #frozenAt = 0; // on this page's clock [ms]
+  #marks = NO_MARKS;
+  #columns = null; // of the samples that are drawn, with their times
+  #data = [[], ...KINDS.map(() => [])]; // as uPlot has them
   #addedAt = 0; // on this page's clock [ms]
 
-  constructor({ element, library, legend, names }) {
+  constructor({ element, library, legend, markLegend, names }) {
     this.#element = element;
     this.#library = library;
     this.#legend = legend;
+    this.#markLegend = markLegend;
     this.joints(names);
     new ResizeObserver(() => this.#fit()).observe(element);
     document.addEventListener("eva:theme", () => this.#build());
@@ -35,22 +45,33 @@ export class Curves {
   joints(names) {
     if (names.join() === this.#names.join()) return;
     this.#names = names;
+    this.#frozen = null;
     this.#trace = new Trace({ dim: names.length, kinds: KINDS.map((kind) => kind.name), rows: ROWS });
   }
 
-  /** One row of vectors by the kinds' names at `t` [s]; NaN, or a kind that is not there: a gap. */
-  add(t, vectors) {
-    if (!this.#trace) return;
-    if (t < this.#trace.newest - 1) this.#trace.clear(); // another server, another clock
-    if (t - this.#trace.newest > GAP_S) this.#trace.add(t - 1e-3, {});
-    this.#trace.add(t, vectors);
-    this.#addedAt = performance.now();
+  /**
+   * Samples, some of which are known already: {t [s], chunk, chunks, limited, simulated, curves}, columns of one
+   * length and in `curves` by their kinds' names [K * D] numbers; NaN: a gap.
+   */
+  add({ t, curves, ...columns }) {
+    const dim = this.#names.length;
+    if (!dim || Object.values(curves).some((numbers) => numbers.length !== t.length * dim)) return;
+    if (t.at(-1) < this.#trace.newest - 1) this.#trace.clear(); // another server, another clock
+    const sample = {};
+    const vectors = {};
+    for (let at = 0; at < t.length; at += 1) {
+      if (t[at] <= this.#trace.newest) continue;
+      if (t[at] - this.#trace.newest > GAP_S) this.#trace.add(t[at] - 1e-3, {});
+      for (const name in columns) sample[name] = Number(columns[name][at]);
+      for (const kind in curves) vectors[kind] = curves[kind].subarray(at * dim, (at + 1) * dim);
+      this.#trace.add(t[at], vectors, sample);
+      this.#addedAt = performance.now();
+    }
   }
 
   /** Draw that joint. */
   show(joint) {
     this.#joint = joint;
-    this.#frozen &&= this.#column();
     this.#draw(true);
   }
 
@@ -63,42 +84,69 @@ export class Curves {
     return this.#frozen !== null;
   }
 
-  /** Stand still to be looked at, while the data goes on. */
+  /** Stand still to be looked at, joint by joint, while the data goes on. */
   pause(paused) {
-    this.#frozen = paused ? this.#column() : null;
+    this.#frozen = paused ? this.#trace.copy() : null;
+    this.#frozenAt = performance.now();
     this.#draw(true);
+  }
+
+  /** How long it has been standing still [s]. */
+  get pausedFor() {
+    return (performance.now() - this.#frozenAt) / 1000;
+  }
+
+  /** Whether something that is drawn was executed by a simulated robot. */
+  get simulated() {
+    return this.#columns?.simulated.includes(1) ?? false;
   }
 
   /** Seconds since something came, where that is worth showing. */
   get #silence() {
     const seconds = (performance.now() - this.#addedAt) / 1000;
-    return seconds > GAP_S ? seconds : 0;
-  }
-
-  #column() {
-    const newest = this.#trace.newest + this.#silence; // without news the curve moves on and nothing follows it
-    const { times, values } = this.#trace.joint(this.#joint, newest - SECONDS);
-    return { times: times.map((t) => t - newest), values };
+    return seconds > GAP_S && !this.#frozen ? seconds : 0;
   }
 
   #draw(always = false) {
-    if (!this.#plot || !this.#trace || document.hidden || (this.#frozen && !always)) return;
-    if (!Number.isFinite(this.#trace.newest)) return;
-    const { times, values } = this.#frozen ?? this.#column();
-    const columns = KINDS.map((kind) => values[kind.name]);
-    const kept = keep(columns, 2 * this.#plot.width);
-    this.#plot.setData([kept.map((at) => times[at]), ...columns.map((column) => blank(kept.map((at) => column[at])))]);
+    const trace = this.#frozen ?? this.#trace;
+    if (!this.#plot || !trace || document.hidden || (this.#frozen && !always)) return;
+    if (!Number.isFinite(trace.newest)) return;
+    const now = trace.newest + this.#silence; // without news the curve moves on and nothing follows it
+    const { times, values, columns } = trace.joint(this.#joint, now - SECONDS, now);
+    this.#marks = marks(times, columns);
+    this.#columns = { times, ...columns };
+    this.#fill(times, KINDS.map((kind) => values[kind.name]));
+    this.#plot.setData(this.#data);
     this.#tell();
+  }
+
+  /** What is drawn of these columns, NaN as uPlot has it. */
+  #fill(times, columns) {
+    const kept = keep(columns, 2 * this.#plot.width);
+    this.#data.forEach((numbers, index) => {
+      const column = index ? columns[index - 1] : times;
+      numbers.length = kept.length;
+      for (let at = 0; at < kept.length; at += 1) numbers[at] = Number.isNaN(column[kept[at]]) ? null : column[kept[at]];
+    });
   }
 
   /** The values under the cursor, else the newest ones; what is old has none. */
   #tell() {
     const at = this.#plot.cursor.idx;
-    const newest = this.#silence && !this.#frozen ? () => NaN : (column) => column.at(-1) ?? NaN;
+    const chosen = Number.isInteger(at);
+    const none = !chosen && this.#silence > 0;
     for (const [index, kind] of KINDS.entries()) {
-      const column = this.#plot.data[index + 1];
-      this.#legend.value(kind.name, Number.isInteger(at) ? (column[at] ?? NaN) : newest(column));
+      const column = this.#data[index + 1];
+      this.#legend.value(kind.name, none ? NaN : ((chosen ? column[at] : column.at(-1)) ?? NaN));
     }
+    this.#markLegend.show(none ? null : this.#sample(chosen ? this.#data[0][at] : 0));
+  }
+
+  #sample(time) {
+    if (!this.#columns || time === undefined) return null;
+    const { times, ...columns } = this.#columns;
+    const at = sampleAt(times, time + 1e-6);
+    return at < 0 ? null : Object.fromEntries(Object.entries(columns).map(([name, numbers]) => [name, numbers[at]]));
   }
 
   #fit() {
@@ -108,6 +156,7 @@ export class Curves {
 
   #build() {
     this.#plot?.destroy();
+    this.#paint = new Paint();
     const options = {
       width: this.#element.clientWidth || 600,
       height: this.#element.clientHeight || 160,
@@ -116,7 +165,11 @@ export class Curves {
       scales: { x: { time: false, range: [-SECONDS, 0] }, y: { range: (plot, low, high) => spread(low, high) } },
       axes: axes(),
       series: series(KINDS, (name) => this.#legend.shown(name)),
-      hooks: { setCursor: [(plot) => plot === this.#plot && this.#tell()] },
+      hooks: {
+        setCursor: [(plot) => plot === this.#plot && this.#tell()],
+        drawAxes: [(plot) => this.#paint.behind(plot, this.#marks)],
+        draw: [(plot) => this.#paint.over(plot, this.#marks)],
+      },
     };
     this.#plot = new this.#library(options, [[], ...KINDS.map(() => [])], this.#element);
     this.#draw(true);

@@ -1,8 +1,8 @@
 // Events in words: the runtime's kinds and sentences as a person reads them, and how much they weigh.
 
-const BAD = new Set(["estopped", "family_died", "policy_failed", "recording_failed", "source_failed", "displaced"]);
-const WARN = new Set(["refused", "word_refused", "refusals", "starved", "chunk_dropped", "ik_unreached", "not_journalled", "unmeasured"]);
-const NAMES = { estopped: "e-stop", family_died: "process ended", ik_unreached: "out of reach", truth: "bench says" };
+const BAD = new Set(["estopped", "family_died", "policy_failed", "policy_lost", "recording_failed", "source_failed", "displaced"]);
+const WARN = new Set(["refused", "word_refused", "refusals", "starved", "starvation", "limited", "far_start", "chunk_dropped", "ik_unreached", "not_journalled", "unmeasured"]);
+const NAMES = { estopped: "e-stop", family_died: "process ended", ik_unreached: "out of reach", truth: "bench says", limited: "safety", limited_sum: "safety" };
 const HOLDER = /\bweb:([^\s:]+):([A-Za-z0-9_-]{1,4})[A-Za-z0-9_-]*/g; // a page of a person
 
 /** The kind in words. */

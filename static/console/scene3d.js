@@ -1,37 +1,35 @@
 // The robot in 3D by the viewer script of meshcat: shapes once, then one matrix per part and frame.
 
-import { Path } from "./scene_path.js";
-import { block, ghostPaint, plate, robotParts, table, three } from "./scene_shapes.js";
+import { ChunkDots } from "./scene_chunk.js";
+import { Ghosts } from "./scene_ghosts.js";
+import { Preview } from "./scene_preview.js";
+import { rendererIn } from "./scene_renderer.js";
+import { block, css, place, plate, robotParts, SIZE, table, three } from "./scene_shapes.js";
+import { Tips } from "./scene_tips.js";
 import { Views } from "./scene_views.js";
-
-const SIZE = 16; // numbers of a matrix
-const PATH_COLOURS = ["#4fa3ff", "#f7a04b", "#46d17f", "#c79bff"];
-
-function css(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-}
 
 /** `element` is filled by it; throws where the browser has no WebGL. */
 export class Scene3D {
   #viewer;
   #views;
-  #parts = [];
-  #ghosts = [];
-  #paths = [];
-  #frames = [];
+  #parts;
+  #ghosts;
+  #tips;
+  #dots = new ChunkDots();
+  #preview = new Preview();
   #blocks = [];
   #plate = null;
   #geometry;
-  #shown = { ghost: false, frames: false, path: true };
+  #shown = { ghost: false, frames: false, path: true, chunk: true };
+  #simulated = false;
   #framed = false;
 
   constructor(element, geometry) {
     if (!window.MeshCat) throw new Error("the viewer script did not load");
-    const renderer = drawing(element);
-    this.software = drawnBySoftware(renderer);
+    const { renderer, software } = rendererIn(element);
+    this.software = software;
     this.#viewer = new window.MeshCat.Viewer(element, undefined, renderer);
     this.#viewer.gui.domElement.remove();
-    renderer.setPixelRatio(this.software ? 1 : Math.min(window.devicePixelRatio, 1.5));
     this.#fitTo(element);
     this.#views = new Views(this.#viewer);
     this.#geometry = geometry;
@@ -41,14 +39,15 @@ export class Scene3D {
     if (geometry.home) this.setPoses(Float32Array.from(geometry.home.flat()), 1);
   }
 
-  /** Where every part is: [count * P * 16]; the second of two is where it was told to be. */
+  /** Where every part is: [count * P * 16]; the second is where it was told to be, the third a simulated robot. */
   setPoses(numbers, count) {
     const size = this.#parts.length * SIZE;
     place(this.#parts, numbers, 0);
-    if (count > 1) place(this.#ghosts, numbers, size);
-    this.#show(this.#ghosts, this.#shown.ghost && count > 1);
+    this.#ghosts.pose("commanded", count > 1 ? numbers : null, size);
+    this.#ghosts.pose("simulated", count > 2 ? numbers : null, 2 * size);
+    this.#ghosts.pose("chunk", this.#preview.at(performance.now()));
     if (!this.#framed) this.#frame();
-    this.#tips();
+    this.#follow();
     this.#viewer.set_dirty();
   }
 
@@ -66,18 +65,44 @@ export class Scene3D {
     this.#viewer.set_dirty();
   }
 
-  /** "all", "front", "top", or "wrist", which goes on to the next arm each time. */
-  view(name) {
-    this.#views.show(name, this.#geometry.tips?.length ?? 0);
-    this.#tips();
+  /** A chunk's rows {state, targets, overlap, tips}, as dots; null: none. */
+  setChunk(chunk) {
+    this.#dots.show(this.#shown.chunk ? chunk : null);
+    this.#viewer.set_dirty();
   }
 
-  /** Show or hide "ghost", "frames" or "path"; returns whether it is shown now. */
+  /** A proposed chunk as a robot that goes through it: matrices [N * P * 16] at `rows`, `period` s apart; null: none. */
+  propose(rows, numbers, period) {
+    if (numbers) this.#preview.begin(rows, numbers, period);
+    else this.#preview.end();
+    this.#ghosts.pose("chunk", this.#preview.at(performance.now()));
+    this.#viewer.set_dirty();
+  }
+
+  /** Where the robot would go, [P * 16]; null: nowhere. */
+  aim(numbers) {
+    this.#ghosts.pose("aim", numbers);
+    this.#viewer.set_dirty();
+  }
+
+  /** Whether that ghost is drawn now: "commanded", "aim", "chunk" or "simulated". */
+  draws(ghost) {
+    return this.#ghosts.visible(ghost);
+  }
+
+  /** "all", "front", "top", or "wrist", which goes on to the next arm each time. */
+  view(name) {
+    this.#views.show(name, this.#tips.count);
+    this.#follow();
+  }
+
+  /** Show or hide "ghost" (the commanded pose), "frames", "path" or "chunk"; returns whether it is shown now. */
   toggle(what) {
     this.#shown[what] = !this.#shown[what];
-    this.#show(this.#paths.map((path) => path.object), this.#shown.path);
-    this.#show(this.#frames, this.#shown.frames);
-    if (what === "ghost") this.#show(this.#ghosts, this.#shown.ghost);
+    this.#tips.show(this.#shown.frames, this.#shown.path);
+    this.#ghosts.allow("commanded", this.#shown.ghost);
+    this.#ghosts.allow("chunk", this.#shown.chunk);
+    if (!this.#shown.chunk) this.#dots.show(null);
     this.#viewer.set_dirty();
     return this.#shown[what];
   }
@@ -85,10 +110,6 @@ export class Scene3D {
   #add(path, object) {
     this.#viewer.set_object(path.split("/"), object);
     return object;
-  }
-
-  #show(objects, visible) {
-    for (const object of objects) object.visible = visible;
   }
 
   /** The viewer measures the window; ours is a pane. */
@@ -118,33 +139,22 @@ export class Scene3D {
   }
 
   #robot(geometry) {
-    const THREE = three();
+    const add = (path, object) => this.#add(path, object);
     this.#parts = robotParts(geometry);
-    this.#ghosts = robotParts(geometry, ghostPaint);
-    this.#parts.forEach((part, index) => this.#add(`robot/${index}`, part));
-    this.#ghosts.forEach((part, index) => this.#add(`ghost/${index}`, part));
-    this.#show(this.#ghosts, false);
-    (geometry.tips ?? []).forEach((tip, index) => {
-      const axes = new THREE.AxesHelper(0.08);
-      axes.matrixAutoUpdate = false;
-      axes.visible = false;
-      this.#frames.push(this.#add(`frame/${index}`, axes));
-      const path = new Path(PATH_COLOURS[index % PATH_COLOURS.length], css("--scene"));
-      this.#paths.push(path);
-      this.#add(`path/${index}`, path.object);
-    });
+    this.#parts.forEach((part, index) => add(`robot/${index}`, part));
+    this.#ghosts = new Ghosts(geometry, add);
+    this.#ghosts.allow("commanded", false);
+    this.#tips = new Tips(geometry.tips ?? [], add);
+    this.#dots.objects.forEach((points, index) => add(`chunk/${index}`, points));
   }
 
-  /** What hangs on fingertips: their frames, their paths, the camera that follows one. */
-  #tips() {
-    (this.#geometry.tips ?? []).forEach((tip, index) => {
-      const axes = this.#frames[index];
-      axes.matrix.multiplyMatrices(this.#parts[tip.part].matrix, axes.matrix.clone().fromArray(tip.pose));
-      axes.matrixWorldNeedsUpdate = true;
-      const world = axes.matrix.elements;
-      this.#paths[index].add(world[12], world[13], world[14]);
-      if (this.#views.following === index) this.#views.follow(world);
-    });
+  /** The robot that acts: in a simulation the simulated one. */
+  #follow() {
+    const simulated = this.#ghosts.visible("simulated");
+    if (simulated !== this.#simulated) this.#tips.forget();
+    this.#simulated = simulated;
+    this.#tips.move(simulated ? this.#ghosts.parts("simulated") : this.#parts);
+    if (this.#views.following >= 0) this.#views.follow(this.#tips.world(this.#views.following));
   }
 
   /** Look at the whole robot, once it is known where it is. */
@@ -166,30 +176,4 @@ export class Scene3D {
     this.#framed = true;
     this.view("all");
   }
-}
-
-/** Edges are smoothed where a graphics card does it; in software that would cost more than all the rest. */
-function drawing(element) {
-  const THREE = three();
-  let renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
-  if (drawnBySoftware(renderer)) {
-    renderer.dispose();
-    renderer.forceContextLoss();
-    renderer = new THREE.WebGLRenderer({ antialias: false, alpha: true });
-  }
-  element.append(renderer.domElement);
-  return renderer;
-}
-
-function drawnBySoftware(renderer) {
-  const gl = renderer.getContext();
-  const names = gl.getExtension("WEBGL_debug_renderer_info");
-  return names !== null && /swiftshader|llvmpipe|software/i.test(gl.getParameter(names.UNMASKED_RENDERER_WEBGL));
-}
-
-function place(groups, numbers, from) {
-  groups.forEach((group, index) => {
-    group.matrix.fromArray(numbers, from + index * SIZE);
-    group.matrixWorldNeedsUpdate = true;
-  });
 }

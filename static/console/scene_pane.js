@@ -1,34 +1,66 @@
-// The pane of the 3D scene: its buttons, and a sentence in its place where it cannot be drawn.
+// The pane of the 3D scene: its buttons, what is drawn beside the robot, and a sentence where it cannot be drawn.
 
 import { get } from "../site/api.js";
+import { aimGhost } from "./aim_ghost.js";
 import { config } from "./config.js";
 import { Scene3D } from "./scene3d.js";
+import { GHOSTS } from "./scene_ghosts.js";
+import { ShownChunk } from "./shown_chunk.js";
+import { Tags } from "./tags.js";
 
-/** Resolves to {poses(numbers, count), bench(truth), software}; the first two do nothing where there is no scene. */
-export async function scenePane() {
+/** Resolves to {poses(numbers, count), bench(truth), chunk(chunk), software}; they do nothing where there is no scene. */
+export async function scenePane(store) {
   const note = document.getElementById("scene-note");
   try {
     const geometry = await get(config.geometry);
-    const scene = new Scene3D(document.getElementById("scene"), geometry);
+    const element = document.getElementById("scene");
+    const scene = new Scene3D(element, geometry);
     note.hidden = true;
-    buttons(scene);
+    aimGhost(scene);
+    const shown = new ShownChunk(scene, () => store.snapshot?.facts?.rate ?? store.facts.rate);
+    const tags = new Tags(element.parentElement, "scene-tags");
+    const name = () => nameGhosts(tags, scene, shown);
+    buttons(scene, shown, name);
+    store.on(["link", "open", "second"], () => {
+      shown.age(store.fresh);
+      name();
+    });
     return {
-      poses: (numbers, count) => scene.setPoses(numbers, count),
+      poses(numbers, count) {
+        scene.setPoses(numbers, count);
+        name();
+      },
       bench: (truth) => scene.setBench(truth),
+      chunk: (chunk) => shown.take(chunk),
       software: scene.software,
     };
   } catch (error) {
     note.textContent = `No 3D scene: ${error.message}. Everything else works without it.`;
     console.error(error);
-    return { poses() {}, bench() {}, software: false };
+    return { poses() {}, bench() {}, chunk() {}, software: false };
   }
 }
 
-function buttons(scene) {
+/** Say in the corner which robots are drawn beside the real one. */
+function nameGhosts(tags, scene, shown) {
+  const words = {
+    simulated: "simulated robot; the solid one is real and is sent nothing of it",
+    chunk: shown.proposal,
+    aim: "target; nothing moves before it is sent",
+    commanded: "commanded pose",
+  };
+  for (const [ghost, { colour }] of Object.entries(GHOSTS)) tags.show(ghost, scene.draws(ghost) && words[ghost], colour);
+}
+
+function buttons(scene, shown, name) {
   for (const button of document.querySelectorAll("[data-view]")) {
     button.addEventListener("click", () => scene.view(button.dataset.view));
   }
   for (const button of document.querySelectorAll("[data-toggle]")) {
-    button.addEventListener("click", () => button.setAttribute("aria-pressed", String(scene.toggle(button.dataset.toggle))));
+    button.addEventListener("click", () => {
+      button.setAttribute("aria-pressed", String(scene.toggle(button.dataset.toggle)));
+      shown.redraw();
+      name();
+    });
   }
 }

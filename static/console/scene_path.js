@@ -33,6 +33,11 @@ export class Path {
     this.#write();
   }
 
+  clear() {
+    this.#points = [];
+    this.object.geometry.setDrawRange(0, 0);
+  }
+
   #write() {
     const { position, color } = this.object.geometry.attributes;
     const count = this.#points.length;

@@ -4,8 +4,29 @@
 export const three = () => window.MeshCat.THREE;
 
 const QUARTER = Math.PI / 2;
+export const SIZE = 16; // numbers of a matrix
+const made = new Map(); // shapes, shared by the robot and its ghosts
+
+/** The value of a custom property where the page stands now. */
+export function css(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+}
+
+/** Put `groups` at matrices that begin at `from` in `numbers`. */
+export function place(groups, numbers, from) {
+  groups.forEach((group, index) => {
+    group.matrix.fromArray(numbers, from + index * SIZE);
+    group.matrixWorldNeedsUpdate = true;
+  });
+}
 
 function shape(kind, size) {
+  const key = `${kind} ${size}`;
+  if (!made.has(key)) made.set(key, newShape(kind, size));
+  return made.get(key);
+}
+
+function newShape(kind, size) {
   const THREE = three();
   if (kind === "box") return new THREE.BoxGeometry(...size);
   if (kind === "sphere") return new THREE.SphereGeometry(size[0], 24, 16);
@@ -37,10 +58,11 @@ export function robotParts({ parts, visuals }, paint = null) {
   return groups;
 }
 
-/** The commanded pose: blue, seen through, never hiding what is measured. */
-export function ghostPaint() {
+/** A robot that is not the real one: seen through, and never hiding what is measured unless it is `solid`. */
+export function ghostPaint({ colour, opacity, solid = false }) {
   const THREE = three();
-  return new THREE.MeshBasicMaterial({ color: 0x3b8cff, transparent: true, opacity: 0.28, depthWrite: false });
+  const look = { color: colour, transparent: true, opacity, depthWrite: solid };
+  return solid ? new THREE.MeshPhongMaterial({ ...look, specular: 0x222222, shininess: 30 }) : new THREE.MeshBasicMaterial(look);
 }
 
 /** Where the arms are mounted; its surface is z = 0. */

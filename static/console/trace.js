@@ -1,8 +1,13 @@
-// The last seconds of every joint: a ring of rows, one per frame, each holding one vector per kind of curve.
+// The last seconds of every joint: a ring of samples, each one vector per kind of curve and what chunks made of it.
+
+/** What stands beside the curves of a sample, and what it is where nothing is known. */
+const COLUMNS = { chunk: -1, chunks: 0, limited: 0, simulated: 0 };
 
 export class Trace {
   #times;
   #rows = {};
+  #columns = {};
+  #window; // where `joint` writes what it found, so that drawing allocates nothing
   #next = 0;
   #filled = 0;
 
@@ -10,23 +15,31 @@ export class Trace {
     this.dim = dim;
     this.size = rows;
     this.#times = new Float64Array(rows);
-    for (const kind of kinds) this.#rows[kind] = new Float32Array(rows * dim).fill(NaN);
+    this.#window = { times: new Float64Array(rows), values: {}, columns: {} };
+    for (const kind of kinds) {
+      this.#rows[kind] = new Float32Array(rows * dim).fill(NaN);
+      this.#window.values[kind] = new Float32Array(rows);
+    }
+    for (const column of Object.keys(COLUMNS)) {
+      this.#columns[column] = new Int32Array(rows);
+      this.#window.columns[column] = new Int32Array(rows);
+    }
   }
 
   get newest() {
     return this.#filled ? this.#times[(this.#next - 1 + this.size) % this.size] : NaN;
   }
 
-  /** Add one row at time `t` [s]; a kind without a vector has no value there. */
-  add(t, vectors) {
-    if (t <= this.newest) return; // a frame that was overtaken
+  /** Add the sample at time `t` [s]: a vector per kind, none where it has no value there, and its columns. */
+  add(t, vectors, columns = {}) {
+    if (t <= this.newest) return; // known already
     const at = this.#next;
     this.#times[at] = t;
     for (const [kind, rows] of Object.entries(this.#rows)) {
-      const row = rows.subarray(at * this.dim, (at + 1) * this.dim);
-      if (vectors[kind]?.length === this.dim) row.set(vectors[kind]);
-      else row.fill(NaN);
+      if (vectors[kind]?.length === this.dim) rows.set(vectors[kind], at * this.dim);
+      else rows.fill(NaN, at * this.dim, (at + 1) * this.dim);
     }
+    for (const [column, absent] of Object.entries(COLUMNS)) this.#columns[column][at] = columns[column] ?? absent;
     this.#next = (at + 1) % this.size;
     this.#filled = Math.min(this.#filled + 1, this.size);
   }
@@ -36,18 +49,33 @@ export class Trace {
     this.#next = 0;
   }
 
-  /** One joint's columns since `from`: {times, values: {kind: Float32Array}}, oldest first. */
-  joint(index, from) {
-    const times = [];
-    const places = [];
+  /** The same samples, which stay when this one goes on. */
+  copy() {
+    const twin = new Trace({ dim: this.dim, kinds: Object.keys(this.#rows), rows: this.size });
+    twin.#times.set(this.#times);
+    for (const [kind, rows] of Object.entries(this.#rows)) twin.#rows[kind].set(rows);
+    for (const [column, rows] of Object.entries(this.#columns)) twin.#columns[column].set(rows);
+    twin.#next = this.#next;
+    twin.#filled = this.#filled;
+    return twin;
+  }
+
+  /**
+   * One joint since `from`, oldest first: {times, values: {kind: numbers}, columns: {name: numbers}}; times count
+   * from `zero` [s]. They are overwritten by the next call.
+   */
+  joint(index, from, zero = 0) {
+    const { times, values, columns } = this.#window;
+    let count = 0;
     for (let back = this.#filled; back > 0; back -= 1) {
       const at = (this.#next - back + this.size) % this.size;
       if (this.#times[at] < from) continue;
-      times.push(this.#times[at]);
-      places.push(at);
+      times[count] = this.#times[at] - zero;
+      for (const kind in values) values[kind][count] = this.#rows[kind][at * this.dim + index];
+      for (const column in columns) columns[column][count] = this.#columns[column][at];
+      count += 1;
     }
-    const values = {};
-    for (const [kind, rows] of Object.entries(this.#rows)) values[kind] = places.map((at) => rows[at * this.dim + index]);
-    return { times, values };
+    const some = (found) => Object.fromEntries(Object.entries(found).map(([name, numbers]) => [name, numbers.subarray(0, count)]));
+    return { times: times.subarray(0, count), values: some(values), columns: some(columns) };
   }
 }

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from evaweb.console import parts
 
@@ -128,7 +130,8 @@ def test_the_trace_keeps_the_newest_rows_and_knows_what_did_not_come() -> None:
         for (let t = 1; t <= 6; t += 1) trace.add(t, { measured: [t, 10 * t], commanded: t > 4 ? [0, t] : undefined });
         trace.add(3, { measured: [99, 99] });  // overtaken by newer ones
         const { times, values } = trace.joint(1, 4);
-        return { newest: trace.newest, times, measured: values.measured, commanded: values.commanded };
+        const [measured, commanded] = [[...values.measured], [...values.commanded]];
+        return { newest: trace.newest, times: [...times], measured, commanded };
         """,
     )
 
@@ -136,6 +139,171 @@ def test_the_trace_keeps_the_newest_rows_and_knows_what_did_not_come() -> None:
     assert found["times"] == [4, 5, 6]
     assert found["measured"] == [40, 50, 60]
     assert found["commanded"] == [None, 5, 6]  # NaN where nothing was sent
+
+
+def test_a_copy_of_the_trace_stays_when_the_trace_goes_on() -> None:
+    found = run(
+        "trace.js",
+        """
+        const trace = new m.Trace({ dim: 1, kinds: ["state"], rows: 3 });
+        for (let t = 1; t <= 3; t += 1) trace.add(t, { state: [t] }, { chunk: t, limited: t === 2 });
+        const paused = trace.copy();
+        for (let t = 4; t <= 9; t += 1) trace.add(t, { state: [t] });
+        const { times, values, columns } = paused.joint(0, 0, 3);
+        const { chunk, limited } = columns;
+        return { times: [...times], state: [...values.state], chunk: [...chunk], limited: [...limited] };
+        """,
+    )
+
+    assert found == {"times": [-2, -1, 0], "state": [1, 2, 3], "chunk": [1, 2, 3], "limited": [0, 1, 0]}
+
+
+def marks(chunk: list[int], chunks: list[int] | None = None, limited: list[int] | None = None) -> Any:
+    """The marks of samples a tenth of a second apart, in tenths."""
+    nothing = [0] * len(chunk)
+    given = {"chunk": chunk, "chunks": chunks or nothing, "limited": limited or nothing}
+    body = """
+    const found = m.marks(given.chunk.map((_, index) => index / 10), given);
+    return { seams: found.seams, bands: found.bands.flat(), limits: found.limits };
+    """
+    found = run("curve_marks.js", body, given)
+    return {name: [round(10 * time, 1) for time in times] for name, times in found.items()}
+
+
+def test_a_hairline_stands_at_the_first_sample_of_another_chunk() -> None:
+    assert marks([-1, -1, 1, 1, 2, 2, 2, 5])["seams"] == [2, 4, 7]
+
+
+def test_what_no_chunk_planned_begins_no_chunk() -> None:
+    assert marks([1, 0, 0, -1, -1, 1])["seams"] == [5]
+
+
+def test_a_band_covers_the_samples_that_more_than_one_chunk_made() -> None:
+    found = run(
+        "curve_marks.js",
+        """
+        const { bands } = m.marks(given.chunks.map((_, index) => index / 30), given);
+        return bands.map((band) => band.map((t) => Math.round(30 * t)));
+        """,
+        {"chunk": [1] * 9, "chunks": [1, 2, 2, 3, 1, 1, 2, 1, 2], "limited": [0] * 9},
+    )
+
+    assert found == [[1, 4], [6, 7], [8, 9]]
+
+
+def test_a_sample_stands_for_no_longer_than_it_was_sampled() -> None:
+    assert marks([1, 1, -1], [1, 2, 0])["bands"] == [1.0, 1.3]
+
+
+def test_every_sample_that_safety_changed_is_marked() -> None:
+    assert marks([1] * 5, limited=[0, 1, 1, 0, 1])["limits"] == [1, 2, 4]
+
+
+def test_the_sample_at_the_cursor_is_the_last_that_began() -> None:
+    body = "return [-1, 0, 0.5, 1, 7].map((t) => m.sampleAt([0, 1, 2], t))"
+
+    assert run("curve_marks.js", body) == [-1, 0, 0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("chunk", "seam", "looks"),
+    [
+        ({"state": "merged", "targets": [-1, 7, 8, 9, -1], "overlap": 2}, 1, "idle blended blended own idle"),
+        ({"state": "merged", "targets": [4, 5], "overlap": 0}, 0, "own own"),
+        ({"state": "proposed", "targets": [-1, -1]}, 0, "own own"),
+        ({"state": "dropped", "targets": [-1, -1]}, -1, "idle idle"),
+        ({"state": "merged", "targets": [-1, -1]}, -1, "idle idle"),
+    ],
+)
+def test_the_seam_of_a_chunk_is_its_first_row_that_is_executed(
+    chunk: dict[str, Any], seam: int, looks: str
+) -> None:
+    assert run("scene_chunk.js", "return m.rowsOf(given)", chunk) == {"seam": seam, "looks": looks.split()}
+
+
+def test_the_film_of_a_chunk_takes_as_long_as_the_chunk_and_begins_again() -> None:
+    body = """
+    return [0, 0.5, 1.75, 4, 4.5, 4.7].map((t) => m.moment([0, 2, 4], 1, t)).map(({ from, to, share }) =>
+      [from, to, Math.round(100 * share) / 100]);
+    """
+
+    assert run("scene_preview.js", body) == [
+        [0, 1, 0],
+        [0, 1, 0.25],
+        [0, 1, 0.88],
+        [2, 2, 0],  # it rests at its end
+        [2, 2, 0],
+        [0, 1, 0],
+    ]
+
+
+def test_a_film_of_one_row_stands_still() -> None:
+    assert run("scene_preview.js", "return m.moment([0], 0.1, 5)") == {"from": 0, "to": 0, "share": 0}
+
+
+def test_the_preview_is_between_its_keyframes() -> None:
+    found = run(
+        "scene_preview.js",
+        """
+        const preview = new m.Preview();
+        const before = preview.at(0);
+        preview.begin([0, 1], Float32Array.from([0, 10, 4, 30]), 1);
+        const middle = [...preview.at(performance.now() + 500)];
+        preview.end();
+        return { before, middle: middle.map(Math.round), after: preview.at(0) };
+        """,
+    )
+
+    assert found == {"before": None, "middle": [2, 20], "after": None}
+
+
+@given(
+    st.lists(st.lists(st.integers(0, 60), min_size=1, max_size=60), min_size=1, max_size=20), st.booleans()
+)
+@settings(max_examples=5, deadline=None)
+def test_every_value_of_a_distribution_is_in_one_bar_between_its_ends(
+    many: list[list[int]], whole: bool
+) -> None:
+    found = run(
+        "distribution.js",
+        "return given[0].map((values) => m.bars(values, given[1]))",
+        [many, {"whole": whole}],
+    )
+
+    for values, made in zip(many, found, strict=True):
+        assert sum(made["counts"]) == len(values)
+        assert made["low"] <= min(values)
+        assert made["high"] >= max(values)
+        assert 1 <= len(made["counts"]) <= 24
+
+
+def test_each_whole_number_has_a_bar_of_its_own() -> None:
+    found = run("distribution.js", "return m.bars([3, 3, 5, 4, 3], { whole: true })")
+
+    assert found == {"low": 3, "high": 5, "counts": [3, 1, 1]}
+
+
+def test_equal_values_are_no_spread() -> None:
+    found = run("distribution.js", "return m.bars([80, 80], { narrow: 10 })")
+
+    assert (found["low"], found["high"], max(found["counts"])) == (75, 85, 2)
+
+
+@given(
+    st.lists(st.lists(st.floats(0, 1000), min_size=1, max_size=30), min_size=1, max_size=20),
+    st.integers(0, 100),
+)
+@settings(max_examples=5, deadline=None)
+def test_quantiles_are_those_of_numpy(many: list[list[float]], percent: int) -> None:
+    found = run(
+        "distribution.js", "return given[0].map((values) => m.quantile(values, given[1]))", [many, percent]
+    )
+
+    assert found == pytest.approx([np.percentile(values, percent) for values in many])
+
+
+def test_of_nothing_there_is_no_quantile() -> None:
+    assert run("distribution.js", "return Number.isNaN(m.quantile([], 50))") is True
 
 
 @pytest.mark.parametrize(
@@ -281,6 +449,9 @@ def test_an_event_is_said_in_words_with_its_weight() -> None:
         {"kind": "recording_failed", "text": "the disk is full"},
         {"kind": "estopped", "text": "by ann"},
         {"kind": "setup", "text": "idle"},
+        {"kind": "limited", "text": "left_arm.joint1 limited"},
+        {"kind": "limited_sum", "text": "12 actions were limited"},
+        {"kind": "policy_lost", "text": "no answer within 2 s"},
     ]
     body = "return given.map((event) => [m.kindWords(event.kind), m.sentence(event), m.weight(event)])"
 
@@ -294,6 +465,9 @@ def test_an_event_is_said_in_words_with_its_weight() -> None:
         ["recording failed", "the disk is full", "bad"],
         ["e-stop", "by ann", "bad"],
         ["setup", "the set-up is over", ""],
+        ["safety", "left_arm.joint1 limited", "warn"],
+        ["safety", "12 actions were limited", ""],
+        ["policy lost", "no answer within 2 s", "bad"],
     ]
 
 

@@ -59,6 +59,7 @@ def test_chunk_boundaries_and_what_safety_did_stand_beside_their_samples():
         "chunk": [7, 7],
         "chunks": [2, 2],
         "limited": [True, True],
+        "simulated": [False, False],
     }
 
 
@@ -73,7 +74,9 @@ def test_executed_is_what_was_sent_and_nothing_where_nothing_was():
 
 
 def test_in_simulation_executed_is_the_simulated_robot_whatever_the_real_one_is_sent():
-    assert one({"simulated": row(3)}, engaged=True).array("recent", "executed").tolist() == [[3, 3, 3]]
+    frame = one({"simulated": row(3)}, engaged=True)
+    assert frame.array("recent", "executed").tolist() == [[3, 3, 3]]
+    assert facts(frame)["simulated"] == [True]
     assert one({"simulated": NOTHING}, engaged=True).array("recent", "executed").tolist() == [[2, 2, 2]]
 
 

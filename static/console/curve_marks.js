@@ -1,0 +1,42 @@
+// What is drawn with the curves: where a chunk takes over, where chunks overlap, what safety changed. It is found in
+// the samples as they came, before fewer points are drawn: no mark is lost, and each is within one sample of its step.
+
+/** The kinds of marks, in their order in the legend; `colour` is a custom property, `shape` that of the swatch. */
+export const MARKS = [
+  { name: "chunk", colour: "--mark-chunk", shape: "hairline", means: "A hairline where another chunk takes over; beside it the chunk at the cursor, 0 for the held target" },
+  { name: "overlap", colour: "--mark-overlap", shape: "patch", means: "A band where an action is made of more than one chunk; beside it of how many at the cursor" },
+  { name: "safety", colour: "--holding", shape: "tick", means: "A tick where safety changed or refused the action" },
+];
+
+const SAMPLE_S = 1 / 30; // how long a sample stands for at most
+
+/**
+ * Of times [s] and the columns of a trace: `seams`, times at which a chunk of the policy begins to lead; `bands`,
+ * [from, to] of more than one chunk; `limits`, times at which safety changed something.
+ */
+export function marks(times, { chunk, chunks, limited }) {
+  const seams = [];
+  const bands = [];
+  const limits = [];
+  for (let at = 0; at < times.length; at += 1) {
+    if (at && chunk[at] > 0 && chunk[at] !== chunk[at - 1]) seams.push(times[at]);
+    if (limited[at]) limits.push(times[at]);
+    if (chunks[at] < 2) continue;
+    const end = Math.min(times[at + 1] ?? Infinity, times[at] + SAMPLE_S);
+    if (chunks[at - 1] > 1 && times[at] - bands.at(-1)[1] < 1e-6) bands.at(-1)[1] = end;
+    else bands.push([times[at], end]);
+  }
+  return { seams, bands, limits };
+}
+
+/** The index of the sample that holds at time `t` [s], -1 before the first. */
+export function sampleAt(times, t) {
+  let low = 0;
+  let high = times.length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (times[middle] <= t) low = middle + 1;
+    else high = middle;
+  }
+  return low - 1;
+}

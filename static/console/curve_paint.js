@@ -1,0 +1,47 @@
+// Bands, hairlines and ticks on the canvas of the curves.
+
+import { css } from "./curve_kinds.js";
+
+const TICK = 7; // px high
+const MOST_SEAMS = 200; // more of them in a pane would be a surface
+
+/** Paints on a plot of uPlot; made anew where the theme changes. */
+export class Paint {
+  #seam = css("--mark-chunk");
+  #band = css("--mark-overlap");
+  #limit = css("--holding");
+
+  /** Under the curves. */
+  behind(plot, { bands, seams }) {
+    inside(plot, (ctx, { top, height }) => {
+      ctx.fillStyle = this.#band;
+      for (const [from, to] of bands) ctx.fillRect(x(plot, from), top, Math.max(1, x(plot, to) - x(plot, from)), height);
+      if (seams.length > MOST_SEAMS) return;
+      ctx.fillStyle = this.#seam;
+      for (const time of seams) ctx.fillRect(Math.round(x(plot, time)), top, Math.max(1, Math.round(devicePixelRatio)), height);
+    });
+  }
+
+  /** Over them, at the foot of the plot. */
+  over(plot, { limits }) {
+    inside(plot, (ctx, { top, height }) => {
+      const tall = TICK * devicePixelRatio;
+      ctx.fillStyle = this.#limit;
+      for (const time of limits) ctx.fillRect(x(plot, time), top + height - tall, Math.max(2, 2 * devicePixelRatio), tall);
+    });
+  }
+}
+
+function x(plot, time) {
+  return plot.valToPos(time, "x", true);
+}
+
+function inside(plot, paint) {
+  const { left, top, width, height } = plot.bbox;
+  plot.ctx.save();
+  plot.ctx.beginPath();
+  plot.ctx.rect(left, top, width, height);
+  plot.ctx.clip();
+  paint(plot.ctx, { top, height });
+  plot.ctx.restore();
+}

@@ -1,0 +1,37 @@
+// What the marks among the curves mean, and what they are at the cursor.
+
+import { MARKS } from "./curve_marks.js";
+
+export class MarkLegend {
+  #values = new Map();
+
+  /** Appends an entry per mark to `element`. */
+  constructor(element) {
+    for (const mark of MARKS) {
+      const entry = document.createElement("span");
+      entry.className = "legend legend-mark";
+      entry.dataset.mark = mark.name;
+      entry.title = mark.means;
+      const swatch = document.createElement("i");
+      swatch.className = mark.shape;
+      swatch.style.setProperty("--colour", `var(${mark.colour})`);
+      const value = document.createElement("span");
+      value.className = "legend-value";
+      entry.append(swatch, mark.name, value);
+      element.append(entry);
+      this.#values.set(mark.name, value);
+    }
+  }
+
+  /** Of the sample at the cursor: {chunk, chunks, limited}; nothing where there is none. */
+  show(sample) {
+    this.#write("chunk", sample && sample.chunk >= 0 ? String(sample.chunk) : "–");
+    this.#write("overlap", sample && sample.chunks > 1 ? `of ${sample.chunks}` : "–");
+    this.#write("safety", sample ? (sample.limited ? "changed" : "no") : "–");
+  }
+
+  #write(name, text) {
+    const place = this.#values.get(name);
+    if (place.textContent !== text) place.textContent = text;
+  }
+}

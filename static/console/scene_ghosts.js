@@ -1,0 +1,66 @@
+// Robots that are not the real one: the commanded pose, a target, a proposed chunk, the robot of a simulation.
+
+import { ghostPaint, place, robotParts, SIZE } from "./scene_shapes.js";
+
+/** Each a translucent blue; what is to be looked at is more solid than what is only compared with. */
+export const GHOSTS = {
+  commanded: { colour: "#3b8cff", opacity: 0.28 },
+  aim: { colour: "#3b8cff", opacity: 0.42 },
+  chunk: { colour: "#3b8cff", opacity: 0.42 },
+  simulated: { colour: "#2f7df0", opacity: 0.7, solid: true },
+};
+
+export class Ghosts {
+  #geometry;
+  #add;
+  #robots = new Map(); // made when they are first wanted: most pages never show most of them
+  #there = new Set();
+  #hidden = new Set();
+
+  /** `add(path, object)` puts an object into the scene. */
+  constructor(geometry, add) {
+    this.#geometry = geometry;
+    this.#add = add;
+  }
+
+  /** Where the parts of ghost `name` are, [P * 16] from `from` on; null, or not a number: nowhere. */
+  pose(name, numbers, from = 0) {
+    if (!numbers || numbers.length < from + this.#geometry.parts.length * SIZE || Number.isNaN(numbers[from])) this.#there.delete(name);
+    else {
+      this.#there.add(name);
+      if (!this.#hidden.has(name)) place(this.#robot(name), numbers, from);
+    }
+    this.#show(name);
+  }
+
+  /** Whether ghost `name` is drawn where it is somewhere. */
+  allow(name, shown) {
+    if (shown) this.#hidden.delete(name);
+    else this.#hidden.add(name);
+    this.#show(name);
+  }
+
+  /** Whether it is drawn now. */
+  visible(name) {
+    return this.#there.has(name) && !this.#hidden.has(name);
+  }
+
+  /** The groups of a ghost that is drawn. */
+  parts(name) {
+    return this.#robot(name);
+  }
+
+  #show(name) {
+    const visible = this.visible(name);
+    for (const part of this.#robots.get(name) ?? []) part.visible = visible;
+  }
+
+  #robot(name) {
+    if (!this.#robots.has(name)) {
+      const parts = robotParts(this.#geometry, () => ghostPaint(GHOSTS[name]));
+      parts.forEach((part, index) => this.#add(`ghost/${name}/${index}`, part));
+      this.#robots.set(name, parts);
+    }
+    return this.#robots.get(name);
+  }
+}

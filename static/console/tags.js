@@ -1,0 +1,35 @@
+// Short sentences in the corner of a pane about what is drawn there.
+
+export class Tags {
+  #list = document.createElement("ul");
+  #tags = new Map();
+
+  /** A list of class `name` in `element`. */
+  constructor(element, name) {
+    this.#list.className = `tags ${name}`;
+    element.append(this.#list);
+  }
+
+  /** Say `words` under that name, with a patch of `colour` where one is given; nothing where there are no words. */
+  show(name, words, colour = "") {
+    let tag = this.#tags.get(name);
+    if (!words) {
+      tag?.remove();
+      this.#tags.delete(name);
+      return;
+    }
+    if (!tag) {
+      tag = document.createElement("li");
+      tag.dataset.tag = name;
+      if (colour) {
+        const patch = document.createElement("i");
+        patch.style.setProperty("--colour", colour);
+        tag.append(patch);
+      }
+      tag.append(document.createElement("span"));
+      this.#tags.set(name, tag);
+      this.#list.append(tag);
+    }
+    if (tag.lastElementChild.textContent !== words) tag.lastElementChild.textContent = words;
+  }
+}
