@@ -29,7 +29,7 @@ class ByHand:
         self._orders = orders
         self._runs = runs
         self._targets = Targets(plan, spaces, plan.kinematics())
-        self.grippers = Grippers(plan, page)
+        self.grippers = Grippers(plan)
 
     def require_robot(self, what: str) -> None:
         """Refuse where the transport moves no robot."""
@@ -39,14 +39,14 @@ class ByHand:
 
     def aim(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Where the robot would go; nothing moves."""
-        start = self._commanded()
+        start = self.commanded()
         aim = self._targets.aim(read("aim", AimRequest, arguments), start)
         away = first_action(aim.joints, start, self._plan)["distance"]
         return told(aim, self._plan, away, self._targets.duration(start, aim.joints))
 
     def move(self, asked: MoveRequest) -> dict[str, Any]:
         """Go there on a limited path, within the open run."""
-        start = self._commanded()
+        start = self.commanded()
         goal = self._targets.goal(asked, start)
         self._runs.move(goal, asked.speed)
         return {"duration_s": self._targets.duration(start, goal, asked.speed)}
@@ -54,16 +54,16 @@ class ByHand:
     def checked(self, what: str, goal: Float64) -> Float64:
         """`goal` [D] where a motion there is allowed all the way."""
         self.require_robot(what)
-        return self._targets.checked(what, goal, self._commanded())
+        return self._targets.checked(what, goal, self.commanded())
 
     def grip(self, asked: GripperRequest, free: bool) -> dict[str, Any]:
         """Open, close, lock or give back; `free`: no policy moves the arms just now."""
         self.require_robot("gripper")
-        grip = self.grippers.asked(asked, free)
+        grip = self.grippers.asked(asked, self.commanded(), free)
         self.lock(grip.locks)
         if grip.goal is not None:
             self._runs.move(grip.goal, 1.0)
-        return {"grippers": self.grippers.told()}
+        return {"grippers": self.grippers.told(self.commanded())}
 
     def unlock(self) -> None:
         """Give all grippers back."""
@@ -74,7 +74,7 @@ class ByHand:
         self._orders.lock(locks)
         self.grippers.locks = locks
 
-    def _commanded(self) -> Float64:
+    def commanded(self) -> Float64:
         """Where the robot was told to be, or where it is measured as long as nothing was told."""
         status = self._page.control.read()
         known = status["commanded"] if status["engaged"] else self._page.observation.read()["qpos"]

@@ -124,7 +124,7 @@ class Director(Effects):
                 setup=self.setup,
                 runs=self.runs,
                 media=self.media_report,
-                grippers=self.by_hand.grippers,
+                by_hand=self.by_hand,
                 estop=self._watch.estop,
                 boot=self.boot,
                 now=self.clock.now(),

@@ -10,14 +10,16 @@ import numpy as np
 from robots.robot import Group
 from runtime.errors import RuntimeFault
 from runtime.family import Plan
-from runtime.page import Page
 from runtime.requests import GripperRequest
 from runtime.types import Float64
 
 
 @dataclass(frozen=True, slots=True)
 class Grip:
-    """What a request amounts to: locks float64 [D] (NaN: free), and where grippers are to move, None for nowhere."""
+    """What a request amounts to: locks float64 [D] (NaN: free), and where to move, None for nowhere.
+
+    A goal float64 [D] is NaN for all that stays where it is.
+    """
 
     locks: Float64
     goal: Float64 | None
@@ -26,9 +28,8 @@ class Grip:
 class Grippers:
     """The locks in force, and what requests make of them."""
 
-    def __init__(self, plan: Plan, page: Page) -> None:
+    def __init__(self, plan: Plan) -> None:
         self._groups = [group for group in plan.robot.groups if group.gripper is not None]
-        self._page = page
         self._robot = plan.robot.name
         self.locks: Float64 = np.full(plan.robot.dim, np.nan)
 
@@ -36,14 +37,13 @@ class Grippers:
         """Nothing is locked."""
         self.locks = np.full(len(self.locks), np.nan)
 
-    def asked(self, request: GripperRequest, free: bool) -> Grip:
+    def asked(self, request: GripperRequest, commanded: Float64, free: bool) -> Grip:
         """`free`: nothing else moves the arms, so that a gripper can be moved; else opening and closing lock it there.
 
-        Raises RuntimeFault where the robot has no such gripper.
+        `commanded` [D] is where the robot was told to be. Raises RuntimeFault where it has no such gripper.
         """
         chosen = self._chosen(request.arm)
-        commanded = np.array(self._page.control.read()["commanded"], np.float64)
-        locks, goal = self.locks.copy(), commanded.copy()
+        locks, goal = self.locks.copy(), np.full(len(commanded), np.nan)
         for group in chosen:
             dim, gripper = group.gripper_dim, group.gripper
             assert dim is not None
@@ -68,9 +68,8 @@ class Grippers:
             raise RuntimeFault(f"gripper: arm = {name!r}; {self._robot} has grippers on {names}")
         return chosen
 
-    def told(self) -> dict[str, Any]:
-        """For a snapshot: where each one is told to be, and whether it is locked."""
-        commanded = self._page.control.read()["commanded"]
+    def told(self, commanded: Float64) -> dict[str, Any]:
+        """For a snapshot: where each one was told to be [D], and whether it is locked."""
         return {
             group.name: {
                 "locked": not bool(np.isnan(self.locks[group.gripper_dim])),

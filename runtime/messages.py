@@ -31,7 +31,7 @@ class Order:
     number: int
     kind: OrderKind
     run: int = 0  # the run that is open, 0 where none is; chunks of another run are ignored
-    goal: Float64 | None = None  # [D] end of a "motion"
+    goal: Float64 | None = None  # [D] end of a "motion"; NaN: where it comes to a stand
     reason: str = ""
     mode: Mode = "continuous"  # of a "follow"
     speed: float = 1.0  # part of the speed of motions of ours that a "motion" may use

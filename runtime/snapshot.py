@@ -9,8 +9,8 @@ from typing import Any, get_args
 
 import numpy as np
 
+from runtime.by_hand import ByHand
 from runtime.family import Plan
-from runtime.grippers import Grippers
 from runtime.inference import Inference
 from runtime.lease import Lease
 from runtime.messages import MediaReport, Mode
@@ -36,7 +36,7 @@ class View:
     setup: SetUp
     runs: Runs
     media: MediaReport
-    grippers: Grippers
+    by_hand: ByHand
     estop: str
     boot: str
     now: float
@@ -63,7 +63,7 @@ def snapshot(view: View) -> dict[str, Any]:
         "stages": _stages(view),
         "first_action": _first_action(view),
         "proposal": _proposal(view),
-        "grippers": view.grippers.told(),
+        "grippers": view.by_hand.grippers.told(view.by_hand.commanded()),
         "drives": dict(view.media.drives),
         "validated": view.setup.validated,
         "task": settings.task,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +12,6 @@ import pytest
 import robots
 from runtime.errors import RuntimeFault
 from runtime.grippers import Grippers
-from runtime.page import Page, PageLayout
 from runtime.requests import GripperRequest
 
 
@@ -22,43 +20,42 @@ def robot() -> Any:
     return robots.load("agilex_piper")
 
 
-def grippers(at: float = 0.05) -> Grippers:
-    layout = PageLayout(robot().dim, robot().eef_dim, ())
-    page = Page(layout, mmap.mmap(-1, Page.size(layout)))
-    status = page.control.read().copy()
-    status["commanded"] = at
-    page.control.write(status)
+def grippers() -> Grippers:
     plan: Any = SimpleNamespace(robot=robot())
-    return Grippers(plan, page)
+    return Grippers(plan)
+
+
+def at(value: float = 0.05) -> np.ndarray:
+    return np.full(robot().dim, value)
 
 
 LEFT, RIGHT = 6, 13
 
 
 def test_where_nothing_else_moves_a_gripper_is_moved_and_nothing_but_it() -> None:
-    grip = grippers().asked(GripperRequest(arm="left_arm", action="open"), free=True)
+    grip = grippers().asked(GripperRequest(arm="left_arm", action="open"), at(), free=True)
     assert grip.goal is not None
     assert grip.goal[LEFT] == robot().group("left_arm").gripper.open
-    assert np.allclose(np.delete(grip.goal, LEFT), 0.05)
+    assert np.isnan(np.delete(grip.goal, LEFT)).all()
     assert np.isnan(grip.locks).all()
 
 
 def test_while_a_policy_drives_it_is_locked_where_it_is_wanted() -> None:
-    grip = grippers().asked(GripperRequest(arm="right_arm", action="close"), free=False)
+    grip = grippers().asked(GripperRequest(arm="right_arm", action="close"), at(), free=False)
     assert grip.goal is None
     assert grip.locks[RIGHT] == robot().group("right_arm").gripper.close
     assert np.isnan(np.delete(grip.locks, RIGHT)).all()
 
 
 def test_a_lock_keeps_it_where_it_is_told_to_be_and_unlocking_gives_it_back() -> None:
-    hand = grippers(at=0.03)
-    hand.locks = hand.asked(GripperRequest(action="lock"), free=False).locks
+    hand = grippers()
+    hand.locks = hand.asked(GripperRequest(action="lock"), at(0.03), free=False).locks
     assert np.allclose(hand.locks[[LEFT, RIGHT]], 0.03)
-    assert hand.told() == {
+    assert hand.told(at(0.03)) == {
         "left_arm": {"locked": True, "at": pytest.approx(0.03)},
         "right_arm": {"locked": True, "at": pytest.approx(0.03)},
     }
-    hand.locks = hand.asked(GripperRequest(arm="left_arm", action="unlock"), free=False).locks
+    hand.locks = hand.asked(GripperRequest(arm="left_arm", action="unlock"), at(), free=False).locks
     assert np.isnan(hand.locks[LEFT])
     assert not np.isnan(hand.locks[RIGHT])
     hand.forget()
@@ -67,12 +64,12 @@ def test_a_lock_keeps_it_where_it_is_told_to_be_and_unlocking_gives_it_back() ->
 
 def test_a_locked_gripper_that_is_opened_by_hand_stays_locked_there() -> None:
     hand = grippers()
-    hand.locks = hand.asked(GripperRequest(arm="left_arm", action="lock"), free=True).locks
-    grip = hand.asked(GripperRequest(arm="left_arm", action="open"), free=True)
+    hand.locks = hand.asked(GripperRequest(arm="left_arm", action="lock"), at(), free=True).locks
+    grip = hand.asked(GripperRequest(arm="left_arm", action="open"), at(), free=True)
     assert grip.goal is not None
     assert grip.locks[LEFT] == grip.goal[LEFT]
 
 
 def test_an_arm_without_a_gripper_is_refused_with_those_that_have_one() -> None:
     with pytest.raises(RuntimeFault, match=r"arm = 'head'; agilex_piper has grippers on left_arm, right_arm"):
-        grippers().asked(GripperRequest(arm="head", action="open"), free=True)
+        grippers().asked(GripperRequest(arm="head", action="open"), at(), free=True)
