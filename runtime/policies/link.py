@@ -6,7 +6,6 @@ Replies carry no id, so a connection whose answer did not come in time is droppe
 from __future__ import annotations
 
 import contextlib
-import queue
 import socket
 import threading
 import time
@@ -14,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from runtime.errors import PolicyError, PolicyLostError
+from runtime.policies.reach import reach
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
@@ -38,7 +38,6 @@ class WebsocketLink:
         self._connect_deadline = connect_deadline
         self._stack = contextlib.ExitStack()
         self._connection: ClientConnection | None = None
-        self._reaching: socket.socket | None = None  # its connection is being made
         self._shaking: ClientConnection | None = None  # its handshake is under way
         self._aborted = False
 
@@ -61,7 +60,7 @@ class WebsocketLink:
             self._require_not_aborted()
             raise
         finally:
-            self._reaching = self._shaking = None
+            self._shaking = None
         with self._dropping_on_error():
             self._require_not_aborted()
             return self._receive(self._connection, deadline, "its metadata", self._connect_deadline)
@@ -82,8 +81,6 @@ class WebsocketLink:
         Only the search for a host's address goes on until the connect deadline.
         """
         self._aborted = True
-        if self._reaching is not None:
-            _end(self._reaching)
         for connection in (self._shaking, self._connection):
             if connection is not None:
                 _end(connection.socket)
@@ -109,27 +106,6 @@ class WebsocketLink:
             raise PolicyError(f"{self._url} is no websocket address, e.g. ws://127.0.0.1:8000") from error
         return uri.host, uri.port
 
-    def _reach(self, host: str, port: int, deadline: float) -> socket.socket:
-        """A TCP connection to the first address of the host that takes one; OSError of the last one else."""
-        refusal: OSError = OSError(f"{host} has no address")
-        for family, kind, protocol, _, address in _addresses(host, port, self._connect_deadline):
-            wire = socket.socket(family, kind, protocol)
-            self._reaching = wire
-            try:
-                self._require_not_aborted()
-                wire.settimeout(max(1e-3, deadline - time.monotonic()))
-                wire.connect(address)
-            except OSError as error:
-                wire.close()
-                refusal = error
-            except BaseException:
-                wire.close()
-                raise
-            else:
-                wire.settimeout(None)
-                return wire
-        raise refusal
-
     def _connect(self, deadline: float) -> ClientConnection:
         from websockets.exceptions import InvalidStatus, InvalidURI, WebSocketException
         from websockets.sync.client import ClientConnection, connect
@@ -146,7 +122,7 @@ class WebsocketLink:
                     _end(self.socket)
 
         try:
-            wire = self._stack.enter_context(self._reach(*self._place(), deadline))
+            wire = self._stack.enter_context(reach(*self._place(), deadline, self._require_not_aborted))
             return self._stack.enter_context(
                 connect(
                     self._url,
@@ -258,28 +234,6 @@ def _end(wire: socket.socket) -> None:
     """Wake every thread that waits on this socket; it is of no use afterwards."""
     with contextlib.suppress(OSError):
         wire.shutdown(socket.SHUT_RDWR)
-
-
-def _addresses(host: str, port: int, seconds: float) -> list[tuple[Any, ...]]:
-    """What the host's name stands for; TimeoutError after `seconds`, for which alone the resolver knows no end."""
-    found: queue.SimpleQueue[list[tuple[Any, ...]] | OSError] = queue.SimpleQueue()
-
-    def resolve() -> None:
-        try:
-            found.put(list(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)))
-        except OSError as error:
-            found.put(error)
-        except UnicodeError as error:
-            found.put(socket.gaierror(socket.EAI_NONAME, str(error)))
-
-    threading.Thread(target=resolve, name="resolver", daemon=True).start()
-    try:
-        addresses = found.get(timeout=seconds)
-    except queue.Empty as error:
-        raise TimeoutError(f"the name {host} was not resolved") from error
-    if isinstance(addresses, OSError):
-        raise addresses
-    return addresses
 
 
 def headline(text: str) -> str:

@@ -20,13 +20,14 @@ from runtime.clock import Clock
 from runtime.errors import CodecError, ConfigurationError, PolicyError
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.link import WebsocketLink
-from runtime.policies.pictures import Layout, Resize, fitted, laid_out
+from runtime.policies.pictures import Layout, Resize
+from runtime.policies.request import RequestLayout, width_of
 from runtime.policies.rows import action_rows
 from runtime.policies.rtc.async_rtc import AsyncRtc, Schedule
 from runtime.policies.rtc.base import Dialect, Plain
 from runtime.policies.rtc.prev_action import PrevAction
 from runtime.section import Section
-from runtime.types import ActionChunk, ActionMode, Conditioning, Float32, Observation, RelativeFrame, Space
+from runtime.types import ActionChunk, ActionMode, Conditioning, Observation, RelativeFrame, Space
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -105,10 +106,8 @@ class OpenpiPolicy(Policy):
 
     def __init__(self, config: Config, robot: Robot) -> None:
         self._config = config
-        self._cameras = _cameras(config, robot)
-        self._state_width = _width(config.observation_space, robot)
-        self._width = _width(config.action_space, robot)
-        _check_parts(config, self._state_width)
+        self._layout = RequestLayout(config, robot)
+        self._width = width_of(config.action_space, robot)
         self._headers = _headers(config)
         self._dialect = _dialect(config)
         self._link = self._new_link()
@@ -159,35 +158,8 @@ class OpenpiPolicy(Policy):
             self._link.abort()
 
     def request(self, observation: Observation) -> dict[str, object]:
-        """The request map for an observation, in the declared layout."""
-        config = self._config
-        state = self._state(observation)
-        request: dict[str, object] = {config.state_key: state} if config.state_key else {}
-        request |= {key: state[dims] for key, dims in config.state_parts.items()}
-        cameras = self._cameras if self._cameras is not None else {key: key for key in observation.pictures}
-        pictures = {key: self._picture(observation, camera) for camera, key in cameras.items()}
-        request |= {config.images_key: pictures} if config.images_key else pictures
-        if config.prompt_key:
-            request[config.prompt_key] = observation.prompt
-        return request
-
-    def _state(self, observation: Observation) -> Float32:
-        state = observation.qpos if self._config.observation_space == "joint" else observation.eef
-        if state is None:
-            raise PolicyError('policy.observation_space is "eef" but the observation has no poses')
-        if state.shape != (self._state_width,):
-            raise PolicyError(f"the state has shape {list(state.shape)}; expected [{self._state_width}]")
-        return np.ascontiguousarray(state, dtype=np.float32)
-
-    def _picture(self, observation: Observation, camera: str) -> np.ndarray[Any, Any]:
-        picture = observation.pictures.get(camera)
-        if picture is None:
-            given = ", ".join(observation.pictures) or "none"
-            raise PolicyError(f"the observation has no picture {camera!r}; it has {given}")
-        config = self._config
-        if config.image_size is not None and config.resize != "none":
-            picture = fitted(picture, config.image_size[0], config.image_size[1], config.resize)
-        return laid_out(picture, config.image_layout)
+        """The request map for an observation, in the declared layout, without what a dialect adds."""
+        return self._layout.of(observation)
 
     def _new_link(self) -> WebsocketLink:
         return WebsocketLink(self._config.url, self._headers, self._config.connect_deadline)
@@ -270,31 +242,6 @@ class OpenpiPolicy(Policy):
                 f"{self._config.action_space!r}; correct the one that is wrong"
             )
         return space
-
-
-def _cameras(config: Config, robot: Robot) -> dict[str, str] | None:
-    """The named cameras; None for whatever the observation has: a deployment may do without some."""
-    if config.cameras is None:
-        return None
-    known = [camera.key for camera in robot.cameras]
-    unknown = [key for key in config.cameras if key not in known]
-    if unknown:
-        raise ConfigurationError(
-            f"policy.cameras names {', '.join(unknown)}; cameras of {robot.name}: {', '.join(known)}"
-        )
-    return dict(config.cameras)
-
-
-def _width(space: Space, robot: Robot) -> int:
-    return robot.dim if space == "joint" else robot.eef_dim
-
-
-def _check_parts(config: Config, width: int) -> None:
-    for key, dims in config.state_parts.items():
-        if max(dims) >= width:
-            raise ConfigurationError(
-                f"policy.state_parts.{key} = {dims} leaves the state; allowed: 0 to {width - 1}"
-            )
 
 
 def _dialect(config: Config) -> Dialect:

@@ -23,6 +23,9 @@ NAMES = {
     "two_batches": "actions [2, T, D]",
     "single_row": "actions [D]",
     "action_mode": "says that its actions are :MODE",
+    "no_rtc": "says that it continues no chunk, and continues none",
+    "envelope_version": "with --rtc async_rtc: speaks version :N of the envelope (3)",
+    "request_id": "with --rtc async_rtc: answers carry the number of another request",
 }
 
 

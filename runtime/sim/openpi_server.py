@@ -19,7 +19,9 @@ from websockets.sync.server import Server, ServerConnection, serve
 
 from runtime import codecs
 from runtime.errors import SetupError
+from runtime.sim.continuing import ModelSpace, continued
 from runtime.sim.faults import NONE, Fault
+from runtime.sim.rtc_wires import WIRES, Asked, Name
 from runtime.sim.script import Answer, Script, Waving
 from runtime.types import UInt8
 
@@ -33,13 +35,17 @@ _LATE = 3.0  # s
 
 @dataclass(frozen=True, slots=True)
 class Behaviour:
-    """How the server answers: rows per chunk, their rate [Hz], time of an inference [s], what goes wrong."""
+    """How the server answers: rows per chunk, their rate [Hz], time of an inference [s], what goes wrong.
+
+    `rtc` is the dialect in which it is told what the robot is committed to; the flat one takes plain requests too.
+    """
 
     horizon: int = 50
     rate: float = 30.0
     latency: float = 0.0
     fault: Fault = NONE
     seed: int = 0
+    rtc: Name = "prev_action"
 
 
 class OpenpiServer:
@@ -52,6 +58,8 @@ class OpenpiServer:
         self._behaviour = behaviour
         self._port = port
         self._script = script or Waving(robot, behaviour.horizon, behaviour.rate, behaviour.seed)
+        self._space = ModelSpace(robot)
+        self._wire = WIRES[behaviour.rtc](self._space, behaviour.horizon, behaviour.fault)
         self._device = threading.Lock()  # one inference at a time, as on one GPU
         self._asked = 0
         self._server: Server | None = None
@@ -108,7 +116,7 @@ class OpenpiServer:
                 previous = 1e3 * (time.monotonic() - started)
 
     def _metadata(self) -> dict[str, object]:
-        metadata = dict(self._script.metadata)
+        metadata = dict(self._script.metadata) | self._wire.metadata()
         if self._behaviour.fault.name == "action_mode":
             metadata["action_mode"] = self._behaviour.fault.argument
         return metadata
@@ -119,15 +127,20 @@ class OpenpiServer:
         """Answer one request, rightly or as the fault has it; False where the conversation is over."""
         with self._device:
             number, self._asked = self._asked, self._asked + 1
+            message: Any = None
             try:
+                if isinstance(request, str):
+                    raise TypeError("the request is a text frame; expected a binary one")
+                message = codecs.unpack(request)
                 if self._behaviour.fault.name == "exception":
                     raise RuntimeError("CUDA out of memory (on purpose)")
-                reply = self._reply(answer, request, previous)
+                asked = self._wire.read(message)
+                reply = self._wire.answer(self._result(answer, asked, previous), asked)
             except Exception:  # whatever goes wrong in a policy is told to the client, as openpi does it
-                connection.send(traceback.format_exc())
+                connection.send(self._wire.failure(traceback.format_exc(), message))
                 connection.close(1011, "Internal server error. Traceback included in previous frame.")
                 return False
-        return self._send(connection, codecs.pack(reply), number)
+        return self._send(connection, reply, number)
 
     def _send(self, connection: ServerConnection, payload: bytes, number: int) -> bool:
         fault = self._behaviour.fault
@@ -144,18 +157,20 @@ class OpenpiServer:
         connection.send(payload)
         return True
 
-    def _reply(self, answer: Answer, request: str | bytes, previous: float | None) -> dict[str, object]:
-        if isinstance(request, str):
-            raise TypeError("the request is a text frame; expected a binary one")
+    def _result(self, answer: Answer, asked: Asked, previous: float | None) -> dict[str, object]:
         started = time.monotonic()
-        observation = codecs.unpack(request)
+        observation = asked.observation
         state, pictures = self._state(observation), self._pictures(observation)
         actions = answer(state, pictures, str(observation.get("prompt", "")))
+        if asked.prefix is not None:
+            actions = continued(actions, asked.prefix, self._robot.binary_dims)
         time.sleep(max(0.0, self._behaviour.latency - (time.monotonic() - started)))
         took = 1e3 * (time.monotonic() - started)
         timing = {"infer_ms": took} | ({} if previous is None else {"prev_total_ms": previous})
+        own = {"origin_actions": self._space.of(actions)} if self._behaviour.rtc != "none" else {}
         return {
             "actions": self._spoilt(actions),
+            **own,
             "policy_timing": {"infer_ms": took},
             "server_timing": timing,
         }

@@ -41,6 +41,13 @@ def parser() -> argparse.ArgumentParser:
     skill.add_argument(
         "--failure-rate", type=_share, default=0.0, metavar="P", help="share of episodes that it spoils"
     )
+    line.add_argument(
+        "--rtc",
+        choices=["none", "prev_action", "async_rtc"],
+        default="prev_action",
+        help="how it is told what the robot is committed to, which it then copies: flat keys (plain requests are "
+        "understood too), envelopes alone, or not at all",
+    )
     line.add_argument("--fault", type=faults.parse, default=faults.NONE, metavar="NAME[:ARG]")
     standin.add_arguments(line)
     return line
@@ -56,7 +63,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         robot = robots.load(options.robot)
         rate = options.rate or robot.control_rate
-        behaviour = Behaviour(options.horizon, rate, options.latency_ms / 1e3, options.fault, options.seed)
+        behaviour = Behaviour(
+            options.horizon, rate, options.latency_ms / 1e3, options.fault, options.seed, options.rtc
+        )
         played = _script(robot, rate, options)
         with contextlib.closing(OpenpiServer(robot, behaviour, options.port, played)) as server:
             standin.announce(server.start(), options.ready_file)

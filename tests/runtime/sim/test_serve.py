@@ -113,6 +113,14 @@ def test_a_server_that_dies_during_an_inference_is_gone_for_the_client(serve: An
             policy.infer(shown)
 
 
+def test_it_says_how_it_continues_a_chunk_and_that_this_proves_nothing(serve: Any) -> None:
+    with conversation(serve("--rtc", "async_rtc").ready["url"]) as connection:
+        metadata = receive(connection)
+    assert metadata["rtc"]["dialect"] == "async_rtc"
+    assert "no evidence for a model" in metadata["rtc"]["stand_in"]
+    assert metadata["async_rtc"]["protocol_version"] == 2
+
+
 def test_it_writes_its_address_and_ends_on_sigterm(serve: Any, tmp_path: Path) -> None:
     file = tmp_path / "ready.json"
     standin = serve("--ready-file", str(file))

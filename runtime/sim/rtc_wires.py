@@ -1,0 +1,161 @@
+"""The two ways in which the stand-in policy server is told what the robot is committed to."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from runtime import codecs
+from runtime.policies.rtc import async_rtc
+from runtime.sim.continuing import STAND_IN, ModelSpace, Prefix
+from runtime.sim.faults import Fault
+
+Name = Literal["none", "prev_action", "async_rtc"]
+_FIELDS = (
+    "prev_chunk_left_over",
+    "inference_delay",
+    "execution_horizon",
+    "prefix_attention_schedule",
+    "max_guidance_weight",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A request, read: the observation, what it is to continue, its number where it has one."""
+
+    observation: dict[str, Any]
+    prefix: Prefix | None = None
+    number: int | None = None
+
+
+class Wire(ABC):
+    """Reads requests and frames answers; `fault` may have it say or answer something else."""
+
+    def __init__(self, space: ModelSpace, horizon: int, fault: Fault) -> None:
+        self._space = space
+        self._horizon = horizon
+        self._fault = fault
+
+    @abstractmethod
+    def metadata(self) -> dict[str, object]:
+        """What the server says of it on connect."""
+
+    @abstractmethod
+    def read(self, message: Any) -> Asked:
+        """The request; an exception where it is none."""
+
+    @abstractmethod
+    def answer(self, result: dict[str, object], asked: Asked) -> bytes:
+        """The frame that answers it."""
+
+    @abstractmethod
+    def failure(self, traceback: str, message: Any) -> str | bytes:
+        """The frame that says what went wrong with it."""
+
+    @property
+    def _continues(self) -> bool:
+        return self._fault.name != "no_rtc"
+
+
+class Ignorant(Wire):
+    """What most servers do: keys that they do not know are dropped, without a word."""
+
+    def metadata(self) -> dict[str, object]:
+        return {}
+
+    def read(self, message: Any) -> Asked:
+        return Asked(message)
+
+    def answer(self, result: dict[str, object], asked: Asked) -> bytes:
+        return codecs.pack(result)
+
+    def failure(self, traceback: str, message: Any) -> str | bytes:
+        return traceback
+
+
+class Flat(Ignorant):
+    """Keys of the observation; it names no delay, so as many rows are kept as were consumed since the last request."""
+
+    def metadata(self) -> dict[str, object]:
+        dialect = "prev_action" if self._continues else "none"
+        return {"rtc": {"dialect": dialect, "stand_in": STAND_IN}}
+
+    def read(self, message: Any) -> Asked:
+        if not self._continues or "prev_action" not in message:
+            return Asked(message)
+        rows = self._space.joints(message["prev_action"])
+        consumed = message["rtc_params"]["s"]
+        if not isinstance(consumed, int) or not 0 <= consumed < len(rows):
+            raise ValueError(f"rtc_params.s is {consumed!r}, expected 0 to {len(rows) - 1}")
+        left = rows[: len(rows) - consumed]
+        return Asked(message, Prefix(left, consumed, len(left)))
+
+
+class Envelope(Wire):
+    """openpi-async-rtc, version 2."""
+
+    def metadata(self) -> dict[str, object]:
+        return {
+            "rtc": {"dialect": "async_rtc", "stand_in": STAND_IN},
+            "async_rtc": {
+                **self._head(),
+                "model_action_horizon": self._horizon,
+                "model_action_dim": self._space.width,
+                "rtc_supported": self._continues,
+                "image_transport_codecs": ["raw"],
+            },
+        }
+
+    def read(self, message: Any) -> Asked:
+        found = (message.get("protocol"), message.get("protocol_version"))
+        if found != (async_rtc.NAME, async_rtc.VERSION):
+            raise ValueError(
+                f"protocol {found[0]!r} version {found[1]!r}; expected {async_rtc.NAME!r} version 2"
+            )
+        number, codec = message.get("request_id"), message["image_transport"]["codec"]
+        if not isinstance(number, int) or number < 0:
+            raise ValueError(f"request_id is {number!r}, expected 0 or more")
+        if codec != "raw":
+            raise ValueError(f"image_transport.codec is {codec!r}, expected 'raw'")
+        rtc = message.get("rtc")
+        prefix = None if rtc is None or not self._continues else self._prefix(rtc)
+        return Asked(message["observation"], prefix, number)
+
+    def answer(self, result: dict[str, object], asked: Asked) -> bytes:
+        number = asked.number
+        if self._fault.name == "request_id" and number is not None:
+            number += 1
+        timing = {"image_decode_ms": 0.0, "codec": "raw"}
+        whole = {**self._head(), "request_id": number, "result": {**result, "image_transport": timing}}
+        return codecs.pack(whole)
+
+    def failure(self, traceback: str, message: Any) -> str | bytes:
+        number = message.get("request_id") if isinstance(message, dict) else None
+        known = number if isinstance(number, int) else None
+        return codecs.pack({**self._head(), "request_id": known, "error": traceback})
+
+    def _head(self) -> dict[str, object]:
+        version = async_rtc.VERSION
+        if self._fault.name == "envelope_version":
+            version = int(self._fault.number(async_rtc.VERSION + 1))
+        return {"protocol": async_rtc.NAME, "protocol_version": version}
+
+    def _prefix(self, rtc: Any) -> Prefix:
+        missing = [name for name in _FIELDS if name not in rtc]
+        if missing:
+            raise KeyError(f"rtc has no {', '.join(missing)}")
+        rows = self._space.joints(np.asarray(rtc["prev_chunk_left_over"]))
+        delay, end = rtc["inference_delay"], rtc["execution_horizon"]
+        if not 0 <= delay <= end <= self._horizon:
+            raise ValueError(
+                f"inference_delay {delay} and execution_horizon {end}: expected 0 <= delay <= execution_horizon "
+                f"<= {self._horizon}"
+            )
+        return Prefix(rows, delay, end)
+
+
+WIRES: dict[Name, type[Wire]] = {"none": Ignorant, "prev_action": Flat, "async_rtc": Envelope}
