@@ -62,13 +62,13 @@ def _attended(client: StationClient, given: argparse.Namespace) -> int:
 def _within(
     client: StationClient, given: argparse.Namespace, kind: str, said: dict[str, Any], wants: str = ""
 ) -> int:
-    """Give one command; with --wait stay until the run waits again. `wants`: the event that then belongs to it."""
-    newest = client.status()["newest_event"]
+    """Give one command; with --wait stay until it is over. `wants`: the event that then belongs to it."""
+    before = client.status()
     client.command(kind, **said)
     if not getattr(given, "wait", False):
         _show(client.status(), given.json)
         return DONE
-    settled = settle(client, newest, lambda event: _tell(event, given.json))
+    settled = settle(client, before, lambda event: _tell(event, given.json))
     _show(settled.status, given.json)
     failure = settled.failure(wants)
     if failure:

@@ -1,4 +1,4 @@
-"""Waits until what was asked of an open run is over, so that a script can ask for the next thing."""
+"""Waits until what was asked for is over, so that a script can ask for the next thing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from runtime.client import StationClient
 
-BUSY = ("asking", "executing", "moving", "approaching", "starved")
+_BUSY = ("asking", "executing", "moving", "approaching", "starved")
 _CALM_TICKS = 3  # an order reaches control, and its answer us, within that many
 _LOOK_S = 0.02
 _FAILURES = ("chunk_dropped", "policy_failed", "policy_lost")
@@ -17,15 +17,16 @@ _FAILURES = ("chunk_dropped", "policy_failed", "policy_lost")
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """The status when all was over, and the events until then."""
+    """The state when it was asked for, the status when all was over, and the events until then."""
 
+    began: str
     status: dict[str, Any]
     events: list[dict[str, Any]]
 
     def failure(self, wants: str = "") -> str:
         """Why it did not go well, "" where it did; `wants` is the kind of the event that belongs to it."""
-        if self.status["state"] != "running":
-            return f"the run does not go on: {self.status['state']}, {self.status['reason']}"
+        if self.status["state"] != self.began:
+            return f"{self.began} no longer: {self.status['state']}, {self.status['reason']}"
         failed = [str(event["text"]) for event in self.events if event["kind"] in _FAILURES]
         if failed:
             return failed[-1]
@@ -34,8 +35,12 @@ class Settled:
         return ""
 
 
-def settle(client: StationClient, newest_event: int, tell: Callable[[dict[str, Any]], None]) -> Settled:
-    """Stay until the run waits again or does not go on; events after `newest_event` are told as they come."""
+def settle(client: StationClient, before: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Settled:
+    """Stay until nothing moves and nothing is asked any more, or the state of `before` has changed.
+
+    Events since the status `before` are told as they come.
+    """
+    began, newest_event = before["state"], before["newest_event"]
     events: list[dict[str, Any]] = []
     calm_since = None
     while True:
@@ -46,9 +51,14 @@ def settle(client: StationClient, newest_event: int, tell: Callable[[dict[str, A
                 events.append(event)
                 tell(event)
         step = status["control"]["step"]
-        if status["phase"] in BUSY or calm_since is None:
+        if _busy(status) or calm_since is None:
             calm_since = step
-        if status["state"] != "running" or step - calm_since >= _CALM_TICKS:
-            return Settled(status, events)
+        if status["state"] != began or step - calm_since >= _CALM_TICKS:
+            return Settled(began, status, events)
         client.renew()
         time.sleep(_LOOK_S)
+
+
+def _busy(status: dict[str, Any]) -> bool:
+    """Whether something goes on; a gripper moves also where no run is open."""
+    return status["phase"] in _BUSY or status["control"]["behaviour"] == "motion"

@@ -106,7 +106,7 @@ def _run(line: argparse.ArgumentParser) -> None:
 
 
 def _waits(line: argparse.ArgumentParser) -> None:
-    line.add_argument("--wait", action="store_true", help="until the run waits again, and say how it went")
+    line.add_argument("--wait", action="store_true", help="until it is over, and say how it went")
 
 
 def _target(line: argparse.ArgumentParser, *more: str) -> Any:

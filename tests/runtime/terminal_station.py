@@ -26,7 +26,7 @@ STATUS = {
     "drives": {},
     "newest_event": 0,
     "clock": 100.0,
-    "control": {"lateness_p99_ms": 0.5, "missed": 2, "step": 0},
+    "control": {"lateness_p99_ms": 0.5, "missed": 2, "step": 0, "behaviour": "hold"},
     "policy": {
         "kind": "openpi",
         "name": "pi0",

@@ -25,7 +25,7 @@ def run(monkeypatch):
 
 
 def running(phase="waiting", step=0, **changes):
-    control = {"lateness_p99_ms": 0.5, "missed": 0, "step": step}
+    control = {"lateness_p99_ms": 0.5, "missed": 0, "step": step, "behaviour": "follow"}
     return status("running", phase=phase, control=control, mode="step", **changes)
 
 
@@ -150,7 +150,7 @@ def test_a_script_waits_for_the_end_of_what_it_asked_for(run, capsys):
 @pytest.mark.parametrize(
     ("words", "last", "says"),
     [
-        (["step"], status("holding", reason="policy lost"), "the run does not go on: holding, policy lost"),
+        (["step"], status("holding", reason="policy lost"), "running no longer: holding, policy lost"),
         (["move", "--pose", "home"], running("waiting", 9), "it was ended before its end"),
     ],
 )

@@ -10,15 +10,14 @@ def no_sleep(monkeypatch):
     monkeypatch.setattr(settling.time, "sleep", lambda _: None)
 
 
-def running(phase, step, **changes):
-    return status(
-        "running", phase=phase, control={"lateness_p99_ms": 0.5, "missed": 0, "step": step}, **changes
-    )
+def running(phase, step, state="running", behaviour="follow", **changes):
+    control = {"lateness_p99_ms": 0.5, "missed": 0, "step": step, "behaviour": behaviour}
+    return status(state, phase=phase, control=control, **changes)
 
 
 def settled(*statuses, events=()):
     script, told = Script(statuses, events=events), []
-    return settle(script, 0, told.append), told, script
+    return settle(script, {"state": statuses[0]["state"], "newest_event": 0}, told.append), told, script
 
 
 def test_it_is_over_when_the_run_has_waited_for_a_few_ticks():
@@ -48,7 +47,7 @@ def test_a_chunk_that_is_shown_is_the_end_of_a_step():
 
 def test_a_run_that_does_not_go_on_is_a_failure_with_its_reason():
     found, _, _ = settled(running("asking", 10), status("holding", reason="policy lost"))
-    assert found.failure() == "the run does not go on: holding, policy lost"
+    assert found.failure() == "running no longer: holding, policy lost"
 
 
 def test_events_are_told_as_they_come_and_a_dropped_chunk_is_a_failure():
@@ -69,3 +68,15 @@ def test_a_motion_that_did_not_arrive_is_a_failure():
     assert found.failure("motion_done") == "it was ended before its end (motion_done was not told)"
     found, _, _ = settled(*ended, events=[event(1, "motion_done")])
     assert found.failure("motion_done") == ""
+
+
+def test_a_gripper_is_waited_for_where_no_run_is_open():
+    found, _, _ = settled(
+        running("", 10, "ready", "hold"),
+        running("", 11, "ready", "motion"),
+        running("", 14, "ready", "motion"),
+        running("", 15, "ready", "hold"),
+        running("", 17, "ready", "hold"),
+    )
+    assert found.status["control"]["step"] == 17
+    assert found.failure() == ""
