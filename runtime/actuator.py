@@ -1,19 +1,22 @@
-"""Where commands leave: the last one sent, how fast it was moving, how it comes to a stand."""
+"""Where commands leave: the last one a robot was told, how fast that moved, how it comes to a stand."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runtime.behaviour import Target
+from runtime.config import Answer
 from runtime.errors import RuntimeFault
 from runtime.motion import Brake
 from runtime.page import EStop, Page
-from runtime.safety import SafetySettings
+from runtime.safety import Limits, RobotState, SafetySettings
+from runtime.seen import Seen
+from runtime.timeline import Dims, difference
 from runtime.transports.base import Sink
 from runtime.types import Float64, RobotCommand
 
@@ -23,19 +26,20 @@ class TickSettings:
     """What a tick goes by; times in seconds."""
 
     period: float
-    velocity: Float64  # [D] of motions of ours
-    lower: Float64  # [D] joint limits
-    upper: Float64
-    grippers: NDArray[np.bool_]  # [D] dimensions in a unit of their own
-    binary: NDArray[np.bool_]  # [D] dimensions that switch and have no velocity
-    reach: Float64  # [D] what one rad of acceleration is in the dimension's own unit
+    limits: Limits
+    dims: Dims
     safety: SafetySettings
     heartbeat_timeout: float
-    starvation_hold: float
+    starvation: Answer
+    starvation_hold: float  # until "slow" holds
+
+    @property
+    def starvation_patience(self) -> float:
+        """How long a run may go on with nothing planned."""
+        return self.starvation_hold if self.starvation == "slow" else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Sent:
+class Sent(NamedTuple):
     """What became of one tick: what was wanted, and float64 [D] of what left, None where nothing did."""
 
     time: float  # our monotonic clock [s]
@@ -43,24 +47,32 @@ class Sent:
     executed: Float64 | None = None
     notes: tuple[str, ...] = ()
     refused: bool = False
+    limited: str = ""  # the joint that safety changed most, "" where it changed nothing
+    change: float = 0.0  # by how much [rad, or what a gripper's travel is worth]
 
 
-class Actuator:
-    """Sends commands and remembers them; only an engaged one knows where the robot was told to be.
+class Actuator(ABC):
+    """A robot as it was last told; only an engaged one knows where it was told to be."""
 
-    A restarted control goes on from the last command of its predecessor, at rest.
-    """
-
-    def __init__(self, page: Page, sink: Sink, settings: TickSettings, clock: Callable[[], float]) -> None:
-        self._page = page
-        self._sink = sink
+    def __init__(self, settings: TickSettings) -> None:
+        dim = len(settings.limits.lower)
         self._settings = settings
-        self._clock = clock
-        before = page.control.read()
-        self.engaged = bool(before["engaged"])
-        self.commanded: Float64 = np.array(before["commanded"], np.float64)
-        self.velocity: Float64 = np.zeros(page.layout.dim)
-        self._last_planned = float("-inf")
+        self._reach = settings.limits.reach
+        self._switching = bool(settings.limits.binary.any())
+        self._last_planned: float | None = None
+        self.engaged = False
+        self.commanded: Float64 = np.zeros(dim)
+        self.velocity: Float64 = np.zeros(dim)
+
+    @abstractmethod
+    def state(self, seen: Seen, planned: float, aim: Float64 | None) -> RobotState:
+        """What an action is judged against; `aim` is the action that was wanted before it."""
+
+    @abstractmethod
+    def _deliver(
+        self, step: int, target: Target, action: Float64, notes: tuple[str, ...]
+    ) -> tuple[float, Float64, tuple[str, ...]]:
+        """Tell the robot; when that was, and what it was really told, with the notes."""
 
     def engage(self, measured: Float64) -> None:
         """Take the robot over where it stands: from now on something is sent on every tick.
@@ -68,7 +80,7 @@ class Actuator:
         The grippers of a robot that was engaged before keep their command: closing on an object, they measure
         wider than they were told, and would let go.
         """
-        keep = self._settings.grippers & self.engaged
+        keep = self._settings.limits.grippers & self.engaged
         self.commanded = np.where(keep, self.commanded, measured)
         self.velocity = np.zeros(len(measured))
         self.engaged = True
@@ -76,7 +88,8 @@ class Actuator:
     def elapsed(self, planned: float) -> float:
         """Time since the last tick as limits may use it: half a period to 1.5 periods."""
         period = self._settings.period
-        return float(min(max(planned - self._last_planned, period * 0.5), 1.5 * period))
+        since = period if self._last_planned is None else planned - self._last_planned
+        return min(max(since, period * 0.5), 1.5 * period)
 
     def ticked(self, planned: float) -> None:
         """The tick planned for `planned` is over, whether it sent anything or not."""
@@ -84,12 +97,58 @@ class Actuator:
 
     def brake(self) -> Brake:
         """A stop from the last commanded velocity, as hard as needed to stay within the joint limits."""
-        bounds, speed = self._settings, self.velocity
-        ahead = np.where(speed > 0, bounds.upper - self.commanded, self.commanded - bounds.lower)
+        limits, safety, speed = self._settings.limits, self._settings.safety, self.velocity
+        ahead = np.where(speed > 0, limits.upper - self.commanded, self.commanded - limits.lower)
         needed = speed * speed / (2.0 * np.maximum(ahead, 1e-9))
-        softest = bounds.safety.brake_acceleration * bounds.reach
-        rate = np.clip(needed, softest, np.maximum(softest, bounds.safety.acceleration * bounds.reach))
-        return Brake(self.commanded.copy(), speed.copy(), rate, bounds.lower, bounds.upper)
+        softest = safety.brake_acceleration * self._reach
+        rate = np.clip(needed, softest, np.maximum(softest, safety.acceleration * self._reach))
+        return Brake(self.commanded.copy(), speed.copy(), rate, limits.lower, limits.upper)
+
+    def send(
+        self, step: int, planned: float, target: Target, action: Float64, notes: tuple[str, ...] = ()
+    ) -> Sent:
+        """Tell the robot `action`, which is what locks and safety made of `target`."""
+        time, action, notes = self._deliver(step, target, action, notes)
+        self.velocity = (action - self.commanded) / self.elapsed(planned)
+        if self._switching:
+            self.velocity[self._settings.limits.binary] = 0.0
+        self.commanded = action
+        return Sent(time, target, action, notes)
+
+
+class RobotActuator(Actuator):
+    """The robot itself, behind a transport. A restarted control goes on from the last command, at rest."""
+
+    def __init__(self, page: Page, sink: Sink, settings: TickSettings, clock: Callable[[], float]) -> None:
+        super().__init__(settings)
+        self._page = page
+        self._sink = sink
+        self._clock = clock
+        before = page.control.read()
+        self.engaged = bool(before["engaged"])
+        self.commanded = np.array(before["commanded"], np.float64)
+
+    def measured(self, seen: Seen, now: float) -> Float64 | None:
+        """Where the robot is, None where that is not known freshly."""
+        return self._branch(seen) if seen.fresh(now, self._settings.safety.joint_age_s) else None
+
+    def state(self, seen: Seen, planned: float, aim: Float64 | None) -> RobotState:
+        return RobotState(
+            previous=self.commanded,
+            velocity=self.velocity,
+            measured=self._branch(seen),
+            elapsed=self.elapsed(planned),
+            joint_age=planned - seen.joints_captured,
+            picture_ages=seen.picture_ages(planned),
+            aim=aim,
+        )
+
+    def _branch(self, seen: Seen) -> Float64:
+        """The joints, angles that wrap counted in the turn of the last command, as the node may not count them."""
+        wrapping = self._settings.dims.wrapping
+        if not wrapping or not self.engaged:
+            return seen.joints
+        return self.commanded + difference(seen.joints, self.commanded, wrapping)
 
     def tell(self, word: str, data: Mapping[str, Any]) -> str:
         """Pass a control word on to the node, unless the e-stop is pressed; why it was not, "" where it was."""
@@ -101,16 +160,37 @@ class Actuator:
             return str(error)
         return ""
 
-    def send(
-        self, step: int, planned: float, target: Target, action: Float64, notes: tuple[str, ...] = ()
-    ) -> Sent:
-        """Send `action`, which is what safety made of `target`."""
+    def _deliver(
+        self, step: int, target: Target, action: Float64, notes: tuple[str, ...]
+    ) -> tuple[float, Float64, tuple[str, ...]]:
         now = self._clock()
         if self._page.estop is EStop.LATCHED and target.source != "estop":
             # Pressed since this tick looked: the next one takes over, this one repeats the last command.
             action, notes = self.commanded, ("e-stop pressed within the tick",)
         self._sink.send(RobotCommand(action.astype(np.float32), step, now))
-        velocity = (action - self.commanded) / self.elapsed(planned)
-        self.velocity = np.where(self._settings.binary, 0.0, velocity)
-        self.commanded = action
-        return Sent(now, target, action, notes)
+        return now, action, notes
+
+
+class SimulatedActuator(Actuator):
+    """A robot that is at once where it is told to be. It knows of no transport: nothing of it is ever sent."""
+
+    def __init__(self, start: Float64, settings: TickSettings, clock: Callable[[], float]) -> None:
+        super().__init__(settings)
+        self._clock = clock
+        self.engage(start)
+
+    def state(self, seen: Seen, planned: float, aim: Float64 | None) -> RobotState:
+        # Its joints are known at once; pictures come from outside and grow old as they do for the real robot.
+        return RobotState(
+            previous=self.commanded,
+            velocity=self.velocity,
+            measured=self.commanded,
+            elapsed=self.elapsed(planned),
+            picture_ages=seen.picture_ages(planned),
+            aim=aim,
+        )
+
+    def _deliver(
+        self, step: int, target: Target, action: Float64, notes: tuple[str, ...]
+    ) -> tuple[float, Float64, tuple[str, ...]]:
+        return self._clock(), action, notes

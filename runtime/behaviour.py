@@ -1,21 +1,20 @@
-"""What control does tick by tick: keep silent, hold, follow the timeline, move, obey the e-stop."""
+"""What a robot does tick by tick when it follows no plan: keep silent, hold, move, obey the e-stop."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from runtime.motion import Motion
 from runtime.recording.base import ControlSource
 from runtime.safety import Path
-from runtime.timeline import Makers, Timeline
+from runtime.timeline import Makers
 from runtime.types import Float64
 
 
-@dataclass(frozen=True, slots=True)
-class Target:
+class Target(NamedTuple):
     """What a behaviour wants sent for one tick: float64 [D], and how strictly it is to be judged.
 
     `path` None is a braking or held target, which is sent as it is: refusing it would leave nothing to send.
@@ -64,19 +63,23 @@ class Hold(Behaviour):
         """Whether it has come to a stand."""
         return self._time >= self._brake.duration
 
-    def target(self, step: int, elapsed: float) -> Target | None:
+    def target(self, step: int, elapsed: float) -> Target:
         self._time += elapsed
         return Target(self._brake.at(self._time), "hold", None)
 
 
 class Move(Behaviour):
-    """Comes to a stand, then runs a trajectory of ours; its time goes on only with what was sent."""
+    """Comes to a stand, then runs a trajectory of ours; its time goes on only with what was sent.
+
+    `speed` is the part of the speed of such motions that it was planned with.
+    """
 
     name = "motion"
     moving = True
 
-    def __init__(self, brake: Motion, motion: Motion, goal: Float64) -> None:
+    def __init__(self, brake: Motion, motion: Motion, goal: Float64, speed: float) -> None:
         self.goal = goal
+        self.speed = speed
         self._brake = brake
         self._motion = motion
         self._time = self._next = 0.0
@@ -94,23 +97,6 @@ class Move(Behaviour):
     @property
     def finished(self) -> bool:
         return self._time >= self._brake.duration + self._motion.duration
-
-
-class Follow(Behaviour):
-    """Executes the timeline; None for a step that nothing is planned for."""
-
-    name = "follow"
-    moving = True
-
-    def __init__(self, run: int, timeline: Timeline) -> None:
-        self.run = run
-        self.timeline = timeline
-
-    def target(self, step: int, elapsed: float) -> Target | None:
-        planned = self.timeline.at(step)
-        if planned is None:
-            return None
-        return Target(planned.action, "policy", "policy", planned.makers)
 
 
 class EStopped(Behaviour):

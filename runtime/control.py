@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import logging
-from collections import deque
 from collections.abc import Callable
 
 import numpy as np
@@ -12,8 +11,10 @@ import numpy as np
 from runtime import realtime
 from runtime.clock import Clock, MonotonicClock
 from runtime.errors import RuntimeFault
+from runtime.execution import Strategy
 from runtime.family import Lifeline, Plan, join
 from runtime.page import Page
+from runtime.report import StatusRecord
 from runtime.safety import SafetyFilter
 from runtime.tick import Tick, TickSettings
 from runtime.transports.base import Sink
@@ -25,24 +26,20 @@ _LATENESS_KEPT = 2000
 
 def make_tick(plan: Plan, page: Page, sink: Sink, now: Callable[[], float]) -> Tick:
     """The tick of a deployment; the same object in real time and in lockstep."""
-    settings, limits = plan.deployment.safety, plan.limits
-    merge = plan.strategy.merge(plan.deployment.strategy, plan.robot.binary_dims)
+    deployment, limits = plan.deployment, plan.limits
     return Tick(
         page,
         sink,
-        SafetyFilter(settings, limits, _outside(plan)),
-        merge,
+        SafetyFilter(deployment.safety, limits, _outside(plan)),
+        Strategy(deployment.strategy.kind, plan.strategy.merge(deployment.strategy, plan.dims)),
         TickSettings(
             period=1.0 / plan.rate,
-            velocity=limits.velocity * settings.motion_velocity_scale,
-            lower=limits.lower,
-            upper=limits.upper,
-            grippers=limits.grippers,
-            binary=limits.binary,
-            reach=limits.reach,
-            safety=settings,
-            heartbeat_timeout=plan.deployment.control.heartbeat_timeout_s,
-            starvation_hold=plan.deployment.control.starvation_hold_s,
+            limits=limits,
+            dims=plan.dims,
+            safety=deployment.safety,
+            heartbeat_timeout=deployment.control.heartbeat_timeout_s,
+            starvation=deployment.faults.starvation,
+            starvation_hold=deployment.control.starvation_hold_s,
         ),
         now,
     )
@@ -72,35 +69,30 @@ def _outside(plan: Plan) -> Callable[[Float64], tuple[str, ...]] | None:
 
 
 class Lateness:
-    """How late ticks begin, over the last seconds; figures renewed once a second."""
+    """How late ticks begin, over the last `_LATENESS_KEPT` of them."""
 
-    def __init__(self, page: Page, scheduling: str) -> None:
-        self._page = page
-        self._late: deque[float] = deque(maxlen=_LATENESS_KEPT)
-        self._scheduling = scheduling.encode()
-        self.ticks = int(page.control.read()["ticks"])
-        self.missed = int(page.control.read()["missed"])
-        self._renewed = 0.0
-        self._p50 = self._p99 = self._max = 0.0
+    def __init__(self, status: StatusRecord, scheduling: str) -> None:
+        self._status = status
+        self._late = np.zeros(_LATENESS_KEPT)  # [s]
+        self._count = 0
+        self._ticks, self._missed = int(status["ticks"]), int(status["missed"])
+        status["scheduling"] = scheduling.encode()
 
-    def add(self, lateness: float, missed: int, now: float) -> None:
+    def add(self, lateness: float, missed: int) -> None:
         """Count one tick."""
-        self._late.append(lateness)
-        self.ticks += 1
-        self.missed += missed
-        if now - self._renewed >= 1.0:
-            self._renewed = now
-            late = np.array(self._late)
-            self._p50, self._p99 = np.percentile(late, (50, 99))
-            self._max = float(late.max())
+        self._late[self._count % _LATENESS_KEPT] = lateness
+        self._count += 1
+        self._ticks += 1
+        self._missed += missed
 
     def write(self) -> None:
-        """Add the figures to control's status."""
-        status = self._page.control.read().copy()
-        status["ticks"], status["missed"] = self.ticks, self.missed
-        status["lateness_p50"], status["lateness_p99"] = self._p50, self._p99
-        status["lateness_max"], status["scheduling"] = self._max, self._scheduling
-        self._page.control.write(status)
+        """Renew the figures in control's status; the next tick writes them to the page."""
+        status, late = self._status, self._late[: min(self._count, _LATENESS_KEPT)]
+        status["ticks"], status["missed"] = self._ticks, self._missed
+        if len(late):
+            p50, p99, p999, worst = np.percentile(late, (50, 99, 99.9, 100))
+            status["lateness_p50"], status["lateness_p99"] = p50, p99
+            status["lateness_p999"], status["lateness_max"] = p999, worst
 
 
 class Loop:
@@ -111,7 +103,7 @@ class Loop:
         self._page = page
         self._clock = clock
         self._period = 1.0 / rate
-        self._lateness = Lateness(page, scheduling)
+        self._lateness = Lateness(tick.status, scheduling)
         self._step = int(page.control.read()["step"]) + 1
         self._start = clock.now() + self._period
         self._n = 0
@@ -128,7 +120,7 @@ class Loop:
         planned = deadline + missed * self._period
         self._page.beat("control", now)
         self._tick(self._step, planned)
-        self._lateness.add(now - planned if not missed else now - deadline, missed, now)
+        self._lateness.add(now - deadline, missed)
         self._n += 1
         self._step += 1
         if now >= self._collect_at:

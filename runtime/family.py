@@ -27,6 +27,7 @@ from runtime.plugins import variants
 from runtime.policies.base import Policy
 from runtime.safety import Limits
 from runtime.spaces import Spaces
+from runtime.timeline import Dims
 from runtime.transports.base import Capabilities
 
 
@@ -106,6 +107,12 @@ class Plan:
         return Limits(
             robot.joint_names, robot.lower, robot.upper, robot.velocity, np.array(grippers), np.array(binary)
         )
+
+    @property
+    def dims(self) -> Dims:
+        """Dimensions that do not blend as numbers do: grippers that switch, angles without limits."""
+        endless = np.flatnonzero(np.isinf(self.robot.lower) & np.isinf(self.robot.upper))
+        return Dims(self.robot.binary_dims, tuple(endless.tolist()))
 
     def kinematics(self) -> Kinematics:
         """Forward and inverse kinematics of the robot."""

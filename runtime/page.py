@@ -101,6 +101,7 @@ class PageLayout:
                 ("refused_in_row", "i8"),
                 ("lateness_p50", "f8"),
                 ("lateness_p99", "f8"),
+                ("lateness_p999", "f8"),
                 ("lateness_max", "f8"),
                 ("records_lost", "i8"),
                 ("scheduling", "S24"),

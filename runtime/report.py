@@ -2,13 +2,65 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 
 from runtime.actuator import Actuator, Sent
 from runtime.behaviour import Behaviour, EStopped
 from runtime.messages import ChunkMerged, Event, Message, TickDone, encode
 from runtime.page import Page
-from runtime.types import Float32
+from runtime.recording.base import ControlSource
+from runtime.seen import Seen
+from runtime.timeline import HELD, Makers
+from runtime.types import Float32, Float64
+
+StatusRecord = np.ndarray[Any, np.dtype[np.void]]  # of PageLayout.control_dtype, without dimensions
+_TOLD = 1e-4  # [rad] less than that is rounding at a limit, no news
+_QUIET_S = 1.0  # without a change by safety: its sum is told, and the next change is news again
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """Where control stands at the end of a tick."""
+
+    robot: Actuator
+    behaviour: Behaviour  # the robot's
+    simulating: bool  # the simulated robot follows a run
+    simulated: Float64 | None  # [D] the simulated robot's command
+    remaining: int  # steps planned after this one
+    waiting: bool
+    starved: bool
+    refused: int
+    locked: Float64  # [D]
+
+
+class Limiting:
+    """Tells when safety begins to change what is sent, and how much it did once that is over; never once per tick."""
+
+    def __init__(self, say: Callable[[str, str], None]) -> None:
+        self._say = say
+        self._last = float("-inf")
+        self._count, self._worst, self._most = 0, 0.0, ""
+
+    def note(self, sent: Sent, now: float) -> None:
+        """One tick."""
+        if sent.change > _TOLD:
+            if not self._count:
+                self._say("limited", sent.limited)
+            if sent.change > self._worst:
+                self._worst, self._most = sent.change, sent.limited
+            self._count, self._last = self._count + 1, now
+        elif self._count and now - self._last >= _QUIET_S:
+            self.close()
+
+    def close(self) -> None:
+        """Whatever was limited is over."""
+        if self._count:
+            self._say("limited_sum", f"{self._count} actions were limited, worst: {self._most}")
+        self._count, self._worst, self._most = 0, 0.0, ""
 
 
 class Report:
@@ -18,67 +70,69 @@ class Report:
         self._page = page
         self._outbox: list[ChunkMerged | Event] = []
         self._records_lost = 0
+        self._step, self._planned = -1, 0.0
         self._smoothed: Float32 | None = None  # of this tick: what was wanted before safety
+        self.status: StatusRecord = np.zeros((), page.layout.control_dtype())  # written whole by every tick
+        self.status[()] = page.control.read()  # counters go on from a predecessor's
+        self.limiting = Limiting(self.say)
         self.order = 0  # number of the newest order obeyed
         self.run = 0
 
-    def say(self, kind: str, text: str, now: float) -> None:
+    def begin(self, step: int, planned: float) -> None:
+        """The tick that everything is about from here on."""
+        self._step, self._planned = step, planned
+
+    def say(self, kind: str, text: str) -> None:
         """An event, told at the end of the tick."""
-        self._outbox.append(Event(kind, text, now))
+        self._outbox.append(Event(kind, text, self._planned, self._step))
 
     def merged(self, merged: ChunkMerged) -> None:
         """Where a chunk fell, told at the end of the tick."""
         self._outbox.append(merged)
 
-    def record(self, step: int, planned: float, observation: np.void, sent: Sent) -> None:
-        """The tick, for the episode."""
+    def record(self, seen: Seen, sent: Sent, simulated: bool) -> None:
+        """The tick, for the episode; `simulated`: it was the simulated robot that was told."""
+        self.limiting.note(sent, self._planned)
         target, executed = sent.target, sent.executed
         wanted = target is not None and target.path is not None
         self._smoothed = target.action.astype(np.float32) if target and wanted else None
-        source = "none" if executed is None else "hold"
-        if target is not None and executed is not None and not sent.refused:
-            source = target.source
+        makers = target.makers if target else ()
         done = TickDone(
-            step=step,
+            step=self._step,
             run=self.run,
-            planned=planned,
+            planned=self._planned,
             sent=sent.time,
-            sequence=int(observation["sequence"]),
-            source=source,
-            qpos=np.array(observation["qpos"]),
+            sequence=seen.sequence,
+            source=_source(sent, simulated),
+            qpos=seen.qpos,
             smoothed=self._smoothed,
             executed=None if executed is None else executed.astype(np.float32),
-            chunk_ids=[maker for maker, _ in target.makers] if target else [],
-            weights=[share for _, share in target.makers] if target else [],
+            chunk_ids=[maker for maker, _ in makers],
+            weights=[share for _, share in makers],
             notes=list(sent.notes),
             refused=sent.refused,
         )
         self._push("ticks", done)
+        self._tell_makers(makers, sent)
 
-    def status(
-        self,
-        step: int,
-        planned: float,
-        observation: np.void,
-        behaviour: Behaviour,
-        actuator: Actuator,
-        remaining: int,
-        refused: int,
-    ) -> None:
+    def publish(self, seen: Seen, standing: Standing) -> None:
         """Control's status, and only then the events: main decides by it, so that none may overtake it.
 
         The tick's record comes before either, so that whoever ends an episode by them loses no row.
         """
-        status = self._page.control.read().copy()
-        status["step"], status["planned"] = step, planned
-        status["sequence"], status["order"] = observation["sequence"], self.order
-        status["run"], status["behaviour"] = self.run, behaviour.name.encode()
-        status["remaining"] = remaining
-        status["engaged"], status["moving"] = actuator.engaged, behaviour.moving
-        status["estop_obeyed"] = isinstance(behaviour, EStopped)
-        status["commanded"], status["velocity"] = actuator.commanded, actuator.velocity
+        status, robot = self.status, standing.robot
+        status["step"], status["planned"] = self._step, self._planned
+        status["sequence"], status["order"] = seen.sequence, self.order
+        name = "simulate" if standing.simulating else standing.behaviour.name
+        status["run"], status["behaviour"] = self.run, name.encode()
+        status["remaining"], status["refused_in_row"] = standing.remaining, standing.refused
+        status["engaged"], status["moving"] = robot.engaged, standing.behaviour.moving
+        status["estop_obeyed"] = isinstance(standing.behaviour, EStopped)
+        status["commanded"], status["velocity"] = robot.commanded, robot.velocity
         status["smoothed"] = np.nan if self._smoothed is None else self._smoothed
-        status["refused_in_row"] = refused
+        status["simulated"] = np.nan if standing.simulated is None else standing.simulated
+        status["waiting"], status["starved"] = standing.waiting, standing.starved
+        status["locked"] = standing.locked
         status["records_lost"] = self._records_lost
         self._page.control.write(status)
         for message in self._outbox:
@@ -86,6 +140,20 @@ class Report:
             self._push("ticks", message)
         self._outbox.clear()
 
+    def _tell_makers(self, makers: Makers, sent: Sent) -> None:
+        status = self.status
+        status["chunk"] = max(makers, key=lambda made: made[1])[0] if makers else -1
+        status["chunks"] = sum(maker != HELD for maker, _ in makers)
+        status["limited"] = bool(sent.limited) or sent.refused
+
     def _push(self, ring: str, message: Message) -> None:
         if not self._page.rings[ring].push(encode(message)):
             self._records_lost += 1
+
+
+def _source(sent: Sent, simulated: bool) -> ControlSource:
+    if sent.executed is None:
+        return "none"
+    if sent.target is None or sent.refused:
+        return "sim" if simulated else "hold"
+    return "sim" if simulated and sent.target.source == "policy" else sent.target.source

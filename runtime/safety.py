@@ -68,14 +68,22 @@ class RobotState:
     elapsed: float  # since the last command, capped by the caller at 1.5 periods
     joint_age: float = 0.0
     picture_ages: dict[str, float] = field(default_factory=dict)
+    aim: Float64 | None = (
+        None  # the action that was wanted at the last tick; None: none was, `previous` counts
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What may be sent: `action` float64 [D], None where refused; `notes` say what was changed or why."""
+    """What may be sent: `action` float64 [D], None where refused; `notes` say what was changed or why.
+
+    `most` is the note on what was changed most, and `change` by how much [rad, or a gripper's worth of them].
+    """
 
     action: Float64 | None
     notes: tuple[str, ...] = ()
+    most: str = ""
+    change: float = 0.0
 
     @property
     def refused(self) -> bool:
@@ -124,6 +132,20 @@ class SafetyFilter:
         self._limits = limits
         self._outside = outside  # names the arms whose end effector leaves its box
         self._angles = ~limits.grippers
+        self._switching = bool(limits.binary.any())
+        self._reach = limits.reach
+        self._bounds = np.stack([limits.upper, -limits.lower])  # [2, D]
+        self._stopping = settings.acceleration * self._reach
+        self._braking = settings.brake_acceleration * self._reach
+        self._top = {
+            "policy": limits.velocity * settings.velocity_scale,
+            # A motion is planned at its limits; the margin keeps rounding from counting as excess.
+            "motion": limits.velocity * settings.motion_velocity_scale * _MARGIN,
+        }
+        self._rate = {
+            "policy": self._stopping,
+            "motion": settings.motion_acceleration * self._reach * _MARGIN,
+        }
 
     def judge(self, action: Float64, state: RobotState, path: Path = "policy") -> Verdict:
         """The verdict on `action` [D]; with report-only the action comes back unchanged, with the notes."""
@@ -132,13 +154,14 @@ class SafetyFilter:
         refusal = self._refusal(action, state, path)
         if refusal and not self._settings.report_only:
             return Verdict(None, (refusal,))
-        reachable, notes = self._reachable(action, state, path)
+        reachable = self.reachable(action, state, path)
+        notes = self._changes(action, reachable)
         if self._settings.report_only:
             return Verdict(action, (*filter(None, [refusal]), *notes, *self._excess(action)))
-        violation = self._violation(reachable, state) or self._box_violation(reachable, state, path)
+        violation = self._violation(reachable, state) or self._box_violation(action, reachable, state, path)
         if violation:
             return Verdict(None, (*notes, violation))
-        return Verdict(reachable, notes)
+        return self._changed(action, reachable, notes) if notes else Verdict(reachable)
 
     def _refusal(self, action: Float64, state: RobotState, path: Path) -> str:
         if path == "motion":  # of ours: needs no pictures, and may come from outside the box
@@ -169,14 +192,20 @@ class SafetyFilter:
         return f"{', '.join(arms)} would leave the workspace box" if arms else ""
 
     def _runs_away(self, action: Float64, state: RobotState) -> str:
-        error = np.where(self._angles, np.abs(action - state.measured), 0.0)
+        allowed = self._settings.following_error
+        error = np.abs(action - state.measured)
+        if (
+            (error <= allowed) | self._limits.grippers
+        ).all():  # NaN, a joint that is measured nowhere, is not
+            return ""
+        error = np.where(self._angles, error, 0.0)
         # A blocked arm must still be allowed to come back towards where it is measured.
         returning = error < np.abs(state.previous - state.measured)
-        excess = np.where(returning | (error <= self._settings.following_error), 0.0, error)
-        if not excess.any():  # NaN, a joint that is measured nowhere, counts
+        excess = np.where(returning | (error <= allowed), 0.0, error)
+        if not excess.any():
             return ""
         worst = int(excess.argmax())
-        name, allowed = self._limits.names[worst], self._settings.following_error
+        name = self._limits.names[worst]
         return f"{name} would be {excess[worst]:.2f} rad from where it is measured, allowed {allowed:g}"
 
     def _jumps(self, action: Float64, state: RobotState) -> str:
@@ -186,47 +215,76 @@ class SafetyFilter:
             return ""
         return f"{self._limits.names[worst]} jumps {jump[worst]:.2f} rad, allowed {self._settings.jump:g}"
 
-    def _box_violation(self, reachable: Float64, state: RobotState, path: Path) -> str:
+    def _box_violation(self, action: Float64, reachable: Float64, state: RobotState, path: Path) -> str:
         """The box also holds for what is really sent, and for where the arm would come to a stand after it."""
         if self._outside is None or path == "motion":
             return ""
         velocity = (reachable - state.previous) / state.elapsed
-        a = self._settings.brake_acceleration * self._limits.reach
-        stop = reachable + velocity * np.abs(velocity) / (2.0 * a)
-        return self._leaves_box(reachable) or self._leaves_box(stop)
+        stop = reachable + velocity * np.abs(velocity) / (2.0 * self._braking)
+        changed = reachable is not action  # an action that was not changed has been looked at already
+        return (self._leaves_box(reachable) if changed else "") or self._leaves_box(stop)
 
-    def _reachable(self, action: Float64, state: RobotState, path: Path) -> tuple[Float64, tuple[str, ...]]:
-        limits, dt, settings = self._limits, state.elapsed, self._settings
-        stopping = settings.acceleration * limits.reach
-        if path == "motion":
-            # A motion is planned at its limits; the margin keeps rounding from counting as excess.
-            a = settings.motion_acceleration * limits.reach * _MARGIN
-            top = limits.velocity * settings.motion_velocity_scale * _MARGIN
-        else:
-            a, top = stopping, limits.velocity * settings.velocity_scale
-        up = np.minimum(top, _stopping_speed(limits.upper - state.previous, stopping, dt))
-        down = -np.minimum(top, _stopping_speed(state.previous - limits.lower, stopping, dt))
-        fastest = np.minimum(up, state.velocity + a * dt)
-        slowest = np.maximum(down, state.velocity - a * dt)
-        # Where the two contradict (a limit was changed, a stall), braking as hard as allowed wins.
-        braking = state.velocity - np.sign(state.velocity) * np.minimum(a * dt, np.abs(state.velocity))
+    def reachable(self, action: Float64, state: RobotState, path: Path = "policy") -> Float64:
+        """The action next to `action` [D] that velocity, acceleration and joint limits allow; itself where they do."""
+        dt, now = state.elapsed, state.velocity
+        gain = self._rate[path] * dt
+        room = self._bounds - np.stack([state.previous, -state.previous])
+        most = np.minimum(self._top[path], _stopping_speed(room, self._stopping, dt))
+        fastest = np.minimum(most[0], now + gain)
+        slowest = np.maximum(-most[1], now - gain)
         crossed = slowest > fastest
-        fastest, slowest = np.where(crossed, braking, fastest), np.where(crossed, braking, slowest)
+        if crossed.any():
+            # Where the two contradict (a limit was changed, a stall), braking as hard as allowed wins.
+            braking = now - np.sign(now) * np.minimum(gain, np.abs(now))
+            fastest, slowest = np.where(crossed, braking, fastest), np.where(crossed, braking, slowest)
         wanted = (action - state.previous) / dt
-        velocity = np.clip(wanted, slowest, fastest)
+        velocity = np.minimum(np.maximum(self._in_time(wanted, action, state, path), slowest), fastest)
         changed = np.abs(velocity - wanted) * dt > _TOLERANCE
-        reachable = np.where(changed, state.previous + velocity * dt, action)
-        binary = limits.binary
-        reachable = np.where(binary, np.clip(action, limits.lower, limits.upper), reachable)
-        notes = tuple(
-            f"{limits.names[i]} limited from {action[i]:.4f} to {reachable[i]:.4f}"
+        if self._switching:
+            changed &= ~self._limits.binary
+        reachable = np.where(changed, state.previous + velocity * dt, action) if changed.any() else action
+        if self._switching:
+            within = np.clip(action, self._limits.lower, self._limits.upper)
+            reachable = np.where(self._limits.binary, within, reachable)
+        return reachable
+
+    def _in_time(self, wanted: Float64, action: Float64, state: RobotState, path: Path) -> Float64:
+        """Velocities that catch up with a target so that they can be in step with it when they reach it.
+
+        Who is behind a target that jumped must not arrive with all the speed gathered on the way: beside the
+        target's own velocity there may be as much as can still be braked away within the distance.
+        """
+        aim = state.previous if state.aim is None else state.aim
+        behind = aim - state.previous
+        if not (np.abs(behind) > _TOLERANCE).any():
+            return wanted
+        dt = state.elapsed
+        own = (action - aim) / dt
+        speed = _stopping_speed(np.abs(behind), self._rate[path], dt)
+        bounded = own + np.minimum(np.maximum(wanted - own, -speed), speed)
+        return np.where(np.abs(behind) > _TOLERANCE, bounded, wanted)
+
+    def _changes(self, action: Float64, reachable: Float64) -> tuple[str, ...]:
+        if reachable is action:
+            return ()
+        return tuple(
+            self._change(i, action, reachable)
             for i in np.flatnonzero(np.abs(reachable - action) > _TOLERANCE)
         )
-        return reachable, notes
+
+    def _change(self, i: int | np.intp, action: Float64, reachable: Float64) -> str:
+        return f"{self._limits.names[i]} limited from {action[i]:.4f} to {reachable[i]:.4f}"
+
+    def _changed(self, action: Float64, reachable: Float64, notes: tuple[str, ...]) -> Verdict:
+        change = np.abs(reachable - action) / self._reach
+        worst = change.argmax()
+        return Verdict(reachable, notes, self._change(worst, action, reachable), float(change[worst]))
 
     def _violation(self, action: Float64, state: RobotState) -> str:
         limits = self._limits
         excess = _outside(action, limits)
+        if not (excess > _TOLERANCE).any():
+            return ""
         worse = (excess > _TOLERANCE) & (excess > _outside(state.previous, limits) + _TOLERANCE)
         if not worse.any():
             return ""

@@ -1,34 +1,32 @@
-"""One control tick: obey orders, merge chunks, choose a target, judge it, send it, write it down."""
+"""One control tick: obey orders, let chunks join the plan, look out for alarms, tell the robot, write it down."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
-from runtime.actuator import Actuator, Sent, TickSettings
-from runtime.behaviour import Behaviour, EStopped, Follow, Hold, Move, Silent, Target
-from runtime.messages import ChunkMerged, NodeRequest, Order, PostedChunk, decode
-from runtime.motion import Trajectory
+from runtime.actuator import Actuator, RobotActuator, Sent, SimulatedActuator, TickSettings
+from runtime.alarms import Displacement, silent_sibling
+from runtime.behaviour import EStopped, Hold
+from runtime.errors import ConfigurationError
+from runtime.execution import Follow, Strategy, dropped, strategy
+from runtime.lane import Lane
+from runtime.locks import Locks
+from runtime.messages import LockGrippers, NodeRequest, Order, PostedChunk, Tune, decode
 from runtime.page import EStop, Page
-from runtime.report import Report
-from runtime.safety import RobotState, SafetyFilter
-from runtime.strategies.base import Arrival, Merge
-from runtime.timeline import Timeline
+from runtime.report import Report, Standing, StatusRecord
+from runtime.safety import SafetyFilter
+from runtime.seen import Eyes
 from runtime.transports.base import Sink
 from runtime.types import Float64
 
 __all__ = ["Tick", "TickSettings"]
-_UNSEEN_S = 0.5  # without joints: whatever has happened to the robot meanwhile was not seen
-_RETURNED_AWAY = 0.1  # [rad] that an arm may be off after that, by sagging
-_ARRIVED = 1e-4  # [rad] of a motion's end: it may have been limited on its last steps
-_JOINED_AT_ONCE = 0.05  # [rad] that a run's first action may be off without being blended in
 
 
 class Tick:
-    """The control loop's body; owns the timeline and everything that is sent.
+    """The control loop's body: two lanes, the robot's and, during a run in simulation, the simulated robot's.
 
     A missed deadline is never caught up: the caller passes the step that is due now, and limits use the time
     since the last command, capped at 1.5 periods.
@@ -39,281 +37,231 @@ class Tick:
         page: Page,
         sink: Sink,
         safety: SafetyFilter,
-        merge: Merge,
+        chosen: Strategy,
         settings: TickSettings,
         clock: Callable[[], float],
     ) -> None:
         self._page = page
         self._safety = safety
-        self._merge = merge
+        self._strategy = chosen
         self._settings = settings
-        self._actuator = Actuator(page, sink, settings, clock)
+        self._clock = clock
+        self._eyes = Eyes(page)
         self._report = Report(page)
-        self.timeline = Timeline(page.layout.dim)
+        self._locks = Locks(settings.limits)
+        self._displacement = Displacement(settings)
+        self._actuator = RobotActuator(page, sink, settings, clock)
         # A restarted control goes on holding where its predecessor stood; a new one keeps silent.
-        self._behaviour: Behaviour = self._holding() if self._actuator.engaged else Silent()
-        self._standing: Hold | None = None  # a stop in place of what could not be sent
-        self._refused = 0
-        # Refusals among the last actions: every second one refused is as bad as all of them.
-        self._verdicts: deque[bool] = deque(maxlen=2 * settings.safety.refusals_to_hold)
-        self._unseen_since: float | None = None
-        self._starved_since: float | None = None
-        self._waiting = True  # for a run's first chunk: no starvation yet, the policy's deadline bounds it
+        self._robot = self._lane(self._actuator)
+        self._simulated: Lane | None = None
+        self._simulated_run = 0
         self.orphaned = False
 
     def __call__(self, step: int, planned: float) -> None:
         """Do the tick `step`, planned for `planned` on our clock."""
-        self._observation = self._page.observation.read()
+        self._seen = self._eyes.look()
+        self._report.begin(step, planned)
         for payload in self._page.rings["orders"].drain():
             self._obey(decode(payload), step, planned)
         self._check_estop(planned)
         self._check_family(planned)
         self._check_displaced(planned)
-        sent = self._send(step, planned)
-        self._finish_motion(planned, sent)
-        self._report.record(step, planned, self._observation, sent)
-        remaining = self.timeline.remaining(step + 1)
-        self._report.status(
-            step, planned, self._observation, self._behaviour, self._actuator, remaining, self._refused
+        sent = self._drive(step, planned)
+        self._report.record(self._seen, sent, self._simulated is not None)
+        self._report.publish(self._seen, self._standing(step, sent))
+        for lane in self._lanes:
+            lane.actuator.ticked(planned)
+
+    @property
+    def status(self) -> StatusRecord:
+        """Control's status, as the next tick will write it; the loop adds its own figures to it."""
+        return self._report.status
+
+    # --- lanes ---------------------------------------------------------------------------------------------
+
+    @property
+    def _lanes(self) -> tuple[Lane, ...]:
+        return (self._robot,) if self._simulated is None else (self._robot, self._simulated)
+
+    @property
+    def _led(self) -> Lane:
+        """The lane that chunks are for."""
+        return self._robot if self._simulated is None else self._simulated
+
+    def _lane(self, actuator: Actuator) -> Lane:
+        return Lane(actuator, self._safety, self._locks, self._settings, self._report)
+
+    def _drive(self, step: int, planned: float) -> Sent:
+        """Move every lane on by a tick; what became of it on the one that is led, for the record."""
+        sent = Sent(planned)
+        if self._page.estop is not EStop.UNKNOWN:
+            for lane in self._lanes:
+                sent = lane.drive(step, planned, self._seen)
+        return sent
+
+    def _standing(self, step: int, sent: Sent) -> Standing:
+        led, run = self._led, self._led.run
+        waits = run is None or run.waits
+        empty = run is not None and sent.target is None
+        simulated = None if self._simulated is None else self._simulated.actuator.commanded
+        return Standing(
+            robot=self._actuator,
+            behaviour=self._robot.behaviour,
+            simulating=self._simulated is not None and run is not None,
+            simulated=simulated,
+            remaining=0 if run is None else run.timeline.remaining(step + 1),
+            waiting=empty and waits,
+            starved=empty and not waits,
+            refused=led.refused,
+            locked=self._locks.values,
         )
-        self._actuator.ticked(planned)
 
     # --- orders and chunks ---------------------------------------------------------------------------------
 
     def _obey(self, message: object, step: int, now: float) -> None:
         if isinstance(message, PostedChunk):
-            self._merge_chunk(message, step)
+            self._merge(message, step)
         elif isinstance(message, NodeRequest):
-            refusal = self._actuator.tell(message.word, message.data)
-            if refusal:
-                self._report.say("word_refused", refusal, now)
+            self._answer("word_refused", self._actuator.tell(message.word, message.data))
+        elif isinstance(message, Tune):
+            self._tune(message.strategy, step)
+        elif isinstance(message, LockGrippers):
+            self._lock(message.values)
         elif isinstance(message, Order):
             self._report.order, self._report.run = message.number, message.run
-            if not isinstance(self._behaviour, EStopped):
+            if not isinstance(self._robot.behaviour, EStopped):
                 self._follow_order(message, now)
 
-    def _follow_order(self, order: Order, now: float) -> None:
-        if order.kind != "hold":
-            self._standing = None
-        if order.kind == "silent":
-            self._actuator.engaged = False
-            self._behaviour = Silent()
-        elif order.kind == "hold":
-            self._hold(now)
-        elif order.kind == "motion" and order.goal is not None and self._engage(now):
-            self._forget_refusals()
-            self._move(order.goal)
-        elif order.kind == "follow" and self._engage(now):
-            self._forget_refusals()
-            self._starved_since = None
-            self._waiting = True
-            self.timeline.clear()
-            self._behaviour = Follow(order.run, self.timeline)
+    def _answer(self, kind: str, refusal: str) -> None:
+        if refusal:
+            self._report.say(kind, refusal)
 
-    def _merge_chunk(self, chunk: PostedChunk, step: int) -> None:
-        if not isinstance(self._behaviour, Follow) or chunk.run != self._report.run:
-            why = "control is not following that run any more"
-            targets = np.full(len(chunk.rows), -1, np.int64)
-            delay = step - chunk.observation_step
-            self._report.merged(ChunkMerged(chunk.chunk_id, chunk.run, step, delay, targets, 0, why))
+    def _merge(self, chunk: PostedChunk, step: int) -> None:
+        lane, run = self._led, self._led.run
+        if run is None or chunk.run != run.number:
+            self._report.merged(dropped(chunk, step, "control is not following that run any more"))
             return
-        held_before = (self._starved_since is not None or self._far(chunk.rows[0])) and not self._merge.waits
-        if held_before:
-            # Nothing was planned: blend the new chunk over from the target that is being held.
-            held = np.repeat(self._actuator.commanded[None], len(chunk.rows), 0)
-            self.timeline.replace(step, held, [()] * len(chunk.rows))
-        arrival = Arrival(chunk.chunk_id, chunk.observation_step, chunk.rows)
-        merged = self._merge(self.timeline, arrival, step)
-        if held_before and merged.dropped:
-            self.timeline.clear()  # what was only laid out to be blended with is no plan
-        self._waiting = False  # also where it was dropped: a policy that is always too late starves
-        self._report.merged(
-            ChunkMerged(
-                merged.chunk_id,
-                chunk.run,
-                merged.arrival_step,
-                merged.delay,
-                merged.targets,
-                merged.mistimed,
-                merged.dropped,
+        joined = run.join(chunk, step, lane.actuator.commanded)
+        self._report.merged(joined.merged)
+        self._answer("far_start", joined.far)
+
+    def _tune(self, section: Mapping[str, Any], step: int) -> None:
+        try:
+            chosen = strategy(section, self._settings.dims)
+        except ConfigurationError as error:
+            self._report.say("tune_refused", str(error))
+            return
+        self._strategy, run = chosen, self._led.run
+        if run is not None:
+            run.tune(chosen, step)
+        self._report.say("tuned", f"chunks are merged by {chosen.kind} from now on")
+
+    def _lock(self, values: Float64) -> None:
+        refusal = self._locks.set(values)
+        if refusal:
+            self._report.say("lock_refused", refusal)
+            return
+        for lane in self._lanes:
+            lane.relock()
+        self._report.say("locked", str(self._locks))
+
+    def _follow_order(self, order: Order, now: float) -> None:
+        self._report.limiting.close()
+        rehearses = order.kind == "hold" or (order.kind == "follow" and order.mode == "sim")
+        if order.run != self._simulated_run or not rehearses:
+            self._simulated = None
+        if order.kind == "silent":
+            self._robot.silence()
+        elif order.kind == "hold":
+            for lane in self._lanes:
+                lane.hold()
+        elif order.kind == "motion":
+            self._begin_motion(order, now)
+        elif order.mode == "sim":
+            self._begin_simulation(order, now)
+        elif self._engage(now):
+            self._robot.follow(self._run(order))
+
+    def _run(self, order: Order) -> Follow:
+        return Follow(order.run, order.mode, self._strategy, self._settings)
+
+    def _begin_motion(self, order: Order, now: float) -> None:
+        goal = order.goal
+        if goal is None or goal.shape != self._locks.values.shape or np.isinf(goal).any():
+            self._robot.hold()
+            self._report.say(
+                "refusals", f"a motion to {goal} is none: expected {len(self._locks.on)} numbers"
             )
-        )
+        elif not 0.0 < order.speed <= 1.0:
+            self._robot.hold()
+            self._report.say("refusals", f"a motion at {order.speed} of its speed; allowed: above 0 up to 1")
+        elif self._engage(now):
+            self._robot.move(goal.astype(np.float64), order.speed)
 
-    def _far(self, row: Float64) -> bool:
-        """Whether a run's first chunk begins too far from where the robot is held to be joined at once."""
-        if not self._waiting or self._settings.safety.report_only:
-            return False
-        away = np.abs(row - self._actuator.commanded)
-        return bool(np.where(self._settings.grippers, 0.0, away).max() > _JOINED_AT_ONCE)
+    def _begin_simulation(self, order: Order, now: float) -> None:
+        """The robot holds, or stays silent; the simulated one goes on where it is, or starts where that one is."""
+        self._robot.hold()
+        if self._simulated is None:
+            measured = self._measured(now)
+            if measured is None:
+                self._report.say(
+                    "unmeasured", "no fresh joints: nobody knows where the simulation is to begin"
+                )
+                return
+            start = SimulatedActuator(measured, self._settings, self._clock)
+            self._simulated, self._simulated_run = self._lane(start), order.run
+        self._simulated.follow(self._run(order))
 
-    # --- behaviours ----------------------------------------------------------------------------------------
+    # --- alarms --------------------------------------------------------------------------------------------
 
     def _measured(self, now: float) -> Float64 | None:
         """Where the robot is, None where that is not known freshly."""
-        seen = self._observation
-        qpos = np.array(seen["qpos"], np.float64)
-        fresh = seen["sequence"] > 0 and now - seen["joints_captured"] <= self._settings.safety.joint_age_s
-        return qpos if fresh and np.isfinite(qpos).all() else None
+        return self._actuator.measured(self._seen, now)
 
     def _engage(self, now: float) -> bool:
         """Take the robot over where it is measured; False, and said so, where nobody knows where it is."""
         if not self._actuator.engaged:
             measured = self._measured(now)
             if measured is None:
-                self._report.say("unmeasured", "no fresh joints: nothing is sent to a robot unseen", now)
+                self._report.say("unmeasured", "no fresh joints: nothing is sent to a robot unseen")
                 return False
             self._actuator.engage(measured)
         return True
 
-    def _hold(self, now: float) -> None:
-        if self._actuator.engaged and not isinstance(self._behaviour, Hold):
-            self._behaviour = self._standing or self._holding()
-
-    def _holding(self) -> Hold:
-        return Hold(self._actuator.brake())
-
-    def _move(self, goal: Float64) -> None:
-        """Come to a stand, then go to `goal`."""
-        brake = self._actuator.brake()
-        rate = self._settings.safety.motion_acceleration * self._settings.reach
-        path = Trajectory(brake.at(brake.duration), goal, self._settings.velocity, rate)
-        self._behaviour = Move(brake, path, goal)
-
-    def _forget_refusals(self) -> None:
-        self._refused = 0
-        self._verdicts.clear()
-
-    def _hold_because(self, kind: str, reason: str, now: float) -> None:
-        """Hold for a reason of control's own, and say so."""
-        if self._behaviour.moving:
-            self._hold(now)
-            self._report.say(kind, reason, now)
-
     def _check_estop(self, now: float) -> None:
         latched = self._page.estop is EStop.LATCHED
-        if latched and not isinstance(self._behaviour, EStopped):
+        stopped = self._robot.behaviour if isinstance(self._robot.behaviour, EStopped) else None
+        if latched and stopped is None:
             # Before it was ever engaged nothing is known to send, until the robot has been measured.
-            self._behaviour = EStopped(self._actuator.commanded.copy() if self._actuator.engaged else None)
-            self._report.say("estopped", "e-stop", now)
-        elif not latched and isinstance(self._behaviour, EStopped):
-            self._behaviour = self._holding() if self._actuator.engaged else Silent()
-            self._report.say("released", "e-stop released", now)
-        if isinstance(self._behaviour, EStopped):
-            measured = self._measured(now)
-            if measured is not None:
-                if not self._actuator.engaged:
-                    self._actuator.engage(measured)
-                # An object in the gripper keeps it open: its command stays, or it would let go.
-                seen = np.where(self._settings.grippers, self._actuator.commanded, measured)
-                self._behaviour.see(seen, self._settings.safety.following_error)
-
-    def _check_displaced(self, now: float) -> None:
-        """Hold where the robot is, and not where it was told to hold, once these are far apart.
-
-        It was moved by hand, switched off, or its node was restarted: to send the old target would make it move
-        by itself.
-        """
-        measured = self._measured(now)
-        if measured is None:
-            self._unseen_since = now if self._unseen_since is None else self._unseen_since
+            stopped = EStopped(self._actuator.commanded.copy() if self._actuator.engaged else None)
+            self._robot.behaviour, self._simulated = stopped, None
+            self._report.say("estopped", "e-stop")
+        elif not latched and stopped is not None:
+            self._robot.release()
+            self._report.say("released", "e-stop released")
             return
-        returned = self._unseen_since is not None and now - self._unseen_since > _UNSEEN_S
-        self._unseen_since = None
-        held = isinstance(self._behaviour, Hold) and self._actuator.engaged
-        if not held or self._settings.safety.report_only:
-            return
-        away = np.where(self._settings.grippers, 0.0, np.abs(measured - self._actuator.commanded))
-        allowed = _RETURNED_AWAY if returned else self._settings.safety.following_error
-        if away.max() > allowed:
-            self._actuator.engage(measured)
-            self._behaviour = self._holding()
-            text = f"the robot is {away.max():.2f} rad from where it was told to hold: holding where it is"
-            self._report.say("displaced", text, now)
+        measured = None if stopped is None else self._measured(now)
+        if stopped is not None and measured is not None:
+            if not self._actuator.engaged:
+                self._actuator.engage(measured)
+            # An object in the gripper keeps it open: its command stays, or it would let go.
+            seen = np.where(self._settings.limits.grippers, self._actuator.commanded, measured)
+            stopped.see(seen, self._settings.safety.following_error)
 
     def _check_family(self, now: float) -> None:
-        if self.orphaned:
-            self._hold_because("orphaned", "the supervisor is gone", now)
-            return
-        for process in ("main", "guard"):
-            beat = self._page.last_beat(process)
-            if now - beat > self._settings.heartbeat_timeout:
-                since = f"for {now - beat:.1f} s" if beat else "since it was restarted"
-                self._hold_because("family", f"no sign of life from {process} {since}", now)
+        kind, reason = "orphaned", "the supervisor is gone" if self.orphaned else ""
+        if not reason:
+            kind, reason = "family", silent_sibling(self._page, now, self._settings.heartbeat_timeout)
+        for lane in self._lanes if reason else ():
+            lane.hold_because(kind, reason)
 
-    def _finish_motion(self, now: float, sent: Sent) -> None:
-        """A motion is done when its end has been sent: not refused, and not limited on the way there."""
-        if not isinstance(self._behaviour, Move) or sent.target is None or sent.executed is None:
-            return
-        if sent.refused:
-            self._move(self._behaviour.goal)  # from where it stands, when it may go on
-            return
-        self._behaviour.sent()
-        if self._behaviour.finished and np.allclose(sent.executed, self._behaviour.goal, atol=_ARRIVED):
-            self._behaviour = self._holding()
-            self._report.say("motion_done", "arrived", now)
-
-    # --- sending -------------------------------------------------------------------------------------------
-
-    def _send(self, step: int, planned: float) -> Sent:
-        target = self._behaviour.target(step, self._actuator.elapsed(planned))
-        if self._page.estop is EStop.UNKNOWN:
-            return Sent(planned)
-        if target is None:
-            return self._starve(step, planned) if isinstance(self._behaviour, Follow) else Sent(planned)
-        if target.path is None:
-            self._standing = None  # what is sent now is another stop: the old one must not go on later
-            return self._actuator.send(step, planned, target, target.action)
-        verdict = self._safety.judge(target.action, self._state(planned), target.path)
-        if verdict.action is None:
-            return self._refuse(step, planned, target, verdict.notes)
-        self._refused = 0
-        self._verdicts.append(False)
-        self._standing = None
-        self._recover(planned)
-        return self._actuator.send(step, planned, target, verdict.action, verdict.notes)
-
-    def _state(self, now: float) -> RobotState:
-        seen = self._observation
-        pictures = zip(self._page.layout.cameras, seen["picture_captured"], strict=False)
-        return RobotState(
-            previous=self._actuator.commanded,
-            velocity=self._actuator.velocity,
-            measured=np.array(seen["qpos"], np.float64),
-            elapsed=self._actuator.elapsed(now),
-            joint_age=now - float(seen["joints_captured"]),
-            picture_ages={camera: now - float(captured) for camera, captured in pictures},
-        )
-
-    def _refuse(self, step: int, planned: float, target: Target, notes: tuple[str, ...]) -> Sent:
-        self._refused += 1
-        self._verdicts.append(True)
-        if self._refused == 1:
-            self._report.say("refused", notes[-1], planned)
-        refused = sum(self._verdicts)
-        if refused >= self._settings.safety.refusals_to_hold:
-            how = "in a row" if refused == self._refused else f"of the last {len(self._verdicts)}"
-            text = f"{refused} actions refused {how}, the last one: {notes[-1]}"
-            self._hold_because("refusals", text, planned)
-        return replace(self._stand(step, planned), target=target, notes=notes, refused=True)
-
-    def _stand(self, step: int, planned: float) -> Sent:
-        """Send the next point of a stop instead of what could not be sent."""
-        if self._standing is None:
-            self._standing = self._holding()
-        target = self._standing.target(step, self._actuator.elapsed(planned))
-        assert target is not None
-        return replace(self._actuator.send(step, planned, target, target.action), target=None)
-
-    def _starve(self, step: int, planned: float) -> Sent:
-        if not (self._merge.waits or self._waiting):
-            if self._starved_since is None:
-                self._starved_since = planned
-                self._report.say("starved", "no action for this step: slowing down and holding", planned)
-            elif (since := planned - self._starved_since) >= self._settings.starvation_hold:
-                self._hold_because("starvation", f"no usable chunk for {since:.1f} s", planned)
-        return self._stand(step, planned)
-
-    def _recover(self, now: float) -> None:
-        if self._starved_since is not None:
-            self._report.say("recovered", f"actions again after {now - self._starved_since:.2f} s", now)
-            self._starved_since = None
+    def _check_displaced(self, now: float) -> None:
+        """Hold where the robot is, and not where it was told to hold, once these are far apart."""
+        held = isinstance(self._robot.behaviour, Hold) and self._actuator.engaged
+        where = self._displacement(self._actuator, self._seen, now, held)
+        if where is not None:
+            away = self._displacement.distance(self._actuator, where)
+            self._actuator.engage(where)
+            self._robot.hold_here()
+            text = f"the robot is {away:.2f} rad from where it was told to hold: holding where it is"
+            self._report.say("displaced", text)

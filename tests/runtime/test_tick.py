@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 
 from runtime.clock import VirtualClock
+from runtime.execution import Strategy
 from runtime.messages import ChunkMerged, Event, NodeRequest, Order, PostedChunk, TickDone, decode, encode
 from runtime.page import EStop, Page, PageLayout
 from runtime.safety import Limits, SafetyFilter, SafetySettings
 from runtime.strategies import overlap, sync
 from runtime.tick import Tick, TickSettings
+from runtime.timeline import Dims
 from runtime.transports.base import Sink
 from runtime.types import Observation
 
@@ -44,7 +46,7 @@ class Bench:
         self.page.set_estop(EStop.CLEAR)
         self.step, self.order, self.sequence = 0, 0, 0
         self.measured = np.zeros(DIM)
-        self.merge = merge or overlap.merge(overlap.Config(), ())
+        self.merge = merge or overlap.merge(overlap.Config(), Dims())
         self.safety = SafetySettings(**safety)
         self.before_send = lambda: None
         self.tick = self.new_tick()
@@ -56,18 +58,17 @@ class Bench:
         limits = Limits(("a", "b"), np.full(2, -2.0), np.full(2, 2.0), np.full(2, 3.0), no, no)
         settings = TickSettings(
             period=PERIOD,
-            velocity=limits.velocity * self.safety.motion_velocity_scale,
-            lower=limits.lower,
-            upper=limits.upper,
-            grippers=limits.grippers,
-            binary=limits.binary,
-            reach=limits.reach,
+            limits=limits,
+            dims=Dims(),
             safety=self.safety,
             heartbeat_timeout=1.0,
+            starvation="slow",
             starvation_hold=1.0,
         )
         safety = SafetyFilter(self.safety, limits)
-        return Tick(self.page, self.sink, safety, self.merge, settings, self.time_of_sending)
+        return Tick(
+            self.page, self.sink, safety, Strategy("async", self.merge), settings, self.time_of_sending
+        )
 
     def time_of_sending(self):
         self.before_send()
@@ -89,9 +90,9 @@ class Bench:
         self.order += 1
         self.page.rings["orders"].push(encode(Order(self.order, kind, **fields)))
 
-    def chunk(self, number, rows, step=None, run=1):
+    def chunk(self, number, rows, step=None, run=1, waited=False):
         step = self.step if step is None else step
-        chunk = PostedChunk(number, run, step, np.asarray(rows, float))
+        chunk = PostedChunk(number, run, step, np.asarray(rows, float), waited)
         self.page.rings["orders"].push(encode(chunk))
 
     def run(self, ticks=1, stretch=1.0):
@@ -277,12 +278,13 @@ def test_starvation_becomes_holding_after_its_time(bench):
 
 
 def test_waiting_is_no_starvation_for_sync_and_every_action_is_executed_in_order():
-    bench = Bench(sync.merge(sync.Config(), ()))
-    following(bench, wave(5))
-    bench.run(50)
+    bench = Bench(sync.merge(sync.Config(), Dims()))
+    bench.say("follow", run=1)
+    bench.chunk(1, wave(5), waited=True)
+    bench.run(51)
     assert bench.behaviour == "follow"
     assert bench.said() == []
-    bench.chunk(2, wave(5, start=bench.sink.sent[-1][0]), step=6)
+    bench.chunk(2, wave(5, start=bench.sink.sent[-1][0]), step=6, waited=True)
     bench.run(10)
     executed = [r.executed[0] for r in bench.records() if r.source == "policy"]
     assert len(executed) == 10

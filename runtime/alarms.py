@@ -1,0 +1,53 @@
+"""What makes control hold although nobody told it to: a family that is silent, an arm that was moved."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.actuator import RobotActuator, TickSettings
+from runtime.page import Page
+from runtime.seen import Seen
+from runtime.types import Float64
+
+_UNSEEN_S = 0.5  # without joints: whatever has happened to the robot meanwhile was not seen
+_RETURNED_AWAY = 0.1  # [rad] that an arm may be off after that, by sagging
+
+
+def silent_sibling(page: Page, now: float, allowed: float) -> str:
+    """The process whose heartbeat is older than `allowed` seconds, in a sentence; "" where none is."""
+    for process in ("main", "guard"):
+        beat = page.last_beat(process)
+        if now - beat > allowed:
+            since = f"for {now - beat:.1f} s" if beat else "since it was restarted"
+            return f"no sign of life from {process} {since}"
+    return ""
+
+
+class Displacement:
+    """Notices a robot that is far from where it is told to hold.
+
+    It was moved by hand, switched off, or its node was restarted: to send the old target would make it move by
+    itself.
+    """
+
+    def __init__(self, settings: TickSettings) -> None:
+        self._settings = settings
+        self._angles = ~settings.limits.grippers
+        self._unseen_since: float | None = None
+
+    def __call__(self, robot: RobotActuator, seen: Seen, now: float, held: bool) -> Float64 | None:
+        """Where the robot is [D], where that is too far from where it is `held`; None where all is well."""
+        measured = robot.measured(seen, now)
+        if measured is None:
+            self._unseen_since = now if self._unseen_since is None else self._unseen_since
+            return None
+        returned = self._unseen_since is not None and now - self._unseen_since > _UNSEEN_S
+        self._unseen_since = None
+        if not held or self._settings.safety.report_only:
+            return None
+        allowed = _RETURNED_AWAY if returned else self._settings.safety.following_error
+        return measured if self.distance(robot, measured) > allowed else None
+
+    def distance(self, robot: RobotActuator, measured: Float64) -> float:
+        """How far the farthest joint is from its command [rad]."""
+        return float(np.abs(measured - robot.commanded).max(where=self._angles, initial=0.0))

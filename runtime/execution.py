@@ -1,0 +1,166 @@
+"""A run as control executes it: its plan, how chunks join it, and what it means when nothing is planned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import ValidationError
+
+from runtime.actuator import TickSettings
+from runtime.behaviour import Behaviour, Target
+from runtime.errors import ConfigurationError
+from runtime.messages import ChunkMerged, Mode, PostedChunk
+from runtime.plugins import variants
+from runtime.strategies.base import Arrival, Merge, Merged, join
+from runtime.timeline import Dims, Timeline, difference
+from runtime.types import Float64
+
+_JOINED_AT_ONCE = 0.05  # [rad] that a run's first action may be off without being blended in
+_ONE_BY_ONE: tuple[Mode, ...] = ("step", "preview")  # a person asks for each chunk
+
+
+@dataclass(frozen=True, slots=True)
+class Strategy:
+    """The merging half of a strategy, and its kind."""
+
+    kind: str
+    merge: Merge
+
+
+def strategy(section: Mapping[str, Any], dims: Dims) -> Strategy:
+    """The strategy of a deployment's section `strategy`; ConfigurationError where it is none."""
+    known = variants("runtime.strategies")
+    kind = section.get("kind")
+    if kind not in known:
+        raise ConfigurationError(f"strategy.kind = {kind!r}; allowed: {', '.join(known)}")
+    module = known[kind]
+    try:
+        config = module.Config.model_validate(dict(section))
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        raise ConfigurationError(f"strategy.{key} = {first['input']!r}: {first['msg']}") from None
+    return Strategy(kind, module.merge(config, dims))
+
+
+class Joined(NamedTuple):
+    """What became of a chunk; `far` says how far from where the robot stood it began, "" where it is near."""
+
+    merged: ChunkMerged
+    far: str = ""
+
+
+class Follow(Behaviour):
+    """Executes the timeline of one run; None for a step that nothing is planned for."""
+
+    name = "follow"
+    moving = True
+
+    def __init__(self, number: int, mode: Mode, chosen: Strategy, settings: TickSettings) -> None:
+        self.number = number
+        self.timeline = Timeline(len(settings.limits.lower))
+        self._one_by_one = mode in _ONE_BY_ONE
+        self._strategy = chosen
+        self._settings = settings
+        self._switched = False  # the kind of the strategy, since the last chunk that was merged
+        # For the first chunk of all, or after a wait: no starvation yet, the policy's deadline bounds it.
+        self._expecting = True
+        self._starved_since: float | None = None
+
+    def target(self, step: int, elapsed: float) -> Target | None:
+        planned = self.timeline.at(step)
+        if planned is None:
+            return None
+        return Target(planned.action, "policy", "policy", planned.makers)
+
+    # --- chunks --------------------------------------------------------------------------------------------
+
+    def tune(self, chosen: Strategy, step: int) -> None:
+        """Merge by another strategy from now on; what is planned from `step` on stays."""
+        self._switched = self._switched or chosen.kind != self._strategy.kind
+        if self._starved_since is None and self.waits and not self.timeline.remaining(step):
+            self._expecting = True  # what the old strategy waited for is no gap of the new one
+        self._strategy = chosen
+
+    def join(self, chunk: PostedChunk, step: int, commanded: Float64) -> Joined:
+        """Let a chunk join the plan from `step`, the first one not yet sent, on; `commanded` [D] was sent last."""
+        rows, dim = chunk.rows, len(commanded)
+        if rows.ndim != 2 or rows.shape[1] != dim or not len(rows):
+            shape = f"it has the shape {list(rows.shape)}; expected [H, {dim}], H from 1 on"
+            return Joined(dropped(chunk, step, shape))
+        arrival = Arrival(chunk.chunk_id, chunk.observation_step, rows.astype(np.float64), chunk.waited)
+        away, far = self._away(arrival, step, commanded)
+        held = commanded if away > _JOINED_AT_ONCE or self.starved else None
+        switched, self._expecting = (
+            self._switched,
+            False,
+        )  # also where it is dropped: always too late is starving
+        merged = join(
+            self._strategy.merge,
+            self.timeline,
+            arrival,
+            step,
+            held,
+            self._settings.dims,
+            joining=switched,
+            commanded=commanded,
+        )
+        self._switched = switched and bool(merged.dropped)
+        return Joined(self._told(chunk, merged), far)
+
+    def _away(self, arrival: Arrival, step: int, commanded: Float64) -> tuple[float, str]:
+        """How far from where the robot stands a run's first action is [rad], and a sentence where that is far."""
+        settings, placed = self._settings, self._strategy.merge.place(self.timeline, arrival, step)
+        if not self._expecting or settings.safety.report_only or not len(placed.rows):
+            return 0.0, ""
+        apart = difference(placed.rows[0], commanded, settings.dims.wrapping)
+        away = np.where(settings.limits.grippers, 0.0, np.abs(apart))
+        worst, name = float(away.max()), settings.limits.names[int(away.argmax())]
+        far = f"{name}: the first action is {worst:.2f} rad from where the robot stands: blended in"
+        return worst, far if worst > settings.safety.first_action_far else ""
+
+    def _told(self, chunk: PostedChunk, merged: Merged) -> ChunkMerged:
+        return ChunkMerged(
+            chunk_id=merged.chunk_id,
+            run=chunk.run,
+            arrival_step=merged.arrival_step,
+            delay=merged.delay,
+            targets=merged.targets,
+            mistimed=merged.mistimed,
+            dropped=merged.dropped,
+            strategy=self._strategy.kind,
+            overlap=merged.overlap,
+        )
+
+    # --- nothing planned -----------------------------------------------------------------------------------
+
+    @property
+    def waits(self) -> bool:
+        """Whether an empty timeline is as it should be: a person, or the strategy, asks when it is empty."""
+        return self._expecting or self._one_by_one or self._strategy.merge.waits
+
+    @property
+    def starved(self) -> bool:
+        return self._starved_since is not None
+
+    def starve(self, now: float) -> float | None:
+        """Nothing is planned for this tick: how long that has been so, 0 when it begins, None while it waits."""
+        if self.waits:
+            return None
+        if self._starved_since is None:
+            self._starved_since = now
+        return now - self._starved_since
+
+    def fed(self, now: float) -> float | None:
+        """An action was sent: how long there was none before it, None where there was no gap."""
+        since, self._starved_since = self._starved_since, None
+        return None if since is None else now - since
+
+
+def dropped(chunk: PostedChunk, step: int, why: str) -> ChunkMerged:
+    """What is told of a chunk that control has no use for."""
+    nowhere = np.full(len(np.atleast_1d(chunk.rows)), -1, np.int64)
+    return ChunkMerged(chunk.chunk_id, chunk.run, step, step - chunk.observation_step, nowhere, 0, why)

@@ -1,0 +1,207 @@
+"""One robot, real or simulated: what it does, and the way from what that wants to what the robot is told."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from runtime.actuator import Actuator, Sent, TickSettings
+from runtime.behaviour import Behaviour, Hold, Move, Silent, Target
+from runtime.execution import Follow
+from runtime.locks import Locks
+from runtime.motion import Trajectory
+from runtime.report import Report
+from runtime.safety import SafetyFilter
+from runtime.seen import Seen
+from runtime.types import Float64
+
+_ARRIVED = 1e-4  # [rad] of a motion's end: it may have been limited on its last steps
+_QUIET_S = 1.0  # without a refusal: the next one is told again
+
+
+class Lane:
+    """Behaviour -> target -> locked grippers -> safety -> actuator, once per tick.
+
+    What safety refuses is replaced by the next point of a stop, so that something is sent on every tick; too many
+    refusals, or too long with nothing planned, make it hold for that reason.
+    """
+
+    def __init__(
+        self, actuator: Actuator, safety: SafetyFilter, locks: Locks, settings: TickSettings, report: Report
+    ) -> None:
+        self.actuator = actuator
+        self._safety = safety
+        self._locks = locks
+        self._settings = settings
+        self._report = report
+        self._standing: Hold | None = None  # a stop in place of what could not be sent
+        self._aim: Float64 | None = None  # what was wanted, and judged, at the last tick
+        # Refusals among the last actions: every second one refused is as bad as all of them.
+        self._verdicts: deque[bool] = deque(maxlen=2 * settings.safety.refusals_to_hold)
+        self._refused_at = float("-inf")
+        self.refused = 0  # in a row
+        self.behaviour: Behaviour = Silent()
+        if actuator.engaged:
+            self.hold_here()
+
+    # --- what it does --------------------------------------------------------------------------------------
+
+    @property
+    def run(self) -> Follow | None:
+        """The run it executes, None where it does something else."""
+        return self.behaviour if isinstance(self.behaviour, Follow) else None
+
+    def silence(self) -> None:
+        """Send nothing any more: the robot is not ours."""
+        self._standing = None
+        self.actuator.engaged = False
+        self.behaviour = Silent()
+
+    def hold(self) -> None:
+        """Come to a stand and stay there; who is not engaged stays silent."""
+        if self.actuator.engaged and not isinstance(self.behaviour, Hold):
+            self.behaviour = self._standing or self._holding()
+
+    def hold_here(self) -> None:
+        """Hold anew, from the last command on."""
+        self._standing = None
+        self.behaviour = self._holding()
+
+    def release(self) -> None:
+        """The e-stop is over: hold, or be silent where the robot was never ours."""
+        self.behaviour = self._holding() if self.actuator.engaged else Silent()
+
+    def hold_because(self, kind: str, reason: str) -> None:
+        """Hold for a reason of control's own, and say so."""
+        if self.behaviour.moving:
+            self.hold()
+            self._report.say(kind, reason)
+
+    def move(self, goal: Float64, speed: float) -> None:
+        """Come to a stand, then go to `goal` at `speed`, a part of the speed of motions of ours.
+
+        Dimensions that are NaN stay where they come to a stand.
+        """
+        self._begin()
+        self._go(goal, speed)
+
+    def follow(self, run: Follow) -> None:
+        """Execute `run` from the next tick on."""
+        self._begin()
+        self.behaviour = run
+
+    def relock(self) -> None:
+        """Locks have changed: a stop must not go on to where an unlocked gripper was before, it begins anew."""
+        self._standing = None
+        if isinstance(self.behaviour, Hold):
+            self.hold_here()
+        elif isinstance(self.behaviour, Move):
+            self._go(self.behaviour.goal, self.behaviour.speed)
+
+    def _begin(self) -> None:
+        self._standing, self._aim = None, None
+        self.refused = 0
+        self._verdicts.clear()
+
+    def _go(self, goal: Float64, speed: float) -> None:
+        limits, safety = self._settings.limits, self._settings.safety
+        brake = self.actuator.brake()
+        goal = np.where(np.isnan(goal), brake.at(brake.duration), goal)
+        top = limits.velocity * safety.motion_velocity_scale * speed
+        path = Trajectory(brake.at(brake.duration), goal, top, safety.motion_acceleration * limits.reach)
+        self.behaviour = Move(brake, path, goal, speed)
+
+    def _holding(self) -> Hold:
+        return Hold(self.actuator.brake())
+
+    # --- one tick ------------------------------------------------------------------------------------------
+
+    def drive(self, step: int, planned: float, seen: Seen) -> Sent:
+        """Tell the robot what the behaviour wants, as far as locks and safety let it pass."""
+        target = self.behaviour.target(step, self.actuator.elapsed(planned))
+        if target is None:
+            return self._nothing_planned(step, planned, seen)
+        if target.path is None:
+            sent = self._hold_to(step, planned, target, seen)
+            self._standing = None  # what is sent now is another stop: the old one must not go on later
+        else:
+            sent = self._judge(step, planned, target, seen)
+        if isinstance(self.behaviour, Move):
+            self._finish(self.behaviour, sent)
+        return sent
+
+    def _judge(self, step: int, planned: float, target: Target, seen: Seen) -> Sent:
+        action, notes = self._locks.apply(target.action)
+        state = self.actuator.state(seen, planned, self._aim)
+        verdict = self._safety.judge(action, state, target.path or "policy")
+        if verdict.action is None:
+            return self._refuse(step, planned, target, (*notes, *verdict.notes), seen)
+        self.refused, self._standing, self._aim = 0, None, action
+        self._verdicts.append(False)
+        if self.run is not None and (gap := self.run.fed(planned)) is not None:
+            self._report.say("recovered", f"actions again after {gap:.2f} s")
+        sent = self.actuator.send(step, planned, target, verdict.action, (*notes, *verdict.notes))
+        return sent._replace(limited=verdict.most, change=verdict.change)
+
+    def _hold_to(self, step: int, planned: float, target: Target, seen: Seen) -> Sent:
+        """Send a braking or held target as it is; a gripper that is locked elsewhere goes there within its limits."""
+        self._aim = None
+        action = target.action
+        notes: tuple[str, ...] = ()
+        if target.source != "estop":
+            locked, notes = self._locks.apply(action)
+            if notes:
+                state = self.actuator.state(seen, planned, None)
+                action = np.where(self._locks.on, self._safety.reachable(locked, state, "motion"), action)
+        return self.actuator.send(step, planned, target, action, notes)
+
+    def _refuse(self, step: int, planned: float, target: Target, notes: tuple[str, ...], seen: Seen) -> Sent:
+        self.refused += 1
+        self._verdicts.append(True)
+        self._brace()
+        if planned - self._refused_at > _QUIET_S:
+            self._report.say("refused", notes[-1])
+        self._refused_at = planned
+        refused = sum(self._verdicts)
+        if refused >= self._settings.safety.refusals_to_hold:
+            how = "in a row" if refused == self.refused else f"of the last {len(self._verdicts)}"
+            self.hold_because("refusals", f"{refused} actions refused {how}, the last one: {notes[-1]}")
+        return self._stand(step, planned, seen)._replace(target=target, notes=notes, refused=True)
+
+    def _nothing_planned(self, step: int, planned: float, seen: Seen) -> Sent:
+        run = self.run
+        if run is None:
+            return Sent(planned)
+        self._brace()
+        starved = run.starve(planned)
+        if starved == 0.0:
+            self._report.say("starved", "no action for this step: slowing down and holding")
+        if starved is not None and starved >= self._settings.starvation_patience:
+            why = f"no usable chunk for {starved:.1f} s" if starved else "no usable chunk for this step"
+            self.hold_because("starvation", why)
+        return self._stand(step, planned, seen)
+
+    def _stand(self, step: int, planned: float, seen: Seen) -> Sent:
+        """Send the next point of a stop instead of what could not be sent."""
+        target = self._brace().target(step, self.actuator.elapsed(planned))
+        return self._hold_to(step, planned, target, seen)._replace(target=None)
+
+    def _brace(self) -> Hold:
+        """The stop that is under way in place of what could not be sent; `hold` goes on with it."""
+        if self._standing is None:
+            self._standing = self._holding()
+        return self._standing
+
+    def _finish(self, move: Move, sent: Sent) -> None:
+        """A motion is done when its end has been sent: not refused, and not limited on the way there."""
+        if sent.executed is None:
+            return
+        if sent.refused:
+            self._go(move.goal, move.speed)  # from where it stands, when it may go on
+            return
+        move.sent()
+        left = np.where(self._locks.on, 0.0, np.abs(sent.executed - move.goal))
+        if move.finished and left.max() <= _ARRIVED:
+            self.hold_here()
+            self._report.say("motion_done", "arrived")

@@ -1,0 +1,49 @@
+"""Grippers that stay where they are locked, whatever is asked of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.safety import Limits
+from runtime.types import Float64
+
+_SAME = 1e-9
+
+
+class Locks:
+    """Replaces locked dimensions of an action, after the plan and before safety."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._notes: dict[int, str] = {}
+        self.values: Float64 = np.full(
+            len(limits.lower), np.nan
+        )  # [D] where it is locked, NaN where it is free
+        self.on = np.zeros(len(limits.lower), bool)  # [D]
+
+    def set(self, values: Float64) -> str:
+        """Lock grippers at `values` [D], NaN for free, within their limits; why not, "" where it was done."""
+        limits = self._limits
+        if values.shape != limits.lower.shape or values.dtype.kind != "f":
+            return f"locks are {values.dtype} {values.shape}; expected float {limits.lower.shape}"
+        wrong = np.flatnonzero(~np.isnan(values) & ~limits.grippers)
+        if len(wrong):
+            return f"{limits.names[wrong[0]]} is no gripper: only grippers are locked"
+        self.values = np.clip(values.astype(np.float64), limits.lower, limits.upper)
+        self.on = ~np.isnan(self.values)
+        self._notes = {
+            int(i): f"{limits.names[i]} locked at {self.values[i]:g}" for i in np.flatnonzero(self.on)
+        }
+        return ""
+
+    def apply(self, action: Float64) -> tuple[Float64, tuple[str, ...]]:
+        """`action` [D] with its locked dimensions replaced, and a note for each lock that made a difference."""
+        if not self._notes or action.shape != self.values.shape:
+            return action, ()
+        replaced = np.where(self.on, self.values, action)
+        return replaced, tuple(
+            note for i, note in self._notes.items() if not abs(replaced[i] - action[i]) <= _SAME
+        )
+
+    def __str__(self) -> str:
+        return ", ".join(self._notes.values()) or "every gripper is free"

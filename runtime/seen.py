@@ -1,0 +1,60 @@
+"""The newest observation as control's tick judges by it; pictures stay where they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from runtime.page import Page
+from runtime.types import Float32, Float64
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What is known of the robot: joints [D], and when each part of it was captured on our monotonic clock [s]."""
+
+    sequence: int  # 0 before the first observation
+    qpos: Float32  # as it was measured
+    joints: Float64  # the same, to calculate with
+    joints_captured: float
+    pictures_captured: tuple[tuple[str, float], ...]  # by camera; NaN for a picture that never came
+    measured: bool  # there is a number for every joint
+
+    def fresh(self, now: float, allowed: float) -> bool:
+        """Whether the joints are known, and not older than `allowed` seconds."""
+        return self.measured and now - self.joints_captured <= allowed
+
+    def picture_ages(self, now: float) -> dict[str, float]:
+        """Age of each camera's newest picture [s]."""
+        return {camera: now - captured for camera, captured in self.pictures_captured}
+
+
+class Eyes:
+    """Reads the page; an observation that is still the newest is not read again."""
+
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._version = -1
+        self._seen: Seen
+
+    def look(self) -> Seen:
+        """The newest observation."""
+        version = self._page.observation.version
+        if version != self._version:
+            self._seen, self._version = self._read(), version
+        return self._seen
+
+    def _read(self) -> Seen:
+        record = self._page.observation.read()
+        qpos = record["qpos"].copy()
+        sequence = int(record["sequence"])
+        captured = record["picture_captured"].tolist()
+        return Seen(
+            sequence=sequence,
+            qpos=qpos,
+            joints=qpos.astype(np.float64),
+            joints_captured=float(record["joints_captured"]),
+            pictures_captured=tuple(zip(self._page.layout.cameras, captured, strict=False)),
+            measured=sequence > 0 and bool(np.isfinite(qpos).all()),
+        )
