@@ -10,7 +10,16 @@ from pathlib import Path
 
 import benchmarks
 
-_NOT_BENCHMARKS = ("__main__", "report", "sleeper", "step_loop", "viewers")
+_NOT_BENCHMARKS = (
+    "__main__",
+    "conveyor_station",
+    "reference",
+    "report",
+    "sleeper",
+    "step_loop",
+    "strategy_station",
+    "viewers",
+)
 
 
 def main() -> int:

@@ -13,9 +13,11 @@ from types import ModuleType
 
 import numpy as np
 
+from runtime.commitment import Commitment
+from runtime.messages import ChunkMerged
 from runtime.strategies.base import Arrival, Merged, Progress, StrategyParameters, join
 from runtime.timeline import Dims, Makers, Timeline
-from runtime.types import Conditioning, Float64
+from runtime.types import ActionChunk, Conditioning, Float64
 
 Policy = Callable[[int, Conditioning | None], Float64]  # observation step, conditioning -> rows [H, D]
 FAR = 0.05  # [rad] that a run's first action may be off without being blended in, as in control
@@ -75,8 +77,8 @@ class StepLoop:
         self._asked = -1
         self._waiting = True  # for the first chunk: no starvation yet
         self._starved = False
-        self._delays: deque[int] = deque(maxlen=60)
-        self._newest: tuple[int, Float64] | None = None  # merged last: observation step, rows
+        self._delays: deque[int] = deque(maxlen=50)
+        self._commitment = Commitment(rate)
         self._kind = ""
         self._joining = False
         self.tune(strategy, config)
@@ -122,17 +124,14 @@ class StepLoop:
         return _Request(self._number, self.step, due, self._query.waits, rows)
 
     def _conditioning(self) -> Conditioning | None:
-        if self._newest is None:
-            return None
-        observed, rows = self._newest
-        predicted = int(np.ceil(np.quantile(self._delays, self._config.delay_quantile)))
-        horizon = self._config.execution_horizon or len(rows)
-        consumed = min(self.step - observed, len(rows))
-        return Conditioning(rows.astype(np.float32), consumed, predicted, horizon)
+        """What the robot is committed to, as main would tell a policy that continues its chunks."""
+        quantile, horizon = self._config.delay_quantile, self._config.execution_horizon
+        return self._commitment.conditioning(self.step, self._delays, quantile, horizon)
 
     def _arrive(self, request: _Request) -> None:
         arrival = Arrival(request.number, request.step, request.rows, request.waited)
-        far = self._waiting and np.abs(request.rows[0] - self.commanded).max() > FAR
+        first = self._merge.place(self.timeline, arrival, self.step).rows[:1]
+        far = self._waiting and np.abs(first - self.commanded).max(initial=0.0) > FAR
         held = self.commanded if (self._starved or far) and not self._merge.waits else None
         merged = join(
             self._merge,
@@ -147,9 +146,10 @@ class StepLoop:
         self._waiting = False
         self._delays.append(merged.delay)
         self.log.merged.append(merged)
-        if not merged.dropped:
-            self._joining = False
-            self._newest = request.step, request.rows
+        self._joining = self._joining and bool(merged.dropped)
+        chunk = ActionChunk(request.rows.astype(np.float32))
+        self._commitment.answered(request.number, chunk, request.step, request.waited)
+        self._commitment.merged(_as_told(merged))
 
     def _execute(self) -> None:
         planned = self.timeline.at(self.step)
@@ -158,3 +158,10 @@ class StepLoop:
             self.commanded = planned.action
         makers = () if planned is None else planned.makers
         self.log.executed.append(Executed(self.step, self.commanded, makers, self._starved))
+
+
+def _as_told(merged: Merged) -> ChunkMerged:
+    """What control would tell main of it."""
+    return ChunkMerged(
+        merged.chunk_id, 1, merged.arrival_step, merged.delay, merged.targets, merged.mistimed, merged.dropped
+    )

@@ -1,0 +1,258 @@
+"""What each strategy makes of a policy whose every action is known: offset, error, jerk, reaction, starvation.
+
+The halves of the strategies themselves (query, merge, timeline, commitment) are driven in integer steps by
+benchmarks/step_loop.py: no process, no wire, no safety, no robot that lags. So it is deterministic and fast enough
+for every cell. `checked_in_lockstep` counts the actions that the real station, whole and in lockstep
+(benchmarks/strategy_station.py), planned for the same policy; `different_in_lockstep` those that the step loop has
+otherwise, to the bit.
+
+A cell is infeasible where a chunk ends before the next one can have arrived: H < delay + query interval, the
+interval being the longer of 1 / rate and delay + 1 ticks (an answer is asked for on the tick after the last one
+arrived). Its figures are in the rows and count in none of the summary but `unrecovered_starvations`. `sync` waits,
+and is feasible everywhere.
+
+* `offset_steps`: by how many steps the published actions are late, found in the numbers alone and not in what the
+  merge says of itself: the shift of the reference, by fractions of a step, that fits them best (least squares).
+  For `sync` the reference of a chunk is the one it was asked for, from the step its first row is executed on.
+* `rms_error` [rad]: published action against the reference at the same moment, also for `sync`.
+* `jerk_ratio`: 95th percentile of the third difference of what is published, relative to that of the reference.
+* `..._disagreeing`: the same where each chunk is off by a constant of its own, up to 0.02 rad: seams show.
+* `reaction50/90/99`: steps from a change of mind by 1 rad until so much of it is published. The worst of four
+  changes, the first one right after a request has gone out, the others spread over the interval.
+* `starved`: steps without a plan. `spike`: the same where one answer takes longer than the chunk lasts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from benchmarks import moving_target
+from benchmarks.reference import DIM, Meant, Reference, answering, chunks_of, disagreeing
+from benchmarks.report import Figure, Report
+from benchmarks.step_loop import Executed, Log, StepLoop
+from benchmarks.strategy_station import Case, compare
+from runtime.plugins import variants
+from runtime.strategies.base import JOIN_WINDOW, StrategyParameters
+from runtime.types import Float64
+
+KINDS = ("sync", "async", "ensemble", "naive", "rtc")
+DELAYS = (0, 1, 3, 8, 15)  # [ticks]
+RATES = (1.0, 3.0, 10.0, None)  # [Hz], None back to back
+HORIZONS = (16, 50)
+CONTROLS = (30.0, 50.0, 100.0)  # [Hz]
+_SECONDS = 6.0  # of virtual time per run
+_CHANGES = 4
+_SLOW = 4  # number of the request that takes too long, in the run with a spike
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One strategy under one set of circumstances."""
+
+    strategy: str
+    control_hz: float
+    inference_hz: float | None
+    horizon: int
+    delay: int
+
+    @property
+    def interval(self) -> int:
+        """Ticks from one request to the next, while the robot moves."""
+        paced = 0 if self.inference_hz is None else math.ceil(self.control_hz / self.inference_hz - 1e-6)
+        return max(self.delay + 1, paced)
+
+    @property
+    def feasible(self) -> bool:
+        """Whether a chunk lasts until the next one can arrive."""
+        return self.strategy == "sync" or self.horizon >= self.delay + self.interval
+
+    @property
+    def cycle(self) -> int:
+        """Ticks within which everything happens once."""
+        return self.horizon + self.delay + self.interval + JOIN_WINDOW
+
+    @property
+    def config(self) -> StrategyParameters:
+        """Its parameters: the defaults, at its rate."""
+        made: StrategyParameters = variants("runtime.strategies")[self.strategy].Config(
+            inference_rate=self.inference_hz
+        )
+        return made
+
+    def loop(self, meant: Meant, start: Float64, spike: int = 0) -> StepLoop:
+        """A run of it; request number _SLOW takes `spike` ticks instead."""
+        module = variants("runtime.strategies")[self.strategy]
+
+        def delay(number: int) -> int:
+            return spike if spike and number == _SLOW else self.delay
+
+        return StepLoop(module, self.config, answering(meant), delay, self.control_hz, start)
+
+
+CHECKED = [
+    Case(*values)
+    for values in product(KINDS, (30.0,), (3.0, None), (50,), (0, 3, 15))
+    if Cell(*values).feasible
+]
+THE_CELL = {"control_hz": 30.0, "inference_hz": 3.0, "horizon": 50, "delay": 3}
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """How the reference was followed; errors in rad, offset in steps."""
+
+    offset: float
+    rms_error: float
+    jerk_ratio: float
+    starved: int
+    unrecovered: int
+
+
+def measure(seconds: float) -> Report:
+    """Everything; `seconds` is the budget of the moving target alone, a cell takes as long as it takes."""
+    cells = [Cell(*values) for values in product(KINDS, CONTROLS, RATES, HORIZONS, DELAYS)]
+    with ProcessPoolExecutor(2) as pool:
+        rows = list(pool.map(_row, cells, chunksize=20))
+        checked = list(pool.map(compare, CHECKED))
+    moving = moving_target.table(seconds)
+    figures = [
+        *(figure for kind in KINDS for figure in _figures([row for row in rows if row["strategy"] == kind])),
+        Figure("unrecovered_starvations", sum(row["unrecovered"] for row in rows), "", "== 0"),
+        Figure("infeasible_cells", sum(not row["feasible"] for row in rows), ""),
+        Figure("checked_in_lockstep", sum(actions for actions, _ in checked), "steps"),
+        Figure("different_in_lockstep", sum(different for _, different in checked), "steps", "== 0"),
+        *(Figure(f"on_target.{row['strategy']}.{row['delay']}", row["on_target"], "") for row in moving),
+    ]
+    tables = ({"table": "cells"}, rows), ({"table": "moving_target"}, moving)
+    return Report("strategies", figures, [name | row for name, part in tables for row in part])
+
+
+def _figures(rows: Sequence[dict[str, Any]]) -> Iterable[Figure]:
+    """One strategy's: the worst over its feasible cells, and what it does in the cell of the reaction."""
+    kind, feasible = rows[0]["strategy"], [row for row in rows if row["feasible"]]
+    there = next(row for row in rows if all(row[key] == value for key, value in THE_CELL.items()))
+    bound = THE_CELL["delay"] + StrategyParameters().blend_window + there["interval"]
+    yield Figure(f"offset_steps.{kind}", max(abs(row["offset_steps"]) for row in feasible), "steps", "== 0")
+    for share in (50, 90, 99):
+        wanted = f"<= {bound}" if (kind, share) == ("async", 99) else ""
+        yield Figure(f"reaction{share}_steps.{kind}", there[f"reaction{share}_steps"], "steps", wanted)
+    for name in ("rms_error", "jerk_ratio"):
+        unit = "rad" if name == "rms_error" else ""
+        yield Figure(f"{name}.{kind}", max(row[name] for row in feasible), unit)
+        yield Figure(f"{name}_disagreeing.{kind}", there[f"{name}_disagreeing"], unit)
+    yield Figure(f"starved_steps.{kind}", sum(row["starved_steps"] for row in feasible), "steps", "== 0")
+    yield Figure(f"spike_starved_steps.{kind}", there["spike_starved_steps"], "steps")
+
+
+def _row(cell: Cell) -> dict[str, Any]:
+    """Everything of one cell."""
+    exact, other = track(cell, False), track(cell, True)
+    spike = track(cell, False, spike=cell.horizon + 5)
+    reaction = react(cell) if cell.feasible else (None, None, None)
+    return asdict(cell) | {
+        "interval": cell.interval,
+        "feasible": cell.feasible,
+        "offset_steps": exact.offset,
+        "rms_error": exact.rms_error,
+        "jerk_ratio": exact.jerk_ratio,
+        "rms_error_disagreeing": other.rms_error,
+        "jerk_ratio_disagreeing": other.jerk_ratio,
+        "reaction50_steps": reaction[0],
+        "reaction90_steps": reaction[1],
+        "reaction99_steps": reaction[2],
+        "starved_steps": exact.starved,
+        "spike_starved_steps": spike.starved,
+        "unrecovered": exact.unrecovered + spike.unrecovered,
+        "recovered": exact.unrecovered + spike.unrecovered == 0,
+    }
+
+
+def track(cell: Cell, disagree: bool, spike: int = 0) -> Tracked:
+    """Follow the reference for _SECONDS after everything has begun."""
+    reference = Reference(cell.control_hz)
+    begin = 2 * cell.cycle
+    ticks = begin + 4 * spike + int(_SECONDS * cell.control_hz)
+    table = reference.at(np.arange(ticks + 5 * cell.cycle + spike, dtype=float))
+    meant = chunks_of(table, cell.horizon)
+    loop = cell.loop(disagreeing(meant) if disagree else meant, table[0], spike)
+    log = loop.run(ticks)
+    for _ in range(4 * cell.cycle):  # a gap at the end is given the time to end
+        if not log.executed[-1].starved:
+            break
+        loop.tick()
+    steps, actions = np.arange(begin, ticks), _actions(log.executed[begin:ticks])
+    return Tracked(
+        offset=_offset(reference, cell, log, begin),
+        rms_error=float(np.sqrt(np.mean((actions - table[steps]) ** 2))),
+        jerk_ratio=_jerk(actions) / _jerk(table[steps]),
+        starved=sum(tick.starved for tick in log.executed),
+        unrecovered=int(log.executed[-1].starved),
+    )
+
+
+def _actions(ticks: Sequence[Executed]) -> Float64:
+    return np.array([tick.action for tick in ticks]).reshape(-1, DIM)
+
+
+def _jerk(actions: Float64) -> float:
+    return float(np.percentile(np.linalg.norm(np.diff(actions, n=3, axis=0), axis=1), 95))
+
+
+def _offset(reference: Reference, cell: Cell, log: Log, begin: int) -> float:
+    """By how many steps what is published is late against the reference, to a millionth."""
+    ticks = [tick for tick in log.executed[begin:] if tick.makers]
+    if not ticks:
+        return 0.0
+    steps = np.array([tick.step for tick in ticks], np.float64)
+    if cell.strategy == "sync":
+        waited = {merged.chunk_id: merged.delay for merged in log.merged}
+        steps -= [waited[tick.makers[0][0]] for tick in ticks]
+    actions, late = _actions(ticks), 0.0
+    for _ in range(5):
+        error, slope = actions - reference.at(steps - late), reference.slope(steps - late)
+        late -= float((error * slope).sum() / (slope * slope).sum())
+    return round(late, 6) + 0.0
+
+
+class _Mind:
+    """Means 0 or 1 for every step to come, whatever it meant before."""
+
+    def __init__(self, horizon: int) -> None:
+        self.value = 0.0
+        self._horizon = horizon
+
+    def __call__(self, step: int) -> Float64:
+        return np.full((self._horizon, DIM), self.value)
+
+
+def react(cell: Cell) -> tuple[int, int, int]:
+    """Steps until 50, 90 and 99 % of a change of mind are published, each the worst of _CHANGES changes."""
+    mind = _Mind(cell.horizon)
+    loop = cell.loop(mind, np.zeros(DIM))
+    period = cell.interval if cell.strategy != "sync" else cell.horizon + cell.delay
+    settled = 2 * cell.cycle + cell.horizon
+    worst = np.zeros(3, np.int64)
+    for change in range(_CHANGES):
+        loop.run(settled)
+        asked = len(loop.log.observed)
+        while len(loop.log.observed) == asked:
+            loop.tick()
+        loop.run(change * period // _CHANGES)
+        at, before, mind.value = loop.step, mind.value, 1.0 - mind.value
+        published = _actions(loop.run(settled).executed[at:])[:, 0]
+        done = np.abs(published - before)
+        worst = np.maximum(worst, [_last_below(done, share) + 1 for share in (0.5, 0.9, 0.99)])
+    return int(worst[0]), int(worst[1]), int(worst[2])
+
+
+def _last_below(done: Float64, share: float) -> int:
+    """The last step that has not come so far, to a billionth."""
+    below = np.flatnonzero(done < share - 1e-9)
+    return int(below[-1]) if len(below) else -1

@@ -1,0 +1,202 @@
+"""The whole station in lockstep beside the step loop: the same policy, the same delay, action for action."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from benchmarks.reference import DIM, Reference, answering, chunks_of, disagreeing
+from benchmarks.step_loop import Policy as Answering
+from benchmarks.step_loop import StepLoop
+from robots import Robot
+from runtime import deployment, family
+from runtime.clock import Clock
+from runtime.family import Plan
+from runtime.lockstep import Lockstep
+from runtime.plugins import variants
+from runtime.policies.base import Policy, PolicyInfo
+from runtime.session import State
+from runtime.transports.base import Capabilities, Sink, Source
+from runtime.types import ActionChunk, Conditioning, Float32, Float64, Observation, RobotCommand
+
+_SCALE = 0.3  # of the reference: so slow that safety has nothing to change
+_TICKS = 300
+
+
+class Obedient(Source, Sink):
+    """A robot that is at once where it is told to be."""
+
+    def __init__(self, robot: Robot, clock: Clock) -> None:
+        self._clock = clock
+        self._keys = [camera.key for camera in robot.cameras]
+        self._sequence = 0
+        self.position = robot.poses["ready"].astype(np.float64)
+
+    def connect(self) -> None:
+        """Nothing to open."""
+
+    def receive(self, timeout: float) -> Observation | None:
+        """Where it is now, with black pictures."""
+        self._sequence += 1
+        now = self._clock.now()
+        return Observation(
+            sequence=self._sequence,
+            arrived=now,
+            captured=dict.fromkeys(("joints", *self._keys), now),
+            qpos=self.position.astype(np.float32),
+            pictures=dict.fromkeys(self._keys, np.zeros((4, 4, 3), np.uint8)),
+        )
+
+    def send(self, command: RobotCommand) -> None:
+        """Go there."""
+        self.position = command.action.astype(np.float64)
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+class Known(Policy):
+    """Answers by the number of control steps since the first observation after a reset."""
+
+    def __init__(self, answer: Answering, horizon: int) -> None:
+        self._answer = answer
+        self._horizon = horizon
+        self.first = -1
+
+    def connect(self) -> PolicyInfo:
+        """Nothing to reach."""
+        return PolicyInfo("known", action_space="joint", horizon=self._horizon, supports_rtc=True)
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        """The rows for that step."""
+        if self.first < 0:
+            self.first = observation.step
+        return ActionChunk(self._answer(observation.step - self.first, conditioning).astype(np.float32))
+
+    def reset(self) -> None:
+        """The next observation is the first."""
+        self.first = -1
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+@dataclass(frozen=True, slots=True)
+class KnownPlan(Plan):
+    """A plan whose robot and policy are those above; they are kept in `made`."""
+
+    made: dict[str, Any]
+
+    @property
+    def transport(self) -> Any:
+        return SimpleNamespace(source=self._robot, sink=self._robot)
+
+    @property
+    def policy(self) -> Any:
+        return SimpleNamespace(build=lambda *given: self.made["policy"])
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return Capabilities(moves_robot=True)
+
+    def _robot(self, config: object, robot: Robot, clock: Clock) -> Obedient:
+        found: Obedient = self.made.setdefault("robot", Obedient(robot, clock))
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What the station and the step loop are both to do; `inference_hz` None is back to back."""
+
+    strategy: str
+    control_hz: float
+    inference_hz: float | None
+    horizon: int
+    delay: int
+
+    @property
+    def section(self) -> dict[str, Any]:
+        """The strategy, as in a deployment file."""
+        paced = {} if self.inference_hz is None else {"inference_rate": self.inference_hz}
+        return {"kind": self.strategy, **paced}
+
+
+def compare(case: Case) -> tuple[int, int]:
+    """How many actions of the policy the station planned, and how many of them the step loop has otherwise."""
+    with tempfile.TemporaryDirectory() as folder:
+        plan = _plan(Path(folder), case)
+        start = plan.robot.poses["ready"].astype(np.float64)
+        answer = _answer(start, case)
+        plan.made["policy"] = Known(answer, case.horizon)
+        first, planned = _run(plan)
+    module = variants("runtime.strategies")[case.strategy]
+    config = module.Config.model_validate(case.section)
+    loop = StepLoop(module, config, answer, lambda number: case.delay, plan.rate, start, plan.dims)
+    meant = [tick for tick in loop.run(_TICKS).executed if tick.makers]
+    other = [
+        tick
+        for tick in meant
+        if not np.array_equal(planned[first + tick.step], tick.action.astype(np.float32))
+    ]
+    return len(meant), len(other)
+
+
+def _run(plan: KnownPlan) -> tuple[int, Mapping[int, Float32]]:
+    """The step of the run's first observation, and by control step what was planned, before safety."""
+    planned: dict[int, Float32] = {}
+    with closing(Lockstep(plan)) as station:
+        session = station.main.session
+        station.connect()
+        station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
+        station.command("setup")
+        station.until(lambda: session.state is not State.SETTING_UP, 60.0, "set-up")
+        station.command("run")
+        end = station.step + _TICKS + 1
+
+        def over() -> bool:
+            status = station.page.control.read()
+            planned[int(status["step"])] = status["smoothed"].copy()
+            return station.step >= end
+
+        station.until(over, 60.0, "the run")
+        return plan.made["policy"].first, planned
+
+
+def _answer(start: Float64, case: Case) -> Answering:
+    """What both are to ask: chunks that disagree, around `start`, in the float32 of the wire."""
+    steps = np.arange(_TICKS + 4 * case.horizon, dtype=float)
+    reference = Reference(case.control_hz)
+    meant = disagreeing(chunks_of(reference.at(steps) - reference.at(steps[:1]), case.horizon))
+
+    def rows(step: int) -> Float64:
+        made = np.tile(start, (case.horizon, 1))
+        made[:, :DIM] += _SCALE * meant(step)
+        return made
+
+    known = answering(rows)
+    return lambda step, given: known(step, given).astype(np.float32).astype(np.float64)
+
+
+def _plan(data: Path, case: Case) -> KnownPlan:
+    tree: dict[str, Any] = {
+        "station": "strategies",
+        "robot": "agilex_piper",
+        "data_dir": str(data),
+        "task": "follow the reference",
+        "transport": {"kind": "dataset", "path": "-"},
+        "policy": {"kind": "mock"},
+        "strategy": case.section,
+        "control": {"rate": case.control_hz},
+        "setup": {"home": False},
+        "recording": {"enabled": False},
+        "lockstep": {"delay_ticks": case.delay},
+    }
+    made = family.plan(deployment.resolve(tree, {}, "strategies"))
+    return KnownPlan(made.resolved, made.robot, {})
