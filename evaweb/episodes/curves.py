@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evaweb.episodes.chunks import chunks
 from evaweb.errors import NotFound
 from evaweb.frames import Stream, encode
 from evaweb.stations.geometry import looks_of
@@ -23,12 +24,20 @@ def curves(folder: Path) -> bytes:
 
     Times are seconds of the video: row k is at k / fps. Streams, vectors joint by joint (a row per joint):
     ticks, at the control rate: time f8 [M], measured, smoothed and executed f4 [D, M] (NaN where nothing was
-    asked for or sent), safety u1 [M] (1 changed, 2 refused). raw, where the policy speaks in joints: time
-    f8 [R], values f4 [D, R], chunk i4 [R].
+    asked for or sent), safety u1 [M] (1 changed, 2 refused), chunk i4 [M] (with the largest weight, -1 none,
+    0 the held target), makers i4 [M + 1]: tick k was made of the entries makers[k] to makers[k + 1] of stream
+    makers. makers: chunk i4 [W], weight f4 [W]. raw, where the policy speaks in joints: time f8 [R], values
+    f4 [D, R], chunk i4 [R]. chunks: see evaweb.episodes.chunks.
     """
     episode = open_episode(folder)
     start = _start(episode)
-    streams = {"ticks": _ticks(episode, start), "raw": _raw(episode, start)}
+    made, makers = _makers(episode)
+    streams = {
+        "ticks": _ticks(episode, start, made),
+        "makers": makers,
+        "raw": _raw(episode, start),
+        "chunks": chunks(episode, lambda steps: _times_of(episode, steps) - start),
+    }
     names = _robot(episode).get("joint_names")
     return encode(
         streams,
@@ -36,6 +45,7 @@ def curves(folder: Path) -> bytes:
         units=_units(episode),
         frames=episode.frames,
         fps=episode.layout.fps,
+        period=_period(episode),
         held=held_spans(episode.rows.column("control_source").to_pylist(), episode.layout.fps),
         marks=_marks(episode, start),
     )
@@ -76,14 +86,34 @@ def vectors(table: Any, name: str, width: int) -> Array:
     return np.ascontiguousarray(values.T)
 
 
-def _ticks(episode: Episode, start: float) -> Stream:
-    ticks, dim = episode.ticks, episode.layout.dim
-    steps = ticks.column("step").to_numpy()
-    smoothed = np.full((dim, ticks.num_rows), np.nan, np.float32)
+def _asked(episode: Episode) -> tuple[Array, Array]:
+    """Of the rows of the smoothed stream: the tick of each, and whether that was recorded."""
+    steps = episode.ticks.column("step").to_numpy()
     asked = episode.smoothed.column("step").to_numpy()
     places = np.searchsorted(steps, asked)
     known = places < len(steps)
     known[known] = steps[places[known]] == asked[known]
+    return places, known
+
+
+def _makers(episode: Episode) -> tuple[Array, Stream]:
+    """Where the makers of each tick begin and end (int32 [M + 1]), and all of them, tick by tick."""
+    places, known = _asked(episode)
+    table = episode.smoothed.filter(known)
+    chunk_ids, weights = (table.column(name).combine_chunks() for name in ("chunk_ids", "weights"))
+    counts = np.zeros(episode.ticks.num_rows, np.int64)
+    counts[places[known]] = chunk_ids.value_lengths().to_numpy(zero_copy_only=False)
+    arrays = {
+        "chunk": chunk_ids.flatten().to_numpy(zero_copy_only=False).astype(np.int32),
+        "weight": weights.flatten().to_numpy(zero_copy_only=False).astype(np.float32),
+    }
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), Stream(arrays=arrays)
+
+
+def _ticks(episode: Episode, start: float, made: Array) -> Stream:
+    ticks, dim = episode.ticks, episode.layout.dim
+    smoothed = np.full((dim, ticks.num_rows), np.nan, np.float32)
+    places, known = _asked(episode)
     smoothed[:, places[known]] = vectors(episode.smoothed, "smoothed", dim)[:, known]
     changed = np.asarray([bool(changes) for changes in ticks.column("changes").to_pylist()], np.uint8)
     refused = ticks.column("refused").to_numpy(zero_copy_only=False).astype(np.uint8)
@@ -94,6 +124,8 @@ def _ticks(episode: Episode, start: float) -> Stream:
             "smoothed": smoothed,
             "executed": vectors(ticks, "executed", dim),
             "safety": np.maximum(changed, 2 * refused).astype(np.uint8),
+            "chunk": ticks.column("chunk_id").to_numpy().astype(np.int32),
+            "makers": made,
         }
     )
 
@@ -124,11 +156,16 @@ def _times_of(episode: Episode, steps: Array) -> Array:
     if not ticks.num_rows:
         return np.zeros(len(steps))
     known, planned = ticks.column("step").to_numpy(), ticks.column("planned").to_numpy()
-    rate = episode.manifest.get("control_rate")
-    period = 1.0 / rate if isinstance(rate, int | float) and rate > 0 else 1.0 / episode.layout.fps
+    period = _period(episode)
     beyond = np.clip(steps - known[-1], 0, None) * period - np.clip(known[0] - steps, 0, None) * period
     times: Array = np.interp(steps, known, planned) + beyond
     return times
+
+
+def _period(episode: Episode) -> float:
+    """Of the control loop [s]."""
+    rate = episode.manifest.get("control_rate")
+    return 1.0 / rate if isinstance(rate, int | float) and rate > 0 else 1.0 / episode.layout.fps
 
 
 def held_spans(sources: Sequence[str], fps: float) -> list[list[float]]:

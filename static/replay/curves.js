@@ -1,8 +1,10 @@
 // The pane of the curves: which joint, what its values are at the clock, and the plot.
 
 import { Legend } from "../console/curve_legend.js";
-import { joint, message } from "./data.js";
-import { Plot } from "./plot.js";
+import { Chunks } from "./chunks.js";
+import { joint, last, message } from "./data.js";
+import { Plot, tunes } from "./plot.js";
+import { readout, write } from "./readout.js";
 
 const KEY = "eva-replay-joint";
 
@@ -25,9 +27,10 @@ export async function curvePane({ clock, address, uplot }) {
 }
 
 function read(header, numbers) {
-  const { ticks, raw } = header.streams;
+  const { ticks, raw, makers, chunks } = header.streams;
   const all = (stream) => Object.fromEntries(Object.entries(stream.arrays).map(([name, place]) => [name, numbers(place)]));
-  return { header, ticks: all(ticks), raw: all(raw), spaces: raw.json.spaces };
+  const owners = { ticks: all(ticks), makers: all(makers), chunks: all(chunks), strategies: chunks.json.strategies, period: header.period };
+  return { header, ticks: owners.ticks, raw: all(raw), spaces: raw.json.spaces, chunks: new Chunks(owners) };
 }
 
 class Pane {
@@ -35,19 +38,21 @@ class Pane {
   #episode;
   #plot;
   #curves = null;
-  #chunks = [];
+  #raw = []; // what each chunk wanted of the joint
   #legend;
+  #hovered = null; // [s], null where the pointer is elsewhere
+  #said = document.getElementById("chunk");
 
   constructor(clock, episode, library) {
     this.#clock = clock;
     this.#episode = episode;
     const { held, marks } = episode.header;
-    const behind = { held, marks, safety: this.#safety(), chunks: [] };
+    const behind = { held, marks, safety: this.#safety(), owners: episode.chunks };
     const element = document.getElementById("legend");
     this.#legend = new Legend(element, (name, shown) => this.#plot.reveal(name, shown));
     this.#explain(element);
     const seek = (time) => clock.seekRow(Math.floor(time * clock.fps));
-    this.#plot = new Plot({ element: document.getElementById("curves"), library, behind, shown: (name) => this.#legend.shown(name), seek });
+    this.#plot = new Plot({ element: document.getElementById("curves"), library, behind, shown: (name) => this.#legend.shown(name), seek, hover: (time) => this.#hover(time) });
     this.#select();
     for (const kind of ["tick", "seek"]) clock.addEventListener(kind, () => this.#at());
   }
@@ -78,33 +83,48 @@ class Pane {
     const pick = (name) => joint(ticks[name], index, length);
     this.#curves = { time: ticks.time, state: pick("measured"), executed: pick("executed"), smoothed: pick("smoothed") };
     document.getElementById("unit").textContent = this.#episode.header.units[index] ?? "";
-    this.#chunks = chunks(raw.time, joint(raw.values, index, raw.time.length), raw.chunk);
-    this.#plot.show(this.#curves, this.#chunks);
+    this.#raw = answers(raw.time, joint(raw.values, index, raw.time.length), raw.chunk);
+    this.#plot.show(this.#curves, this.#raw);
     this.#at();
   }
 
   #explain(element) {
     const { safety } = this.#episode.ticks;
-    if (this.#episode.header.held.length) mark(element, "held", "--holding-soft", "patch");
-    if (safety.includes(1)) mark(element, "changed by safety", "--holding", "line");
-    if (safety.includes(2)) mark(element, "refused", "--faulted", "line");
+    const { chunks, header } = this.#episode;
+    if (chunks.spans.length) mark(element, "chunk", "--mark-chunk", "hairline", "Where another chunk takes over; the strip over the curves has its number");
+    if (chunks.overlaps.length) mark(element, "overlap", "--mark-overlap", "patch", "Steps that several chunks made");
+    if (header.held.length) mark(element, "held", "--holding-soft", "patch", "Nobody asked the robot for anything");
+    if (safety.includes(1)) mark(element, "changed", "--holding", "tick", "Safety had another action sent than was asked for");
+    if (safety.includes(2)) mark(element, "refused", "--faulted", "tick", "Safety let nothing be sent");
+    if (header.marks.length) mark(element, "event", "--text-normal", "tick", "Something that the list of events tells, at the top of the plot");
+    if (header.marks.some(({ kind }) => tunes(kind))) mark(element, "tuned", "--ready", "hairline", "Another strategy, or other parameters, from here on");
     const { spaces } = this.#episode;
     if (!spaces.includes("joint")) this.#legend.explain("raw", `The policy speaks in ${spaces.join(", ") || "no"} space: it has no joint to draw.`);
   }
 
+  #hover(time) {
+    this.#hovered = time;
+    this.#at();
+  }
+
+  /** The values and the chunk under the pointer, or else at the clock. */
   #at() {
-    const { time } = this.#clock;
-    this.#plot.at(time);
+    this.#plot.at(this.#clock.time);
+    const time = this.#hovered ?? this.#clock.time;
+    const { chunks } = this.#episode;
+    this.#plot.choose(chunks.ownerAt(time + 1e-6));
+    write(this.#said, readout(chunks, time + 1e-6));
     const tick = last(this.#curves.time, time + 1e-6);
     for (const name of ["state", "executed", "smoothed"]) this.#legend.value(name, tick < 0 ? NaN : this.#curves[name][tick]);
-    this.#legend.value("raw", wanted(this.#chunks, time + 1e-6));
+    this.#legend.value("raw", wanted(this.#raw, time + 1e-6));
   }
 }
 
 /** Say what a colour behind the curves means. */
-function mark(element, name, colour, shape) {
+function mark(element, name, colour, shape, means) {
   const part = document.createElement("span");
-  part.className = "legend";
+  part.className = "legend legend-mark";
+  part.title = means;
   const swatch = document.createElement("i");
   swatch.className = shape;
   swatch.style.setProperty("--colour", `var(${colour})`);
@@ -118,25 +138,13 @@ function wanted(chunks, time) {
   return chunk ? chunk.values[last(chunk.times, time)] : NaN;
 }
 
-/** Consecutive values of one chunk belong to one line. */
-function chunks(times, values, ids) {
+/** Consecutive values of one chunk belong to one line: [{id, times, values}]. */
+function answers(times, values, ids) {
   const found = [];
   ids.forEach((id, index) => {
-    if (!index || id !== ids[index - 1]) found.push({ times: [], values: [] });
+    if (!index || id !== ids[index - 1]) found.push({ id, times: [], values: [] });
     found.at(-1).times.push(times[index]);
     found.at(-1).values.push(values[index]);
   });
   return found;
-}
-
-/** The last index whose time is not after `time`, -1 where there is none. */
-function last(times, time) {
-  let low = 0;
-  let high = times.length;
-  while (low < high) {
-    const middle = (low + high) >> 1;
-    if (times[middle] <= time) low = middle + 1;
-    else high = middle;
-  }
-  return low - 1;
 }

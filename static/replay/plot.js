@@ -1,10 +1,18 @@
 // The curves of one joint over the whole episode, with what happened drawn behind and over them.
 
 import { KINDS, axes, blank, css, series, spread } from "../console/curve_kinds.js";
+import { LANE, Lane } from "./lane.js";
 
 const LINES = KINDS.filter((kind) => kind.name !== "raw"); // raw is drawn chunk by chunk
 const RAW = KINDS.find((kind) => kind.name === "raw");
 const SAFETY_HEIGHT = 5; // px
+const EVENT_HEIGHT = 7; // px
+const FAINT = 0.6; // of what the chunks wanted that are not under the cursor
+
+/** Whether an event of that kind is another strategy, or other parameters of it. */
+export function tunes(kind) {
+  return kind === "tuned" || kind === "tuned_to";
+}
 
 export class Plot {
   #element;
@@ -12,24 +20,29 @@ export class Plot {
   #plot = null;
   #cursor = document.createElement("i");
   #data;
-  #behind; // {held, marks, safety, chunks}
+  #behind; // {held, marks, safety, raw, owners}
   #time = 0;
   #shown;
+  #lane;
+  #chosen = -1; // the chunk under the cursor
+  #hover;
 
-  constructor({ element, library, behind, shown, seek }) {
+  constructor({ element, library, behind, shown, seek, hover }) {
     this.#element = element;
     this.#library = library;
     this.#behind = behind;
     this.#shown = shown;
     this.seek = seek;
+    this.#hover = hover;
+    this.#lane = new Lane(behind.owners);
     this.#cursor.className = "replay-cursor";
     new ResizeObserver(() => this.#fit()).observe(element);
     document.addEventListener("eva:theme", () => this.#build());
   }
 
-  /** `curves`: {time, state, executed, smoothed} of one joint; `chunks`: [{times, values}] as the policy gave them. */
-  show(curves, chunks) {
-    this.#behind.chunks = chunks;
+  /** `curves`: {time, state, executed, smoothed} of one joint; `raw`: [{id, times, values}] as the policy gave them. */
+  show(curves, raw) {
+    this.#behind.raw = raw;
     this.#data = [Array.from(curves.time), ...LINES.map((kind) => blank(curves[kind.name]))];
     if (this.#plot) this.#plot.setData(this.#data);
     else this.#build();
@@ -51,6 +64,13 @@ export class Plot {
     this.#cursor.style.transform = `translateX(${left}px)`;
   }
 
+  /** Bring out the chunk of that number. */
+  choose(id) {
+    if (id === this.#chosen) return;
+    this.#chosen = id;
+    this.#plot?.redraw(false);
+  }
+
   #fit() {
     const { clientWidth: width, clientHeight: height } = this.#element;
     if (this.#plot && width && height) this.#plot.setSize({ width, height });
@@ -63,6 +83,7 @@ export class Plot {
     const options = {
       width: this.#element.clientWidth || 600,
       height: this.#element.clientHeight || 160,
+      padding: [LANE, null, null, null],
       legend: { show: false },
       cursor: { drag: { x: true, y: false }, points: { show: false } },
       scales: { x: { time: false }, y: { range: (plot, low, high) => spread(low, high) } },
@@ -72,6 +93,7 @@ export class Plot {
         drawAxes: [(plot) => this.#drawBehind(plot)],
         draw: [(plot) => this.#drawOver(plot)],
         setScale: [() => this.at(this.#time)],
+        setCursor: [(plot) => this.#hover(plot.cursor.left >= 0 ? plot.posToVal(plot.cursor.left, "x") : null)],
       },
     };
     this.#plot = new this.#library(options, this.#data, this.#element);
@@ -91,27 +113,49 @@ export class Plot {
     });
   }
 
-  #inside(plot, draw) {
+  /** Draw within the plot, `above` it by so many pixels; `x(time)` knows where the plot begins and ends. */
+  #inside(plot, draw, above = 0) {
     const { left, top, width, height } = plot.bbox;
+    const x = Object.assign((time) => plot.valToPos(time, "x", true), { left, right: left + width });
     plot.ctx.save();
     plot.ctx.beginPath();
-    plot.ctx.rect(left, top, width, height);
+    plot.ctx.rect(left, top - above, width, height + above);
     plot.ctx.clip();
-    draw(plot.ctx, (time) => plot.valToPos(time, "x", true), { top, height });
+    draw(plot.ctx, x, { left, top: top - above, width, height });
     plot.ctx.restore();
   }
 
   #drawBehind(plot) {
-    this.#inside(plot, (ctx, x, { top, height }) => {
+    this.#inside(plot, (ctx, x, place) => {
+      const { top, height } = place;
       ctx.fillStyle = css("--holding-soft");
       for (const [from, to] of this.#behind.held) ctx.fillRect(x(from), top, Math.max(1, x(to) - x(from)), height);
-      ctx.fillStyle = css("--edge");
-      for (const { time } of this.#behind.marks) ctx.fillRect(Math.round(x(time)), top, 1, height);
-      if (!this.#shown(RAW.name)) return;
-      ctx.strokeStyle = css(RAW.colour);
-      ctx.lineWidth = devicePixelRatio;
+      this.#lane.behind(ctx, x, place);
+      for (const { time, kind } of this.#behind.marks) {
+        const tall = tunes(kind) ? height : EVENT_HEIGHT * devicePixelRatio;
+        ctx.fillStyle = css(tunes(kind) ? "--ready" : "--text-normal");
+        ctx.fillRect(Math.round(x(time)), top, 2 * devicePixelRatio, tall);
+      }
+      if (this.#shown(RAW.name)) this.#drawRaw(plot, ctx, x);
+    });
+    const above = LANE * devicePixelRatio;
+    this.#inside(plot, (ctx, x, place) => this.#lane.strip(ctx, x, { ...place, chosen: this.#chosen }), above);
+  }
+
+  /** What each chunk wanted, the one under the cursor on top. */
+  #drawRaw(plot, ctx, x) {
+    const own = ({ id }) => id === this.#chosen;
+    const { raw } = this.#behind;
+    ctx.strokeStyle = css(RAW.colour);
+    const kinds = [
+      [raw.filter((chunk) => !own(chunk)), 1, FAINT],
+      [raw.filter(own), 2.5, 1],
+    ];
+    for (const [chunks, width, alpha] of kinds) {
+      ctx.lineWidth = width * devicePixelRatio;
+      ctx.globalAlpha = alpha;
       ctx.beginPath();
-      for (const { times, values } of this.#behind.chunks) {
+      for (const { times, values } of chunks) {
         values.forEach((value, index) => {
           const at = [x(times[index]), plot.valToPos(value, "y", true)];
           if (index) ctx.lineTo(...at);
@@ -119,7 +163,8 @@ export class Plot {
         });
       }
       ctx.stroke();
-    });
+    }
+    ctx.globalAlpha = 1;
   }
 
   #drawOver(plot) {

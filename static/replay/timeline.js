@@ -25,7 +25,11 @@ export class Timeline {
     const strip = document.getElementById("marks");
     const share = (time) => `${(100 * Math.min(time, this.#clock.duration)) / this.#clock.duration}%`;
     for (const [from, to] of held) strip.append(piece("timeline-held", share(from), share(to - from)));
-    for (const { time } of marks) strip.append(piece("timeline-mark", share(time), null));
+    for (const { time, kind } of marks) {
+      const mark = piece("timeline-mark", share(time), null);
+      mark.dataset.kind = kind;
+      strip.append(mark);
+    }
     this.#list(marks);
     this.#at();
   }

@@ -1,0 +1,71 @@
+"""What the policy answered, chunk by chunk: when, how late, which of its rows were planned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaweb.frames import Stream
+from runtime.recording.reader import Episode
+
+Array = NDArray[Any]
+UNKNOWN = -1
+
+
+def chunks(episode: Episode, times_of: Callable[[Array], Array]) -> Stream:
+    """Every chunk of the episode, by its number; `times_of` says when control steps were [s].
+
+    Arrays [C]: id i4; observed and arrived f8 [s] (NaN: it never arrived); delay, mistimed and overlap i4
+    [steps]; rows i4, how many it has; first and last i4, the rows that were planned; strategy i4, a place in
+    the list `strategies` beside them; inference f4 [ms]. -1 stands for unknown or none: episodes from before
+    have no overlap and no strategy.
+    """
+    raw = episode.raw
+    numbers, firsts, counts = np.unique(
+        raw.column("chunk_id").to_numpy(), return_index=True, return_counts=True
+    )
+    heads = raw.take(firsts)
+    observed, arrived = (heads.column(name).to_numpy() for name in ("observation_step", "arrival_step"))
+    names, kinds = _strategies(heads)
+    first, last = _planned(raw, numbers)
+    columns = {
+        "id": numbers,
+        "rows": counts,
+        "first": first,
+        "last": last,
+        "delay": np.where(arrived < 0, UNKNOWN, heads.column("delay").to_numpy()),
+        "mistimed": heads.column("mistimed").to_numpy(),
+        "overlap": heads.column("overlap").fill_null(UNKNOWN).to_numpy(),
+        "strategy": kinds,
+    }
+    return Stream(
+        json={"strategies": names},
+        arrays={name: np.asarray(values).astype(np.int32) for name, values in columns.items()}
+        | {
+            "observed": times_of(observed),
+            "arrived": np.where(arrived < 0, np.nan, times_of(arrived)),
+            "inference": heads.column("inference_ms").to_numpy().astype(np.float32),
+        },
+    )
+
+
+def _strategies(heads: Any) -> tuple[list[str], Array]:
+    """The kinds that merged them, and which one each chunk has."""
+    kinds = [kind or "" for kind in heads.column("strategy").to_pylist()]
+    names = sorted(set(kinds) - {""})
+    return names, np.array([names.index(kind) if kind else UNKNOWN for kind in kinds], np.int32)
+
+
+def _planned(raw: Any, numbers: Array) -> tuple[Array, Array]:
+    """The first and the last row of each chunk that has a step it was planned for."""
+    used = raw.filter(np.asarray(raw.column("target_step").to_numpy() >= 0))
+    places = np.searchsorted(numbers, used.column("chunk_id").to_numpy())
+    index = used.column("index").to_numpy()
+    first = np.full(len(numbers), np.iinfo(np.int64).max)
+    last = np.full(len(numbers), UNKNOWN)
+    np.minimum.at(first, places, index)
+    np.maximum.at(last, places, index)
+    return np.where(last < 0, UNKNOWN, first), last

@@ -1,0 +1,74 @@
+// Which chunk owns each step, which steps several chunks made, and what is known of a chunk.
+
+import { last } from "./data.js";
+
+const NONE = -1;
+
+export class Chunks {
+  #time; // of the ticks [s]
+  #owner; // chunk with the largest weight, -1 none, 0 the held target
+  #makers; // tick k was made of the entries makers[k] to makers[k + 1]
+  #maker; // {chunk, weight}
+  #known; // {id, observed, arrived, delay, mistimed, overlap, rows, first, last, strategy, inference}
+  #strategies;
+  #period;
+
+  /** `ticks`, `makers` and `chunks` are the streams of the episode's curves; `period` is that of the ticks [s]. */
+  constructor({ ticks, makers, chunks, strategies, period }) {
+    this.#time = ticks.time;
+    this.#owner = ticks.chunk;
+    this.#makers = ticks.makers;
+    this.#maker = makers;
+    this.#known = chunks;
+    this.#strategies = strategies;
+    this.#period = period;
+    this.spans = this.#spans((tick) => this.#owner[tick], NONE);
+    this.overlaps = this.#spans((tick) => Number(this.#count(tick) > 1), 0).map(({ from, to }) => [from, to]);
+  }
+
+  #count(tick) {
+    return this.#makers[tick + 1] - this.#makers[tick];
+  }
+
+  /** Ticks in a row with the same value, [{from, to, id}] in seconds, without those of value `none`. */
+  #spans(value, none) {
+    const found = [];
+    for (let tick = 0; tick < this.#time.length; tick += 1) {
+      const id = value(tick);
+      const end = this.#end(tick);
+      const open = found.at(-1);
+      if (open && open.id === id && open.next === tick) Object.assign(open, { to: end, next: tick + 1 });
+      else if (id !== none) found.push({ from: this.#time[tick], to: end, id, next: tick + 1 });
+    }
+    return found;
+  }
+
+  /** When the next tick begins, or, before a gap, when it should have. */
+  #end(tick) {
+    const next = this.#time[tick + 1] ?? Infinity;
+    return Math.min(next, this.#time[tick] + 1.5 * this.#period);
+  }
+
+  /** The chunk that owns the step at `time`, -1 where there is none. */
+  ownerAt(time) {
+    const tick = last(this.#time, time);
+    return tick < 0 || time >= this.#end(tick) ? NONE : this.#owner[tick];
+  }
+
+  /** What made the step at `time`: [{id, weight}], the largest share first. */
+  makersAt(time) {
+    const tick = last(this.#time, time);
+    if (tick < 0) return [];
+    const found = [];
+    for (let at = this.#makers[tick]; at < this.#makers[tick + 1]; at += 1) found.push({ id: this.#maker.chunk[at], weight: this.#maker.weight[at] });
+    return found.sort((one, other) => other.weight - one.weight);
+  }
+
+  /** What is known of chunk `id`; null for the held target and for one that no policy gave. */
+  about(id) {
+    const at = last(this.#known.id, id);
+    if (at < 0 || this.#known.id[at] !== id) return null;
+    const told = Object.fromEntries(Object.entries(this.#known).map(([name, values]) => [name, values[at]]));
+    return { ...told, strategy: this.#strategies[told.strategy] ?? "", seconds: told.arrived - told.observed };
+  }
+}
