@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from robots import Robot
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Rate = Annotated[float, Field(ge=1, le=1000)]
 Pixels = Annotated[int, Field(ge=8, le=4096)]
 Size = Annotated[list[Pixels], Field(min_length=2, max_length=2)]
 Dims = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
@@ -63,7 +64,7 @@ class Config(Section):
     Grippers are absolute in every mode. A server's own metadata key action_mode names the space, not this."""
     relative_frame: RelativeFrame = "base"
     """Axes of relative poses: the arm's base, or the tool as observed."""
-    action_rate: Positive | None = None
+    action_rate: Rate | None = None
     """Rows per second of the answer [Hz]; the control rate where it is not given."""
     rtc: Literal["none", "prev_action", "async_rtc"] = "none"
     """How the server is told what the robot is committed to: flat keys, or the openpi-async-rtc envelope."""

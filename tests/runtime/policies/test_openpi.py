@@ -198,6 +198,17 @@ def test_it_keeps_the_models_own_rows_for_later_conditioning() -> None:
     np.testing.assert_array_equal(chunk.model_actions, np.ones((4, 32), np.float32))
 
 
+def test_a_chunk_says_what_its_numbers_are_and_how_fast_they_come() -> None:
+    settings: dict[str, Any] = {"action_mode": "delta", "relative_frame": "tool", "action_rate": 15.0}
+    with stub(replying({"actions": np.zeros((3, 16))})) as url:
+        with policy_at(url, action_space="eef", **settings) as policy:
+            chunk = policy.infer(observation())
+        with policy_at(url, action_space="eef") as policy:
+            plain = policy.infer(observation())
+    assert (chunk.mode, chunk.frame, chunk.rate) == ("delta", "tool", 15.0)
+    assert (plain.mode, plain.frame, plain.rate) == ("absolute", "base", None)
+
+
 # Requests
 
 
@@ -347,11 +358,22 @@ def test_what_may_come_back_is_told_from_what_will_never_be_a_policy_server(
     assert isinstance(raised.value, PolicyLostError) == lost
 
 
-@pytest.mark.parametrize("host", ["nobody.invalid", "two..dots"])
-def test_a_host_that_nobody_knows_is_named(host: str) -> None:
+def test_a_host_that_nobody_knows_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(*given: object, **options: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
     with (
-        policy_at(f"ws://{host}:8000") as policy,
-        pytest.raises(PolicyLostError, match=f"the host of ws://{host}:8000 is not known"),
+        policy_at("ws://nobody.invalid:8000") as policy,
+        pytest.raises(PolicyLostError, match=r"the host of ws://nobody\.invalid:8000 is not known"),
+    ):
+        policy.connect()
+
+
+def test_a_name_that_can_be_no_host_is_said_to_be_unknown() -> None:
+    with (
+        policy_at("ws://two..dots:8000") as policy,
+        pytest.raises(PolicyLostError, match=r"the host of ws://two\.\.dots:8000 is not known"),
     ):
         policy.connect()
 
