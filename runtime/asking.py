@@ -19,16 +19,23 @@ Committed = Callable[[int], Conditioning | None]  # by the step of the observati
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """An inference that came back: the chunk, how long it took [s], what it was asked about, under what."""
+    """An inference that came back: the chunk, how long it took [s], what it was asked about, what it means.
+
+    `made` are its rows in command space. `waited`: the robot stood meanwhile.
+    """
 
     chunk: ActionChunk
     seconds: float
     observation: Observation
-    waited: bool = False  # the robot stood meanwhile
+    made: CommandRows
+    waited: bool = False
 
 
 class Asking:
-    """Asks one policy; calls are made one after the other, and nobody waits for them here."""
+    """Asks one policy; calls are made one after the other, and nobody waits for them here.
+
+    Kinematics belong to the call: for a chunk of poses they take as long as a small model, and main must not.
+    """
 
     def __init__(
         self, policy: Policy, task: str, spaces: Spaces, sight: Sight, runner: Runner, clock: Clock
@@ -75,16 +82,16 @@ class Asking:
             if shown.eef is None:
                 shown = replace(shown, eef=self._spaces.eef_of(shown.qpos))
             chunk = policy.infer(shown, conditioning)
-            return Answered(chunk, self._clock.now() - begun, shown, waited)
+            seconds = self._clock.now() - begun
+            return Answered(chunk, seconds, shown, self._spaces.to_command(chunk, shown), waited)
 
         return self.runner.submit(infer)
 
-    def command_rows(self, answered: Answered) -> CommandRows:
-        """The answer as rows in command space at control rate, and the policy row each was made from."""
-        made = self._spaces.to_command(answered.chunk, answered.observation)
+    def note(self, answered: Answered) -> None:
+        """Say what could not be done of an answer."""
+        made = answered.made
         if made.solved is not None and not made.solved.reached.all():
             missed = int((~made.solved.reached).any(axis=1).sum())
             worst = float(made.solved.position_error.max()) * 1000
             text = f"{missed} of {len(made.rows)} poses are out of reach, the worst by {worst:.1f} mm: nearest taken"
             self.notes.append(Event("ik_unreached", text, self._clock.now(), answered.observation.step))
-        return made

@@ -72,7 +72,7 @@ class Director(Effects):
         self.media_report = MediaReport(0.0, {}, {}, 0, "", 0)
         self.spaces = plan.spaces()
         asking = Asking(
-            plan.new_policy(clock), settings.task, self.spaces, _sight(plan, page, clock), runner, clock
+            plan.new_policy(clock), settings.task, plan.spaces(), _sight(plan, page, clock), runner, clock
         )
         patience = Patience(settings.control.starvation_hold_s, settings.faults.patience_s)
         self.inference = Inference(

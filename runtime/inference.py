@@ -19,7 +19,6 @@ from runtime.orders import Orders
 from runtime.page import Page
 from runtime.policies.base import Policy
 from runtime.sight import StaleObservationError
-from runtime.spaces import CommandRows
 from runtime.strategies.base import Progress, Query, StrategyParameters
 from runtime.tally import Tally
 from runtime.types import Conditioning, Float64
@@ -286,7 +285,7 @@ class Inference:
             step, list(self.tally.delays)[-50:], parameters.delay_quantile, parameters.execution_horizon
         )
         warning = self._commitment.warning
-        if warning and warning != self.rtc_warning:
+        if warning and not self.rtc_warning:  # its numbers change with every request
             self._note("rtc_warning", warning)
         self.rtc_warning, self._given = warning, found
         return found
@@ -294,8 +293,8 @@ class Inference:
     def _take(self, answered: Answered) -> PolicyAnswer:
         self._recovered()
         step, chunk = answered.observation.step, answered.chunk
-        made_rows = self.asking.command_rows(answered)
-        made = Made(self._orders.next_chunk(), made_rows.rows, answered)
+        self.asking.note(answered)
+        made = Made(self._orders.next_chunk(), answered.made.rows, answered)
         self._wanted = False
         self.tally.answered(answered.seconds)
         self._commitment.answered(made.number, chunk, step, answered.waited, self._generation)
@@ -305,9 +304,9 @@ class Inference:
             self.shown = ShownChunk(made.number, self._run, "proposed", step, nowhere, made.rows)
         else:
             self._post(made)
-        return self._record(made, made_rows)
+        return self._record(made)
 
-    def _record(self, made: Made, rows: CommandRows) -> PolicyAnswer:
+    def _record(self, made: Made) -> PolicyAnswer:
         answered = made.answered
         return PolicyAnswer(
             made.number,
@@ -315,7 +314,7 @@ class Inference:
             answered.observation.step,
             answered.chunk.actions,
             answered.chunk.space,
-            rows.source,
+            answered.made.source,
             answered.seconds * 1000.0,
         )
 

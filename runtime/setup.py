@@ -230,7 +230,8 @@ class SetUp:
         return True
 
     def _validate(self, answered: Answered) -> None:
-        self.first_action = self._inference.asking.command_rows(answered).rows[0]
+        self._inference.asking.note(answered)
+        self.first_action = answered.made.rows[0]
         first = first_action(self.first_action, np.asarray(answered.observation.qpos, np.float64), self._plan)
         far = ": far, approach it or start elsewhere" if first["far"] else ""
         self.validated = (
