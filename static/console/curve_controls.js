@@ -20,9 +20,8 @@ export async function curvePane(store) {
     note.textContent = "Curves are drawn by uPlot, which is not installed: run make setup and start the lab again.";
     return { add() {}, joints() {} };
   }
-  const place = document.getElementById("curves-legend");
-  const legend = new Legend(place, (name, shown) => curves.reveal(name, shown));
-  const markLegend = new MarkLegend(place);
+  const legend = new Legend(document.getElementById("curves-legend"), (name, shown) => curves.reveal(name, shown));
+  const markLegend = new MarkLegend(document.getElementById("curves-marks"));
   const curves = new Curves({ element: document.getElementById("curves"), library, legend, markLegend, names: config.joints });
   const select = joints(curves, config.joints);
   document.getElementById("joint-next").addEventListener("click", () => {

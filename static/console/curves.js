@@ -10,6 +10,8 @@ const SECONDS = 20;
 const ROWS = 60 * (SECONDS + 2);
 const GAP_S = 0.5; // without news for so long: a gap, not a line
 const DRAW_MS = 100;
+const WHOLE = [-SECONDS, 0];
+const LEAST_S = 0.2; // of a closer look
 const NO_MARKS = { seams: [], bands: [], limits: [] };
 
 export class Curves {
@@ -22,6 +24,7 @@ export class Curves {
   #trace = null;
   #names = [];
   #joint = 0;
+  #span = WHOLE; // of time that is drawn
   #frozen = null; // the trace as it was when it was paused
   #frozenAt = 0; // on this page's clock [ms]
   #marks = NO_MARKS;
@@ -88,6 +91,7 @@ export class Curves {
   pause(paused) {
     this.#frozen = paused ? this.#trace.copy() : null;
     this.#frozenAt = performance.now();
+    this.#span = WHOLE;
     this.#draw(true);
   }
 
@@ -149,6 +153,19 @@ export class Curves {
     return at < 0 ? null : Object.fromEntries(Object.entries(columns).map(([name, numbers]) => [name, numbers[at]]));
   }
 
+  /** While it stands still, a drag looks closer and a double click at everything again. */
+  #closer(plot) {
+    const { left, width } = plot.select;
+    const [from, to] = [left, left + width].map((at) => plot.posToVal(at, "x"));
+    plot.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
+    if (this.#frozen && width > 0 && to - from > LEAST_S) this.#look([from, to]);
+  }
+
+  #look(span) {
+    this.#span = span;
+    this.#draw(true);
+  }
+
   #fit() {
     const { clientWidth: width, clientHeight: height } = this.#element;
     if (this.#plot && width && height) this.#plot.setSize({ width, height });
@@ -161,12 +178,13 @@ export class Curves {
       width: this.#element.clientWidth || 600,
       height: this.#element.clientHeight || 160,
       legend: { show: false },
-      cursor: { drag: { x: false, y: false }, points: { show: false } },
-      scales: { x: { time: false, range: [-SECONDS, 0] }, y: { range: (plot, low, high) => spread(low, high) } },
+      cursor: { drag: { x: true, y: false, setScale: false }, points: { show: false }, bind: { dblclick: () => () => this.#look(WHOLE) } },
+      scales: { x: { time: false, range: () => this.#span }, y: { range: (plot, low, high) => spread(low, high) } },
       axes: axes(),
       series: series(KINDS, (name) => this.#legend.shown(name)),
       hooks: {
         setCursor: [(plot) => plot === this.#plot && this.#tell()],
+        setSelect: [(plot) => plot === this.#plot && this.#closer(plot)],
         drawAxes: [(plot) => this.#paint.behind(plot, this.#marks)],
         draw: [(plot) => this.#paint.over(plot, this.#marks)],
       },

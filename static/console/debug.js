@@ -74,7 +74,7 @@ function entry(list, name) {
 function lateness({ ticks, lateness_p50_ms: p50, lateness_p99_ms: p99, lateness_p999_ms: p999, lateness_max_ms: most }) {
   if (!ticks) return "no tick yet";
   const parts = [["p50", p50], ["p99", p99], ["p99.9", p999], ["most", most]];
-  return `${parts.map(([name, ms]) => `${name} ${Number.isFinite(ms) ? ms.toFixed(2) : "–"}`).join(", ")} ms`;
+  return `${parts.map(([name, ms]) => `${name}\u00a0${Number.isFinite(ms) ? ms.toFixed(2) : "–"}`).join(", ")} ms`;
 }
 
 function predicted({ predicted_delay: delay, conditioned }) {

@@ -71,9 +71,10 @@ function colours(arms) {
 
 function points(size, draw) {
   const THREE = three();
-  const look = { size, vertexColors: true, sizeAttenuation: false, map: picture(draw), transparent: true, alphaTest: 0.4, depthWrite: false };
+  const look = { size, vertexColors: true, sizeAttenuation: false, map: picture(draw), transparent: true, alphaTest: 0.4, depthTest: false };
   const made = new THREE.Points(new THREE.BufferGeometry(), new THREE.PointsMaterial(look));
   made.frustumCulled = false;
+  made.renderOrder = 1; // over the robot: what it will do is never hidden by what it is
   made.visible = false;
   return made;
 }
