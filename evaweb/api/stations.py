@@ -21,7 +21,7 @@ from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
 from evaweb.stations.wire import wire_to
 from evaweb.trials import selectors as trial_selectors
 from evaweb.trials import services
-from evaweb.trials.bench import trial_command
+from evaweb.trials.bench import checkpoint_command, trial_command
 
 router = Router(tags=["stations"])
 PageId = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$", description="Made by the page at random")]
@@ -117,7 +117,8 @@ def _no_trial(args: dict[str, Any]) -> dict[str, Any]:
 class CommandIn(Schema):
     """A discrete verb; boot and sequence are those of the snapshot that it was decided by.
 
-    With `trial`, set-up and run get their arguments from the trial.
+    With `trial`, set-up and run get their arguments from the trial; `checkpoint`, by name or id, is for a set-up
+    without one.
     """
 
     uuid: UUID
@@ -128,6 +129,7 @@ class CommandIn(Schema):
     boot: Annotated[str, Field(max_length=64)] = ""
     sequence: Annotated[int, Field(ge=0, le=2**53)] = 0
     trial: int | None = None
+    checkpoint: str | int | None = None
 
 
 class CommandOut(Schema):
@@ -225,8 +227,13 @@ def lease(request: HttpRequest, name: str, given: LeaseIn) -> Any:
 def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
     """Set-up, run, stop, modes, strategy, motions, grippers; the same uuid again gets the first answer."""
     found = selectors.station_get(name=name)
-    order = given.model_dump(exclude={"trial"})
-    if given.trial is None:
+    order = given.model_dump(exclude={"trial", "checkpoint"})
+    if given.trial is not None and given.checkpoint is not None:
+        raise EvaError("trial and checkpoint: a trial has its own checkpoint, name one of them")
+    if given.checkpoint is not None:
+        checkpoint = trial_selectors.checkpoint_get(name=given.checkpoint)
+        row = checkpoint_command(user=request.auth, station=found, checkpoint=checkpoint, **order)
+    elif given.trial is None:
         row = commands.issue(user=request.auth, station=found, **order)
     else:
         trial = trial_selectors.trial_get(id=given.trial)

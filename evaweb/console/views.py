@@ -14,6 +14,7 @@ from evaweb.errors import NotFound
 from evaweb.roles import role_of
 from evaweb.stations.models import Station
 from evaweb.stations.selectors import request_list, station_get
+from evaweb.trials.selectors import checkpoint_list
 
 
 def home(request: HttpRequest) -> HttpResponse:
@@ -29,7 +30,7 @@ def station(request: HttpRequest, name: str) -> HttpResponse:
 
 def debug(request: HttpRequest, name: str) -> HttpResponse:
     """A station by hand: every command, every figure."""
-    return _page(request, _station(name), "debug", {})
+    return _page(request, _station(name), "debug", {"checkpoints": checkpoint_list()})
 
 
 def evaluate(request: HttpRequest, name: str) -> HttpResponse:

@@ -1,4 +1,7 @@
-"""The commands of a trial: what its set-up and its run take with them, and what their answers do to it."""
+"""The commands of a trial: what its set-up and its run take with them, and what their answers do to it.
+
+Beside them the set-up for a checkpoint without a trial.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from uuid import UUID
 from django.contrib.auth.models import User
 from django.db import transaction
 
-from evaweb.errors import Conflict
+from evaweb.errors import Conflict, EvaError
 from evaweb.frames import plain
 from evaweb.roles import Role, require
 from evaweb.stations.commands import identity_of, issue
@@ -19,7 +22,7 @@ from evaweb.stations.wire import wire_to
 from evaweb.trials import lifecycle
 from evaweb.trials.facts import trial_facts
 from evaweb.trials.following import run_begun
-from evaweb.trials.models import Trial, TrialStatus
+from evaweb.trials.models import Checkpoint, Trial, TrialStatus
 
 
 def trial_command(
@@ -58,13 +61,27 @@ def trial_command(
     return issue(**given, args=dict(args or {}))
 
 
+def checkpoint_command(
+    *, user: User, checkpoint: Checkpoint, kind: str, args: Mapping[str, Any] | None = None, **given: Any
+) -> Command:
+    """Set a station up for a checkpoint, for no trial; `given` as in `issue`. Raises EvaError for other commands."""
+    require(user, Role.OPERATOR)
+    if kind != "setup":
+        raise EvaError(f"{kind} takes no checkpoint: setup does")
+    if "policy" in (args or {}) or "checkpoint" in (args or {}):
+        raise EvaError("args say policy or checkpoint beside the checkpoint that is named: give one of them")
+    if not checkpoint.active:
+        raise Conflict(f"checkpoint {checkpoint.name} is switched off: choose another one")
+    return issue(user=user, kind=kind, args={**(args or {}), **_policy_args(checkpoint)}, **given)
+
+
+def _policy_args(checkpoint: Checkpoint) -> dict[str, Any]:
+    return {"policy": checkpoint.policy, "checkpoint": {"id": checkpoint.pk, "name": checkpoint.name}}
+
+
 def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
     """What the station needs to know for this trial; `reset` names this laying out of a simulated bench."""
-    args: dict[str, Any] = {
-        "policy": trial.checkpoint.policy,
-        "task": trial.instruction,
-        "checkpoint": {"id": trial.checkpoint_id, "name": trial.checkpoint.name},
-    }
+    args: dict[str, Any] = {"task": trial.instruction, **_policy_args(trial.checkpoint)}
     if trial.station.simulated and trial.seed is not None:
         args["bench"] = {"id": str(reset), "seed": trial.seed, "positions": trial.position.bench}
     return args

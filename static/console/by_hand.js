@@ -15,5 +15,12 @@ export function byHand(store, socket, commands) {
   new TuningPanel(store, commands);
   new ManualPanel(store, commands, aim);
   robotPanel(store, commands);
+  commands.provide("setup", bench);
   return { aimed: (answer) => aim.answered(answer) };
+}
+
+/** How a simulated bench is to be laid out at set-up; nothing where it is to stay as it lies. */
+function bench() {
+  const seed = document.getElementById("seed");
+  return seed && seed.value !== "" ? { bench: { seed: seed.valueAsNumber } } : {};
 }

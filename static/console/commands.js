@@ -34,13 +34,14 @@ export class Commands {
     this.#givers.set(kind, args);
   }
 
-  /** Send one command; resolves to the answer, or null where it was not accepted (and says why on the page). */
-  async give(kind, args = {}, trial = null) {
+  /** Send one command, for a trial or for the checkpoint of that id where one is given; resolves to the answer, or null where it was not accepted (and says why on the page). */
+  async give(kind, args = {}, { trial = null, checkpoint = "" } = {}) {
     const name = verb(kind);
     this.say(`${name}: pressed …`, "pressed");
     const command = { uuid: uuid(), kind, args, page: this.#store.page, epoch: this.#store.epoch };
     Object.assign(command, { boot: this.#store.snapshot?.boot ?? "", sequence: this.#store.snapshot?.sequence ?? 0 });
     if (trial) command.trial = Number(trial);
+    if (checkpoint) command.checkpoint = Number(checkpoint);
     try {
       const answer = await (STOPPING.includes(kind) ? this.#stops.give(command) : post(config.api.commands, command));
       this.say(`${name}: ${answer.status}`, "accepted");
@@ -113,7 +114,7 @@ export class Commands {
   async #clicked(event) {
     const button = event.target.closest("[data-command]");
     if (!button) return;
-    const { command: kind, trial } = button.dataset;
+    const { command: kind, trial, checkpoint } = button.dataset;
     if (button.getAttribute("aria-disabled") === "true") {
       this.say(`${verb(kind)}: ${button.title}`, "refused");
       return;
@@ -121,7 +122,8 @@ export class Commands {
     if (this.#pending.has(kind) && !STOPPING.includes(kind)) return;
     this.#pending.add(kind);
     button.dataset.pressed = "";
-    await this.give(kind, { ...this.#givers.get(kind)?.(), ...argsOf(button) }, trial || null);
+    const beside = { trial, checkpoint: checkpoint && document.querySelector(checkpoint).value };
+    await this.give(kind, { ...this.#givers.get(kind)?.(), ...argsOf(button) }, beside);
     delete button.dataset.pressed;
     this.#pending.delete(kind);
   }

@@ -24,9 +24,11 @@ export function setUp(store) {
     for (const list of document.querySelectorAll("[data-stages]")) {
       list.hidden = !stages.length;
       fill(list, stages);
+      const line = list.parentElement.querySelector('[data-show="stage"]'); // says the same while it goes on
+      line.toggleAttribute("data-said", Boolean(stages.length) && snapshot.state === "setting_up");
     }
     const failed = stages.some((stage) => stage.state === "failed");
-    for (const name of document.querySelectorAll("[data-set-up-name]")) name.textContent = failed ? "Try again" : "Set up";
+    for (const name of document.querySelectorAll("[data-set-up-name]")) name.textContent = failed ? "Retry" : "Set up";
     for (const button of document.querySelectorAll("[data-hidden-state]")) button.hidden = snapshot.state === button.dataset.hiddenState;
   };
   store.on("snapshot", draw);

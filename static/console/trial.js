@@ -106,7 +106,7 @@ export class TrialPanel {
     if (seed?.value) choice.seed = Number(seed.value);
     const trial = await post(config.trials, choice);
     saved(form);
-    await this.#commands.give("setup", {}, trial.id);
+    await this.#commands.give("setup", {}, { trial: trial.id });
     return null; // the command has said what became of it
   }
 

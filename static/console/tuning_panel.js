@@ -105,6 +105,7 @@ export class TuningPanel {
     part("undo").setAttribute("aria-disabled", String(!words.length && !error));
     part("deployed").setAttribute("aria-disabled", String(!snapshot.facts.strategy));
     part("deployed").title = snapshot.facts.strategy ? "" : "the station does not say what its deployment has";
+    write("checkpoint", `In force: ${snapshot.checkpoint?.name || "as deployed"}`);
     write("task", `In force: ${snapshot.task ? `“${snapshot.task}”` : "no prompt"}`);
     write("edited", error || (words.length ? `Edited, not yet in force: ${words.join(", ")}` : ""));
     part("edited").dataset.kind = error ? "error" : "";

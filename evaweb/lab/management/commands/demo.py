@@ -75,14 +75,16 @@ class Command(BaseCommand):
 
     def _up(self, lab: Lab, seed_number: int) -> tuple[str, list[Login]]:
         node = lab.processes.start(programs.tabletop(_ROBOT, seed_number))
+        served = {}
         for name, (description, options) in _POLICIES.items():
             serving = programs.policy(name, _ROBOT, (*options, "--seed", str(seed_number)))
-            policy = {"url": lab.processes.start(serving)["url"]}
-            seed.demo_checkpoint(name=name, description=description, policy=policy)
+            served[name] = lab.processes.start(serving)["url"]
+            seed.demo_checkpoint(name=name, description=description, policy={"url": served[name]})
         seed.demo_scene()
         assignments = [
             f'transport.sub_endpoint="{node["obs_endpoint"]}"',
             f'transport.pub_endpoint="{node["action_endpoint"]}"',
+            f'policy.url="{served[_SKILLED]}"',
         ]
         url = lab.up([Bench(_DEPLOYMENT, assignments)])
         roles = {"operator": Role.OPERATOR, "admin": Role.ADMIN}
