@@ -36,7 +36,7 @@ _NODES = (16, 5)  # of the map from places to joints, along and across the belt
 
 
 class Chase(Script):
-    """The policy for every connection; `belt` is the one that it has learnt."""
+    """The policy for every connection; `places` are those of the belt that it has learnt."""
 
     def __init__(
         self,
@@ -45,13 +45,11 @@ class Chase(Script):
         rate: float,
         name: str | None = None,
         clock: Clock | None = None,
-        belt: Belt | None = None,
+        places: Places | None = None,
     ) -> None:
-        self.belt = belt or Belt()
         self.clock = clock or MonotonicClock()
-        table = Bench(belt=self.belt)
-        self.overhead = Overhead(robot, table)
-        self.places = Places(robot, Planner(robot, rate, table), self.belt)
+        self.places = places or Places(robot, Belt())
+        self.overhead = Overhead(robot, Bench(belt=self.places.belt))
         self.times = np.arange(horizon) / rate
         self.metadata = {
             "name": name or "chase",
@@ -101,16 +99,17 @@ class Follower:
         spread = float(since @ since)
         velocity = float(since @ fitted[:, 1]) / spread if spread > 0 else 0.0
         x = fitted[:, 1].mean() + velocity * (times - fitted[:, 0].mean())
-        return np.clip(x, *self._policy.belt.x), np.full(len(times), newest[2])
+        return np.clip(x, *self._policy.places.belt.x), np.full(len(times), newest[2])
 
 
 class Places:
     """From places of the block to joints with fingertips beside it: solved at some, interpolated between."""
 
-    def __init__(self, robot: Robot, planner: Planner, belt: Belt) -> None:
-        self._belt = belt
+    def __init__(self, robot: Robot, belt: Belt) -> None:
+        self.belt = belt
         self._x = np.linspace(belt.x[0] - _BEYOND, belt.x[1] + _BEYOND, _NODES[0])
         self._y = belt.y + np.linspace(-_ACROSS, _ACROSS, _NODES[1])
+        planner = Planner(robot, robot.control_rate, Bench(belt=belt))
         for arm in robot.arms:
             solved = self._solved(robot, planner, arm)
             if solved is not None:
@@ -133,7 +132,7 @@ class Places:
     def _solved(self, robot: Robot, planner: Planner, arm: Group) -> Float64 | None:
         """Joints [along, across, D]; None where the arm does not reach one of the places."""
         rest = robot.poses.get("ready", robot.poses["home"])
-        dx, dy, height = self._belt.beside
+        dx, dy, height = self.belt.beside
         found = []
         for x in self._x:
             for y in self._y:

@@ -30,6 +30,7 @@ REST_S = 0.2  # without moving, after which a block is at rest
 LIFTED_M = 0.03  # between a held block and the table
 MARGIN_M = 0.01  # inside the plate's rim that the block's centre must be
 _APART_SPEED = 0.5  # m/s with which things that ended up in each other part
+_WITHIN = 0.25  # m from fingertips to a block's centre, beyond which no part of a hand touches it
 _RIM = 0.002  # m below the plate's top at which a block stands beside it
 
 
@@ -43,7 +44,12 @@ class Reset:
 
 
 class Tabletop:
-    """What lies on the bench of one robot; `advance` moves the robot's plant and everything it touches."""
+    """What lies on the bench of one robot; `advance` moves the robot's plant and everything it touches.
+
+    Time passes in pieces of at most `step` [s].
+    """
+
+    step = STEP
 
     def __init__(self, robot: Robot, seed: int, blocks: int = 1, bench: Bench | None = None) -> None:
         self.bench = bench or Bench()
@@ -65,7 +71,7 @@ class Tabletop:
 
     def advance(self, plant: Plant, seconds: float) -> None:
         """Let time pass for the plant and the bench together; what is held keeps the jaws open."""
-        steps = math.ceil(seconds / STEP)
+        steps = math.ceil(seconds / self.step)
         for _ in range(steps):
             plant.advance(seconds / steps)
             self._step(plant.q, seconds / steps)
@@ -115,7 +121,11 @@ class Tabletop:
         """What one arm's fingers do to every block within this step."""
         before = self._hands.get(jaws.name)
         hand = jaws.hand(q, before, seconds)
-        stops = [self._touch(hand, before or hand, block, seconds) for block in self._blocks]
+        stops = [
+            self._touch(hand, before or hand, block, seconds)
+            for block in self._blocks
+            if block.held_by or math.dist(hand.tip[:3, 3], block.pose[:3, 3]) < _WITHIN
+        ]
         opening = max((stop for stop in stops if stop is not None), default=0.0)
         if hand.opening < opening:
             jaws.stop(q, opening)

@@ -131,7 +131,7 @@ def _tape(texture: UInt8, bench: Bench) -> None:
 
 def _roll_out(texture: UInt8, belt: Belt) -> None:
     """A belt across the table with a rail on either side, both longer than what rides on it ever goes."""
-    ends = np.array(belt.x) + (-_BEYOND, _BEYOND)
+    ends = belt.x[0] - _BEYOND, belt.x[1] + _BEYOND
     for half, colour in ((belt.width / 2 + _RAIL, _RAIL_COLOUR), (belt.width / 2, belt.colour)):
         corners = np.column_stack([ends, (belt.y - half, belt.y + half)]) - (X[0], Y[0])
         (left, low), (right, high) = (corners / _TEXEL).round().astype(int).tolist()

@@ -1,0 +1,171 @@
+"""A station in lockstep at the simulated conveyor: node, transport and policy in this process, without sockets."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+import robots
+from robots import Robot
+from runtime import deployment, family
+from runtime.clock import Clock
+from runtime.family import Plan
+from runtime.policies.base import Policy, PolicyInfo
+from runtime.sim.bench import BenchState, camera_arm
+from runtime.sim.chase import SPEED, Chase, Places
+from runtime.sim.conveyor import CONVEYOR, Conveyor
+from runtime.sim.link import Link
+from runtime.sim.node import Node, parser
+from runtime.sim.plant import Plant
+from runtime.sim.prefix import continued
+from runtime.sim.render import Renderer
+from runtime.sim.surroundings import Surroundings
+from runtime.sim.tabletop import Reset
+from runtime.transports import zmq
+from runtime.transports.base import Capabilities
+from runtime.types import ActionChunk, Conditioning, Float64, Observation, UInt8
+
+HORIZON = 50  # rows of a chunk
+_WIDTH, _HEIGHT = 320, 240
+_KEPT = 4  # frames of which a picture can still be drawn
+
+
+@cache
+def _renderer(robot: str) -> Renderer:
+    """Draws the overhead camera's pictures of the conveyor; the same for every station of this process."""
+    made = robots.load(robot)
+    above = tuple(camera for camera in made.cameras if camera_arm(made, camera) is None)
+    return Renderer(replace(made, cameras=above), CONVEYOR, _WIDTH, _HEIGHT)
+
+
+@cache
+def _places(robot: str) -> Places:
+    """Where the joints of a robot are for the places of the belt; the same for every station of this process."""
+    assert CONVEYOR.belt is not None
+    return Places(robots.load(robot), CONVEYOR.belt)
+
+
+class Gallery(Surroundings):
+    """The conveyor, with a stamp for each picture: the number of its frame, of which `develop` draws the picture."""
+
+    def __init__(self, robot: Robot, conveyor: Conveyor) -> None:
+        self.conveyor = conveyor
+        self._keys = tuple(camera.key for camera in robot.cameras)
+        self._renderer = _renderer(robot.name)
+        self._frames: OrderedDict[int, tuple[Float64, BenchState]] = OrderedDict()
+
+    def move(self, plant: Plant, seconds: float) -> None:
+        """The plant moves, and what its fingers touch."""
+        self.conveyor.advance(plant, seconds)
+
+    def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
+        """A stamp for each camera, uint8 [4, 4, 3]."""
+        self._frames[frame] = q.copy(), self.conveyor.state()
+        if len(self._frames) > _KEPT:
+            self._frames.popitem(last=False)
+        digits = np.frombuffer(frame.to_bytes(4, "big"), np.uint8)
+        return {key: np.broadcast_to(digits[:, None, None], (4, 4, 3)).copy() for key in self._keys}
+
+    def develop(self, stamp: UInt8) -> dict[str, UInt8]:
+        """The picture from above, RGB [H, W, 3] by its key, of the frame that a stamp names."""
+        q, state = self._frames[int.from_bytes(stamp[:, 0, 0].tobytes(), "big")]
+        drawn = self._renderer.draw(q, state)
+        return {key: np.ascontiguousarray(bgr[..., ::-1]) for key, bgr in drawn.items()}
+
+    def truth(self) -> dict[str, object]:
+        """What rides where, and how well it is followed."""
+        return self.conveyor.truth()
+
+    def reset(self, wish: Reset) -> None:
+        """Another course."""
+        self.conveyor.reset(wish)
+
+
+class Seeing(Policy):
+    """A script as a policy in this process, which is shown developed pictures."""
+
+    def __init__(self, script: Chase, rate: float, gallery: Gallery) -> None:
+        self._script, self._rate, self._gallery = script, rate, gallery
+        self._answer = script.begin()
+
+    def connect(self) -> PolicyInfo:
+        """Nothing to reach."""
+        return PolicyInfo("chase", action_space="joint", horizon=HORIZON, supports_rtc=True)
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        """The rows of the script for this observation, after those that the robot is committed to."""
+        pictures = self._gallery.develop(observation.pictures[self._script.overhead.key])
+        rows = self._answer(observation.qpos.astype(np.float64), pictures, observation.prompt)
+        if conditioning is not None:
+            prefix = conditioning.left_over[: conditioning.predicted_delay]
+            rows = continued(rows, prefix, SPEED / self._rate)
+        return ActionChunk(rows)
+
+    def reset(self) -> None:
+        """It has seen nothing."""
+        self._answer = self._script.begin()
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+@dataclass(frozen=True, slots=True)
+class ConveyorPlan(Plan):
+    """A plan whose transport is the simulated node, and whose policy sees that node's pictures."""
+
+    gallery: Gallery
+    links: dict[int, Link]  # by the clock of their station
+
+    @property
+    def conveyor(self) -> Conveyor:
+        """What is on the bench."""
+        return self.gallery.conveyor
+
+    @property
+    def transport(self) -> Any:
+        return SimpleNamespace(source=self._link, sink=self._link)
+
+    @property
+    def policy(self) -> Any:
+        return SimpleNamespace(build=self._policy)
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return zmq.capabilities(zmq.Config(simulated=True))
+
+    def _link(self, config: object, robot: Robot, clock: Clock) -> Link:
+        if id(clock) not in self.links:
+            line = ["--robot", robot.name, "--bench", "conveyor", "--start-pose", "ready"]
+            node = Node(robot, parser().parse_args(line), clock, self.gallery)
+            self.links[id(clock)] = Link(node, robot, clock)
+        return self.links[id(clock)]
+
+    def _policy(self, config: object, robot: Robot, clock: Clock, rate: float) -> Seeing:
+        script = Chase(robot, HORIZON, rate, clock=clock, places=_places(robot.name))
+        return Seeing(script, rate, self.gallery)
+
+
+def plan(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -> ConveyorPlan:
+    """A station at the belt whose course is that of `seed`; nothing is recorded."""
+    tree: dict[str, Any] = {
+        "station": "conveyor",
+        "robot": "agilex_piper",
+        "data_dir": str(data),
+        "task": "stay beside the block",
+        "transport": {"kind": "zmq", "simulated": True, "detect_frozen": False},
+        "policy": {"kind": "mock"},
+        "strategy": dict(strategy),
+        "setup": {"pose": "ready"},
+        "recording": {"enabled": False},
+        "lockstep": {"delay_ticks": delay},
+    }
+    made = family.plan(deployment.resolve(tree, {}, "moving_target"))
+    gallery = Gallery(made.robot, Conveyor(made.robot, seed))
+    return ConveyorPlan(made.resolved, made.robot, gallery, {})

@@ -1,0 +1,79 @@
+"""The simulated node within this process, for lockstep: its real messages both ways, and no sockets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from runtime import codecs
+from runtime.clock import Clock
+from runtime.sim.node import Node
+from runtime.transports.base import Sink, Source
+from runtime.transports.node_messages import NodeMessages
+from runtime.transports.zmq import MESSAGE_LIMIT
+from runtime.types import Observation, RobotCommand
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+_NAME = "lockstep"
+
+
+class Link(Source, Sink):
+    """Both halves of a transport around a node that is not opened.
+
+    The node moves when it is looked at: it obeys what was sent since the last time, then lets that time pass. So
+    an observation shows what came of the commands of all earlier ticks. Everything passes the codec, the node's
+    own gate, and the check of its messages.
+    """
+
+    def __init__(self, node: Node, robot: Robot, clock: Clock) -> None:
+        self._node, self._clock = node, clock
+        self._messages = NodeMessages(robot, "bgr", frozenset(), MESSAGE_LIMIT)
+        self._commands: list[bytes] = []
+        self._sequence = 0
+        self._looked: float | None = None
+
+    def connect(self) -> None:
+        """There is nothing to open."""
+
+    def receive(self, timeout: float) -> Observation | None:
+        """What the node says now; None where no time has passed since it said something. It never waits.
+
+        Raises MessageRefused for a message that is none: this node has no excuse.
+        """
+        now = self._clock.now()
+        if self._looked is not None and now <= self._looked:
+            return None
+        seconds = 0.0 if self._looked is None else now - self._looked
+        self._looked, self._sequence = now, self._sequence + 1
+        commands, self._commands = self._commands, []
+        frame = self._messages.read(self._node.exchange(commands, seconds))
+        streams = ("joints", *(() if frame.eef is None else ("eef",)), *frame.pictures)
+        return Observation(
+            sequence=self._sequence,
+            arrived=now,
+            captured=MappingProxyType(dict.fromkeys(streams, frame.stamp)),
+            qpos=frame.qpos,
+            pictures={key: np.ascontiguousarray(bgr[..., ::-1]) for key, bgr in frame.pictures.items()},
+            eef=frame.eef,
+            truth=frame.truth,
+        )
+
+    def send(self, command: RobotCommand) -> None:
+        """The node obeys it when it is looked at next."""
+        self._say({"t": command.time, "target": "real", "action": command.action})
+
+    def tell(self, word: str, data: Mapping[str, Any]) -> None:
+        """The same for a control word."""
+        self._say({**data, "t": self._clock.now(), "target": word})
+
+    def close(self) -> None:
+        """Release what the node has."""
+        self._node.close()
+
+    def _say(self, message: dict[str, Any]) -> None:
+        self._commands.append(codecs.pack(message | {"master": _NAME}))
