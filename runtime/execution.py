@@ -34,7 +34,7 @@ def strategy(section: Mapping[str, Any], dims: Dims) -> Strategy:
     """The strategy of a deployment's section `strategy`; ConfigurationError where it is none."""
     known = variants("runtime.strategies")
     kind = section.get("kind")
-    if kind not in known:
+    if not isinstance(kind, str) or kind not in known:
         raise ConfigurationError(f"strategy.kind = {kind!r}; allowed: {', '.join(known)}")
     module = known[kind]
     try:

@@ -152,7 +152,7 @@ class Lane:
         if target.source != "estop":
             locked, notes = self._locks.apply(action)
             if notes:
-                state = self.actuator.state(seen, planned, None)
+                state = self.actuator.state(seen, planned, locked)
                 action = np.where(self._locks.on, self._safety.reachable(locked, state, "motion"), action)
         return self.actuator.send(step, planned, target, action, notes)
 

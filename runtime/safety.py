@@ -134,7 +134,7 @@ class SafetyFilter:
         self._angles = ~limits.grippers
         self._switching = bool(limits.binary.any())
         self._reach = limits.reach
-        self._bounds = np.stack([limits.upper, -limits.lower])  # [2, D]
+        self._room = np.zeros((2, len(limits.lower)))  # scratch: to the upper and from the lower limit
         self._stopping = settings.acceleration * self._reach
         self._braking = settings.brake_acceleration * self._reach
         self._top = {
@@ -228,7 +228,9 @@ class SafetyFilter:
         """The action next to `action` [D] that velocity, acceleration and joint limits allow; itself where they do."""
         dt, now = state.elapsed, state.velocity
         gain = self._rate[path] * dt
-        room = self._bounds - np.stack([state.previous, -state.previous])
+        room = self._room
+        np.subtract(self._limits.upper, state.previous, out=room[0])
+        np.subtract(state.previous, self._limits.lower, out=room[1])
         most = np.minimum(self._top[path], _stopping_speed(room, self._stopping, dt))
         fastest = np.minimum(most[0], now + gain)
         slowest = np.maximum(-most[1], now - gain)

@@ -1,141 +1,14 @@
-import mmap
-
 import numpy as np
 import pytest
 
-from runtime.clock import VirtualClock
-from runtime.execution import Strategy
-from runtime.messages import ChunkMerged, Event, NodeRequest, Order, PostedChunk, TickDone, decode, encode
-from runtime.page import EStop, Page, PageLayout
-from runtime.safety import Limits, SafetyFilter, SafetySettings
-from runtime.strategies import overlap, sync
-from runtime.tick import Tick, TickSettings
-from runtime.timeline import Dims
-from runtime.transports.base import Sink
-from runtime.types import Observation
-
-DIM, PERIOD = 2, 1 / 30
-
-
-class RecordingSink(Sink):
-    def __init__(self):
-        self.sent, self.told, self.takes_words = [], [], True
-
-    def connect(self):
-        pass
-
-    def send(self, command):
-        self.sent.append(command.action.copy())
-
-    def tell(self, word, data):
-        if not self.takes_words:
-            super().tell(word, data)
-        self.told.append((word, dict(data)))
-
-    def close(self):
-        pass
-
-
-class Bench:
-    """A tick with everything around it under the test's hand."""
-
-    def __init__(self, merge=None, **safety):
-        layout = PageLayout(DIM, 8, ("cam",), 300)
-        shared = mmap.mmap(-1, Page.size(layout))
-        self.page, self.clock, self.sink = Page(layout, shared), VirtualClock(100.0), RecordingSink()
-        self.page.set_estop(EStop.CLEAR)
-        self.step, self.order, self.sequence = 0, 0, 0
-        self.measured = np.zeros(DIM)
-        self.merge = merge or overlap.merge(overlap.Config(), Dims())
-        self.safety = SafetySettings(**safety)
-        self.before_send = lambda: None
-        self.tick = self.new_tick()
-        self.feed = self.alive = True
-        self.moved_by_hand = None
-
-    def new_tick(self):
-        no = np.zeros(2, bool)
-        limits = Limits(("a", "b"), np.full(2, -2.0), np.full(2, 2.0), np.full(2, 3.0), no, no)
-        settings = TickSettings(
-            period=PERIOD,
-            limits=limits,
-            dims=Dims(),
-            safety=self.safety,
-            heartbeat_timeout=1.0,
-            starvation="slow",
-            starvation_hold=1.0,
-        )
-        safety = SafetyFilter(self.safety, limits)
-        return Tick(
-            self.page, self.sink, safety, Strategy("async", self.merge), settings, self.time_of_sending
-        )
-
-    def time_of_sending(self):
-        self.before_send()
-        return self.clock.now()
-
-    def observe(self, **changes):
-        self.sequence += 1
-        now = self.clock.now()
-        fields = {
-            "sequence": self.sequence,
-            "arrived": now,
-            "captured": {"joints": now, "cam": now},
-            "qpos": self.measured.astype(np.float32),
-            "pictures": {},
-        }
-        self.page.publish_observation(Observation(**(fields | changes)), {"cam": self.sequence})
-
-    def say(self, kind, **fields):
-        self.order += 1
-        self.page.rings["orders"].push(encode(Order(self.order, kind, **fields)))
-
-    def chunk(self, number, rows, step=None, run=1, waited=False):
-        step = self.step if step is None else step
-        chunk = PostedChunk(number, run, step, np.asarray(rows, float), waited)
-        self.page.rings["orders"].push(encode(chunk))
-
-    def run(self, ticks=1, stretch=1.0):
-        for _ in range(ticks):
-            if self.alive:
-                self.page.beat("main", self.clock.now())
-                self.page.beat("guard", self.clock.now())
-            if self.feed:
-                self.observe()
-            self.tick(self.step, self.clock.now())
-            self.step += 1
-            self.clock.advance(PERIOD * stretch)
-            if self.moved_by_hand is not None:
-                self.measured = self.moved_by_hand
-            elif self.sink.sent:
-                self.measured = self.sink.sent[-1].astype(float)
-
-    def said(self, kind=None):
-        found = [decode(m) for m in self.page.rings["control_events"].drain()]
-        return [m for m in found if isinstance(m, Event) and kind in (None, m.kind)]
-
-    def records(self):
-        return [m for m in map(decode, self.page.rings["ticks"].drain()) if isinstance(m, TickDone)]
-
-    @property
-    def behaviour(self):
-        return bytes(self.page.control.read()["behaviour"]).decode()
+from runtime.messages import ChunkMerged, NodeRequest, decode, encode
+from runtime.page import EStop
+from tests.runtime.tick_bench import PERIOD, Bench, following, wave
 
 
 @pytest.fixture
 def bench():
     return Bench()
-
-
-def wave(count, speed=0.5, start=0.0):
-    return np.column_stack([start + speed * PERIOD * np.arange(count)] * DIM)
-
-
-def following(bench, rows=None):
-    bench.say("follow", run=1)
-    bench.chunk(1, wave(60) if rows is None else rows)
-    bench.run()
-    return bench
 
 
 def test_a_new_control_keeps_silent(bench):
@@ -278,7 +151,7 @@ def test_starvation_becomes_holding_after_its_time(bench):
 
 
 def test_waiting_is_no_starvation_for_sync_and_every_action_is_executed_in_order():
-    bench = Bench(sync.merge(sync.Config(), Dims()))
+    bench = Bench({"kind": "sync"})
     bench.say("follow", run=1)
     bench.chunk(1, wave(5), waited=True)
     bench.run(51)

@@ -1,0 +1,44 @@
+import numpy as np
+import pytest
+
+from runtime.seen import Eyes
+from tests.runtime.tick_bench import Bench
+
+
+def test_before_the_first_observation_nothing_is_measured():
+    seen = Eyes(Bench().page).look()
+    assert (seen.sequence, seen.measured) == (0, False)
+    assert not seen.fresh(0.0, 1.0)
+
+
+def test_the_newest_observation_is_read_once():
+    bench = Bench()
+    eyes = Eyes(bench.page)
+    bench.measured = np.array([0.25, -0.5])
+    bench.observe()
+    first = eyes.look()
+    assert first.joints.tolist() == first.qpos.tolist() == [0.25, -0.5]
+    assert eyes.look() is first
+    bench.observe()
+    assert eyes.look().sequence == first.sequence + 1
+
+
+def test_ages_are_those_of_each_part():
+    bench = Bench()
+    bench.observe(captured={"joints": 99.0, "cam": 98.0})
+    seen = Eyes(bench.page).look()
+    assert seen.fresh(99.2, 0.2 + 1e-9)
+    assert not seen.fresh(99.3, 0.2)
+    assert seen.picture_ages(100.0) == {"cam": pytest.approx(2.0)}
+
+
+def test_a_picture_that_never_came_has_no_age():
+    bench = Bench()
+    bench.observe(captured={"joints": 99.0})
+    assert np.isnan(Eyes(bench.page).look().picture_ages(100.0)["cam"])
+
+
+def test_a_joint_that_is_no_number_is_no_measurement():
+    bench = Bench()
+    bench.observe(qpos=np.array([np.nan, 0.0], np.float32))
+    assert not Eyes(bench.page).look().fresh(bench.clock.now(), 1.0)

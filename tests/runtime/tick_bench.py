@@ -1,0 +1,208 @@
+"""A control tick with everything around it under the test's hand."""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from runtime.clock import VirtualClock
+from runtime.config import Answer
+from runtime.execution import Strategy, strategy
+from runtime.messages import (
+    ChunkMerged,
+    Event,
+    LockGrippers,
+    Message,
+    Order,
+    PostedChunk,
+    TickDone,
+    Tune,
+    decode,
+    encode,
+)
+from runtime.page import EStop, Page, PageLayout
+from runtime.safety import Limits, SafetyFilter, SafetySettings
+from runtime.tick import Tick, TickSettings
+from runtime.timeline import Dims
+from runtime.transports.base import Sink
+from runtime.types import Float64, Observation, RobotCommand
+
+PERIOD = 1 / 30
+NO = np.zeros(2, bool)
+TWO_JOINTS = Limits(("a", "b"), np.full(2, -2.0), np.full(2, 2.0), np.full(2, 3.0), NO, NO)
+GRIPPER = np.array([False, False, True])
+WITH_GRIPPER = Limits(
+    ("a", "b", "gripper"),
+    np.array([-2.0, -2.0, 0.0]),
+    np.array([2.0, 2.0, 0.1]),
+    np.array([3.0, 3.0, 1.0]),
+    GRIPPER,
+    np.zeros(3, bool),
+)
+
+
+class RecordingSink(Sink):
+    def __init__(self) -> None:
+        self.sent: list[Any] = []
+        self.told: list[tuple[str, dict[str, Any]]] = []
+        self.takes_words = True
+
+    def connect(self) -> None:
+        pass
+
+    def send(self, command: RobotCommand) -> None:
+        self.sent.append(command.action.copy())
+
+    def tell(self, word: str, data: Any) -> None:
+        if not self.takes_words:
+            super().tell(word, data)
+        self.told.append((word, dict(data)))
+
+    def close(self) -> None:
+        pass
+
+
+class Bench:
+    """The robot goes at once where it is told, unless `moved_by_hand`; `feed` and `alive` let its joints and main be.
+
+    `chosen` is the strategy's section; further keywords are settings of safety.
+    """
+
+    def __init__(
+        self,
+        chosen: dict[str, Any] | None = None,
+        limits: Limits = TWO_JOINTS,
+        dims: Dims | None = None,
+        starvation: Answer = "slow",
+        **safety: Any,
+    ) -> None:
+        self.limits = limits
+        self.dim = len(limits.names)
+        layout = PageLayout(self.dim, 8, ("cam",), 300)
+        shared = mmap.mmap(-1, Page.size(layout))
+        self.page, self.clock, self.sink = Page(layout, shared), VirtualClock(100.0), RecordingSink()
+        self.page.set_estop(EStop.CLEAR)
+        self.step, self.order, self.sequence = 0, 0, 0
+        self.measured: Float64 = np.zeros(self.dim)
+        self.dims = dims or Dims()
+        self.chosen: Strategy = strategy(chosen or {"kind": "async"}, self.dims)
+        self.safety = SafetySettings(**safety)
+        self.starvation: Answer = starvation
+        self.before_send: Callable[[], object] = lambda: None
+        self.tick = self.new_tick()
+        self.feed = self.alive = True
+        self.moved_by_hand: Any = None
+
+    def new_tick(self) -> Tick:
+        settings = TickSettings(
+            period=PERIOD,
+            limits=self.limits,
+            dims=self.dims,
+            safety=self.safety,
+            heartbeat_timeout=1.0,
+            starvation=self.starvation,
+            starvation_hold=1.0,
+        )
+        safety = SafetyFilter(self.safety, self.limits)
+        return Tick(self.page, self.sink, safety, self.chosen, settings, self.time_of_sending)
+
+    def time_of_sending(self) -> float:
+        self.before_send()
+        return self.clock.now()
+
+    def observe(self, **changes: Any) -> None:
+        self.sequence += 1
+        now = self.clock.now()
+        fields = {
+            "sequence": self.sequence,
+            "arrived": now,
+            "captured": {"joints": now, "cam": now},
+            "qpos": self.measured.astype(np.float32),
+            "pictures": {},
+        }
+        self.page.publish_observation(Observation(**(fields | changes)), {"cam": self.sequence})
+
+    # --- what main posts -----------------------------------------------------------------------------------
+
+    def post(self, message: Message) -> None:
+        assert self.page.rings["orders"].push(encode(message))
+
+    def say(self, kind: Any, **fields: Any) -> None:
+        self.order += 1
+        self.post(Order(self.order, kind, **fields))
+
+    def chunk(
+        self, number: int, rows: Any, step: int | None = None, run: int = 1, waited: bool = False
+    ) -> None:
+        step = self.step if step is None else step
+        self.post(PostedChunk(number, run, step, np.asarray(rows, float), waited))
+
+    def tune(self, kind: str, **section: Any) -> None:
+        self.post(Tune({"kind": kind, **section}))
+
+    def lock(self, *values: float) -> None:
+        self.post(LockGrippers(np.array(values, float)))
+
+    # --- time ----------------------------------------------------------------------------------------------
+
+    def run(self, ticks: int = 1, stretch: float = 1.0) -> None:
+        for _ in range(ticks):
+            if self.alive:
+                self.page.beat("main", self.clock.now())
+                self.page.beat("guard", self.clock.now())
+            if self.feed:
+                self.observe()
+            self.tick(self.step, self.clock.now())
+            self.step += 1
+            self.clock.advance(PERIOD * stretch)
+            if self.moved_by_hand is not None:
+                self.measured = self.moved_by_hand
+            elif self.sink.sent:
+                self.measured = self.sink.sent[-1].astype(float)
+
+    # --- what control tells --------------------------------------------------------------------------------
+
+    def told(self) -> list[Event | ChunkMerged]:
+        """Everything that main was told since the last call."""
+        messages = [decode(payload) for payload in self.page.rings["control_events"].drain()]
+        return [message for message in messages if isinstance(message, Event | ChunkMerged)]
+
+    def said(self, kind: str | None = None, quiet: Sequence[str] = ("limited", "limited_sum")) -> list[Event]:
+        """The events since the last call: of `kind`, or all but the `quiet` ones."""
+        events = [message for message in self.told() if isinstance(message, Event)]
+        return [
+            event for event in events if (event.kind not in quiet if kind is None else event.kind == kind)
+        ]
+
+    def records(self) -> list[TickDone]:
+        payloads = map(decode, self.page.rings["ticks"].drain())
+        return [message for message in payloads if isinstance(message, TickDone)]
+
+    @property
+    def status(self) -> Any:
+        return self.page.control.read()
+
+    @property
+    def behaviour(self) -> str:
+        return bytes(self.status["behaviour"]).decode()
+
+    @property
+    def sent(self) -> Float64:
+        """Everything that the robot was told [N, D]."""
+        return np.array(self.sink.sent, np.float64).reshape(-1, self.dim)
+
+
+def wave(count: int, speed: float = 0.5, start: float = 0.0, dim: int = 2) -> Float64:
+    """Rows [count, dim] that all joints go at `speed` [rad/s]."""
+    return np.column_stack([start + speed * PERIOD * np.arange(count)] * dim)
+
+
+def following(bench: Bench, rows: Any = None, **order: Any) -> Bench:
+    """The bench one tick into a run that executes `rows`."""
+    bench.say("follow", run=1, **order)
+    bench.chunk(1, wave(60, dim=bench.dim) if rows is None else rows)
+    bench.run()
+    return bench
