@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import logging
 import uuid
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from runtime import deployment
 from runtime.asking import Asking
 from runtime.bus import EventLog
 from runtime.by_hand import ByHand
 from runtime.clock import Clock
 from runtime.commitment import Commitment
-from runtime.effects import Effects, Situation, Told
 from runtime.errors import PolicyLostError, RuntimeFault
 from runtime.family import Plan
 from runtime.inference import Inference, Patience
@@ -31,15 +26,9 @@ from runtime.messages import (
     Message,
     decode,
 )
+from runtime.operations import Operations, Parts
 from runtime.orders import Orders
 from runtime.page import Page
-from runtime.requests import (
-    GripperRequest,
-    MoveRequest,
-    RunRequest,
-    SetUpRequest,
-    TuneRequest,
-)
 from runtime.run import Provenance, Run
 from runtime.runner import Runner
 from runtime.runs import Runs
@@ -48,7 +37,7 @@ from runtime.setup import SetUp
 from runtime.sight import Sight, SightSettings
 from runtime.snapshot import View, control_figures, facts, snapshot
 from runtime.transitions import Happening, State
-from runtime.tuning import strategy_of, tuned
+from runtime.tuning import strategy_of
 from runtime.watch import Watch
 
 log = logging.getLogger(__name__)
@@ -56,19 +45,17 @@ log = logging.getLogger(__name__)
 _HOLDS = ("refusals", "starvation", "unmeasured", "family", "orphaned")
 
 
-class Director(Effects):
+class Director:
     """One `pump` does everything that is due; lockstep calls it tick by tick."""
 
     def __init__(self, plan: Plan, page: Page, clock: Clock, runner: Runner) -> None:
-        self._own = plan  # the deployment's
-        self.plan, self.page, self.clock = plan, page, clock  # the plan as it was last set up
+        self.page, self.clock = page, clock
         self._facts = facts(plan)
         self.boot = str(uuid.uuid4())
         settings = plan.deployment
         self.events = EventLog()
         self.lease = Lease(settings.lease.ttl_s)
-        self.session = Session(self, self.lease, self.boot, clock.now)
-        self._orders = Orders(page)
+        self._orders = orders = Orders(page)
         self.media_report = MediaReport(0.0, {}, {}, 0, "", 0)
         self.spaces = plan.spaces()
         asking = Asking(
@@ -78,7 +65,6 @@ class Director(Effects):
         self.inference = Inference(
             asking, strategy_of(plan), page, self._orders, clock, patience, Commitment(plan.rate)
         )
-        self._tuned = False  # since the last set-up
         self.setup = SetUp(plan, self.inference, self._orders, page, clock, lambda: self.media_report)
         self._watch = Watch(plan, page, self.lease, clock)
         provenance = Provenance(plan, self.boot)
@@ -91,10 +77,21 @@ class Director(Effects):
             provenance,
             lambda: control_figures(page, plan.rate),
         )
-        self.by_hand = ByHand(plan, page, self._orders, self.runs, self.spaces)
+        self.by_hand = ByHand(plan, page, orders, self.runs, self.spaces)
+        parts = Parts(page, clock, orders, self.inference, self.setup, self.runs, self.by_hand)
+        self.operations = Operations(plan, parts, self._state, self._watch.absent, self.say)
+        self.session = Session(self.operations, self.lease, self.boot, clock.now)
         for ring in ("control_events", "media_events"):
             for _ in page.rings[ring].drain():
                 pass  # told to a predecessor that died
+
+    @property
+    def plan(self) -> Plan:
+        """As it was last set up or tuned."""
+        return self.operations.plan
+
+    def _state(self) -> State:
+        return self.session.state
 
     @property
     def run(self) -> Run | None:
@@ -132,141 +129,6 @@ class Director(Effects):
                 facts=self._facts,
             )
         )
-
-    # --- effects: what the session makes happen ------------------------------------------------------------
-
-    def begin_setup(self, asked: SetUpRequest) -> Told:
-        plan, reset = self._changed(asked), self.setup.bench.of(asked.bench)
-        policy = self.inference.policy
-        if plan.deployment.policy != self.plan.deployment.policy:
-            policy = plan.new_policy(self.clock)
-        # Nothing is refused from here on.
-        checkpoint = asked.checkpoint.model_dump() if asked.checkpoint else {}
-        self.plan = plan
-        told = replace(self.runs.provenance, plan=plan, checkpoint=checkpoint, bench=reset or {})
-        self.runs.provenance = told
-        self.inference.exchange(policy, plan.deployment.task)
-        self.inference.tune(strategy_of(plan), plan.deployment.task)
-        self._orders.tune(plan.deployment.strategy.model_dump())
-        self.by_hand.unlock()
-        self._tuned = False
-        self.setup.begin(reset)
-        return {"bench": reset["id"]} if reset else {}
-
-    def _changed(self, asked: SetUpRequest) -> Plan:
-        """The plan of a set-up; raises RuntimeFault where it is none, or an open recording would not be about it."""
-        resolved = deployment.changed(self._own.resolved, asked.changes, "setup")
-        if self.runs.alone and resolved.digest != self.plan.resolved.digest:
-            raise RuntimeFault(
-                "a recording is open, whose manifest says another policy or task: record stop first"
-            )
-        return replace(self._own, resolved=resolved)
-
-    def cancel_setup(self, reason: str) -> None:
-        self.setup.cancel()
-        self._orders.give("hold", reason=reason)
-
-    def begin_run(self, asked: RunRequest) -> Told:
-        self._require_family()
-        if asked.trial is not None:
-            self._require_comparable(asked)
-        if (asked.mode or self.plan.deployment.run.mode) == "manual":
-            self.by_hand.require_robot("run in the mode manual")
-        return {"episode": self.runs.begin(self.setup.info, asked)}
-
-    def _require_comparable(self, asked: RunRequest) -> None:
-        """What a trial measures is what was set up: nothing by hand, nothing tuned, the policy on the robot."""
-        mode = asked.mode or self.plan.deployment.run.mode
-        if mode != "continuous":
-            raise RuntimeFault(f"a trial runs in the mode continuous, and {mode} was asked for")
-        if self._tuned:
-            raise RuntimeFault("strategy or task were tuned since the set-up: set up again for a trial")
-        if not np.isnan(self.by_hand.grippers.locks).all():
-            raise RuntimeFault("a gripper is locked: unlock it, or set up again for a trial")
-
-    # --- effects: what a person does within a run ------------------------------------------------------------
-
-    @property
-    def situation(self) -> Situation:
-        run, control = self.runs.open, self.page.control.read()
-        return Situation(
-            mode=run.mode if run else None,
-            trial=run is not None and run.trial,
-            proposed=self.inference.proposal is not None,
-            asked=self.inference.asked,
-            executing=int(control["remaining"]) > 0,
-            first_action=self.setup.first_action is not None and self.plan.capabilities.moves_robot,
-        )
-
-    def tune(self, asked: TuneRequest) -> Told:
-        plan = tuned(self.plan, asked, self.setup.info)
-        settings = plan.deployment
-        strategy = settings.strategy.model_dump()
-        self._orders.tune(strategy)
-        self.plan, self._tuned = plan, True
-        self.runs.provenance = replace(self.runs.provenance, plan=plan)
-        self.inference.tune(strategy_of(plan), settings.task)
-        data = {"strategy": strategy, "task": settings.task, "hash": plan.resolved.digest}
-        text = f"strategy {settings.strategy.kind}, task {settings.task!r}"
-        self.say(Event("tuned_to", text, self.clock.now(), data=data))
-        return {"strategy": strategy, "task": settings.task}
-
-    def step(self) -> None:
-        self.inference.step()
-
-    def commit(self) -> None:
-        self.inference.commit()
-
-    def cancel(self) -> None:
-        self.runs.cancel()
-
-    def move(self, asked: MoveRequest) -> Told:
-        return self.by_hand.move(asked)
-
-    def grip(self, asked: GripperRequest) -> Told:
-        run = self.runs.open
-        free = run is None or run.mode == "manual" or self.session.state is State.HOLDING
-        return self.by_hand.grip(asked, free)
-
-    def approach(self) -> None:
-        made, first = self.inference.proposal, self.setup.first_action
-        if self.session.state is not State.READY and made is not None:
-            self.runs.approach(self.by_hand.checked("approach", made.rows[0]))
-        elif first is not None:
-            self.by_hand.checked("approach", first)
-            self.setup.begin_approach()
-
-    # --- effects: what goes on -------------------------------------------------------------------------------
-
-    def hold(self, reason: str) -> None:
-        self.runs.hold(reason)
-
-    def resume_run(self) -> None:
-        self._require_family()
-        self.runs.resume()
-
-    def end_run(self, status: str, reason: str) -> None:
-        self.runs.end(status, reason)
-
-    def go_home(self) -> None:
-        self.by_hand.require_robot("home")
-        self.setup.begin_homing()
-
-    def release_estop(self) -> None:
-        self.page.ask_release()
-
-    def start_recording(self) -> Told:
-        self._require_family()
-        return {"episode": self.runs.record_alone(self.setup.info)}
-
-    def stop_recording(self) -> None:
-        self.runs.stop_alone()
-
-    def _require_family(self) -> None:
-        """What is sent to a process that is still starting would be lost."""
-        absent = self._watch.absent()
-        if absent:
-            raise RuntimeFault(f"the process {absent} gives no sign of life yet: try again in a moment")
 
     # --- what the family says ------------------------------------------------------------------------------
 
