@@ -54,9 +54,9 @@ def _do(client: StationClient, given: argparse.Namespace) -> int:
 
 
 def _attended(client: StationClient, given: argparse.Namespace) -> int:
-    status = attend(client, given.command, arguments(given))
+    status = attend(client, given.command, arguments(given), _silent if given.json else _say)
     _show(status, given.json)
-    return DONE if status["state"] == "ready" else FAILED
+    return _outcome("" if status["state"] == "ready" else f"{status['state']}, {status['reason']}")
 
 
 def _within(
@@ -68,17 +68,28 @@ def _within(
     if not getattr(given, "wait", False):
         _show(client.status(), given.json)
         return DONE
-    settled = settle(client, before, lambda event: _tell(event, given.json))
+    settled = settle(client, before, _silent if given.json else _tell)
     _show(settled.status, given.json)
-    failure = settled.failure(wants)
+    return _outcome(settled.failure(wants))
+
+
+def _outcome(failure: str) -> int:
     if failure:
         print(f"failed: {failure}", file=sys.stderr)
     return FAILED if failure else DONE
 
 
-def _tell(event: dict[str, Any], quiet: bool) -> None:
-    if not quiet and event["kind"] != "command":
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+def _tell(event: dict[str, Any]) -> None:
+    if event["kind"] != "command":  # the one that was just given
         watching.tell(event)
+
+
+def _silent(what: object) -> None:
+    """A program reads: the outcome is all there is to say."""
 
 
 def _show(status: dict[str, Any], as_json: bool) -> None:
@@ -179,6 +190,12 @@ def _status(client: StationClient, given: argparse.Namespace) -> int:
     return DONE
 
 
+def _wait(client: StationClient, given: argparse.Namespace) -> int:
+    status = client.wait(lambda status: given.what in (status["state"], status["phase"]), given.timeout)
+    _show(status, given.json)
+    return DONE
+
+
 def _watch(client: StationClient, given: argparse.Namespace) -> int:
     return watching.watch(client, given.json)
 
@@ -194,6 +211,7 @@ _OWN_WAYS = {
     "release": _release,
     "estop": _estop,
     "status": _status,
+    "wait": _wait,
     "watch": _watch,
     "events": watching.list_events,
 }

@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from runtime.client import Refused, StationClient
@@ -31,8 +32,11 @@ _LOOK_S = 0.05
 _SHOW_S = 0.5
 
 
-def attend(client: StationClient, kind: str, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Give a lasting command and stay until it is over; returns the status then."""
+Tell = Callable[[str], None]
+
+
+def attend(client: StationClient, kind: str, arguments: dict[str, Any], tell: Tell) -> dict[str, Any]:
+    """Give a lasting command and stay until it is over, telling how it goes; returns the status then."""
     pressed = threading.Event()
     # An exception out of nowhere can be lost in a destructor; a Ctrl-C that stops a robot must not be.
     before = signal.signal(signal.SIGINT, lambda *_: pressed.set())
@@ -40,7 +44,7 @@ def attend(client: StationClient, kind: str, arguments: dict[str, Any]) -> dict[
         client.command(kind, **arguments)
         status = client.status()
         with _keys_of(kind, status) as keyboard:
-            progress = _Steady() if isinstance(keyboard, NoKeys) else _Keyed(status["mode"])
+            progress = _Steady(tell) if isinstance(keyboard, NoKeys) else _Keyed(tell, status["mode"])
             while status["state"] in LASTING[kind]:
                 if pressed.is_set():
                     raise KeyboardInterrupt
@@ -76,20 +80,21 @@ def _press(client: StationClient, key: str) -> None:
 class _Steady:
     """A line of figures now and then."""
 
-    def __init__(self) -> None:
+    def __init__(self, tell: Tell) -> None:
+        self._tell = tell
         self._shown = -math.inf
 
     def show(self, status: dict[str, Any]) -> None:
         if time.monotonic() - self._shown > _SHOW_S:
             self._shown = time.monotonic()
-            print(line(status), flush=True)
+            self._tell(line(status))
 
 
 class _Keyed(_Steady):
     """A line whenever something else goes on, with the keys where the run waits for one."""
 
-    def __init__(self, mode: str) -> None:
-        super().__init__()
+    def __init__(self, tell: Tell, mode: str) -> None:
+        super().__init__(tell)
         self._keys = _KEYED[mode]
         self._last: tuple[Any, ...] = ()
 
@@ -98,7 +103,7 @@ class _Keyed(_Steady):
         if now == self._last:
             return
         self._last = now
-        print(line(status), flush=True)
+        self._tell(line(status))
         if status["phase"] in ("waiting", "proposed"):
             what = away(status["proposal"], "the chunk that is shown")
-            print(f"  {what + '  ' if what else ''}[{self._keys}]", flush=True)
+            self._tell(f"  {what + '  ' if what else ''}[{self._keys}]")

@@ -11,6 +11,11 @@ from typing import Any, get_args
 
 from runtime.messages import Mode
 
+# States of a station, and phases of a run that goes on.
+WORDS = (
+    *("disconnected", "idle", "setting_up", "ready", "running", "holding", "faulted"),
+    *("asking", "executing", "waiting", "proposed", "moving", "approaching", "starved"),
+)
 _TRIPLES = (
     "--xyz",
     "--rpy",
@@ -177,6 +182,11 @@ def _estop(line: argparse.ArgumentParser) -> None:
     line.add_argument("why", nargs="?", default="pressed in a terminal")
 
 
+def _wait(line: argparse.ArgumentParser) -> None:
+    line.add_argument("what", choices=WORDS, help="a state, or a phase of a run")
+    line.add_argument("--timeout", type=_finite, default=30.0, metavar="S", help="at most (default: 30)")
+
+
 def _events(line: argparse.ArgumentParser) -> None:
     line.add_argument("--since", type=int, default=0, metavar="N", help="those after event N")
     line.add_argument("--last", type=int, metavar="N", help="the newest N of them")
@@ -203,6 +213,7 @@ _COMMANDS = {
     "estop": ("the software e-stop; needs no lease", _estop),
     "record": ("an episode without a policy", _record),
     "status": ("how the station is", _nothing),
+    "wait": ("until the station is in a state, or its run in a phase", _wait),
     "watch": ("figures and events as they come", _nothing),
     "events": ("what has happened", _events),
 }

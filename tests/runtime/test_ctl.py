@@ -101,9 +101,10 @@ def test_what_a_command_is_given_with_goes_along(run, words, given):
         ("approach", "setting_up", "idle", 1),
     ],
 )
-def test_the_end_of_a_lasting_command_is_the_exit_code(run, kind, while_, end, code):
+def test_the_end_of_a_lasting_command_is_the_exit_code(run, capsys, kind, while_, end, code):
     first = [status("ready")] if kind == "approach" else []
-    assert run(Script([*first, status(while_), status(end)]), kind) == code
+    assert run(Script([*first, status(while_), status(end, reason="over")]), kind) == code
+    assert capsys.readouterr().err == (f"failed: {end}, over\n" if code else "")
 
 
 def test_a_set_up_can_be_cancelled_and_only_a_set_up(run, capsys):
@@ -167,6 +168,13 @@ def test_an_approach_within_a_run_waits_for_its_arrival(run):
     assert script.given[0] == "approach"
 
 
+def test_a_script_waits_for_a_state_or_for_a_phase(run):
+    script = Script([status("setting_up"), status("ready"), running("asking")])
+    assert run(script, "wait", "ready") == 0
+    assert run(script, "wait", "asking", "--timeout", "2") == 0
+    assert script.given == []
+
+
 # --- aims ----------------------------------------------------------------------------------------------------
 
 
@@ -209,6 +217,10 @@ def test_a_status_is_a_page_or_json(run, capsys):
 def test_every_outcome_can_be_had_as_json(run, capsys):
     run(Script([status()]), "halt", "--json")
     assert json.loads(capsys.readouterr().out)["state"] == "ready"
+    run(Script([running(), running(), status()]), "run", "--json")
+    assert json.loads(capsys.readouterr().out)["state"] == "ready"
+    run(Script([running(step=1), running("waiting", 9)], events=[event(1)]), "step", "--wait", "--json")
+    assert json.loads(capsys.readouterr().out)["phase"] == "waiting"
 
 
 def test_a_tuning_is_shown_with_and_without_a_change(run, capsys):

@@ -1,10 +1,15 @@
 """A whole session from a terminal: real processes, every mode, exit codes."""
 
 import contextlib
+import fcntl
 import json
+import os
+import pty
+import select
 import signal
 import subprocess
 import sys
+import termios
 
 import numpy as np
 import pytest
@@ -53,7 +58,7 @@ class Terminal:
             text=True,
         )
         try:
-            assert f"RUNNING ({mode}" in run.stdout.readline()
+            assert f"RUNNING ({mode}" in self("wait", "running")
             yield
             self("stop")
             out, err = run.communicate(timeout=15)
@@ -64,12 +69,47 @@ class Terminal:
                 run.send_signal(signal.SIGKILL)
                 run.communicate()
 
+    @contextlib.contextmanager
+    def at_the_keyboard(self, mode):
+        """A run with a person at its terminal: how to press a key, and what is shown; it is to end well."""
+        ours, theirs = pty.openpty()
+        screen = bytearray()
+        run = subprocess.Popen(
+            [*self._words, "run", "--mode", mode],
+            cwd=ROOT,
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+        )
+        os.close(theirs)
+
+        def shown():
+            with contextlib.suppress(OSError):  # it has ended
+                while select.select([ours], [], [], 0)[0]:
+                    screen.extend(os.read(ours, 4096))
+            return screen.decode()
+
+        try:
+            self("wait", "waiting")
+            eventually(lambda: "q: stop]" in shown(), 10, "the keys")
+            yield lambda key: os.write(ours, key.encode()), shown
+            eventually(lambda: shown() is not None and run.poll() is not None, 15, "the end")
+            assert run.returncode == 0, shown()
+        finally:
+            if run.poll() is None:
+                run.send_signal(signal.SIGKILL)
+                run.wait()
+            shown()
+            os.close(ours)
+
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
     made = Lab(tmp_path_factory.mktemp("lab"))
     try:
-        made.up("strategy.execution_horizon=8")
+        made.up("strategy.execution_horizon=8", "setup.observation_timeout_s=3.0")
         made.client.close()
         yield made
     finally:
@@ -127,6 +167,18 @@ def test_a_chunk_is_shown_then_committed_or_cancelled(ctl):
         ctl("step", "--wait")
         assert "waiting" in ctl("cancel", "--wait")
         assert ctl.status()["proposal"] == {}
+
+
+def test_a_person_at_the_terminal_steps_with_single_keys(ctl):
+    with ctl.at_the_keyboard("step") as (press, shown):
+        press("\n")
+        ctl("wait", "executing")
+        ctl("wait", "waiting")
+        press("c")
+        eventually(lambda: "commit is for preview" in shown(), 10, "the refusal")
+        press("q")
+    assert "[Enter: next chunk, x: cancel, q: stop]" in shown()
+    assert ctl.status()["policy"]["answers"] >= 1
 
 
 def test_a_person_moves_jogs_and_grips(ctl):

@@ -2,6 +2,7 @@ import pytest
 
 from runtime.terminal import syntax
 from runtime.terminal.syntax import parse
+from runtime.transitions import COMMANDS, State
 
 
 def said(*words):
@@ -33,10 +34,12 @@ def test_a_command_needs_no_more_than_its_word(command):
 
 
 def test_every_command_of_the_session_can_be_said():
-    from runtime.transitions import COMMANDS
-
     words = {"record" if kind.startswith("record_") else kind for kind in COMMANDS}
     assert words <= set(syntax._COMMANDS)
+
+
+def test_every_state_can_be_waited_for():
+    assert set(State) <= set(syntax.WORDS)
 
 
 def test_the_data_folder_can_be_said_before_and_after_the_command(monkeypatch):
@@ -90,6 +93,7 @@ def test_settings_are_json_where_they_are_some_else_words():
         (["tune", "--set", "k_max"], "k_max was given; allowed: KEY=VALUE"),
         (["setup", "--cancel", "--task", "fold"], "setup --cancel takes nothing else"),
         (["gripper", "squeeze"], "choose from"),
+        (["wait", "godot"], "choose from"),
     ],
 )
 def test_what_cannot_be_said_is_answered_with_what_can(capsys, words, says):
