@@ -9,7 +9,7 @@ import pytest
 
 from runtime import deployment
 from runtime.errors import ConfigurationError, SetupError
-from runtime.session import State
+from runtime.transitions import State
 from tests.runtime.station import Station, on_time, plan
 
 OTHER = {"amplitude": 0.1}  # of the mock policy, whose default is 0.2
@@ -168,7 +168,7 @@ def test_a_failed_set_up_can_be_made_good_by_another_policy(tmp_path: Path) -> N
     station.prepare(policy=OTHER)
     assert (station.state, station.reason) == (State.IDLE, "no server there: start it")
     object.__setattr__(station.plan, "absent", "")  # somebody starts it
-    object.__setattr__(station.main._own, "absent", "")
+    object.__setattr__(station.main.operations._own, "absent", "")
     station.ready(policy={"amplitude": 0.3})
     assert [policy.calls[0] for policy in station.policies[1:]] == ["connect", "connect"]
     assert station.policies[1].calls[-1] == "close"
