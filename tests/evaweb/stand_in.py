@@ -14,9 +14,11 @@ import numpy as np
 import zmq
 
 from runtime.bus import CommandServer, Endpoints, EventLog, Publisher
+from runtime.effects import Effects, Situation
 from runtime.lease import Lease
 from runtime.messages import Ack, Command, Event
-from runtime.session import LEASE_COMMANDS, Effects, Happening, Session, Situation, State
+from runtime.session import LEASE_COMMANDS, Session
+from runtime.transitions import Happening, State
 
 DIM = 14
 

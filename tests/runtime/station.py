@@ -16,7 +16,7 @@ from runtime.family import Plan
 from runtime.lockstep import Lockstep
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.recording.reader import Episode, open_episode
-from runtime.session import State
+from runtime.transitions import State
 from runtime.transports.base import Capabilities, Sink, Source
 from runtime.types import ActionChunk, Conditioning, Float64, Observation, RobotCommand, Space
 from tests.runtime.recording.samples import numbered

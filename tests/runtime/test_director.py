@@ -7,7 +7,7 @@ import pytest
 
 from runtime.errors import SetupError
 from runtime.messages import Command
-from runtime.session import State
+from runtime.transitions import State
 from tests.runtime.station import STANDS, Station, plan
 
 

@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.clock import VirtualClock
-from runtime.errors import PolicyError
 from runtime.asking import Asking
+from runtime.clock import VirtualClock
 from runtime.commitment import Commitment
+from runtime.errors import PolicyError, PolicyLostError
 from runtime.inference import Inference, Patience, Strategy
-from runtime.messages import ChunkMerged, PolicyAnswer, PostedChunk, decode
+from runtime.messages import ChunkMerged, Mode, PolicyAnswer, PostedChunk, decode
 from runtime.orders import Orders
 from runtime.page import Page, PageLayout
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.runner import LockstepRunner, Runner, ThreadRunner
 from runtime.sight import Sight, SightSettings
 from runtime.spaces import CommandRows, Spaces
-from runtime.strategies import overlap, sync
+from runtime.strategies import overlap, rtc, sync
 from runtime.types import ActionChunk, Conditioning, Float32, Observation
 
 RATE = 30.0
@@ -35,6 +35,7 @@ class FakePolicy(Policy):
     def __init__(self) -> None:
         self.calls: list[str] = []
         self.seen: list[Observation] = []
+        self.conditionings: list[Conditioning | None] = []
         self.answer: Any = None
         self.open = threading.Event()
         self.open.set()
@@ -46,6 +47,7 @@ class FakePolicy(Policy):
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
         self.calls.append("infer")
         self.seen.append(observation)
+        self.conditionings.append(conditioning)
         self.reached.set()
         self.open.wait(10)
         self.answered.set()
@@ -426,3 +428,169 @@ def test_a_chunk_that_was_dropped_leaves_what_the_one_before_it_wants(desk: Desk
     assert desk.inference.raw(10) is not None
     desk.inference.pause()
     assert desk.inference.raw(10) is None
+
+
+RTC = Strategy(rtc.query(rtc.Config()), rtc.Config())
+
+
+def _going(desk: Desk, mode: Mode) -> Desk:
+    desk.inference.begin(1, True, mode)
+    return desk
+
+
+@pytest.mark.parametrize("mode", ["step", "preview"])
+def test_a_mode_on_demand_asks_once_per_step_and_the_answer_waited(mode: Mode) -> None:
+    desk = _going(Desk().going(), mode)
+    assert desk.inference.pump() is None
+    desk.inference.step()
+    assert desk.inference.asked
+    assert desk.inference.pump() is not None
+    desk.inference.commit()
+    (chunk,) = desk.posted()
+    assert chunk.waited
+    desk.merged(chunk.chunk_id)
+    assert not desk.inference.asked
+    assert desk.inference.pump() is None
+    assert desk.policy.calls == ["reset", "infer"]
+
+
+def test_a_strategy_that_waits_says_so_with_every_chunk() -> None:
+    desk = Desk(strategy=SYNC).going()
+    desk.inference.pump()
+    assert [chunk.waited for chunk in desk.posted()] == [True]
+
+
+def test_a_proposal_reaches_control_only_when_it_is_committed() -> None:
+    desk = _going(Desk().going(), "preview")
+    desk.inference.step()
+    answer = desk.inference.pump()
+    assert answer is not None
+    assert desk.posted() == []
+    shown, proposal = desk.inference.shown, desk.inference.proposal
+    assert shown is not None
+    assert proposal is not None
+    assert (shown.number, shown.state, proposal.number) == (answer.chunk_id, "proposed", answer.chunk_id)
+    desk.inference.commit()
+    assert [chunk.chunk_id for chunk in desk.posted()] == [answer.chunk_id]
+    assert desk.inference.proposal is None
+    desk.inference.commit()  # there is nothing any more
+    assert desk.posted() == []
+
+
+def test_a_cancelled_proposal_is_gone_and_the_next_step_asks_anew() -> None:
+    desk = _going(Desk().going(), "preview")
+    desk.inference.step()
+    desk.inference.pump()
+    desk.inference.cancel()
+    assert (desk.inference.proposal, desk.inference.shown, desk.inference.asked) == (None, None, False)
+    desk.inference.commit()
+    assert desk.posted() == []
+    desk.inference.step()
+    assert desk.inference.pump() is not None
+
+
+def test_a_policy_that_is_lost_is_tried_again_with_back_off_until_patience_ends(desk: Desk) -> None:
+    tries = []
+    desk.policy.answer = PolicyLostError("no answer within 2 s")
+    for tick in range(200):
+        desk.observe()
+        try:
+            desk.inference.pump()
+        except PolicyLostError as error:
+            tries.append(tick / RATE)
+            if not desk.inference.retries(error):
+                break
+        desk.clock.advance(1 / RATE)
+    waits = np.diff(tries)
+    assert (waits[1:] >= waits[:-1] - 1e-9).all()
+    assert tries[-1] - tries[0] > 3.0
+    assert len(tries) < 10
+    assert [note.kind for note in desk.inference.notes] == ["policy_lost"]  # said once, not at every try
+
+
+def test_a_policy_that_comes_back_is_welcome(desk: Desk) -> None:
+    desk.policy.answer = PolicyLostError("gone")
+    with pytest.raises(PolicyLostError) as lost:
+        desk.inference.pump()
+    assert desk.inference.retries(lost.value)
+    assert desk.inference.lost_for == 0.0
+    assert desk.inference.retry_in > 0.0
+    assert desk.inference.pump() is None  # not yet
+    desk.policy.answer = None
+    desk.clock.advance(0.15)
+    desk.observe()
+    assert desk.inference.pump() is not None
+    assert [note.kind for note in desk.inference.notes] == ["policy_lost", "policy_back"]
+    assert desk.inference.retry_in == 0.0
+
+
+def test_another_strategy_takes_over_while_a_request_is_in_flight() -> None:
+    desk = Desk(LockstepRunner(2)).going()
+    desk.inference.pump()
+    desk.inference.tune(SYNC, "place")
+    desk.runner.tick()
+    desk.runner.tick()
+    assert desk.inference.pump() is not None
+    (chunk,) = desk.posted()
+    assert not chunk.waited  # it was asked while the robot moved
+    desk.merged(chunk.chunk_id)
+    desk.ticked(9, remaining=3)
+    assert desk.inference.pump() is None
+    desk.ticked(12, remaining=0)
+    desk.inference.pump()
+    assert desk.policy.seen[-1].prompt == "place"
+
+
+def test_rtc_tells_the_policy_what_control_has_merged_less_what_is_consumed() -> None:
+    desk = Desk(strategy=RTC).going()
+    desk.inference.pump()
+    assert desk.policy.conditionings == [None]
+    desk.inference.merged(ChunkMerged(1, 1, 8, 1, np.array([-1, 8, 9, 10]), 0, ""))
+    desk.observe()
+    desk.ticked(9)
+    desk.inference.pump()
+    given = desk.policy.conditionings[-1]
+    assert given is not None
+    assert (given.consumed, given.predicted_delay) == (2, 1)
+    assert given.previous.tolist() == [[7.0, 7.0]] * 4
+    assert desk.inference.rtc["conditioned"]
+
+
+def test_a_pause_forgets_what_the_robot_was_committed_to() -> None:
+    desk = Desk(strategy=RTC).going()
+    desk.inference.pump()
+    desk.inference.merged(ChunkMerged(1, 1, 8, 1, np.array([-1, 8, 9, 10]), 0, ""))
+    desk.inference.pause()
+    desk.inference.begin(1, fresh=False)
+    desk.inference.pump()
+    assert desk.policy.conditionings == [None, None]
+
+
+def test_in_simulation_the_policy_is_shown_the_joints_of_the_simulated_robot(desk: Desk) -> None:
+    desk.asking.sight.simulated = True
+    status = desk.page.control.read().copy()
+    status["simulated"] = np.nan
+    desk.page.control.write(status)
+    assert desk.asking.observe().qpos.tolist() == [
+        0.0,
+        0.0,
+    ]  # it has not begun: it stands where the real one does
+    status["simulated"] = [0.5, -0.5]
+    desk.page.control.write(status)
+    shown = desk.asking.observe()
+    assert shown.qpos.tolist() == [0.5, -0.5]
+    assert shown.eef is None
+    assert shown.step == 7
+
+
+def test_figures_are_those_of_the_run(desk: Desk) -> None:
+    desk.inference.pump()
+    desk.merged(1, delay=3)
+    desk.inference.pump()
+    desk.merged(2, delay=5, dropped="too late")
+    figures = desk.inference.tally.figures()
+    assert (figures["answers"], figures["dropped"]) == (2, 1)
+    assert figures["delay_steps"]["max"] == 5.0
+    assert desk.inference.tally.newest()["delays"] == [3, 5]
+    desk.inference.begin(2, fresh=True)
+    assert desk.inference.tally.figures()["delay_steps"] is None

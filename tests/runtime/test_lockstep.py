@@ -14,7 +14,7 @@ from runtime.errors import SetupError
 from runtime.latch import Latch
 from runtime.page import EStop
 from runtime.recording.reader import Episode, open_episode
-from runtime.session import State
+from runtime.transitions import State
 from runtime.types import Float64, Observation
 from tests.runtime.recording.samples import decoded, numbers
 from tests.runtime.station import DIM, MOVED, STANDS, Station, column, on_time, plan, ramp

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from runtime.errors import PolicyError, SetupError
-from runtime.session import State
 from runtime.setup import Stage
+from runtime.transitions import State
 from runtime.types import Observation
 from tests.runtime.station import STANDS, Station, on_time, plan, ramp
 

@@ -13,7 +13,7 @@ from evaweb.console.chronicle import Chronicle, Scribe, events_written
 from evaweb.console.feed import Feeds, History
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Command, CommandStatus, Lease, Station
-from runtime.session import Happening
+from runtime.transitions import Happening
 from tests.processes import eventually
 
 

@@ -21,7 +21,7 @@ from evaweb.console import hub as hubs
 from evaweb.frames import decode
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
-from runtime.session import Happening, State
+from runtime.transitions import Happening, State
 
 pytestmark = pytest.mark.django_db(transaction=True)
 ALL = ["state", "joints", "poses", "camera/cam_high"]

@@ -8,7 +8,7 @@ import pytest
 from django.conf import settings
 
 from evaweb.console.feed import EVENTS_KEPT, Feed, History, Link
-from runtime.session import Happening
+from runtime.transitions import Happening
 
 
 class Ear:

@@ -13,7 +13,8 @@ from evaweb.stations import commands, leases, stops
 from evaweb.stations.commands import NotSent, issue, settle
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.stations.stops import HARDWARE_STOP
-from runtime.session import COMMANDS, STOPPING, Situation
+from runtime.effects import Situation
+from runtime.transitions import COMMANDS, STOPPING
 
 pytestmark = pytest.mark.django_db
 
