@@ -16,6 +16,7 @@ from evaweb.jobs import doorbell
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import work
 from evaweb.stations.models import Station
+from runtime.recording.export import export
 from tests.runtime.station import Station as Bench
 from tests.runtime.station import plan
 
@@ -64,11 +65,12 @@ Put = Callable[..., Path]
 
 @pytest.fixture
 def put(data: Path, recorded: dict[str, Path]) -> Put:
-    """Lay an episode into the data folder as the runtime does."""
+    """Lay an episode into the data folder as the runtime does, with its table."""
 
     def copy(status: str = "finished") -> Path:
         target = data / "episodes" / recorded[status].name
         shutil.copytree(recorded[status], target)
+        export(target, data)
         return target
 
     return copy

@@ -4,6 +4,7 @@ wire."""
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 from uuid import uuid4
 
 import pytest
@@ -31,6 +32,7 @@ from evaweb.trials.models import (
     Trial,
 )
 from evaweb.trials.selectors import statistics, trial_get, trial_list
+from runtime.recording.export import export
 from tests.evaweb.trials import builders
 from tests.runtime.station import Station as Lockstep
 from tests.runtime.station import plan
@@ -117,6 +119,7 @@ class Lab:
         for event in self.station.main.events.since(self._heard):
             self._heard = event["number"]
             if event["kind"] == "episode_closed":
+                export(Path(event["data"]["path"]), self.station.plan.deployment.data)  # as media does
                 episode_closed(station=self.bench.station, data=event["data"])
             services.run_changed(station=self.bench.station, event=event, boot=self.station.main.boot)
 
