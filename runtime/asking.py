@@ -29,6 +29,7 @@ class Answered:
     observation: Observation
     made: CommandRows
     waited: bool = False
+    age: float | None = None  # of the oldest stream of the observation when the policy was asked [s]
 
 
 class Asking:
@@ -81,9 +82,10 @@ class Asking:
             shown = observation
             if shown.eef is None:
                 shown = replace(shown, eef=self._spaces.eef_of(shown.qpos))
+            age = self._clock.now() - min(shown.captured.values())
             chunk = policy.infer(shown, conditioning)
             seconds = self._clock.now() - begun
-            return Answered(chunk, seconds, shown, self._spaces.to_command(chunk, shown), waited)
+            return Answered(chunk, seconds, shown, self._spaces.to_command(chunk, shown), waited, age)
 
         return self.runner.submit(infer)
 

@@ -119,7 +119,7 @@ class Loop:
         self._step += missed
         planned = deadline + missed * self._period
         self._page.beat("control", now)
-        self._tick(self._step, planned)
+        self._tick(self._step, planned, now)
         self._lateness.add(now - deadline, missed)
         self._n += 1
         self._step += 1

@@ -296,7 +296,7 @@ class Inference:
         self.asking.note(answered)
         made = Made(self._orders.next_chunk(), answered.made.rows, answered)
         self._wanted = False
-        self.tally.answered(answered.seconds)
+        self.tally.answered(answered.seconds, answered.age)
         self._commitment.answered(made.number, chunk, step, answered.waited, self._generation)
         if self._mode == "preview":
             self.proposal = made

@@ -94,6 +94,7 @@ class TickDone:
     weights: list[float]
     notes: list[str]
     refused: bool
+    woke: float | None = None  # when the loop woke for it: woke - planned is how late; None in lockstep
 
 
 @dataclass(frozen=True, slots=True)

@@ -282,4 +282,5 @@ def _executed(tick: TickDone) -> ExecutedTick:
         weights=tuple(tick.weights),
         changes=tuple(tick.notes),
         refused=tick.refused,
+        woke=tick.woke,
     )

@@ -71,6 +71,7 @@ class Report:
         self._outbox: list[ChunkMerged | Event] = []
         self._records_lost = 0
         self._step, self._planned = -1, 0.0
+        self._woke: float | None = None
         self._smoothed: Float32 | None = None  # of this tick: what was wanted before safety
         self.status: StatusRecord = np.zeros((), page.layout.control_dtype())  # written whole by every tick
         self.status[()] = page.control.read()  # counters go on from a predecessor's
@@ -78,9 +79,9 @@ class Report:
         self.order = 0  # number of the newest order obeyed
         self.run = 0
 
-    def begin(self, step: int, planned: float) -> None:
-        """The tick that everything is about from here on."""
-        self._step, self._planned = step, planned
+    def begin(self, step: int, planned: float, woke: float | None = None) -> None:
+        """The tick that everything is about from here on; planned for `planned`, begun at `woke`."""
+        self._step, self._planned, self._woke = step, planned, woke
 
     def say(self, kind: str, text: str) -> None:
         """An event, told at the end of the tick."""
@@ -111,6 +112,7 @@ class Report:
             weights=[share for _, share in makers],
             notes=list(sent.notes),
             refused=sent.refused,
+            woke=self._woke,
         )
         self._push("ticks", done)
         self._tell_makers(makers, sent)

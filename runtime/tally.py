@@ -30,12 +30,15 @@ class Tally:
         """Begin anew."""
         self.answers = self.dropped = self.mistimed = self.starved = self.lost = 0
         self.latencies: deque[float] = deque(maxlen=_KEPT)  # [s]
+        self.ages: deque[float] = deque(maxlen=_KEPT)  # of what the policy was shown when it was asked [s]
         self.delays: deque[int] = deque(maxlen=_KEPT)  # control steps, measured
 
-    def answered(self, seconds: float) -> None:
-        """An answer came after so long [s]."""
+    def answered(self, seconds: float, age: float | None = None) -> None:
+        """An answer came after so long [s]; what was shown was so old when the policy was asked [s]."""
         self.answers += 1
         self.latencies.append(seconds)
+        if age is not None:
+            self.ages.append(age)
 
     def merged(self, merged: ChunkMerged) -> None:
         """Control has placed it, or dropped it."""
@@ -52,7 +55,7 @@ class Tally:
 
     def figures(self) -> dict[str, Any]:
         """The run in numbers, None where nothing was measured."""
-        latencies, delays = list(self.latencies), list(self.delays)
+        latencies, delays, ages = list(self.latencies), list(self.delays), list(self.ages)
         return {
             "answers": self.answers,
             "dropped": self.dropped,
@@ -61,6 +64,7 @@ class Tally:
             "lost": self.lost,
             "latency_ms": _spread([seconds * 1000 for seconds in latencies]),
             "delay_steps": _spread(delays),
+            "observation_age_ms": _spread([seconds * 1000 for seconds in ages]),
         }
 
 

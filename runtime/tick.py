@@ -57,10 +57,10 @@ class Tick:
         self._simulated_run = 0
         self.orphaned = False
 
-    def __call__(self, step: int, planned: float) -> None:
-        """Do the tick `step`, planned for `planned` on our clock."""
+    def __call__(self, step: int, planned: float, woke: float | None = None) -> None:
+        """Do the tick `step`, planned for `planned` on our clock; the loop woke for it at `woke`."""
         self._seen = self._eyes.look()
-        self._report.begin(step, planned)
+        self._report.begin(step, planned, woke)
         for payload in self._page.rings["orders"].drain():
             self._obey(decode(payload), step, planned)
         self._check_estop(planned)

@@ -58,6 +58,7 @@ class ExecutedTick:
     weights: tuple[float, ...] = ()
     changes: tuple[str, ...] = ()  # what safety changed, or why it refused
     refused: bool = False
+    woke: float | None = None  # when the loop woke for the tick; None in lockstep
 
 
 @dataclass(frozen=True, slots=True)

@@ -59,6 +59,7 @@ def ticks_columns(layout: Layout, ticks: Sequence[ExecutedTick]) -> dict[str, An
         "changes": [tick.changes for tick in ticks],
         "refused": [tick.refused for tick in ticks],
         "chunk_id": [_leading(tick) for tick in ticks],
+        "woke": [None if tick.woke is None else tick.woke - layout.started for tick in ticks],
     }
 
 

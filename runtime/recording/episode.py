@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import math
 import os
 import shutil
 import time
@@ -169,10 +170,14 @@ class _Recording:
         repeated = [
             camera
             for camera, encoder in self._encoders.items()
-            if not encoder.put(row.pictures[camera], self._patience)
+            if not encoder.put(row.pictures[camera], self._patience, self._taken(row, camera))
         ]
         self._rows += 1
         self._writer.add("rows", RecordedRow(kept, frozenset(repeated)), self._patience)
+
+    def _taken(self, row: Row, camera: str) -> float:
+        """When the picture was captured; NaN in lockstep, whose clock is not that of the encoders."""
+        return math.nan if self._patience else row.captured.get(camera, math.nan)
 
     def mark(self, event: Mapping[str, object]) -> None:
         self._tell()
@@ -229,6 +234,7 @@ class _Recording:
             **summary.fields(),
             "rows": rows,
             "video_frames": videos,
+            "muxed_ms": {camera: encoder.muxed_ms for camera, encoder in self._encoders.items()},
         }
 
     def _tell(self) -> None:

@@ -58,6 +58,7 @@ def ticks_schema(layout: Layout) -> Any:
             pa.field("changes", pa.list_(pa.string())),
             pa.field("refused", pa.bool_()),
             pa.field("chunk_id", pa.int64()),
+            pa.field("woke", pa.float64()),
         ]
     )
 
@@ -103,7 +104,7 @@ SCHEMAS: Mapping[str, Callable[[Layout], Any]] = {
 
 
 # Columns that tables did not have from the beginning: null in those of older episodes.
-ADDED = frozenset({"strategy", "overlap"})
+ADDED = frozenset({"strategy", "overlap", "woke"})
 
 
 def _vector(width: int) -> Any:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
+from array import array
 from collections import deque
+from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -35,6 +38,9 @@ class FragmentedVideo:
         self, file: AppendFile, size: tuple[int, int], fps: float, settings: RecordingSettings
     ) -> None:
         self.frames = 0  # encoded so far
+        self.muxed = array(
+            "d"
+        )  # when the packet of each frame went to the muxer [s, monotonic]; in their order
         self._file = file
         self._muxed = _Muxed()
         self._rate = Fraction(fps).limit_denominator(1001)
@@ -56,17 +62,20 @@ class FragmentedVideo:
             self._picture = self._planes(picture)
         self._picture.pts = self.frames
         self._picture.time_base = 1 / self._rate
-        for packet in self._stream.encode(self._picture):
-            self._container.mux(packet)
+        self._mux(self._stream.encode(self._picture))
         self.frames += 1
         self._store()
 
     def close(self) -> None:
         """Encode what is still in the encoder's look-ahead and end the file; the descriptor stays open."""
-        for packet in self._stream.encode(None):
-            self._container.mux(packet)
+        self._mux(self._stream.encode(None))
         self._container.close()
         self._store()
+
+    def _mux(self, packets: Iterable[Any]) -> None:
+        for packet in packets:
+            self._container.mux(packet)
+            self.muxed.append(time.monotonic())
 
     def _open_stream(self, size: tuple[int, int], settings: RecordingSettings) -> Any:
         gop = max(1, min(settings.gop, int(GOP_SECONDS * self._rate)))
@@ -169,6 +178,7 @@ class CameraEncoder:
         self.failure: RecordingError | None = None
         self.file = AppendFile(path)
         self._abandoned = False
+        self._captured = array("d")  # of each frame that was put [s, monotonic]; NaN for a repeat
         self._queue = PictureQueue(settings.queue_frames)
         try:
             self._video = FragmentedVideo(self.file, size, fps, settings)
@@ -186,9 +196,25 @@ class CameraEncoder:
         """Frames encoded so far; all of them are in the file once the encoder has drained without failure."""
         return self._video.frames
 
-    def put(self, picture: UInt8 | None, patience: float = 0.0) -> bool:
-        """Queue the next row's picture, which must not change any more; False where it became a repeat."""
-        return self._queue.put(picture, patience)
+    def put(self, picture: UInt8 | None, patience: float = 0.0, captured: float = math.nan) -> bool:
+        """Queue the next row's picture, which must not change any more; False where it became a repeat.
+
+        `captured` is when it was taken, on the monotonic clock of this machine.
+        """
+        taken = self._queue.put(picture, patience)
+        self._captured.append(captured if taken else math.nan)
+        return taken
+
+    @property
+    def muxed_ms(self) -> dict[str, float] | None:
+        """From the capture of a picture until its packet went to the muxer; None where that is not known."""
+        muxed = np.array(self._video.muxed)
+        taken = muxed - np.array(self._captured)[: len(muxed)]
+        taken = taken[np.isfinite(taken)] * 1000.0
+        if not len(taken):
+            return None
+        p50, p99, longest = (float(value) for value in np.percentile(taken, (50, 99, 100)))
+        return {"p50": p50, "p99": p99, "max": longest}
 
     def finish(self) -> None:
         """Ask the thread to encode what waits and to end."""

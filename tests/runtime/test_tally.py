@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
 from runtime.messages import ChunkMerged
 from runtime.tally import Tally, quantile
@@ -47,9 +48,23 @@ def test_a_page_is_told_the_newest_sixty_and_the_counts_go_on() -> None:
     assert tally.answers == 100
 
 
-def test_a_new_run_begins_anew() -> None:
+def test_how_old_an_observation_was_when_the_policy_was_asked_is_a_figure() -> None:
     tally = Tally()
     tally.answered(0.1)
+    assert tally.figures()["observation_age_ms"] is None
+    for age in (0.010, 0.020, 0.030):
+        tally.answered(0.1, age)
+    assert tally.figures()["observation_age_ms"] == {
+        "p50": 20.0,
+        "p90": pytest.approx(28.0),
+        "p99": pytest.approx(29.8),
+        "max": 30.0,
+    }
+
+
+def test_a_new_run_begins_anew() -> None:
+    tally = Tally()
+    tally.answered(0.1, 0.02)
     tally.merged(merged(3, mistimed=1, dropped="x"))
     tally.starved = tally.lost = 2
     tally.forget()

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,9 @@ import pytest
 
 from runtime.recording.columns import RecordedRow
 from runtime.recording.layout import Layout
-from runtime.recording.tables import SCHEMAS, TableWriter, read_table
+from runtime.recording.tables import SCHEMAS, TableWriter, read_table, write_table
 
-from .samples import CAMERAS, chunk, manifest, row, tick
+from .samples import CAMERAS, STARTED, chunk, manifest, row, tick
 
 LAYOUT = Layout.of(manifest())
 
@@ -71,10 +72,21 @@ def test_a_tick_is_split_into_what_was_asked_for_and_what_was_done(tmp_path: Pat
     assert executed[1]["chunk_id"] == -1
     assert executed[1]["refused"] is True
     assert executed[1]["changes"] == ["stale"]
+    assert executed[0]["woke"] is None
     smoothed = written(tmp_path, "smoothed", tick(1)).to_pylist()
     assert smoothed == [
         {"step": 1, "smoothed": [1.25, 1.25, 1.25], "chunk_ids": [4, 5], "weights": [0.25, 0.75]}
     ]
+
+
+def test_how_late_a_tick_was_is_in_its_row_and_null_in_episodes_from_before(tmp_path: Path) -> None:
+    table = written(tmp_path, "ticks", tick(1, woke=STARTED + 0.0125))
+    assert table["woke"].to_pylist() == [pytest.approx(0.0125)]
+    assert table["planned"].to_pylist() == [pytest.approx(0.01)]
+    write_table(tmp_path / "ticks.arrow", table.drop_columns(["woke"]))
+    older = read_table(tmp_path / "ticks.arrow", SCHEMAS["ticks"](LAYOUT)).table
+    assert older["woke"].to_pylist() == [None]
+    assert older["step"].to_pylist() == [1]
 
 
 def test_chunks_of_any_width_become_one_row_per_action(tmp_path: Path) -> None:
@@ -92,3 +104,9 @@ def test_numbers_survive_bit_by_bit(tmp_path: Path) -> None:
         written(tmp_path, "ticks", tick(0, qpos=values)).column("qpos").combine_chunks().flatten().to_numpy()
     )
     assert found.tobytes() == values.tobytes()
+
+
+def test_a_chunk_says_which_strategy_merged_it_and_over_how_many_steps(tmp_path: Path) -> None:
+    merged = replace(chunk(1, horizon=2), strategy="rtc", overlap=6)
+    found = written(tmp_path, "raw", merged, chunk(2, horizon=1)).to_pylist()
+    assert [(row["strategy"], row["overlap"]) for row in found] == [("rtc", 6), ("rtc", 6), ("", 0)]

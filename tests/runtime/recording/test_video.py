@@ -196,3 +196,27 @@ def test_real_pictures_keep_at_least_38_db(tmp_path: Path) -> None:
         found = decoded(file.path)
         errors = [np.mean((a.astype(float) - b) ** 2) for a, b in zip(found, pictures, strict=True)]
         assert 10 * np.log10(255**2 / np.array(errors)).min() >= 38
+
+
+def test_the_way_of_each_picture_to_the_muxer_is_measured_and_repeats_do_not_count(tmp_path: Path) -> None:
+    encoder = CameraEncoder("front", tmp_path / "a.mp4", SIZE, 30.0, SETTINGS)
+    begun = time.monotonic()
+    for k in range(3):
+        encoder.put(numbered(k), 5.0, captured=begun - 10.0)
+    encoder.put(None)
+    encoder.finish()
+    assert encoder.drain(time.monotonic() + 30.0)
+    taken = encoder.muxed_ms
+    encoder.file.close()
+    assert taken is not None
+    most = (time.monotonic() - begun + 10.0) * 1000
+    assert 10_000 <= taken["p50"] <= taken["p99"] <= taken["max"] <= most
+
+
+def test_pictures_whose_capture_is_unknown_give_no_such_figure(tmp_path: Path) -> None:
+    encoder = CameraEncoder("front", tmp_path / "a.mp4", SIZE, 30.0, SETTINGS)
+    encoder.put(numbered(1), 5.0)
+    encoder.finish()
+    assert encoder.drain(time.monotonic() + 30.0)
+    assert encoder.muxed_ms is None
+    encoder.file.close()

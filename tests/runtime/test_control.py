@@ -1,0 +1,105 @@
+"""The loop around the tick: absolute deadlines, missed ticks, and what it says of its lateness."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.clock import VirtualClock
+from runtime.control import Lateness, Loop
+from runtime.page import Page, PageLayout
+
+
+class LateClock(VirtualClock):
+    """Each sleep ends so much too late as `late` says next; 0 where it says nothing."""
+
+    def __init__(self, *late: float) -> None:
+        super().__init__(100.0)
+        self._late = list(late)
+
+    def sleep_until(self, deadline: float) -> None:
+        super().sleep_until(deadline)
+        self.advance(self._late.pop(0) if self._late else 0.0)
+
+
+class Ticks:
+    """In the place of the tick: keeps what it was called with."""
+
+    def __init__(self, page: Page) -> None:
+        self.status = np.zeros((), page.layout.control_dtype())
+        self.done: list[tuple[int, float, float]] = []
+
+    def __call__(self, step: int, planned: float, woke: float) -> None:
+        self.done.append((step, planned, woke))
+
+
+@pytest.fixture
+def page() -> Page:
+    page, _ = Page.create(PageLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16))
+    return page
+
+
+def looped(page: Page, clock: VirtualClock, times: int, rate: float = 10.0) -> Ticks:
+    ticks: Any = Ticks(page)
+    loop = Loop(ticks, page, clock, rate, "FIFO 20")
+    for _ in range(times):
+        loop.once()
+    return ticks
+
+
+def test_a_late_tick_does_not_make_the_next_one_late(page: Page) -> None:
+    done = looped(page, LateClock(0.0, 0.03, 0.0), 3).done
+    assert [step for step, _, _ in done] == [1, 2, 3]
+    assert [planned for _, planned, _ in done] == pytest.approx([100.1, 100.2, 100.3])
+    assert [woke - planned for _, planned, woke in done] == pytest.approx([0.0, 0.03, 0.0])
+
+
+def test_missed_ticks_are_skipped_and_counted_and_steps_follow_the_clock(page: Page) -> None:
+    ticks = looped(page, LateClock(0.0, 0.25, 0.0), 3)
+    assert [step for step, _, _ in ticks.done] == [1, 4, 5]
+    assert [planned for _, planned, _ in ticks.done] == pytest.approx([100.1, 100.4, 100.5])
+    assert [woke - planned for _, planned, woke in ticks.done] == pytest.approx([0.0, 0.05, 0.0])
+
+
+def test_the_rate_is_exact_however_late_each_tick_is(page: Page) -> None:
+    done = looped(page, LateClock(*[0.001, 0.004] * 500), 1000, rate=200.0).done
+    assert done[-1][1] - done[0][1] == pytest.approx(999 / 200.0)
+
+
+def test_its_figures_are_those_of_the_newest_ticks_and_counters_go_on() -> None:
+    status = np.zeros((), PageLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16).control_dtype())
+    status["ticks"], status["missed"] = 50, 2
+    lateness = Lateness(status, "FIFO 20")
+    lateness.write()
+    assert status["lateness_p99"] == 0.0
+    for _ in range(2000):
+        lateness.add(9.0, 0)
+    for _ in range(1980):
+        lateness.add(0.001, 0)
+    for _ in range(20):
+        lateness.add(0.5, 1)
+    lateness.write()
+    assert (int(status["ticks"]), int(status["missed"])) == (4050, 22)
+    assert float(status["lateness_p50"]) == pytest.approx(0.001)
+    assert float(status["lateness_max"]) == pytest.approx(0.5)
+    assert status["scheduling"] == b"FIFO 20"
+
+
+class Beats:
+    """In the place of the tick: looks when control last said that it is alive."""
+
+    def __init__(self, page: Page) -> None:
+        self.status = np.zeros((), page.layout.control_dtype())
+        self._page = page
+        self.seen: list[float] = []
+
+    def __call__(self, step: int, planned: float, woke: float) -> None:
+        self.seen.append(self._page.last_beat("control"))
+
+
+def test_control_is_alive_in_the_page_before_its_tick_begins(page: Page) -> None:
+    beats: Any = Beats(page)
+    Loop(beats, page, LateClock(0.002), 10.0, "ordinary").once()
+    assert beats.seen == pytest.approx([100.102])
