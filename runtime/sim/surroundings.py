@@ -6,6 +6,7 @@ import argparse
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
+from runtime.errors import SetupError
 from runtime.sim.conveyor import Conveyor
 from runtime.sim.pictures import Scene
 from runtime.sim.plant import Plant
@@ -92,8 +93,12 @@ class Workbench(Surroundings):
 
 
 def surroundings(robot: Robot, options: argparse.Namespace) -> Surroundings:
-    """Those that `options.bench` names."""
+    """Those that `options.bench` names; SetupError for more blocks than it takes."""
     if options.bench == "conveyor":
+        if options.blocks != 1:
+            raise SetupError(
+                f"--blocks {options.blocks} with --bench conveyor: one block rides on the belt; allowed: 1"
+            )
         return Workbench(robot, options, Conveyor(robot, options.seed))
     if options.bench == "tabletop":
         return Workbench(robot, options, Tabletop(robot, options.seed, options.blocks))

@@ -21,6 +21,7 @@ from runtime.errors import PolicyError
 from runtime.policies import openpi
 from runtime.policies.link import PolicyGone
 from runtime.policies.pictures import fitted, laid_out
+from runtime.sim.bench import Layout
 from runtime.sim.gestures import Gesture
 from runtime.sim.layout import layout_of
 from runtime.types import Observation
@@ -173,9 +174,25 @@ def test_the_pick_and_place_policy_says_what_it_is_and_moves_only_for_a_block_th
     assert np.abs(moving[-1] - HOME).max() > 0.05
 
 
+def test_the_chase_says_what_it_is_and_moves_only_for_a_block_that_it_sees(serve: Any) -> None:
+    url = serve("--behaviour", "chase", "--horizon", "40").ready["url"]
+    with conversation(url) as connection:
+        metadata = receive(connection)
+        connection.send(request(images={"cam_high": np.zeros((3, 224, 224), np.uint8)}))
+        dark = receive(connection)["actions"]
+        seen = fitted(drawn(Layout(((0.1, 0.34, 0.0),), (-0.3, 0.15))), 224, 224, "pad")
+        connection.send(request(images={"cam_high": laid_out(seen, "chw")}))
+        moving = receive(connection)["actions"]
+    assert metadata["name"] == "chase"
+    assert "not a learned policy" in metadata["description"]
+    np.testing.assert_array_equal(dark, np.tile(HOME.astype(np.float32), (40, 1)))
+    assert np.abs(moving[-1] - HOME).max() > 0.3
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
+        (("--behaviour", "chase", "--noise", "5"), "for --behaviour pick_place; no other fails on purpose"),
         (("--noise", "5"), "--noise and --failure-rate are for --behaviour pick_place"),
         (("--behaviour", "pick_place", "--failure-rate", "1.5"), "1.5 was given; allowed: 0 to 1"),
         (("--behaviour", "dance"), "invalid choice: 'dance'"),
