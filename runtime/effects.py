@@ -23,6 +23,7 @@ class Situation:
     asked: bool = False  # the policy is being asked, or its answer has not reached control
     executing: bool = False  # steps are planned
     first_action: bool = False  # the last set-up knows the policy's first action
+    opening: bool = False  # the open run has not begun: its recording is being opened
 
 
 class Effects(ABC):

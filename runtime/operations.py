@@ -120,6 +120,7 @@ class Operations(Effects):
             asked=self.inference.asked,
             executing=int(control["remaining"]) > 0,
             first_action=self.setup.first_action is not None and self.plan.capabilities.moves_robot,
+            opening=run is not None and run.begun is None,
         )
 
     def tune(self, asked: TuneRequest) -> Told:

@@ -159,9 +159,9 @@ def _inference(view: View) -> dict[str, Any]:
 
 
 def _phase(view: View) -> str:
-    """What a run that goes on is doing, in one word; "" where none does."""
+    """What a run that goes on is doing, in one word; "" where none does, or it has not begun."""
     run, control = view.runs.open, view.page.control.read()
-    if run is None or view.session.state is not State.RUNNING:
+    if run is None or run.begun is None or view.session.state is not State.RUNNING:
         return ""
     moving = bytes(control["behaviour"]) == b"motion"
     states = (

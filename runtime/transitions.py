@@ -79,9 +79,20 @@ def _untried(state: State, situation: Situation) -> str:
     return "the open run is one of a trial: what is measured may not be changed" if situation.trial else ""
 
 
+_OPENING = "the run has not begun, its recording is being opened: try again in a moment"
+
+
+def _may_grip(state: State, situation: Situation) -> str:
+    if state is State.RUNNING and situation.opening:
+        return _OPENING
+    return _untried(state, situation)
+
+
 def _may_step(state: State, situation: Situation) -> str:
     if situation.mode not in ("step", "preview"):
         return f"the run's mode is {situation.mode}, and step is for step and preview"
+    if situation.opening:  # what is asked for now would be forgotten when it begins
+        return _OPENING
     if situation.proposed:
         return "a chunk is shown: commit or cancel it first"
     if situation.asked:
@@ -97,13 +108,13 @@ def _may_commit(state: State, situation: Situation) -> str:
 
 def _may_cancel(state: State, situation: Situation) -> str:
     if situation.mode in ("step", "preview", "manual"):
-        return ""
+        return _OPENING if situation.opening else ""
     return f"the run's mode is {situation.mode}, and cancel is for step, preview and manual: stop or halt it"
 
 
 def _may_move(state: State, situation: Situation) -> str:
     if situation.mode == "manual":
-        return ""
+        return _OPENING if situation.opening else ""
     return f"the run's mode is {situation.mode}, and move is for manual"
 
 
@@ -139,7 +150,7 @@ COMMANDS: dict[str, Rule] = {
     "cancel": Rule((S.RUNNING,), None, lambda e, _: e.cancel(), guard=_may_cancel),
     "move": Rule((S.RUNNING,), None, lambda e, asked: e.move(asked), MoveRequest, _may_move),
     "gripper": Rule(
-        (S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.grip(asked), GripperRequest, _untried
+        (S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.grip(asked), GripperRequest, _may_grip
     ),
     "approach": Rule(
         (S.READY, S.RUNNING),

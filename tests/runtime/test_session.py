@@ -47,14 +47,17 @@ ALLOWED = {
 ON_DEMAND = ("step", "preview")
 # What a situation adds while a run goes on or the station is ready, and what it takes away.
 GUARDED = {
-    "step": (S.RUNNING, lambda s: s.mode in ON_DEMAND and not (s.proposed or s.asked or s.executing)),
+    "step": (
+        S.RUNNING,
+        lambda s: s.mode in ON_DEMAND and not (s.proposed or s.asked or s.executing or s.opening),
+    ),
     "commit": (S.RUNNING, lambda s: s.mode == "preview" and s.proposed),
-    "cancel": (S.RUNNING, lambda s: s.mode in (*ON_DEMAND, "manual")),
-    "move": (S.RUNNING, lambda s: s.mode == "manual"),
+    "cancel": (S.RUNNING, lambda s: s.mode in (*ON_DEMAND, "manual") and not s.opening),
+    "move": (S.RUNNING, lambda s: s.mode == "manual" and not s.opening),
 }
 SITUATIONS = [
     Situation(*fields)
-    for fields in product((None, "continuous", "step", "preview", "sim", "manual"), *[(False, True)] * 5)
+    for fields in product((None, "continuous", "step", "preview", "sim", "manual"), *[(False, True)] * 6)
 ]
 
 
@@ -63,6 +66,8 @@ def allowed_in(state, situation):
     found = set(ALLOWED[state])
     if situation.trial:
         found -= {"tune", "gripper"}
+    if situation.opening and state is S.RUNNING:
+        found.discard("gripper")
     found |= {kind for kind, (where, holds) in GUARDED.items() if state is where and holds(situation)}
     committable = situation.mode == "preview" and situation.proposed
     if (state is S.READY and situation.first_action) or (state is S.RUNNING and committable):

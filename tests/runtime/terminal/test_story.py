@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import io
 import json
 import os
 import pty
@@ -14,9 +15,13 @@ import termios
 import numpy as np
 import pytest
 
+from runtime import ctl as ctl_module
 from runtime.sim import drives
 from tests.crash.lab import ROOT, Lab
 from tests.processes import eventually
+
+# What a run of the mode does once it has begun.
+IDLE_PHASE = {"step": "waiting", "preview": "waiting", "manual": "waiting", "sim": "executing"}
 
 
 class Terminal:
@@ -27,17 +32,15 @@ class Terminal:
         self._words = [sys.executable, "-m", "runtime.ctl", "--data-dir", str(lab.data), "demo"]
 
     def __call__(self, *words, code=0):
-        """What one command prints, with the exit code that it is to have."""
-        done = subprocess.run(
-            [*self._words, *words],
-            cwd=ROOT,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=60,
-        )
-        assert done.returncode == code, (words, done.stdout, done.stderr)
-        return done.stdout if code == 0 else done.stderr
+        """What one command prints, with the exit code that it is to have.
+
+        In this process, because there are many of them; what is attended has one of its own.
+        """
+        out, err = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            found = ctl_module.main(["--data-dir", str(self._lab.data), "demo", *words])
+        assert found == code, (words, out.getvalue(), err.getvalue())
+        return err.getvalue() if code else out.getvalue()
 
     def status(self):
         return self._lab.client.status()
@@ -58,7 +61,7 @@ class Terminal:
             text=True,
         )
         try:
-            assert f"RUNNING ({mode}" in self("wait", "running")
+            assert f"RUNNING ({mode}" in self("wait", IDLE_PHASE[mode])
             yield
             self("stop")
             out, err = run.communicate(timeout=15)
@@ -172,13 +175,12 @@ def test_a_chunk_is_shown_then_committed_or_cancelled(ctl):
 def test_a_person_at_the_terminal_steps_with_single_keys(ctl):
     with ctl.at_the_keyboard("step") as (press, shown):
         press("\n")
-        ctl("wait", "executing")
+        eventually(lambda: "(step, executing)" in shown(), 10, "the chunk")
         ctl("wait", "waiting")
         press("c")
         eventually(lambda: "commit is for preview" in shown(), 10, "the refusal")
         press("q")
     assert "[Enter: next chunk, x: cancel, q: stop]" in shown()
-    assert ctl.status()["policy"]["answers"] >= 1
 
 
 def test_a_person_moves_jogs_and_grips(ctl):
