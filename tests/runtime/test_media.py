@@ -80,9 +80,9 @@ class Desk:
         grid = Grid(robot, CAMERAS, RATE, RATE, lambda q: q)
         recorder = Recorder(self.journal, Path("/episodes"), grid, self.clock.now)
         self.previewed: list[int] = []
-        self.media = Media(
-            self.page, self.source, recorder, self.clock, lambda o: self.previewed.append(o.sequence), closer
-        )
+        self.on_disk: list[Path] = []
+        preview = lambda o: self.previewed.append(o.sequence)  # noqa: E731
+        self.media = Media(self.page, self.source, recorder, self.clock, preview, closer, self.on_disk.append)
 
     def observation(self, sequence: int, **changes: Any) -> Observation:
         now = self.clock.now()
@@ -556,3 +556,28 @@ def test_drives_are_reported_and_their_changes_are_events_of_the_episode(desk: D
     assert [(e.text, e.data) for e in events] == [("drives disabled; drive fault: axis 2 is hot", off)]
     assert [m.drives for m in messages if isinstance(m, MediaReport)][-1] == off
     assert [event["kind"] for event in desk.journal.events] == ["drives"]
+
+
+# --- what is made of closed episodes -----------------------------------------------------------------------
+
+
+def test_an_episode_on_disk_is_passed_on_once_after_main_was_told() -> None:
+    desk = Desk()
+    desk.receive(1)
+    desk.begin()
+    desk.media.end("finished", "over")
+    desk.media.digest()
+    assert desk.on_disk == [Path("/episodes/one")]
+    assert len(desk.told(EpisodeClosed)) == 1
+
+
+def test_a_leftover_that_was_repaired_is_passed_on_and_a_broken_one_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def repair(folder: Path) -> Report:
+        return Report(folder, "unreadable" if folder.name == "bad" else "repaired")
+
+    monkeypatch.setattr("runtime.leftovers.repair", repair)
+    heard: list[Path] = []
+    repair_leftovers([left(tmp_path, "bad"), left(tmp_path, "good")], "bench", heard.append)
+    assert heard == [tmp_path / "good"]

@@ -376,3 +376,22 @@ def test_a_journal_that_fails_in_the_middle_raises(desk: Desk) -> None:
         desk.tick(0)
     with pytest.raises(RecordingError, match="mark"):
         desk.recorder.mark({"kind": "x"})
+
+
+def test_a_chunk_is_kept_with_the_strategy_that_merged_it(desk: Desk) -> None:
+    desk.answer(1)
+    targets = np.array([12, 13, 14])
+    desk.recorder.merged(ChunkMerged(1, 1, 12, 2, targets, 0, "", strategy="ensemble", overlap=2))
+    desk.answer(2)
+    desk.recorder.end("finished", "", {})
+    merged, lost = desk.journal.of(RawChunk)
+    assert (merged.strategy, merged.overlap) == ("ensemble", 2)
+    assert (lost.strategy, lost.overlap, lost.arrival_step) == ("", 0, -1)
+
+
+def test_a_row_of_a_simulated_robot_has_its_action_beside_what_was_measured(desk: Desk) -> None:
+    desk.tick(7, source="sim")
+    (row,) = desk.journal.rows
+    assert row.control_source == "sim"
+    assert (row.action == 7.25).all()
+    assert (row.qpos == 1).all()

@@ -1,4 +1,9 @@
-from runtime.run import Run
+import json
+
+from runtime.recording.files import document
+from runtime.revision import revision
+from runtime.run import Provenance, Run, installed_versions
+from tests.runtime.station import plan
 
 BEGUN = {"ticks": 900, "missed": 2, "records_lost": 1, "lateness_p99_ms": 0.4}
 
@@ -12,3 +17,15 @@ def test_what_control_counts_is_counted_from_the_beginning_of_the_run():
 def test_a_control_that_was_restarted_meanwhile_counts_from_its_own_beginning():
     restarted = {"ticks": 40, "missed": 0, "records_lost": 0, "lateness_p99_ms": 0.2}
     assert Run(1, "uuid", 0.0, counted=BEGUN).figures(restarted) == restarted
+
+
+def test_a_manifest_says_what_the_run_was_made_with(tmp_path):
+    made = plan(tmp_path, strategy="sync")
+    manifest = Provenance(made, "boot-1", checkpoint={"id": 7, "name": "good"}).manifest("step", None)
+    assert manifest["configuration"] == made.resolved.tree
+    assert manifest["configuration_hash"] == made.resolved.digest
+    assert (manifest["mode"], manifest["strategy"], manifest["task"]) == ("step", "sync", "stack the cups")
+    assert manifest["checkpoint"] == {"id": 7, "name": "good"}
+    assert manifest["versions"] == installed_versions()
+    assert manifest["git"] == dict(revision())
+    assert json.loads(document(manifest, "the manifest"))["git"] == dict(revision())

@@ -21,6 +21,7 @@ from runtime.datasets.reader import open_dataset
 from runtime.errors import RecordingError
 from runtime.recording.reader import open_episode
 from tests.runtime.datasets.small import CAMERAS, JOINTS, picture, record, row, seen
+from tests.runtime.recording.test_tables import old_raw
 
 STRANGER = Path(__file__).parents[2] / "conformance" / "read_lerobot_v21.py"
 WHOLE = ColumnMapping(
@@ -469,3 +470,28 @@ def test_two_publishers_at_once_get_two_indices(tmp_path: Path) -> None:
         episode.name for episode in episodes
     )
     assert check(dataset) == []
+
+
+# --- a simulated robot -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["rollout", "demonstration"])
+def test_a_run_of_mode_sim_is_never_published(tmp_path: Path, kind: str) -> None:
+    folder = record(tmp_path / "episodes", frames=4, mode="sim", kind=kind)
+    with pytest.raises(
+        RecordingError, match=r"is a run of mode sim: .* it is no rollout and no demonstration"
+    ):
+        publish(folder, tmp_path / "set", success=True, include_interrupted=True)
+    assert not (tmp_path / "set").exists()
+
+
+def test_rows_of_a_simulated_robot_are_refused_whatever_the_manifest_says(tmp_path: Path) -> None:
+    folder = record(tmp_path / "episodes", frames=4, rows={2: {"control_source": "sim"}})
+    with pytest.raises(RecordingError, match="1 of its rows are actions of a simulated robot"):
+        publish(folder, tmp_path / "set")
+
+
+def test_an_episode_from_before_strategies_were_written_down_is_published(tmp_path: Path) -> None:
+    folder = record(tmp_path / "episodes", frames=4)
+    old_raw(folder / "raw.arrow")
+    assert publish(folder, tmp_path / "set").frames == 4

@@ -58,3 +58,37 @@ def test_what_cannot_be_read_ends_with_code_one(folder: Path, capsys: pytest.Cap
     assert main(["repair", str(folder.parent)]) == 1
     assert "unreadable" in capsys.readouterr().out
     assert main(["repair", str(folder / "absent")]) == 1
+
+
+def test_export_writes_one_or_all_into_the_data_folder_that_they_lie_in(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = folder.parent / "data"
+    placed = Path(shutil.copytree(folder, data / "episodes" / folder.name))
+    for given in (placed, placed.parent):
+        assert main(["export", str(given)]) == 0
+        path = Path(capsys.readouterr().out.strip())
+        assert path.is_relative_to(data / "exports")
+        assert path.is_file()
+
+
+def test_export_goes_on_behind_one_that_fails(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    broken = Path(shutil.copytree(folder, folder.with_name("aaa")))
+    (broken / "outcome.json").unlink()
+    assert main(["export", str(broken), str(folder), "--to", str(folder.parent / "data")]) == 1
+    said = capsys.readouterr()
+    assert "aaa has no outcome.json" in said.err
+    assert said.out.strip().endswith(f"{folder.name}.parquet")
+
+
+@pytest.mark.parametrize(
+    ("path", "sentence"),
+    [("", "say where to export to with --to DATA"), ("..", "is no episode"), ("absent", "is no folder")],
+)
+def test_export_says_what_it_cannot_do(
+    folder: Path, capsys: pytest.CaptureFixture[str], path: str, sentence: str
+) -> None:
+    (folder.parent / "empty").mkdir()
+    given = folder.parent / "empty" if path == ".." else folder / path
+    assert main(["export", str(given)]) == 1
+    assert sentence in capsys.readouterr().err

@@ -9,12 +9,14 @@ from runtime.errors import RecordingError
 from runtime.recording import repair as repair_module
 from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
+from runtime.recording.export import export
 from runtime.recording.layout import Layout
 from runtime.recording.reader import open_episode
 from runtime.recording.repair import UNCUT, repair, repair_all
 from runtime.recording.tables import SCHEMAS, read_table
 
 from .samples import CAMERAS, SETTINGS, chunk, manifest, numbers, row, tick
+from .test_tables import old_raw
 
 ROWS = 40
 
@@ -223,3 +225,14 @@ def test_all_unfinished_episodes_are_repaired_and_one_bad_one_keeps_nobody(
     }
     assert "rows.arrow" in reports["b"].problem
     assert repair_all(tmp_path / "absent") == []
+
+
+def test_an_episode_from_before_strategies_were_written_down_is_repaired_and_opens(folder: Path) -> None:
+    whole = old_raw(folder / "raw.arrow")
+    cut(folder / "raw.arrow", len(whole) - 40)
+    assert repair(folder).verdict == "repaired"
+    raw = open_episode(folder).raw
+    assert raw["index"].to_pylist() == [0, 1]
+    assert raw["strategy"].to_pylist() == [None, None]
+    assert read_table(folder / "raw.arrow", SCHEMAS["raw"](open_episode(folder).layout)).closed
+    assert export(folder, folder.parent).is_file()

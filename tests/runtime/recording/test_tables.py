@@ -134,3 +134,68 @@ def test_what_a_full_disk_refused_is_written_at_the_next_attempt(
     read = read_table(tmp_path / "ticks.arrow", SCHEMAS["ticks"](LAYOUT))
     assert read.table.column("step").to_pylist() == [0, 1]
     assert read.closed
+
+
+# raw.arrow as it was before chunks said which strategy merged them: written out, so that it stays as it was.
+RAW_OF_OLD = pa.schema(
+    [
+        ("chunk_id", pa.int64()),
+        ("observation_step", pa.int64()),
+        ("arrival_step", pa.int64()),
+        ("index", pa.int64()),
+        ("target_step", pa.int64()),
+        ("action", pa.list_(pa.float32())),
+        ("space", pa.string()),
+        ("delay", pa.int64()),
+        ("mistimed", pa.int64()),
+        ("inference_ms", pa.float64()),
+    ]
+)
+
+
+def old_raw(path: Path, rows: int = 4) -> bytes:
+    """An older raw.arrow of one chunk, in two batches; returns its bytes."""
+    table = pa.table(
+        {
+            "chunk_id": [1] * rows,
+            "observation_step": [10] * rows,
+            "arrival_step": [11] * rows,
+            "index": list(range(rows)),
+            "target_step": [-1, *range(11, 10 + rows)],
+            "action": [[0.5, 1.5]] * rows,
+            "space": ["joint"] * rows,
+            "delay": [1] * rows,
+            "mistimed": [0] * rows,
+            "inference_ms": [42.0] * rows,
+        },
+        RAW_OF_OLD,
+    )
+    write_table(path, pa.Table.from_batches([*table.slice(0, 2).to_batches(), *table.slice(2).to_batches()]))
+    return path.read_bytes()
+
+
+def test_what_older_files_do_not_say_is_not_known(tmp_path: Path) -> None:
+    old_raw(tmp_path / "raw.arrow")
+    read = read_table(tmp_path / "raw.arrow", SCHEMAS["raw"](LAYOUT))
+    assert read.closed
+    assert read.table.schema.equals(SCHEMAS["raw"](LAYOUT))
+    assert read.table["target_step"].to_pylist() == [-1, 11, 12, 13]
+    assert read.table["strategy"].to_pylist() == read.table["overlap"].to_pylist() == [None] * 4
+
+
+def test_an_older_file_that_was_cut_off_keeps_its_whole_batches(tmp_path: Path) -> None:
+    path = tmp_path / "raw.arrow"
+    whole = old_raw(path)
+    path.write_bytes(whole[: len(whole) - 40])
+    read = read_table(path, SCHEMAS["raw"](LAYOUT))
+    assert read.table["index"].to_pylist() == [0, 1]
+    assert not read.closed
+    assert read.torn_bytes > 0
+
+
+def test_older_columns_in_another_order_are_still_refused(tmp_path: Path) -> None:
+    old_raw(tmp_path / "raw.arrow")
+    table = pa.ipc.open_stream((tmp_path / "raw.arrow").read_bytes()).read_all()
+    write_table(tmp_path / "raw.arrow", table.select([*table.column_names[1:], table.column_names[0]]))
+    with pytest.raises(RecordingError, match="other columns than its manifest says"):
+        read_table(tmp_path / "raw.arrow", SCHEMAS["raw"](LAYOUT))

@@ -1,0 +1,66 @@
+"""Closed episodes are exported in a process of their own, which ends with whoever started it."""
+
+import fcntl
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from runtime import exports as module
+from runtime.exports import Exports
+from runtime.recording.export import place
+from runtime.recording.files import read_document
+from tests.runtime.recording.test_export import recorded
+
+PATIENCE_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return recorded(tmp_path_factory.mktemp("data"))
+
+
+@pytest.mark.slow
+def test_a_closed_episode_is_exported_and_one_that_cannot_be_is_logged(folder, tmp_path, caplog):
+    exports = Exports(tmp_path)
+    exports.start(folder)
+    exports.start(tmp_path / "absent")
+    exports.finish(PATIENCE_S)
+    (path,) = (tmp_path / "exports").rglob("*.parquet")
+    assert path.stem == folder.name
+    assert f"{tmp_path / 'absent'} is no folder" in caplog.text
+
+
+def test_a_process_that_cannot_be_started_is_logged(folder, tmp_path, monkeypatch, caplog):
+    def full(*command, **how):
+        raise OSError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(module.subprocess, "Popen", full)
+    exports = Exports(tmp_path)
+    exports.start(folder)
+    exports.finish(0.0)
+    assert "is not exported: [Errno 11] Resource temporarily unavailable" in caplog.text
+
+
+@pytest.mark.slow
+def test_it_ends_with_its_standard_input(folder, tmp_path):
+    """Kept from its work by a lock that we hold, it would wait for ever."""
+    folder_of_it = place(read_document(folder / "manifest.json"), tmp_path).parent
+    folder_of_it.mkdir(parents=True)
+    lock = os.open(folder_of_it, os.O_RDONLY)
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    command = [sys.executable, "-m", "runtime.recording", "export", str(folder), "--to", str(tmp_path)]
+    child = subprocess.Popen([*command, "--background"], stdin=subprocess.PIPE, cwd=Path(__file__).parents[2])
+    try:
+        with pytest.raises(subprocess.TimeoutExpired):
+            child.wait(3.0)
+        assert child.stdin is not None
+        child.stdin.close()
+        assert child.wait(PATIENCE_S) == 1
+    finally:
+        child.kill()
+        child.wait()
+        os.close(lock)
+    assert list(folder_of_it.iterdir()) == []
