@@ -3,6 +3,7 @@
 import { config } from "./config.js";
 import { Legend } from "./curve_legend.js";
 import { Curves } from "./curves.js";
+import { GHOSTS } from "./scene_ghosts.js";
 import { MarkLegend } from "./mark_legend.js";
 import { Tags } from "./tags.js";
 import { duration } from "./words.js";
@@ -32,7 +33,7 @@ export async function curvePane(store) {
   const tags = new Tags(document.querySelector(".curves-pane"), "curves-tags");
   store.on("second", () => {
     tags.show("paused", curves.paused && `paused ${duration(curves.pausedFor)} ago; the data goes on`);
-    tags.show("simulated", curves.simulated && "executed: the simulated robot's");
+    tags.show("simulated", curves.simulated && "executed by the simulated robot", GHOSTS.simulated.colour);
   });
   return {
     add: (samples) => curves.add(samples),

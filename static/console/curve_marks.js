@@ -8,25 +8,33 @@ export const MARKS = [
   { name: "safety", colour: "--holding", shape: "tick", means: "A tick where safety changed or refused the action" },
 ];
 
-const SAMPLE_S = 1 / 30; // how long a sample stands for at most
+const SAMPLE_S = 0.1; // how long a sample stands for at most: some come late, and nothing lies between
 
 /**
  * Of times [s] and the columns of a trace: `seams`, times at which a chunk of the policy begins to lead; `bands`,
- * [from, to] of more than one chunk; `limits`, times at which safety changed something.
+ * [from, to] of more than one chunk; `simulations`, [from, to] of what a simulated robot executed; `limits`, times at
+ * which safety changed something.
  */
-export function marks(times, { chunk, chunks, limited }) {
+export function marks(times, { chunk, chunks, limited, simulated = [] }) {
   const seams = [];
-  const bands = [];
   const limits = [];
   for (let at = 0; at < times.length; at += 1) {
     if (at && chunk[at] > 0 && chunk[at] !== chunk[at - 1]) seams.push(times[at]);
     if (limited[at]) limits.push(times[at]);
-    if (chunks[at] < 2) continue;
-    const end = Math.min(times[at + 1] ?? Infinity, times[at] + SAMPLE_S);
-    if (chunks[at - 1] > 1 && times[at] - bands.at(-1)[1] < 1e-6) bands.at(-1)[1] = end;
-    else bands.push([times[at], end]);
   }
-  return { seams, bands, limits };
+  return { seams, limits, bands: stretches(times, chunks, 2), simulations: stretches(times, simulated, 1) };
+}
+
+/** [from, to] of every stretch of samples in which `numbers` are at least `least`. */
+function stretches(times, numbers, least) {
+  const found = [];
+  for (let at = 0; at < numbers.length; at += 1) {
+    if (numbers[at] < least) continue;
+    const end = Math.min(times[at + 1] ?? Infinity, times[at] + SAMPLE_S);
+    if (numbers[at - 1] >= least && times[at] - found.at(-1)[1] < 1e-6) found.at(-1)[1] = end;
+    else found.push([times[at], end]);
+  }
+  return found;
 }
 
 /** The index of the sample that holds at time `t` [s], -1 before the first. */

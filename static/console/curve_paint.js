@@ -1,8 +1,10 @@
 // Bands, hairlines and ticks on the canvas of the curves.
 
 import { css } from "./curve_kinds.js";
+import { GHOSTS } from "./scene_ghosts.js";
 
 const TICK = 7; // px high
+const STRIP = 4; // px high
 const MOST_SEAMS = 200; // more of them in a pane would be a surface
 
 /** Paints on a plot of uPlot; made anew where the theme changes. */
@@ -10,6 +12,7 @@ export class Paint {
   #seam = css("--mark-chunk");
   #band = css("--mark-overlap");
   #limit = css("--holding");
+  #simulation = GHOSTS.simulated.colour;
 
   /** Under the curves. */
   behind(plot, { bands, seams }) {
@@ -22,9 +25,11 @@ export class Paint {
     });
   }
 
-  /** Over them, at the foot of the plot. */
-  over(plot, { limits }) {
+  /** Over them: what a simulated robot did along the top, what safety changed at the foot. */
+  over(plot, { limits, simulations }) {
     inside(plot, (ctx, { top, height }) => {
+      ctx.fillStyle = this.#simulation;
+      for (const [from, to] of simulations) ctx.fillRect(x(plot, from), top, Math.max(1, x(plot, to) - x(plot, from)), STRIP * devicePixelRatio);
       const tall = TICK * devicePixelRatio;
       ctx.fillStyle = this.#limit;
       for (const time of limits) ctx.fillRect(x(plot, time), top + height - tall, Math.max(2, 2 * devicePixelRatio), tall);

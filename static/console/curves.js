@@ -12,7 +12,7 @@ const GAP_S = 0.5; // without news for so long: a gap, not a line
 const DRAW_MS = 100;
 const WHOLE = [-SECONDS, 0];
 const LEAST_S = 0.2; // of a closer look
-const NO_MARKS = { seams: [], bands: [], limits: [] };
+const NO_MARKS = { seams: [], bands: [], limits: [], simulations: [] };
 
 export class Curves {
   #element;
@@ -102,7 +102,7 @@ export class Curves {
 
   /** Whether something that is drawn was executed by a simulated robot. */
   get simulated() {
-    return this.#columns?.simulated.includes(1) ?? false;
+    return this.#marks.simulations.length > 0;
   }
 
   /** Seconds since something came, where that is worth showing. */

@@ -61,7 +61,8 @@ export function robotParts({ parts, visuals }, paint = null) {
 /** A robot that is not the real one: seen through, and never hiding what is measured unless it is `solid`. */
 export function ghostPaint({ colour, opacity, solid = false }) {
   const THREE = three();
-  const look = { color: colour, transparent: true, opacity, depthWrite: solid };
+  // Behind the real robot where both are in the same place: blue is what differs.
+  const look = { color: colour, transparent: true, opacity, depthWrite: solid, polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 };
   return solid ? new THREE.MeshPhongMaterial({ ...look, specular: 0x222222, shininess: 30 }) : new THREE.MeshBasicMaterial(look);
 }
 

@@ -158,13 +158,13 @@ def test_a_copy_of_the_trace_stays_when_the_trace_goes_on() -> None:
     assert found == {"times": [-2, -1, 0], "state": [1, 2, 3], "chunk": [1, 2, 3], "limited": [0, 1, 0]}
 
 
-def marks(chunk: list[int], chunks: list[int] | None = None, limited: list[int] | None = None) -> Any:
+def marks(chunk: list[int], **columns: list[int]) -> Any:
     """The marks of samples a tenth of a second apart, in tenths."""
-    nothing = [0] * len(chunk)
-    given = {"chunk": chunk, "chunks": chunks or nothing, "limited": limited or nothing}
+    given = {"chunk": chunk, **dict.fromkeys(("chunks", "limited", "simulated"), [0] * len(chunk)), **columns}
     body = """
     const found = m.marks(given.chunk.map((_, index) => index / 10), given);
-    return { seams: found.seams, bands: found.bands.flat(), limits: found.limits };
+    const { seams, bands, limits, simulations } = found;
+    return { seams, bands: bands.flat(), limits, simulations: simulations.flat() };
     """
     found = run("curve_marks.js", body, given)
     return {name: [round(10 * time, 1) for time in times] for name, times in found.items()}
@@ -179,20 +179,15 @@ def test_what_no_chunk_planned_begins_no_chunk() -> None:
 
 
 def test_a_band_covers_the_samples_that_more_than_one_chunk_made() -> None:
-    found = run(
-        "curve_marks.js",
-        """
-        const { bands } = m.marks(given.chunks.map((_, index) => index / 30), given);
-        return bands.map((band) => band.map((t) => Math.round(30 * t)));
-        """,
-        {"chunk": [1] * 9, "chunks": [1, 2, 2, 3, 1, 1, 2, 1, 2], "limited": [0] * 9},
-    )
-
-    assert found == [[1, 4], [6, 7], [8, 9]]
+    assert marks([1] * 9, chunks=[1, 2, 2, 3, 1, 1, 2, 1, 2])["bands"] == [1, 4, 6, 7, 8, 9]
 
 
-def test_a_sample_stands_for_no_longer_than_it_was_sampled() -> None:
-    assert marks([1, 1, -1], [1, 2, 0])["bands"] == [1.0, 1.3]
+def test_the_newest_sample_stands_for_a_tenth_of_a_second() -> None:
+    assert marks([1, 1], chunks=[1, 2])["bands"] == [1, 2]
+
+
+def test_what_a_simulated_robot_executed_is_a_stretch_of_its_own() -> None:
+    assert marks([1] * 6, simulated=[0, 1, 1, 1, 0, 1])["simulations"] == [1, 4, 5, 6]
 
 
 def test_every_sample_that_safety_changed_is_marked() -> None:
