@@ -16,6 +16,9 @@ export function byHand(store, socket, commands) {
   new ManualPanel(store, commands, aim);
   robotPanel(store, commands);
   commands.provide("setup", bench);
+  document.getElementById("hand").addEventListener("keydown", ({ key, target }) => {
+    if (key === "Enter" && target.matches("input")) target.blur(); // what was typed counts, and the keys are free again
+  });
   return { aimed: (answer) => aim.answered(answer) };
 }
 

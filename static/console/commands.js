@@ -3,7 +3,7 @@
 import { post, RequestFailed } from "../site/api.js";
 import { uuid } from "../site/identity.js";
 import { config } from "./config.js";
-import { whyNot } from "./reasons.js";
+import { refusal } from "./reasons.js";
 import { answered, STOPPING, Stops } from "./stops.js";
 import { verb } from "./words.js";
 
@@ -92,13 +92,7 @@ export class Commands {
 
   /** Why `kind` cannot be given now, "" where it can. */
   reason(kind) {
-    const store = this.#store;
-    if (!store.fresh) return "nothing is known of the station at the moment";
-    if (store.role === "viewer") return "a viewer watches; an administrator can make you an operator";
-    if (store.lease === "free") return "take the station first";
-    if (store.lease === "elsewhere") return "another page of yours commands the station; take it here first";
-    if (store.lease !== "mine") return "somebody else commands the station; ask for it";
-    return whyNot(kind, store.snapshot);
+    return refusal(kind, this.#store);
   }
 
   /** Enable and disable every button that gives a command; a disabled one says why. */

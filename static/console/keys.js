@@ -27,7 +27,8 @@ export function label(key) {
   return key
     .split("+")
     .map((part) => CAPS[part] ?? part[0].toUpperCase() + part.slice(1))
-    .join(" + ");
+    .join(" + ")
+    .replace("⇧ + ", "⇧");
 }
 
 function text(element) {
@@ -82,8 +83,20 @@ function press(element) {
   else if (!element.disabled) element.focus();
 }
 
+/** A list that was chosen from gives the keys back; one that is gone through by keys keeps them until Enter. */
+function released() {
+  let byKey = false;
+  document.addEventListener("pointerdown", () => (byKey = false), { capture: true });
+  document.addEventListener("keydown", ({ key, target }) => {
+    byKey = key !== "Enter";
+    if (key === "Enter" && target.matches?.("select")) target.blur();
+  }, { capture: true });
+  document.addEventListener("change", ({ target }) => !byKey && target.matches("select") && target.blur());
+}
+
 /** Listen for keys. */
 export function keyboard() {
+  released();
   const dialog = document.getElementById("keys");
   document.querySelector("[data-open-keys]")?.addEventListener("click", () => show(dialog));
   window.addEventListener("keydown", (event) => {

@@ -1,7 +1,7 @@
 // Moving by hand: a target made with sliders, numbers, named poses and steps of the hand, shown as a ghost, and sent.
 
 import { JointRows } from "./joint_rows.js";
-import { groups, handAt, jog, start, verdict } from "./targets.js";
+import { arrived, groups, handAt, jog, start, verdict } from "./targets.js";
 
 export class ManualPanel {
   #store;
@@ -12,6 +12,8 @@ export class ManualPanel {
   #target = null; // [D] where the robot would be sent
   #pose = ""; // the named pose that the target is, as long as nobody changes it
   #edited = false; // else the target follows the robot
+  #sent = false; // the target is where the robot was sent
+  #clipped = ""; // what was said of the last edit
   #rows;
   #steps = Promise.resolve(); // steps of the hand, one after the other
   #poses = document.getElementById("pose");
@@ -29,6 +31,7 @@ export class ManualPanel {
     commands.provide("move", () => this.#move());
     store.on("snapshot", (snapshot) => this.#follow(snapshot));
     store.on("joints", () => this.#fromRobot());
+    store.on("second", () => this.#look()); // the robot comes nearer
     document.addEventListener("eva:panel", () => this.#look());
     this.how("joints");
   }
@@ -49,18 +52,19 @@ export class ManualPanel {
   }
 
   #move() {
+    this.#sent = true;
     const speed = Number(this.#speed.value);
     return this.#pose ? { pose: this.#pose, speed } : { joints: this.#target, speed };
   }
 
   /** The target is where the robot is, and goes with it. */
-  reset() {
-    this.#edited = false;
-    this.#pose = "";
+  reset(said = "The target is where the robot is.") {
+    this.#edited = this.#sent = false;
+    this.#pose = this.#clipped = "";
     this.#poses.selectedIndex = 0;
     this.#aim.clear();
     this.#fromRobot();
-    this.#say("The target is where the robot is.");
+    this.#say(said);
   }
 
   #follow({ facts, state, mode, run }) {
@@ -74,7 +78,7 @@ export class ManualPanel {
   #build(facts) {
     this.#groups = groups(facts);
     const poses = (facts.poses ?? []).map((name) => new Option(name));
-    const none = new Option(poses.length ? "choose" : "none named", "");
+    const none = new Option(poses.length ? "pose" : "no pose", "");
     none.disabled = true;
     this.#poses.replaceChildren(none, ...poses);
     this.#poses.disabled = !poses.length;
@@ -119,11 +123,14 @@ export class ManualPanel {
     if (!this.#target) return;
     this.#target[index] = value;
     this.#changed();
-    this.#look(said);
+    this.#clipped = said;
+    this.#look();
   }
 
   #changed(pose = "") {
     this.#edited = true;
+    this.#sent = false;
+    this.#clipped = "";
     this.#pose = pose;
     if (!pose) this.#poses.selectedIndex = 0;
     this.#follow(this.#store.snapshot);
@@ -131,15 +138,19 @@ export class ManualPanel {
   }
 
   /** Ask where the target is, and show it, as long as this panel is shown. */
-  #look(said = "") {
+  #look() {
     if (!this.#edited) return;
     if (document.getElementById("panel-manual").hidden) this.#aim.clear();
-    else this.#aim.follow({ joints: this.#target }, (answer) => this.#heard(answer, said));
+    else this.#aim.follow({ joints: this.#target }, (answer) => this.#heard(answer));
   }
 
-  #heard(answer, said = "") {
+  #heard(answer) {
+    if (this.#sent && answer.ok && arrived(answer)) {
+      this.reset("The robot has arrived.");
+      return;
+    }
     const { text, weight } = verdict(answer, Number(this.#speed.value));
-    this.#say(`${text} ${said}`.trim(), said ? "warn" : weight);
+    this.#say(`${text} ${this.#clipped}`.trim(), this.#clipped ? "warn" : weight);
     part("at").textContent = handAt(answer.poses, this.#store.snapshot.facts.arms.indexOf(this.#arm));
   }
 
@@ -185,7 +196,7 @@ function part(name) {
   return document.querySelector(`[data-target="${name}"]`);
 }
 
-/** The key V stands on the group that it chooses. */
+/** The key stands on the group that it chooses. */
 function groupButton(name, index, chosen, next) {
   const button = document.createElement("button");
   Object.assign(button, { type: "button", className: "segment" });
@@ -195,9 +206,9 @@ function groupButton(name, index, chosen, next) {
   text.textContent = name.replaceAll("_", " ");
   button.append(text);
   if (index !== next || next === chosen) return button;
-  Object.assign(button.dataset, { key: "v", keyText: "Next arm" });
+  Object.assign(button.dataset, { key: "shift+a", keyText: "Next arm" });
   const cap = document.createElement("kbd");
-  cap.textContent = "V";
+  cap.textContent = "⇧A";
   button.append(" ", cap);
   return button;
 }

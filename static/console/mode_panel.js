@@ -22,6 +22,7 @@ export class ModePanel {
     this.#chosen = this.#form.elements.mode.value; // as a draft had it
     this.#form.addEventListener("submit", (event) => event.preventDefault());
     this.#form.addEventListener("change", (event) => this.#choose(event));
+    part("seen").addEventListener("change", () => this.draw());
     commands.provide("run", () => this.#runs());
     store.on(["snapshot", "second"], () => this.draw());
     this.draw();
@@ -102,7 +103,7 @@ export class ModePanel {
     const before = !open && snapshot?.state === "ready" && POLICY_MODES.includes(mode) && mode !== "sim" ? snapshot.first_action : null;
     const far = [proposal, before].find((one) => one?.far);
     part("far").hidden = !far;
-    if (far) write("far-text", proposal ? `This chunk begins ${distance(far)}.` : `The policy's first action is ${distance(far)}: approach it slowly first, or run from here.`);
+    if (far) write("far-text", proposal ? `This chunk begins ${distance(far)}.` : `The policy's first action is ${distance(far)}: approach it on a limited path first, or run from here.`);
   }
 }
 

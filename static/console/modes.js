@@ -4,11 +4,11 @@ import { words } from "./words.js";
 
 /** In the order of the keys that choose them. */
 export const MODES = {
-  sim: "The policy drives a simulated robot in 3D. The real one is sent nothing of it.",
-  step: "Each press asks the policy once and moves the robot by one chunk.",
-  preview: "Each press shows a chunk as a ghost. Commit moves the robot, Cancel forgets it.",
+  sim: "Drives a simulated robot; the real one holds.",
+  step: "Each press moves the robot by one chunk.",
+  preview: "Each press shows a chunk; Commit moves.",
   continuous: "The policy drives the robot until Stop.",
-  manual: "You move the robot. The policy is not asked.",
+  manual: "You move the robot; the policy is not asked.",
 };
 
 /** What the policy sees in the mode sim, to be said while it runs. */

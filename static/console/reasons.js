@@ -1,5 +1,6 @@
 // Why a command cannot be given now, in a sentence. Whether it can is the station's own word: snapshot.allowed.
 
+import { STOPPING } from "./stops.js";
 import { verb, words } from "./words.js";
 
 const MODES = { step: ["step", "preview"], commit: ["preview"], cancel: ["step", "preview", "manual"], move: ["manual"] };
@@ -8,6 +9,16 @@ const BUSY = {
   executing: "the last chunk is still being executed",
   proposed: "a chunk is shown: commit or cancel it first",
 };
+
+/** Why this page cannot give `kind` now, "" where it can. To stop it needs no news, only the lease it last had. */
+export function refusal(kind, { fresh, role, lease, snapshot }) {
+  if (!fresh) return STOPPING.includes(kind) && lease === "mine" ? "" : "nothing is known of the station at the moment";
+  if (role === "viewer") return "a viewer watches; an administrator can make you an operator";
+  if (lease === "free") return "take the station first";
+  if (lease === "elsewhere") return "another page of yours commands the station; take it here first";
+  if (lease !== "mine") return "somebody else commands the station; ask for it";
+  return whyNot(kind, snapshot);
+}
 
 /** "" where the station allows `kind`. */
 export function whyNot(kind, snapshot) {

@@ -33,14 +33,19 @@ export function start({ measured, commanded, engaged } = {}) {
   return from ? [...from] : null;
 }
 
-const VERY_NEAR_M = 0.001;
+const VERY_NEAR = 0.005; // rad, or m of a gripper
+
+/** Whether the robot is where the target is, as the station counts it. */
+export function arrived({ distance }) {
+  return distance < VERY_NEAR;
+}
 
 /** What the station said of a target, in a sentence with its weight: {text, weight}. */
 export function verdict({ ok, reason, distance, duration_s: seconds, reached, clipped = [], position_error_mm: mm, rotation_error_deg: deg }, speed) {
   if (!ok) return { text: reason || "the station did not say where that is", weight: "warn" };
   if (reached === false) return { text: `Out of reach: the nearest is ${mm.toFixed(0)} mm and ${deg.toFixed(1)}° off.`, weight: "warn" };
   const limited = clipped.length ? ` Limited: ${clipped.join(", ")}.` : "";
-  if (distance < VERY_NEAR_M) return { text: `The robot is there.${limited}`, weight: limited ? "warn" : "" };
+  if (arrived({ distance })) return { text: `The robot is there, within ${VERY_NEAR} rad.${limited}`, weight: limited ? "warn" : "" };
   return { text: `${distance.toFixed(2)} rad from the robot, ${(seconds / speed).toFixed(1)} s.${limited}`, weight: limited ? "warn" : "" };
 }
 
