@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from runtime import deployment, lockstep, log
+from runtime import deployment, headless, lockstep, log
 from runtime.deployment import Resolved
 from runtime.errors import ConfigurationError, RuntimeFault
 from runtime.family import Lifeline, Plan, plan
@@ -26,6 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     log.start("supervisor")
     try:
         made = plan(_resolved(given))
+        if given.headless:
+            headless.check(made)
     except RuntimeFault as fault:
         print(fault, file=sys.stderr)
         return 2

@@ -22,7 +22,9 @@ _SHOWN_EVERY_S = 2.0
 _POLL_S = 0.05
 MODES = ("continuous", "sim")  # the others need a person
 # Events that a person who gave no command does not need to read; states are shown as they change.
-_SILENT = frozenset({"command", "setup", "motion_done", "episode_opened", "episode_closed"})
+_SILENT = frozenset(
+    {"command", "setup", "tuned", "locked", "motion_done", "episode_opened", "episode_closed"}
+)
 RESULT_NAME = "headless.json"
 
 

@@ -5,10 +5,12 @@ from types import SimpleNamespace
 
 import pytest
 
+from runtime import __main__ as command_line
 from runtime import headless
 from runtime.errors import RecordingError, RuntimeFault, SetupError, TransportError
 from runtime.headless import drive, summary
 from runtime.recording import export
+from tests.sources import ROOT
 
 STATUS = {
     "boot": "boot-1",
@@ -277,6 +279,13 @@ def test_a_mode_that_needs_a_person_is_refused_before_anything_is_done(plan, mod
     with pytest.raises(SetupError, match=says):
         drive(plan, station)
     assert station.given == []
+
+
+def test_such_a_mode_is_refused_before_any_process_is_started(monkeypatch, capsys):
+    monkeypatch.setattr(command_line, "Supervisor", None)
+    deployment = str(ROOT / "deployments/demo.toml")
+    assert command_line.main([deployment, "--headless", "--set", "run.mode=preview"]) == 2
+    assert "run.mode = 'preview' needs a person" in capsys.readouterr().err
 
 
 def test_the_summary_says_how_it_went():
