@@ -7,37 +7,34 @@ then ten that never read join a station that stands.
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
 
+from benchmarks.labs import STATION, lab, watch
 from benchmarks.report import Figure, Report
 from evaweb.lab.once import Choice, start
 from evaweb.lab.visitor import LivePage, Visitor
 
-_ROOT = Path(__file__).parents[1]
-_STATION = "bench-1"
 _VIEWERS, _STALLED = 20, 10
-_STREAMS = "state,joints,poses,camera/cam_high,camera/cam_left_wrist,camera/cam_right_wrist"
 
 
 def measure(seconds: float) -> Report:
     """`viewer_p99_ms`, `stalled_viewer_mb`, `lateness_p99_ms` and the latter without viewers."""
-    with tempfile.TemporaryDirectory() as folder, _demo(Path(folder)) as (visitor, pids):
-        alone = _run(visitor, seconds, 0)
-        watched = _run(visitor, seconds, _VIEWERS)
-        stalled = _stalled(visitor, pids["web"], seconds)
+    with tempfile.TemporaryDirectory() as folder:
+        ready = Path(folder) / "ready.json"
+        with lab(["manage.py", "demo", "--port", "0", "--ready-file", str(ready)], ready) as demo:
+            visitor, web = demo.visitor, demo.announced["pids"]["web"]
+            alone = _run(visitor, seconds, 0)
+            watched = _run(visitor, seconds, _VIEWERS)
+            stalled = _stalled(visitor, web, seconds)
     ages = np.array(watched["ages_ms"])
     figures = [
         Figure("viewer_p50_ms", float(np.percentile(ages, 50)), "ms"),
@@ -52,39 +49,15 @@ def measure(seconds: float) -> Report:
     return Report("live", figures, rows)
 
 
-@contextmanager
-def _demo(folder: Path) -> Iterator[tuple[Visitor, dict[str, int]]]:
-    ready = folder / "ready.json"
-    environment = os.environ | {"EVA_DATA_DIR": str(folder / "data"), "EVA_LOG_LEVEL": "WARNING"}
-    child = subprocess.Popen(
-        [sys.executable, "manage.py", "demo", "--port", "0", "--ready-file", str(ready)],
-        cwd=_ROOT,
-        env=environment,
-        stdout=subprocess.DEVNULL,
-    )
-    try:
-        while not ready.exists():
-            if child.poll() is not None:
-                raise SystemExit(f"the demo ended with {child.returncode} before it was ready")
-            time.sleep(0.1)
-        found = json.loads(ready.read_text())
-        visitor = Visitor(found["url"])
-        visitor.login("operator", found["passwords"]["operator"])
-        yield visitor, found["pids"]
-    finally:
-        child.send_signal(signal.SIGINT)
-        child.wait(60)
-
-
 def _run(visitor: Visitor, seconds: float, viewers: int) -> Mapping[str, Any]:
     """One trial of `seconds` while so many watch; it is voided afterwards."""
-    with closing(LivePage(visitor, _STATION)) as page:
-        trial = start(visitor, page, Choice(_STATION, "block-on-plate", 1, "pick-place-40k", seed=1))
+    with closing(LivePage(visitor, STATION)) as page:
+        trial = start(visitor, page, Choice(STATION, "block-on-plate", 1, "pick-place-40k", seed=1))
         found = _viewers(visitor, seconds, reading=viewers) if viewers else _wait(seconds)
         state = page.wait(lambda state: True, 10, "looking")
         page.command("stop")
         page.wait(lambda state: state["state"] == "ready", 10, "stopping")
-        visitor.post(f"stations/{_STATION}/lease", {"action": "give_up", "page": page.page})
+        visitor.post(f"stations/{STATION}/lease", {"action": "give_up", "page": page.page})
     _void(visitor, trial)
     return {**found, "control": state["control"]}
 
@@ -101,11 +74,8 @@ def _void(visitor: Visitor, trial: int) -> None:
 
 
 def _viewers(visitor: Visitor, seconds: float, **counts: int) -> dict[str, Any]:
-    options = [part for name, count in counts.items() for part in (f"--{name}", str(count))]
-    command = [sys.executable, "-m", "benchmarks.viewers", visitor.url, _STATION, visitor.cookie("sessionid")]
-    command += ["--streams", _STREAMS, "--seconds", str(seconds), *options]
-    done = subprocess.run(command, cwd=_ROOT, stdout=subprocess.PIPE, text=True, check=True)
-    found: dict[str, Any] = json.loads(done.stdout)
+    child = watch(visitor, seconds, **counts)
+    found: dict[str, Any] = json.loads(child.communicate()[0])
     return found
 
 

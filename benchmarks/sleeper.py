@@ -1,4 +1,8 @@
-"""The common way to pace a loop, measured beside ours: work, then sleep what is left of the period."""
+"""Loops that do nothing but sleep, measured beside ours: `python -m benchmarks.sleeper HOW HZ SECONDS [PRIORITY]`.
+
+"rest" is the common way: work, then sleep what is left of the period. "deadlines" sleeps to absolute deadlines as
+our control does, in its scheduling class where a PRIORITY is given: what is late here is the machine's.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +10,47 @@ import json
 import sys
 import time
 
+from runtime import realtime
+from runtime.clock import MonotonicClock
+
 
 def main() -> None:
-    """Loop at argv[1] Hz for argv[2] seconds; print the wake-up times on the monotonic clock."""
-    period, seconds = 1.0 / float(sys.argv[1]), float(sys.argv[2])
+    """Print one line of JSON: the class it got, and of each wake-up its time, step and lateness [s]."""
+    how, rate, seconds = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
+    scheduling = realtime.enter(int(sys.argv[4])) if len(sys.argv) > 4 else "ordinary"
+    loop = {"rest": _rest, "deadlines": _deadlines}[how]
+    woke, steps, late = loop(1.0 / rate, seconds)
+    print(json.dumps({"scheduling": scheduling, "woke": woke, "steps": steps, "late": late}))
+
+
+def _rest(period: float, seconds: float) -> tuple[list[float], list[int], list[float]]:
+    """Sleep what is left of the period since the last wake-up."""
     woke = [time.monotonic()]
     end = woke[0] + seconds
     while woke[-1] < end:
         started = woke[-1]
         time.sleep(max(0.0, period - (time.monotonic() - started)))
         woke.append(time.monotonic())
-    print(json.dumps(woke))
+    return woke, list(range(len(woke))), []
+
+
+def _deadlines(period: float, seconds: float) -> tuple[list[float], list[int], list[float]]:
+    """Sleep to start + n * period; a deadline that was missed is skipped."""
+    clock = MonotonicClock()
+    woke: list[float] = []
+    steps: list[int] = []
+    late: list[float] = []
+    start, n = clock.now() + period, 0
+    while n * period < seconds:
+        deadline = start + n * period
+        clock.sleep_until(deadline)
+        now = clock.now()
+        n += max(0, int((now - deadline) / period))
+        woke.append(now)
+        steps.append(n)
+        late.append(now - deadline)
+        n += 1
+    return woke, steps, late
 
 
 if __name__ == "__main__":

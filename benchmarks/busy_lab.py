@@ -1,0 +1,77 @@
+"""A lab for measurements: `python -m benchmarks.busy_lab READY_FILE --set KEY=VALUE ...`; ends with Ctrl-C.
+
+The tabletop bench with three cameras of 640x480 at 30 Hz, a policy whose gesture never ends, web and worker; all
+processes are those of every lab. The data lie in EVA_DATA_DIR.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+ROBOT = "agilex_piper"
+_ROOT = Path(__file__).parents[1]
+_POLICY = ("--robot", ROBOT, "--port", "0", "--latency-ms", "80")
+# A machine that stalls must not end the run that measures how it stalls: what is late is only late here.
+_PATIENT = (
+    "safety.joint_age_s=10.0",
+    "safety.picture_age_s=10.0",
+    "safety.following_error=3.0",
+    "safety.refusals_to_hold=1000",
+    "control.starvation_hold_s=30.0",
+    "control.heartbeat_timeout_s=10.0",
+    'faults.policy_error="slow"',
+    "faults.patience_s=30.0",
+    "lease.ttl_s=30.0",
+)
+
+
+def main() -> int:
+    """Stay up until a signal comes."""
+    import django
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("ready_file", type=Path)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
+    given = parser.parse_args()
+    os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
+    django.setup()
+    from evaweb.lab.lab import a_lab
+    from evaweb.lab.lifetime import Ended
+
+    try:
+        with a_lab("127.0.0.1", 0) as lab:
+            _up(lab, given)
+            lab.watch()
+    except Ended:
+        return 0
+
+
+def _up(lab: Any, given: argparse.Namespace) -> None:
+    from evaweb.lab import programs, seed
+    from evaweb.lab.lab import Bench
+    from evaweb.lab.processes import Program
+    from evaweb.roles import Role
+    from runtime.sim.standin import announce
+
+    node = lab.processes.start(programs.tabletop(ROBOT, 1))
+    serving = ("-m", "runtime.sim.serve", "openpi", *_POLICY)
+    policy = lab.processes.start(Program("policy", serving, announces=True))
+    assignments = [
+        f'transport.sub_endpoint="{node["obs_endpoint"]}"',
+        f'transport.pub_endpoint="{node["action_endpoint"]}"',
+        f'policy.url="{policy["url"]}"',
+        *_PATIENT,
+        *given.assignments,
+    ]
+    url = lab.up([Bench(_ROOT / "deployments" / "tabletop.toml", assignments)])
+    login = seed.demo_login(username="operator", role=Role.OPERATOR)
+    facts = {"url": url, "passwords": {login.username: login.password}, "node": node["obs_endpoint"]}
+    announce({**facts, "pids": lab.processes.pids()}, given.ready_file)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

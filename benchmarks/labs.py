@@ -1,0 +1,136 @@
+"""A whole lab in processes of its own, as benchmarks bring it up, use it from outside, and end it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from evaweb.lab.visitor import LivePage, Visitor
+from runtime.recording.reader import Episode, open_episode
+
+ROOT = Path(__file__).parents[1]
+STATION = "bench-1"
+STREAMS = ("state", "joints", "poses", "camera/cam_high", "camera/cam_left_wrist", "camera/cam_right_wrist")
+_END_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class RunningLab:
+    """A lab that is up, somebody logged in to it, and what it announced."""
+
+    visitor: Visitor
+    announced: Mapping[str, Any]
+    process: psutil.Process
+    data: Path
+
+
+@contextmanager
+def lab(program: Sequence[str], ready_file: Path) -> Iterator[RunningLab]:
+    """Start `python PROGRAM`, which is to announce its lab in `ready_file`; its data lie beside that file."""
+    data = ready_file.parent / "data"
+    environment = os.environ | {"EVA_DATA_DIR": str(data), "EVA_LOG_LEVEL": "WARNING"}
+    child = subprocess.Popen([sys.executable, *program], cwd=ROOT, env=environment, stdout=subprocess.DEVNULL)
+    try:
+        while not ready_file.exists():
+            if child.poll() is not None:
+                raise SystemExit(f"the lab ended with {child.returncode} before it was ready")
+            time.sleep(0.1)
+        announced = json.loads(ready_file.read_text())
+        visitor = Visitor(announced["url"])
+        visitor.login("operator", announced["passwords"]["operator"])
+        yield RunningLab(visitor, announced, psutil.Process(child.pid), data)
+    finally:
+        child.send_signal(signal.SIGINT)
+        child.wait(_END_S)
+
+
+@contextmanager
+def busy_lab(folder: Path, assignments: Sequence[str]) -> Iterator[RunningLab]:
+    """The lab of `benchmarks.busy_lab`, with these settings on top of its deployment."""
+    sets = [part for assignment in assignments for part in ("--set", assignment)]
+    ready = folder / "ready.json"
+    with lab(["-m", "benchmarks.busy_lab", str(ready), *sets], ready) as running:
+        yield running
+
+
+def watch(visitor: Visitor, seconds: float, **counts: int) -> subprocess.Popen[str]:
+    """Pages open on the station for so long, in a process of their own; `reading` or `stalled` of them."""
+    options = [part for name, count in counts.items() for part in (f"--{name}", str(count))]
+    command = [sys.executable, "-m", "benchmarks.viewers", visitor.url, STATION, visitor.cookie("sessionid")]
+    command += ["--streams", ",".join(STREAMS), "--seconds", str(seconds), *options]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+
+
+class Processors:
+    """What the processes of a lab, and all others of the machine, take of the processors from now on."""
+
+    def __init__(self, lab: psutil.Process) -> None:
+        self._lab = lab
+        self._begun = time.monotonic()
+        self._busy = _busy()
+        self._before = self._times()
+
+    def percent(self) -> dict[str, float]:
+        """By process, of one processor [%]; `lab` is their sum, `others` everything else on this machine."""
+        seconds = time.monotonic() - self._begun
+        taken = {
+            name: (used - self._before.get(name, 0.0)) / seconds * 100.0
+            for name, used in self._times().items()
+        }
+        whole = sum(taken.values())
+        return {**taken, "lab": whole, "others": (_busy() - self._busy) / seconds * 100.0 - whole}
+
+    def _times(self) -> dict[str, float]:
+        found: dict[str, float] = {}
+        for process in (self._lab, *self._lab.children(recursive=True)):
+            try:
+                name, times = _name(process.cmdline()), process.cpu_times()
+            except psutil.NoSuchProcess:  # it has ended since it was listed: nothing of it can be asked
+                continue
+            found[name] = found.get(name, 0.0) + times.user + times.system
+        return found
+
+
+def _busy() -> float:
+    times = psutil.cpu_times()
+    return float(sum(times) - times.idle - times.iowait - times.guest - times.guest_nice)
+
+
+def _name(command: Sequence[str]) -> str:
+    """The module or the management command that a process runs."""
+    if "-m" in command:
+        return command[command.index("-m") + 1]
+    return next((part for part in command[1:] if not part.startswith("-") and "/" not in part), "?")
+
+
+def set_up(page: LivePage) -> Mapping[str, Any]:
+    """Take the station and set it up; its state when it is ready."""
+    page.wait(lambda state: state["state"] != "disconnected", 60.0, "waiting for the station")
+    page.claim()
+    page.wait(lambda state: state["lease"]["epoch"] == page.epoch, 10.0, "waiting for the lease")
+    page.command("setup")
+    ready = page.wait(lambda state: state["state"] != "setting_up", 60.0, "setting up")
+    if ready["state"] != "ready":
+        raise SystemExit(f"set-up ended {ready['state']}: {ready['reason']}")
+    return ready
+
+
+def only_episode(data: Path, seconds: float = 30.0) -> Episode:
+    """The one episode of a data folder, once it is closed."""
+    deadline = time.monotonic() + seconds
+    while not (found := list(data.glob("episodes/*/outcome.json"))):
+        if time.monotonic() > deadline:
+            raise SystemExit(f"no episode was closed in {data} within {seconds:g} s")
+        time.sleep(0.1)
+    return open_episode(found[0].parent)
