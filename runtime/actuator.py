@@ -110,7 +110,9 @@ class Actuator(ABC):
         """Tell the robot `action`, which is what locks and safety made of `target`."""
         time, action, notes = self._deliver(step, target, action, notes)
         self.velocity = (action - self.commanded) / self.elapsed(planned)
-        if self._switching:
+        if target.source == "estop":
+            self.velocity[:] = 0.0  # it is told where it is: nothing that a stop could begin from
+        elif self._switching:
             self.velocity[self._settings.limits.binary] = 0.0
         self.commanded = action
         return Sent(time, target, action, notes)

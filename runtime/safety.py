@@ -236,8 +236,11 @@ class SafetyFilter:
         slowest = np.maximum(-most[1], now - gain)
         crossed = slowest > fastest
         if crossed.any():
-            # Where the two contradict (a limit was changed, a stall), braking as hard as allowed wins.
-            braking = now - np.sign(now) * np.minimum(gain, np.abs(now))
+            # The limit of a joint is too near for the path's own deceleration (a limit was changed, a stall):
+            # what stops before it wins, as hard as any path may brake.
+            hard = self._stopping * dt
+            stops = np.where(now > 0, most[0], -most[1])
+            braking = np.minimum(np.maximum(stops, now - hard), now + hard)
             fastest, slowest = np.where(crossed, braking, fastest), np.where(crossed, braking, slowest)
         wanted = (action - state.previous) / dt
         velocity = np.minimum(np.maximum(self._in_time(wanted, action, state, path), slowest), fastest)

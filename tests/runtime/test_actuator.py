@@ -106,3 +106,11 @@ def test_the_e_stop_pressed_within_a_tick_repeats_the_last_command_to_the_robot(
     sent = actuator.send(0, 100.0, Target(np.ones(2), "policy", "policy"), np.ones(2))
     assert sent.executed.tolist() == [0.1, 0.1]
     assert bench.sent.tolist() == pytest.approx([pytest.approx([0.1, 0.1])])
+
+
+def test_a_stop_after_the_e_stop_begins_at_rest():
+    """The e-stop went to where the arm was measured, in one tick: that is no speed to brake from."""
+    actuator = robot(Bench())
+    actuator.engage(np.zeros(2))
+    actuator.send(0, 100.0, Target(np.full(2, 0.3), "estop", None), np.full(2, 0.3))
+    assert actuator.brake().duration == 0.0

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from runtime.clock import VirtualClock
-from runtime.control import Lateness, Loop
-from runtime.page import Page, PageLayout
+from runtime.control import Lateness, Loop, make_tick
+from runtime.messages import Order, PostedChunk, TickDone, decode, encode
+from runtime.page import EStop, Page, PageLayout
+from tests.runtime import station
+from tests.runtime.station import STANDS
+from tests.runtime.tick_bench import RecordingSink
 
 
 class LateClock(VirtualClock):
@@ -83,6 +88,7 @@ def test_its_figures_are_those_of_the_newest_ticks_and_counters_go_on() -> None:
     lateness.write()
     assert (int(status["ticks"]), int(status["missed"])) == (4050, 22)
     assert float(status["lateness_p50"]) == pytest.approx(0.001)
+    assert float(status["lateness_p999"]) == pytest.approx(0.5)
     assert float(status["lateness_max"]) == pytest.approx(0.5)
     assert status["scheduling"] == b"FIFO 20"
 
@@ -103,3 +109,28 @@ def test_control_is_alive_in_the_page_before_its_tick_begins(page: Page) -> None
     beats: Any = Beats(page)
     Loop(beats, page, LateClock(0.002), 10.0, "ordinary").once()
     assert beats.seen == pytest.approx([100.102])
+
+
+@pytest.mark.parametrize(("half", "refused"), [(2.0, False), (0.05, True)])
+def test_the_tick_of_a_deployment_keeps_its_arms_in_their_boxes(
+    tmp_path: Path, half: float, refused: bool
+) -> None:
+    box = {"lower": [-half] * 3, "upper": [half] * 3}
+    plan = station.plan(tmp_path, safety={"workspace": {"left_arm": box}})
+    page, _ = Page.create(plan.layout)
+    page.set_estop(EStop.CLEAR)
+    clock, sink = VirtualClock(10.0), RecordingSink()
+    tick = make_tick(plan, page, sink, clock.now)
+    for process in ("main", "guard"):
+        page.beat(process, clock.now())
+    page.publish_observation(
+        plan.transport.source(None, None, clock).receive(0.0), dict.fromkeys(plan.cameras, 1)
+    )
+    page.rings["orders"].push(encode(Order(1, "follow", run=1)))
+    page.rings["orders"].push(encode(PostedChunk(1, 1, 0, np.tile(STANDS, (5, 1)))))
+    tick(0, clock.now())
+    record = next(m for m in map(decode, page.rings["ticks"].drain()) if isinstance(m, TickDone))
+    assert record.refused is refused
+    assert [note for note in record.notes if "box" in note] == (
+        ["left_arm would leave the workspace box"] if refused else []
+    )

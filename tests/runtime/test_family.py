@@ -1,5 +1,6 @@
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from runtime import family
 from runtime.deployment import load
 from runtime.family import Lifeline, plan
 from runtime.page import Page
+from runtime.timeline import Dims
 
 DEPLOYMENTS = Path(__file__).parents[2] / "deployments"
 
@@ -85,3 +87,13 @@ def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path,
     assert member.page.last_beat("main") == 12.5
     assert member.boot == "b"
     os.close(descriptor)
+
+
+def test_angles_without_limits_wrap_and_grippers_that_know_two_places_switch(resolved):
+    made = plan(resolved)
+    assert made.dims == Dims()
+    lower, upper = made.robot.lower.copy(), made.robot.upper.copy()
+    lower[[2, 9]], upper[[2, 4]] = -np.inf, np.inf
+    group = replace(made.robot.groups[1], gripper=replace(made.robot.groups[1].gripper, binary=True))
+    turning = replace(made.robot, lower=lower, upper=upper, groups=(made.robot.groups[0], group))
+    assert replace(made, robot=turning).dims == Dims(switched=(13,), wrapping=(2,))

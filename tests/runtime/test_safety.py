@@ -161,3 +161,75 @@ def test_whatever_is_asked_the_limits_hold_together(asked, stretches, accelerati
         assert abs(new[0] - velocity[0]) <= acceleration * dt + 1e-4
         assert -1.0 - 1e-6 <= verdict.action[0] <= 1.0 + 1e-6
         previous, velocity = verdict.action, new
+
+
+# --- a target that jumped ------------------------------------------------------------------------------------
+
+ONE = Limits(("j",), np.array([-9.0]), np.array([9.0]), np.array([3.0]), np.zeros(1, bool), np.zeros(1, bool))
+
+
+def followed(targets, dt, **options):
+    """What is sent for targets [N], one per tick of `dt` s, from rest at 0; and the notes of each tick."""
+    safety = SafetyFilter(SafetySettings(**({"jump": 20.0, "following_error": 20.0} | options)), ONE)
+    previous, velocity, aim, sent, notes = np.zeros(1), np.zeros(1), None, [], []
+    for target in targets:
+        action = np.array([target], float)
+        verdict = safety.judge(action, RobotState(previous, velocity, previous, dt, aim=aim))
+        velocity, previous, aim = (verdict.action - previous) / dt, verdict.action, action
+        sent.append(previous[0])
+        notes.append(verdict.notes)
+    return np.array(sent), notes
+
+
+@settings(max_examples=60)
+@given(st.floats(-0.5, 0.5), st.sampled_from([30.0, 50.0, 100.0, 200.0]))
+def test_a_target_that_jumped_is_reached_without_going_beyond_it(jump, rate):
+    sent, _ = followed([jump] * int(rate), 1 / rate)
+    assert (np.abs(sent) <= abs(jump) + 1e-5).all()
+    assert sent[-1] == pytest.approx(jump, abs=1e-5)
+
+
+@settings(max_examples=60)
+@given(st.floats(-0.4, 0.4), st.floats(-2.0, 2.0), st.sampled_from([50.0, 100.0, 200.0]))
+def test_a_moving_target_that_jumped_is_caught_up_with_and_then_kept(jump, speed, rate):
+    """Whoever is behind arrives at the target's own speed: not beyond it, and not later and later."""
+    time = np.arange(int(rate)) / rate
+    behind = followed(jump + speed * time, 1 / rate)[0] - (jump + speed * time)
+    assert np.abs(behind[-5:]).max() < 1e-5
+    beyond = -np.sign(behind[0]) * behind if abs(behind[0]) > 1e-3 else -np.abs(behind)
+    assert (
+        beyond.max() < abs(speed) * 2 / rate + 1e-5
+    )  # the target's speed is known from its second action on
+
+
+def test_what_the_limits_allow_is_followed_to_the_last_bit_whatever_was_wanted_before():
+    time = np.arange(200) / 100.0
+    targets = 0.4 * (1 - np.cos(3.0 * time))
+    sent, notes = followed(targets, 0.01)
+    assert (sent == targets).all()
+    assert not any(notes)
+
+
+def test_a_verdict_names_what_was_changed_most():
+    verdict = judge([0.3, 1.02, 0.05], state())
+    assert verdict.most == "arm.joint0 limited from 0.3000 to 0.0667"
+    assert verdict.change == pytest.approx(0.3 - 60.0 * DT**2)
+    assert judge([0.01, 1.0, 0.05]).most == ""
+
+
+def test_a_motion_that_is_too_fast_for_a_limit_brakes_as_hard_as_a_policy_may():
+    """Its own deceleration is soft; the joint limit is not."""
+    near = state(previous=(0.98, 1.0, 0.05), velocity=(0.7, 0, 0))
+    verdict = judge([1.4, 1.0, 0.05], near, path="motion")
+    assert not verdict.refused
+    assert verdict.action[0] <= 1.0
+    assert verdict.action[0] >= 0.98
+
+
+def test_the_box_is_not_asked_twice_about_an_action_that_was_not_changed():
+    asked = []
+    judge([0.01, 1.0, 0.05], outside=lambda action: asked.append(action.copy()) or ())
+    assert len(asked) == 2  # the action, and where the arm would come to a stand after it
+    asked.clear()
+    judge([0.3, 1.0, 0.05], outside=lambda action: asked.append(action.copy()) or ())
+    assert len(asked) == 3

@@ -106,12 +106,13 @@ class Bench:
             starvation=self.starvation,
             starvation_hold=1.0,
         )
-        safety = SafetyFilter(self.safety, self.limits)
-        return Tick(self.page, self.sink, safety, self.chosen, settings, self.time_of_sending)
+        safety = SafetyFilter(self.safety, self.limits, self._judged)
+        return Tick(self.page, self.sink, safety, self.chosen, settings, self.clock.now)
 
-    def time_of_sending(self) -> float:
+    def _judged(self, action: Float64) -> tuple[str, ...]:
+        """Safety looks whether a policy's action leaves the workspace: the last moment before it is sent."""
         self.before_send()
-        return self.clock.now()
+        return ()
 
     def observe(self, **changes: Any) -> None:
         self.sequence += 1

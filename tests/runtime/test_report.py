@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+
+from runtime.actuator import Sent
+from runtime.behaviour import Target
+from runtime.report import Limiting, Report
+from tests.runtime.tick_bench import Bench, following, wave
+
+
+class Said(list):
+    def __call__(self, kind, text):
+        self.append((kind, text))
+
+
+def limited(change, what="a limited from 1.0000 to 0.5000"):
+    return Sent(0.0, None, np.zeros(2), limited=what, change=change)
+
+
+def test_changes_are_told_when_they_begin_and_summed_up_when_they_are_over():
+    limiting = Limiting(said := Said())
+    limiting.note(limited(0.1), 10.0)
+    limiting.note(limited(0.5, "b limited from 2.0000 to 1.5000"), 10.1)
+    limiting.note(Sent(0.0), 10.5)
+    limiting.note(limited(0.2), 10.9)
+    limiting.note(Sent(0.0), 11.8)
+    assert said == [("limited", "a limited from 1.0000 to 0.5000")]
+    limiting.note(Sent(0.0), 11.9)
+    assert said[1:] == [("limited_sum", "3 actions were limited, worst: b limited from 2.0000 to 1.5000")]
+    limiting.note(limited(0.2), 12.0)
+    assert said[2][0] == "limited"
+
+
+def test_rounding_at_a_limit_is_no_news():
+    limiting = Limiting(said := Said())
+    limiting.note(limited(1e-5), 10.0)
+    limiting.close()
+    assert said == []
+
+
+def test_closing_what_was_never_limited_says_nothing():
+    limiting = Limiting(said := Said())
+    limiting.close()
+    limiting.note(limited(0.2), 10.0)
+    limiting.close()
+    limiting.close()
+    assert [kind for kind, _ in said] == ["limited", "limited_sum"]
+
+
+@pytest.mark.parametrize(
+    ("sent", "simulated", "source"),
+    [
+        (Sent(0.0), False, "none"),
+        (Sent(0.0, Target(np.zeros(2), "policy", "policy"), np.zeros(2)), False, "policy"),
+        (Sent(0.0, Target(np.zeros(2), "policy", "policy"), np.zeros(2)), True, "sim"),
+        (Sent(0.0, Target(np.zeros(2), "policy", "policy"), np.zeros(2), refused=True), False, "hold"),
+        (Sent(0.0, Target(np.zeros(2), "policy", "policy"), np.zeros(2), refused=True), True, "sim"),
+        (Sent(0.0, None, np.zeros(2)), False, "hold"),
+        (Sent(0.0, None, np.zeros(2)), True, "sim"),
+        (Sent(0.0, Target(np.zeros(2), "hold", None), np.zeros(2)), True, "hold"),
+        (Sent(0.0, Target(np.zeros(2), "estop", None), np.zeros(2)), False, "estop"),
+    ],
+)
+def test_a_record_says_what_filled_its_tick(sent, simulated, source):
+    bench = Bench()
+    bench.observe()
+    report = Report(bench.page)
+    report.begin(3, 100.0)
+    report.record(bench.tick._eyes.look(), sent, simulated)
+    (record,) = bench.records()
+    assert (record.source, record.step, record.planned) == (source, 3, 100.0)
+
+
+def test_a_restarted_control_goes_on_counting():
+    bench = following(Bench())
+    bench.tick.status["missed"] = 5
+    bench.run(2)
+    assert Report(bench.page).status["missed"] == 5
+
+
+def test_what_leads_a_step_is_the_chunk_with_the_largest_part():
+    bench = following(Bench({"kind": "async", "blend_window": 5}), wave(60))
+    bench.run(2)
+    bench.chunk(2, wave(60) + 0.01, step=0)
+    leading = []
+    for _ in range(5):
+        bench.run()
+        leading.append((int(bench.status["chunk"]), int(bench.status["chunks"])))
+    assert leading == [(1, 1), (1, 2), (1, 2), (2, 2), (2, 1)]
