@@ -22,7 +22,7 @@ class StrategyParameters(Section):
     """The one set of parameters of all strategies; each module's `USES` names those that mean something to it."""
 
     execution_horizon: int | None = Field(default=None, ge=1)
-    """Rows of each chunk that may be executed, counted from its observation; all of them where it is not given."""
+    """Control steps of each chunk that may be executed, counted from its observation; all where it is not given."""
     inference_rate: float | None = Field(default=None, gt=0)
     """Requests per second [Hz]; back to back where it is not given."""
     k_max: int | None = Field(default=None, ge=0)
