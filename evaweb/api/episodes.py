@@ -8,7 +8,7 @@ from uuid import UUID
 
 from asgiref.sync import async_to_sync
 from django.http import HttpRequest
-from ninja import Field, Query, Router, Schema
+from ninja import Field, Query, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.jobs import JobOut
@@ -133,8 +133,8 @@ def episode_export(request: HttpRequest, uuid: UUID) -> Any:
 )
 def episode_export_asked(request: HttpRequest, uuid: UUID) -> Any:
     """For an episode that its station has not exported; the job says how far it is."""
-    require(request.user, Role.OPERATOR)
-    return 202, services.export_asked(episode=_found(uuid))
+    require(request.auth, Role.OPERATOR)
+    return Status(202, services.export_asked(episode=_found(uuid)))
 
 
 def _found(uuid: UUID) -> Episode:

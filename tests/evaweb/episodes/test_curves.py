@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from evaweb.episodes import poses as posing
@@ -17,6 +18,8 @@ from evaweb.frames import decode
 from evaweb.stations.geometry import looks_of
 from runtime.recording.files import RecordingError
 from runtime.recording.reader import open_episode
+from runtime.recording.tables import write_table
+from tests.runtime.recording.test_tables import old_raw
 from tests.runtime.station import STANDS, Station, column, plan
 
 
@@ -138,3 +141,67 @@ def test_a_table_of_zeros_has_no_curve_and_rows_that_are_missing_are_told(put: o
     (folder / "rows.arrow").unlink()
     with pytest.raises(RecordingError, match=r"rows\.arrow is damaged: 0 rows readable"):
         curves(folder)
+
+
+# --- chunks --------------------------------------------------------------------------------------------------
+
+
+def test_every_tick_names_the_chunk_that_owns_it_and_all_that_made_it(folder: Path) -> None:
+    frame, episode = decode(curves(folder)), open_episode(folder)
+    owners = frame.array("ticks", "chunk")
+    assert owners.tolist() == episode.ticks["chunk_id"].to_pylist()
+    offsets, ids = frame.array("ticks", "makers"), frame.array("makers", "chunk")
+    weights = frame.array("makers", "weight")
+    made = {row["step"]: row for row in episode.smoothed.to_pylist()}
+    assert len(offsets) == len(owners) + 1
+    assert offsets[-1] == len(ids) == len(weights) > 0
+    for tick, step in enumerate(episode.ticks["step"].to_pylist()):
+        part = slice(offsets[tick], offsets[tick + 1])
+        assert ids[part].tolist() == made.get(step, {"chunk_ids": []})["chunk_ids"]
+        assert np.allclose(weights[part], made.get(step, {"weights": []})["weights"])
+        assert owners[tick] in (ids[part] if len(ids[part]) else [-1])
+    assert max(np.diff(offsets)) > 1, "some steps are made of several chunks"
+
+
+def test_of_every_chunk_it_is_known_when_and_how_late_it_came(tmp_path: Path) -> None:
+    bench = Station(plan(tmp_path, delay=3))
+    bench.running(40)
+    folder = bench.stop().path
+    frame, episode = decode(curves(folder)), open_episode(folder)
+    told = {name: frame.array("chunks", name) for name in frame.header["streams"]["chunks"]["arrays"]}
+    raw = episode.raw.to_pylist()
+    assert told["id"].tolist() == sorted({row["chunk_id"] for row in raw})
+    assert frame.header["streams"]["chunks"]["json"]["strategies"] == ["async"]
+    assert frame.header["period"] == pytest.approx(1 / 30)
+    arrived = ~np.isnan(told["arrived"])
+    assert set(told["delay"][arrived].tolist()) == {3}
+    assert np.allclose((told["arrived"] - told["observed"])[arrived], 0.1)
+    assert set(told["rows"].tolist()) == {20}
+    for chunk, first, last in zip(told["id"], told["first"], told["last"], strict=True):
+        planned = [row["index"] for row in raw if row["chunk_id"] == chunk and row["target_step"] >= 0]
+        assert (first, last) == ((min(planned), max(planned)) if planned else (-1, -1))
+
+
+def test_a_chunk_that_never_arrived_and_an_older_episode_leave_unknown_what_is_unknown(put: object) -> None:
+    folder = put()  # type: ignore[operator]
+    old_raw(folder / "raw.arrow")
+    frame = decode(curves(folder))
+    told = {
+        name: frame.array("chunks", name).tolist() for name in ("id", "first", "last", "overlap", "strategy")
+    }
+    assert told == {"id": [1], "first": [1], "last": [3], "overlap": [-1], "strategy": [-1]}
+    table = pa.ipc.open_stream((folder / "raw.arrow").read_bytes()).read_all()
+    lost = table.set_column(2, "arrival_step", pa.array([-1] * 4, pa.int64()))
+    write_table(folder / "raw.arrow", lost)
+    frame = decode(curves(folder))
+    assert np.isnan(frame.array("chunks", "arrived")).all()
+    assert frame.array("chunks", "delay").tolist() == [-1]
+
+
+def test_an_episode_of_no_chunks_has_none(put: object) -> None:
+    folder = put()  # type: ignore[operator]
+    for name in ("raw", "smoothed"):
+        (folder / f"{name}.arrow").unlink()
+    frame = decode(curves(folder))
+    assert frame.array("chunks", "id").size == frame.array("makers", "chunk").size == 0
+    assert not frame.array("ticks", "makers").any()

@@ -269,3 +269,46 @@ def test_the_job_reconcile_tells_what_it_found(closed: Closed, data: Path) -> No
     jobs.work("lab")
     again.refresh_from_db()
     assert again.result["missing"] == 1
+
+
+def test_the_table_is_made_once_and_stays(closed: Closed, data: Path) -> None:
+    episode = closed()
+    (path,) = (data / "exports").rglob("*.parquet")
+    before = path.stat()
+    for _ in range(2):
+        job = services.export_asked(episode=episode)
+        jobs.work("lab")
+        job.refresh_from_db()
+        assert job.status == JobStatus.DONE, job.error
+        assert job.result == {"file": str(path.relative_to(data)), "bytes": before.st_size}
+    assert path.stat().st_mtime_ns == before.st_mtime_ns
+    path.unlink()
+    services.export_asked(episode=episode)
+    jobs.work("lab")
+    assert path.stat().st_size == before.st_size
+
+
+def sim_manifest(data: Path, episode: Episode) -> None:
+    path = data / "episodes" / str(episode.uuid) / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"mode": "sim"}))
+
+
+def test_a_run_with_a_simulated_robot_is_not_even_queued(closed: Closed, data: Path) -> None:
+    episode = closed()
+    sim_manifest(data, episode)
+    episode = services.episode_read(uuid=episode.uuid)
+    score(data, episode, True)
+    before = Job.objects.count()
+    assert services.publish_asked(episode=episode) is None
+    assert Job.objects.count() == before
+
+
+def test_a_worker_that_is_asked_all_the_same_publishes_no_simulated_robot(closed: Closed, data: Path) -> None:
+    episode = closed()
+    sim_manifest(data, episode)  # the row does not know it yet
+    score(data, episode, True)
+    job = publish(episode)
+    assert job.status == JobStatus.DONE, job.error
+    assert job.result["published"] is False
+    assert "it is a run of mode sim" in job.result["why"]
+    assert not (data / "datasets").exists()

@@ -205,3 +205,22 @@ def test_the_command_says_what_it_found(
     told = capsys.readouterr()
     assert told.out.startswith("1 episodes read, 1 of them new to the database; 0 missing on this disk")
     assert "notes is no episode" in told.err
+
+
+def test_a_table_that_is_missing_is_asked_for_and_a_damaged_episode_has_none(
+    closed: Callable[..., Episode], data: Path
+) -> None:
+    whole, broken = closed(), closed("interrupted")
+    jobs.work("lab")
+    Job.objects.all().delete()
+    tables = {path.stem: path for path in (data / "exports").rglob("*.parquet")}
+    for path in tables.values():
+        path.unlink()
+    (data / "episodes" / str(broken.uuid) / "manifest.json").write_text("{")
+    reconcile()
+    assert [job.key for job in Job.objects.all()] == [f"export:{whole.uuid}"]
+    jobs.work("lab")
+    assert tables[str(whole.uuid)].is_file()
+    Job.objects.all().delete()
+    reconcile()
+    assert not Job.objects.exists()

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from asgiref.sync import async_to_sync
 from django.contrib.auth.models import Group, User
@@ -172,12 +174,12 @@ def test_a_camera_that_the_row_does_not_name_never_reaches_the_disk(
 
 
 @pytest.mark.parametrize("identity", ["..", "%2e%2e", "not-a-uuid", "c86a888b"])
-@pytest.mark.parametrize("what", ["thumbnail", "video/cam_high", "curves", "poses"])
+@pytest.mark.parametrize("what", ["thumbnail", "video/cam_high", "curves", "poses", "export"])
 def test_an_address_without_a_uuid_does_not_exist(fetch: Fetch, identity: str, what: str) -> None:
     assert fetch(f"/episodes/{identity}/{what}")[0] == 404
 
 
-@pytest.mark.parametrize("what", ["thumbnail", "video/cam_high", "curves", "poses"])
+@pytest.mark.parametrize("what", ["thumbnail", "video/cam_high", "curves", "poses", "export"])
 def test_a_folder_that_the_database_does_not_know_is_not_shown(
     put: Callable[..., Path], fetch: Fetch, what: str
 ) -> None:
@@ -193,7 +195,9 @@ def test_a_video_that_is_not_there_is_named(closed: Callable[..., Episode], fetc
     assert "cam_high.mp4 of this episode is not on this machine" in body.decode()
 
 
-@pytest.mark.parametrize("name", ["episode-thumbnail", "episode-curves", "episode-poses", "replay"])
+@pytest.mark.parametrize(
+    "name", ["episode-thumbnail", "episode-curves", "episode-poses", "episode-table", "replay"]
+)
 def test_nobody_sees_an_episode_without_logging_in(previewed: Episode, client: Client, name: str) -> None:
     answer = client.get(reverse(name, args=[previewed.uuid]))
     assert answer.status_code == 302
@@ -325,9 +329,99 @@ def test_the_list_shows_how_each_stands_and_looks_again_while_something_goes_on(
         ({"station": "other"}, 0),
         ({"status": "finished"}, 1),
         ({"status": "failed"}, 0),
+        ({"mode": "continuous"}, 1),
+        ({"mode": "sim"}, 0),
         ({"page": "99"}, 1),
         ({"page": "x"}, 1),
     ],
 )
 def test_the_list_is_filtered(previewed: Episode, browser: Client, query: dict[str, str], count: int) -> None:
     assert browser.get("/replay/", query).content.decode().count("data-episode=") == count
+
+
+# --- the table -----------------------------------------------------------------------------------------------
+
+
+def table_file(data: Path) -> Path:
+    (path,) = (data / "exports").rglob("*.parquet")
+    return path
+
+
+def test_the_table_is_a_file_to_keep(previewed: Episode, data: Path, fetch: Fetch) -> None:
+    status, headers, body = fetch(reverse("episode-export", args=[previewed.uuid]))
+    assert (status, body) == (200, table_file(data).read_bytes())
+    assert headers["Content-Type"] == "application/vnd.apache.parquet"
+    assert headers["Content-Disposition"] == f'attachment; filename="{previewed.uuid}.parquet"'
+    assert pq.read_table(pa.BufferReader(body)).num_rows > 3 * previewed.frames
+
+
+def test_a_table_that_is_not_made_yet_is_made_on_demand(
+    previewed: Episode, data: Path, browser: Client, fetch: Fetch, user: User
+) -> None:
+    path, address = table_file(data), reverse("episode-export", args=[previewed.uuid])
+    content = path.read_bytes()
+    path.unlink()
+    status, _, body = fetch(address)
+    assert status == 404
+    assert "is not made yet: POST to this address has it made" in body.decode()
+    page = page_of(browser, previewed)
+    assert "make it" in page
+    asked = browser.post(address).content.decode()
+    assert "is being made" in asked
+    assert f'hx-get="{reverse("episode-table", args=[previewed.uuid])}"' in asked
+    assert jobs.work("lab") == 1
+    assert fetch(address)[2] == content
+    shown = browser.get(reverse("episode-table", args=[previewed.uuid])).content.decode()
+    assert f'href="{address}"' in shown
+    assert "hx-get" not in shown
+
+
+def test_who_only_looks_downloads_a_table_but_has_none_made(
+    previewed: Episode, data: Path, browser: Client, fetch: Fetch, user: User
+) -> None:
+    user.groups.clear()
+    address = reverse("episode-export", args=[previewed.uuid])
+    assert fetch(address)[0] == 200
+    before = Job.objects.count()
+    assert browser.post(address).status_code == 403
+    assert Job.objects.count() == before
+
+
+def test_a_table_that_cannot_be_made_says_why(previewed: Episode, data: Path, browser: Client) -> None:
+    table_file(data).unlink()
+    Job.objects.create(kind="export", key=f"export:{previewed.uuid}", status="failed", error="disk full")
+    page = page_of(browser, previewed)
+    assert "failed: try again" in page
+    assert "disk full" in page
+    (data / "episodes" / str(previewed.uuid) / "manifest.json").write_text("{")
+    assert "manifest.json is not a whole JSON document" in page_of(browser, previewed)
+
+
+def test_an_episode_that_is_being_written_has_no_table(station: Station, data: Path, browser: Client) -> None:
+    episode = Episode.objects.create(station=station)
+    shown = browser.get(reverse("episode-table", args=[episode.uuid])).content.decode()
+    assert "href" not in shown
+    assert "button" not in shown
+
+
+# --- modes ---------------------------------------------------------------------------------------------------
+
+
+def test_the_list_and_the_page_say_in_which_mode_it_was(previewed: Episode, browser: Client) -> None:
+    assert (previewed.mode, previewed.strategy) == ("continuous", "async")
+    Episode.objects.update(mode="sim")
+    for page in (browser.get("/replay/").content.decode(), page_of(browser, previewed)):
+        assert 'data-mode="sim">simulated robot</span>' in page
+
+
+def test_the_page_says_how_late_the_policy_was(previewed: Episode, browser: Client) -> None:
+    assert previewed.policy["answers"] > 0
+    spread = {"p50": 3.0, "p90": 4.0, "p99": 5.0, "max": 6.0}
+    figures = {"answers": 40, "mistimed": 2, "dropped": 0, "delay_steps": spread, "latency_ms": spread}
+    Episode.objects.update(policy=figures)
+    page = page_of(browser, previewed)
+    assert "3 steps" in page
+    assert "at most 6, n = 40" in page
+    assert "2 mistimed</span>" in page
+    Episode.objects.update(policy={})
+    assert "Delay" not in page_of(browser, previewed)

@@ -1,0 +1,72 @@
+"""Episodes over REST: their mode, how the policy did, and their table."""
+
+import uuid
+from pathlib import Path
+
+import pytest
+from asgiref.sync import async_to_sync
+from django.test import AsyncClient
+
+from evaweb.episodes import services
+from evaweb.episodes.models import Episode
+from evaweb.jobs import doorbell
+from evaweb.jobs.models import Job
+from evaweb.jobs.services import work
+from tests.runtime.recording.test_export import recorded
+
+
+@pytest.fixture
+def episode(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr(doorbell, "ring", lambda queue: True)
+    folder = recorded(tmp_path, station=bench.station.name, mode="step")
+    found = services.episode_closed(station=bench.station, data={"uuid": folder.name})
+    Job.objects.all().delete()
+    return found
+
+
+def download(rest, episode):
+    """The answer and all its pieces, over ASGI as daphne asks."""
+
+    async def ask():
+        address = f"/api/v1/episodes/{episode.uuid}/export"
+        answer = await AsyncClient().get(address, headers=rest._headers())
+        return answer, b"".join([piece async for piece in answer.streaming_content])
+
+    return async_to_sync(ask)()
+
+
+@pytest.mark.django_db
+def test_mode_strategy_and_figures_of_the_policy_are_told(rest, episode):
+    _, found = rest.get(f"episodes/{episode.uuid}")
+    assert (found["mode"], found["strategy"], found["policy"]) == ("step", "async", {"answers": 2})
+    assert rest.get("episodes", mode="step")[1]["total"] == 1
+    assert rest.get("episodes", mode="sim")[1]["total"] == 0
+    status, refused = rest.get("episodes", mode="fast")
+    assert status == 422
+    assert "mode = 'fast'" in refused["error"]
+
+
+@pytest.mark.django_db
+def test_a_table_is_asked_for_made_and_downloaded(rest, viewer, episode):
+    path = f"episodes/{episode.uuid}/export"
+    status, missing = rest.get(path)
+    assert status == 404
+    assert "is not made yet: POST to this address has it made" in missing["error"]
+    assert viewer.post(path)[0] == 403
+    status, job = rest.post(path)
+    assert (status, job["kind"], job["status"]) == (202, "export", "queued")
+    assert work("lab") == 1
+    answer, content = download(viewer, episode)
+    assert answer["Content-Type"] == "application/vnd.apache.parquet"
+    assert answer["Content-Disposition"].startswith("attachment")
+    assert content[:4] == content[-4:] == b"PAR1"
+
+
+@pytest.mark.django_db
+@pytest.mark.parametrize("method", ["get", "post"])
+def test_an_episode_that_is_not_known_has_no_table(rest, tmp_path, method):
+    folder: Path = recorded(tmp_path)
+    for name in (folder.name, uuid.uuid4()):
+        status, refused = getattr(rest, method)(f"episodes/{name}/export")
+        assert (status, refused["error"]) == (404, f"episode {name} does not exist")
+    assert not Episode.objects.exists()
