@@ -50,6 +50,7 @@ class StubRobot(Source, Sink):
         self.wordless = not plan.simulated
         self.deaf = 0  # control words that are lost on their way to it
         self.truth: dict[str, Any] | None = None
+        self.drives: dict[str, Any] | None = None
         self._sequence = 0
 
     def connect(self) -> None:
@@ -67,6 +68,7 @@ class StubRobot(Source, Sink):
             qpos=self.position.astype(np.float32),
             pictures=dict.fromkeys(self.cameras, self.picture(self._sequence)),
             truth=self.truth,
+            drives=self.drives,
         )
 
     def send(self, command: RobotCommand) -> None:

@@ -1,6 +1,8 @@
 import pytest
 
 from runtime.drives import Drives
+from runtime.transitions import State
+from tests.runtime.station import Station, plan
 
 GOOD = {"enabled": True, "faults": []}
 OFF = {"enabled": False, "faults": []}
@@ -46,3 +48,25 @@ def test_a_change_that_stays_is_told_although_it_came_too_soon(drives):
     assert drives.see(OFF, 1.0) == "drives disabled"
     assert drives.see(GOOD, 1.1) == ""
     assert drives.see(GOOD, 1.3) == "drives enabled"
+
+
+def test_a_robot_whose_drives_are_off_is_not_set_up_until_they_are_on(tmp_path):
+    station = Station(plan(tmp_path))
+    station.robot.drives = {"enabled": False, "faults": ["axis 2 is hot"]}
+    station.prepare()
+    assert station.state is State.IDLE
+    assert "drives are disabled (axis 2 is hot)" in station.reason
+    assert station.main.snapshot()["drives"] == station.robot.drives
+    assert station.events("drives") == ["drives disabled; drive fault: axis 2 is hot"]
+    station.robot.drives = GOOD
+    station.ready()
+    assert station.events("drives")[1:] == ["drives enabled; drive fault gone: axis 2 is hot"]
+
+
+def test_drives_that_switch_off_in_a_run_are_told_in_its_episode(tmp_path):
+    station = Station(plan(tmp_path)).running()
+    station.robot.drives = OFF
+    station.robot.blocked = True
+    station.go(30)
+    assert station.events("drives") == ["drives disabled"]
+    assert "drives disabled" in [event["text"] for event in station.stop().events]
