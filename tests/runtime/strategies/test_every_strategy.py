@@ -234,3 +234,19 @@ def test_what_a_window_costs_when_the_policy_changes_its_mind(kind, given, least
     driven = loop(kind, lambda step, _: np.full((50, 1), float(step >= 60)), [3], inference_rate=3.0, **given)
     actions = np.array([tick.action[0] for tick in driven.run(140).executed])
     assert least <= np.argmax(actions >= 0.99) - 60 <= most
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_angle_that_goes_round_and_round_never_turns_back(kind):
+    """The policy answers within half a turn either way; the commands go on, whatever the branch of an answer."""
+
+    def policy(step, _):
+        angle = 0.1 * np.arange(step, step + 40)
+        return ((angle + np.pi) % (2 * np.pi) - np.pi)[:, None]
+
+    log = loop(kind, policy, [3, 1, 5], dims=Dims(wrapping=(0,))).run(200)
+    steps = np.diff([tick.action[0] for tick in log.executed if tick.makers][JOIN_WINDOW:])
+    assert steps.min() > 0.0
+    assert steps.max() < 1.0
+    if kind != "sync":
+        np.testing.assert_allclose(steps, 0.1, atol=1e-6)
