@@ -10,11 +10,11 @@ import numpy as np
 from runtime.actuator import Actuator, RobotActuator, Sent, SimulatedActuator, TickSettings
 from runtime.alarms import Displacement, silent_sibling
 from runtime.behaviour import EStopped, Hold
-from runtime.errors import ConfigurationError
+from runtime.errors import CodecError, ConfigurationError
 from runtime.execution import Follow, Strategy, dropped, strategy
 from runtime.lane import Lane
 from runtime.locks import Locks
-from runtime.messages import LockGrippers, NodeRequest, Order, PostedChunk, Tune, decode
+from runtime.messages import LockGrippers, Message, NodeRequest, Order, PostedChunk, Tune, decode
 from runtime.page import EStop, Page
 from runtime.report import Report, Standing, StatusRecord
 from runtime.safety import SafetyFilter
@@ -62,7 +62,7 @@ class Tick:
         self._seen = self._eyes.look()
         self._report.begin(step, planned, woke)
         for payload in self._page.rings["orders"].drain():
-            self._obey(decode(payload), step, planned)
+            self._read(payload, step, planned)
         self._check_estop(planned)
         self._check_family(planned)
         self._check_displaced(planned)
@@ -118,7 +118,15 @@ class Tick:
 
     # --- orders and chunks ---------------------------------------------------------------------------------
 
-    def _obey(self, message: object, step: int, now: float) -> None:
+    def _read(self, payload: bytes, step: int, now: float) -> None:
+        try:
+            message = decode(payload)
+        except CodecError as error:  # one message that is none must not end what keeps the robot held
+            self._report.say("unreadable", str(error))
+        else:
+            self._obey(message, step, now)
+
+    def _obey(self, message: Message, step: int, now: float) -> None:
         if isinstance(message, PostedChunk):
             self._merge(message, step)
         elif isinstance(message, NodeRequest):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from runtime.messages import ChunkMerged, NodeRequest, decode, encode
+from runtime.messages import ChunkMerged, NodeRequest, Order, decode, encode
 from runtime.page import EStop
 from tests.runtime.tick_bench import PERIOD, Bench, following, wave
 
@@ -534,3 +534,14 @@ def test_the_status_says_what_was_wanted_before_safety_and_nan_where_nothing_was
     bench.say("hold")
     bench.run()
     assert np.isnan(smoothed(bench)).all()
+
+
+@pytest.mark.parametrize("payload", [b"", b"\xc1", encode(Order(1, "hold"))[:-3]])
+def test_a_message_that_is_none_is_said_and_control_goes_on(bench, payload):
+    following(bench)
+    bench.page.rings["orders"].push(payload)
+    bench.say("hold", run=1)
+    bench.run(3)
+    assert len(bench.said("unreadable")) == 1
+    assert bench.behaviour == "hold"
+    assert len(bench.sink.sent) == 4
