@@ -13,7 +13,7 @@ from evaweb.errors import StationGone
 from evaweb.stations import commands
 from evaweb.stations.models import Command, CommandStatus, Lease, Station
 from evaweb.stations.wire import NoAnswer
-from evaweb.trials.models import Trial
+from evaweb.trials.models import Checkpoint, Trial
 from tests.evaweb.api.conftest import Rest
 from tests.evaweb.trials import builders
 from tests.evaweb.trials.builders import BOOT
@@ -68,6 +68,34 @@ def test_a_trial_goes_through_set_up_and_run(rest, bench, wire):
     assert (status, answer["data"]["episode"]) == (200, str(wire.episode))
     assert Trial.objects.get().status == "running"
     assert rest.get(f"episodes/{wire.episode}")[1]["trial"] == trial.pk
+
+
+def test_a_set_up_without_a_trial_names_a_checkpoint_and_never_its_address(rest, bench, wire):
+    status, _ = command(rest, "setup", checkpoint="pi0-block", args={"task": "wave"})
+    assert status == 200
+    assert wire.heard[0].args == {
+        "task": "wave",
+        "policy": {"url": "ws://127.0.0.1:8000"},
+        "checkpoint": {"id": bench.checkpoint.pk, "name": "pi0-block"},
+    }
+    assert command(rest, "setup", checkpoint=bench.checkpoint.pk)[0] == 200
+
+
+def test_a_checkpoint_that_cannot_be_set_up_is_refused_with_the_reason(rest, bench, wire):
+    trial = bench.prepare()
+    refused = [
+        command(rest, "run", checkpoint="pi0-block"),
+        command(rest, "setup", checkpoint="pi0-block", args={"policy": {"url": "ws://127.0.0.1:1"}}),
+        command(rest, "setup", checkpoint="pi0-block", trial=trial.pk),
+        command(rest, "setup", checkpoint="nothing"),
+    ]
+    Checkpoint.objects.update(active=False)
+    refused.append(command(rest, "setup", checkpoint="pi0-block"))
+    assert [status for status, _ in refused] == [400, 400, 400, 404, 409]
+    sentences = ["run takes no checkpoint", "give one of them", "name one of them", "nothing", "switched off"]
+    for (_, answer), sentence in zip(refused, sentences, strict=True):
+        assert sentence in answer["error"]
+    assert not wire.heard
 
 
 def test_the_same_uuid_again_gets_the_first_answer(rest, bench, wire):

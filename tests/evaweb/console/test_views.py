@@ -17,6 +17,7 @@ from django.utils import timezone
 from evaweb.console import selectors
 from evaweb.episodes.models import Episode
 from evaweb.roles import Role
+from evaweb.stations.commands import KINDS
 from evaweb.stations.models import Command, Lease, LeaseRequest, Station
 from evaweb.trials.models import (
     Checkpoint,
@@ -272,6 +273,76 @@ def test_no_page_has_a_script_of_its_own_in_it(browser: Client, station: Station
         assert scripts
         assert all("src=" in script or "application/json" in script for script in scripts), address
         assert not re.search(r"\son\w+=", text_of(browser, address)), address
+
+
+# --- the Debug page ------------------------------------------------------------------------------------------
+
+BY_HAND = ("tune", "step", "commit", "cancel", "move", "gripper", "approach")
+
+
+def test_the_debug_page_gives_every_command_there_is(browser: Client, station: Station) -> None:
+    html = text_of(browser, "/stations/bench-1/debug/")
+    given = set(re.findall(r'data-command="(\w+)"', html))
+
+    assert given == set(KINDS) - {"estop"}
+
+
+@pytest.mark.parametrize("status", [None, "prepared", "running", "paused", "ended"])
+def test_nothing_on_the_eval_page_changes_what_a_trial_measures(
+    browser: Client, ada: User, station: Station, scene: Scene, checkpoint: Checkpoint, status: str | None
+) -> None:
+    if status:
+        make_trial(station, ada, status, duration_s=1.0)
+    html = text_of(browser, "/stations/bench-1/eval/")
+
+    assert not [kind for kind in BY_HAND if f'data-command="{kind}"' in html]
+    assert 'name="mode"' not in html
+
+
+@pytest.mark.parametrize("page", ["debug", "eval"])
+def test_a_key_means_one_thing_on_a_page(browser: Client, station: Station, page: str) -> None:
+    html = text_of(browser, f"/stations/bench-1/{page}/")
+    tags = re.findall(r'<(?:button|input|select)[^>]*data-key="[^"]+"[^>]*>', html)
+    meant: dict[str, set[str]] = {}
+    for tag in tags:
+        what = re.search(r'data-(?:command|lease|prepare)="?(\w*)', tag)
+        key = re.search(r'data-key="([^"]+)"', tag)
+        assert key is not None
+        meant.setdefault(key[1], set()).add(
+            what[0].split("=")[0] + what[1] if what and key[1] in "sl" else tag
+        )
+
+    assert {key: sorted(tags) for key, tags in meant.items() if len(tags) > 1 and key != "l"} == {}
+    assert not {"escape", "space", " ", "shift+s", "shift+p", "shift+escape"} & set(meant)
+
+
+def test_every_button_and_field_of_the_debug_page_has_a_key(browser: Client, station: Station) -> None:
+    html = text_of(browser, "/stations/bench-1/debug/")
+    steps = html[html.index('id="steps"') : html.index('id="scene"')]
+    tags = re.findall(
+        r"<(?:button|input|select)\b[^>]*>", re.sub(r"<template.*?</template>", "", steps, flags=re.S)
+    )
+    without = [tag for tag in tags if "data-key=" not in tag and 'id="task-choice"' not in tag]
+
+    assert len(tags) > 40
+    assert without == []
+
+
+def test_the_checkpoints_that_may_be_set_up_are_offered_by_name(
+    browser: Client, station: Station, checkpoint: Checkpoint
+) -> None:
+    Checkpoint.objects.create(name="old", active=False)
+    html = text_of(browser, "/stations/bench-1/debug/")
+
+    assert re.findall(r"<option value=\"\d+\">(\w+)</option>", html) == ["forty"]
+
+
+def test_a_bench_is_laid_out_only_where_it_is_simulated(browser: Client, station: Station) -> None:
+    assert 'id="seed"' not in text_of(browser, "/stations/bench-1/debug/")
+
+    Station.objects.update(simulated=True)
+
+    assert 'id="seed"' in text_of(browser, "/stations/bench-1/debug/")
 
 
 # --- home --------------------------------------------------------------------------------------------------

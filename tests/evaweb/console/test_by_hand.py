@@ -1,0 +1,459 @@
+"""The modules of the Debug page's own controls, run by Node."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any, get_args
+
+import pytest
+
+from runtime.messages import Mode
+from runtime.plugins import variants
+from runtime.session import COMMANDS
+from runtime.strategies.base import StrategyParameters
+from tests.evaweb.console.test_modules import NODE, run
+
+pytestmark = pytest.mark.skipif(NODE is None, reason="Node is not installed: the page's modules are not run")
+MODES = get_args(Mode)
+
+
+# --- modes -------------------------------------------------------------------------------------------------
+
+
+def test_every_mode_of_the_runtime_is_offered_with_a_line() -> None:
+    lines = run("modes.js", "return m.MODES")
+
+    assert set(lines) == set(MODES)
+    assert all(line.endswith(".") for line in lines.values())
+
+
+@pytest.mark.parametrize(
+    ("state", "mode", "chunk", "button"),
+    [
+        ("ready", "step", 0, "run"),
+        ("idle", "", 0, "run"),
+        ("running", "continuous", 0, "run"),
+        ("running", "sim", 0, "run"),
+        ("running", "step", 0, "step"),
+        ("running", "preview", 0, "step"),
+        ("running", "preview", 7, "commit"),
+        ("running", "manual", 0, "move"),
+        ("holding", "preview", 7, "resume"),
+    ],
+)
+def test_there_is_one_big_button_at_each_moment(state: str, mode: str, chunk: int, button: str) -> None:
+    proposal = {"chunk": chunk} if chunk else {}
+    given = {"state": state, "mode": mode, "proposal": proposal}
+
+    assert run("modes.js", "return m.primary(given)", given) == button
+
+
+def test_the_mode_that_is_shown_is_that_of_the_open_run_whatever_was_chosen() -> None:
+    body = "return given.map(([station, chosen]) => m.shown(station, chosen))"
+    shown = run(
+        "modes.js",
+        body,
+        [
+            [{"open": True, "mode": "sim", "offered": MODES}, "manual"],
+            [{"open": False, "mode": "sim", "offered": MODES}, "manual"],
+            [{"open": False, "mode": "sim", "offered": MODES}, ""],
+            [{"open": False, "mode": "sim", "offered": ["step"]}, "manual"],
+            [{"open": False}, ""],
+        ],
+    )
+
+    assert shown == ["sim", "manual", "sim", "step", "continuous"]
+
+
+def test_what_the_run_does_is_said_in_words() -> None:
+    body = "return given.map((snapshot) => m.phase(snapshot))"
+    said = run(
+        "modes.js",
+        body,
+        [
+            {"state": "running", "phase": "executing", "control": {"remaining": 45}, "rate": 30},
+            {"state": "running", "phase": "asking"},
+            {"state": "running", "phase": "something_new"},
+            {"state": "ready", "phase": "executing"},
+            {"state": "running", "phase": ""},
+        ],
+    )
+
+    assert said == ["executing, 1.5 s planned", "asking the policy", "something new", "", ""]
+
+
+def test_a_proposed_chunk_is_described_with_how_far_it_begins() -> None:
+    proposal = {"chunk": 4, "rows": 50, "distance": 0.312, "joint": "left_arm.joint1", "age_s": 3.2}
+
+    assert run("modes.js", "return [m.proposed(given), m.proposed({}), m.proposed(null)]", proposal) == [
+        "Chunk 4: 50 steps, begins 0.31 rad away (left_arm.joint1), shown for 3 s.",
+        "",
+        "",
+    ]
+
+
+# --- reasons -----------------------------------------------------------------------------------------------
+
+
+def refusals(kind: str, *stores: dict[str, Any]) -> list[str]:
+    """What the page says to `kind` in each of these situations."""
+    found: list[str] = run(
+        "reasons.js", f"return given.map((store) => m.refusal({kind!r}, store))", list(stores)
+    )
+    return found
+
+
+def store(**more: Any) -> dict[str, Any]:
+    """A page that commands; `more` is of the snapshot or of the page."""
+    page = {"fresh": True, "role": "operator", "lease": "mine"}
+    page |= {key: more.pop(key) for key in tuple(more) if key in page}
+    return {**page, "snapshot": {"state": "running", "mode": "continuous", "allowed": [], **more}}
+
+
+def test_a_stop_needs_no_news_and_everything_else_does() -> None:
+    old, others = store(fresh=False), store(fresh=False, lease="other")
+
+    assert refusals("stop", old) == refusals("halt", old) == [""]
+    assert refusals("run", old) == ["nothing is known of the station at the moment"]
+    assert refusals("stop", others) == ["nothing is known of the station at the moment"]
+
+
+def test_who_does_not_command_is_told_how_to() -> None:
+    said = refusals(
+        "run", *(store(lease=lease) for lease in ("free", "elsewhere", "other")), store(role="viewer")
+    )
+
+    assert said == [
+        "take the station first",
+        "another page of yours commands the station; take it here first",
+        "somebody else commands the station; ask for it",
+        "a viewer watches; an administrator can make you an operator",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "situation", "reason"),
+    [
+        ("step", {"mode": "continuous"}, "this is for step and preview; the run's mode is continuous"),
+        ("step", {"mode": "step", "phase": "asking"}, "the policy is being asked"),
+        ("step", {"mode": "step", "phase": "executing"}, "the last chunk is still being executed"),
+        ("step", {"mode": "preview", "phase": "proposed"}, "a chunk is shown: commit or cancel it first"),
+        ("step", {"state": "ready"}, "run in the mode step or preview first"),
+        ("commit", {"mode": "preview"}, "no chunk is shown: show one first"),
+        ("commit", {"mode": "step"}, "this is for preview; the run's mode is step"),
+        ("move", {"state": "holding"}, "the robot holds: resume or stop first"),
+        ("move", {"state": "idle"}, "run in the mode manual first"),
+        ("approach", {"state": "ready"}, "the policy's first action is not known: set up again"),
+        ("tune", {"state": "running"}, "a trial is being run: what is measured may not be changed"),
+        ("gripper", {"state": "ready"}, "a trial is being run: what is measured may not be changed"),
+        ("home", {"allowed": ["stop", "estop"]}, "not while running; possible now: Stop"),
+    ],
+)
+def test_a_button_that_is_dead_says_why(kind: str, situation: dict[str, Any], reason: str) -> None:
+    assert refusals(kind, store(**situation)) == [reason]
+
+
+def test_every_command_has_a_reason_wherever_the_station_does_not_allow_it() -> None:
+    states = ("disconnected", "idle", "setting_up", "ready", "running", "holding", "faulted")
+    situations = [store(state=state, mode=mode) for state, mode in product(states, (*MODES, None))]
+
+    body = (
+        "return given[0].flatMap((kind) => given[1].filter((one) => !m.refusal(kind, one)).map(() => kind))"
+    )
+
+    assert run("reasons.js", body, [list(COMMANDS), situations]) == []
+
+
+# --- strategy ----------------------------------------------------------------------------------------------
+
+
+def test_the_parameters_shown_are_those_that_strategies_use() -> None:
+    used = set().union(*(module.USES for module in variants("runtime.strategies").values()))
+    shown = run("tuning.js", "return Object.keys(m.PARAMETERS)")
+
+    assert used <= set(shown) <= set(StrategyParameters.model_fields)
+
+
+def test_a_field_left_alone_stands_for_what_is_in_force() -> None:
+    section = StrategyParameters().model_dump() | {"kind": "async"}
+    body = """
+    const fields = Object.fromEntries(Object.keys(m.PARAMETERS).map((name) => [name, m.text(name, given[name])]));
+    return m.changes(given.kind, fields, given, Object.keys(m.PARAMETERS));
+    """
+
+    assert run("tuning.js", body, section) == {"changes": {}, "error": ""}
+    assert run("tuning.js", body, section | {"blend_window": "all", "k_max": 3}) == {
+        "changes": {},
+        "error": "",
+    }
+
+
+def test_only_what_was_edited_is_sent_and_an_empty_field_means_none() -> None:
+    body = """
+    const uses = ["execution_horizon", "blend_window", "k_max"];
+    return m.changes("naive", { execution_horizon: "16", blend_window: "", k_max: "3" }, given, uses);
+    """
+    in_force = {"kind": "async", "execution_horizon": None, "blend_window": 8, "k_max": 3}
+
+    assert run("tuning.js", body, in_force)["changes"] == {
+        "kind": "naive",
+        "execution_horizon": 16,
+        "blend_window": "all",
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "typed", "sentence"),
+    [
+        ("blend_window", "0", "Blend over: a whole number from 1, or empty for all; given 0"),
+        ("k_max", "1.5", "k max: a whole number from 0, or empty for no bound; given 1.5"),
+        ("ensemble_m", "", "Ensemble m: a number is needed"),
+        ("delay_quantile", "2", "Delay quantile: a number from 0.01 to 1; given 2"),
+        ("inference_rate", "fast", "Ask at: a number from 0.1, or empty for back to back; given fast"),
+    ],
+)
+def test_what_cannot_be_is_said_before_it_is_sent(name: str, typed: str, sentence: str) -> None:
+    body = "return m.changes('async', { [given[0]]: given[1] }, { kind: 'async' }, [given[0]])"
+
+    assert run("tuning.js", body, [name, typed]) == {"changes": {}, "error": sentence}
+
+
+def test_the_cost_of_a_window_is_said_in_time() -> None:
+    cost = run("tuning.js", "return m.cost('async', { blend_window: 15 }, 30)")
+
+    assert "15 steps = 500 ms" in cost
+
+
+def test_every_strategy_has_its_cost() -> None:
+    kinds = list(variants("runtime.strategies"))
+    given = [kinds, StrategyParameters().model_dump()]
+    costs = run("tuning.js", "return given[0].map((kind) => m.cost(kind, given[1], 30))", given)
+
+    assert all(cost.endswith(".") for cost in costs)
+    assert not any("undefined" in cost or "NaN" in cost for cost in costs)
+
+
+# --- targets -----------------------------------------------------------------------------------------------
+
+FACTS = {
+    "joint_names": ["left_arm.joint0", "left_arm.joint6", "right_arm.joint0", "lift"],
+    "lower": [-2.6, 0.0, -2.6, None],
+    "upper": [2.6, 0.1, 2.6, None],
+    "gripper_dims": [1],
+}
+
+
+def test_joints_come_in_the_robots_groups_with_their_limits() -> None:
+    groups = run("targets.js", "return m.groups(given)", FACTS)
+
+    assert [group["name"] for group in groups] == ["left_arm", "right_arm", "joints"]
+    assert groups[0]["joints"][1] == {
+        "index": 1,
+        "name": "joint6",
+        "full": "left_arm.joint6",
+        "gripper": True,
+        "lower": 0.0,
+        "upper": 0.1,
+    }
+    assert groups[2]["joints"][0]["lower"] == pytest.approx(-6.283, abs=0.001)  # turns without an end
+
+
+def test_a_value_beyond_a_limit_is_clipped_and_said() -> None:
+    body = "const [joint] = m.groups(given)[0].joints; return [m.within(joint, 9), m.within(joint, 1)]"
+
+    assert run("targets.js", body, FACTS) == [
+        {"value": 2.6, "said": "left_arm.joint0 ends at 2.600"},
+        {"value": 1, "said": ""},
+    ]
+
+
+def test_arrow_keys_go_by_round_steps() -> None:
+    body = "return given.map(([lower, upper]) => m.stepOf({ lower, upper }))"
+
+    steps = run("targets.js", body, [[-2.618, 2.618], [0, 0.1], [-6.28, 6.28]])
+
+    assert steps == pytest.approx([0.01, 0.0001, 0.01])
+
+
+def test_the_target_begins_where_the_robot_is_told_to_be_else_where_it_is() -> None:
+    joints = {"measured": [1, 2], "commanded": [1.1, 2.1]}
+    body = "return [m.start({ ...given, engaged: true }), m.start({ ...given, engaged: false }), m.start()]"
+
+    assert run("targets.js", body, joints) == [[1.1, 2.1], [1, 2], None]
+
+
+def test_the_verdict_on_a_target_says_distance_time_and_what_is_wrong() -> None:
+    answers = [
+        {"ok": True, "distance": 0.5, "duration_s": 1.0, "reached": True, "clipped": []},
+        {"ok": True, "distance": 0.5, "duration_s": 1.0, "clipped": ["left_arm.joint1"]},
+        {
+            "ok": True,
+            "reached": False,
+            "position_error_mm": 31.4,
+            "rotation_error_deg": 2.06,
+            "distance": 1.0,
+            "duration_s": 2.0,
+        },
+        {"ok": True, "distance": 0.0004, "duration_s": 0.0},
+        {"ok": False, "reason": "no pose is called nest"},
+    ]
+
+    assert run("targets.js", "return given.map((answer) => m.verdict(answer, 0.25).text)", answers) == [
+        "0.50 rad from the robot, 4.0 s.",
+        "0.50 rad from the robot, 4.0 s. Limited: left_arm.joint1.",
+        "Out of reach: the nearest is 31 mm and 2.1° off.",
+        "The robot is there, within 0.005 rad.",
+        "no pose is called nest",
+    ]
+
+
+def test_a_step_of_the_hand_is_in_metres_and_radians() -> None:
+    asked = {
+        "arm": "left_arm",
+        "frame": "tool",
+        "axis": "y",
+        "sign": -1,
+        "turned": False,
+        "mm": 20,
+        "degrees": 90,
+    }
+    step = run("targets.js", "return m.jog(given)", asked)
+    turn = run("targets.js", "return m.jog(given)", asked | {"turned": True})
+
+    assert step == {"arm": "left_arm", "frame": "tool", "translation": [0, -0.02, 0]}
+    assert turn["rotation"] == pytest.approx([0, -1.5708, 0], abs=1e-4)
+
+
+def test_the_hand_is_said_in_millimetres() -> None:
+    poses = [0.1, -0.2, 0.3, 1, 0, 0, 0, 0.05, 0.4, 0.5, 0.6, 1, 0, 0, 0, 0.0]
+
+    assert run("targets.js", "return [m.handAt(given, 1), m.handAt(given, 2), m.handAt(null, 0)]", poses) == [
+        "x 400  y 500  z 600 mm",
+        "",
+        "",
+    ]
+
+
+AIM = """
+const told = [], sent = [];
+globalThis.document = { dispatchEvent: ({ detail }) => told.push(detail && detail.id) };
+globalThis.CustomEvent = class { constructor(name, { detail }) { Object.assign(this, { name, detail }); } };
+const aim = new m.Aim((message) => { sent.push(message); return given.open; });
+"""
+
+
+def test_a_slider_that_runs_asks_the_newest_place_alone() -> None:
+    body = """
+    const heard = [];
+    for (const x of [1, 2, 3, 4]) aim.follow({ joints: [x] }, (answer) => heard.push(answer.id));
+    aim.answered({ id: 1, ok: true });
+    await new Promise((resolve) => setTimeout(resolve, 120));
+    aim.answered({ id: 2, ok: true });
+    await new Promise((resolve) => setTimeout(resolve, 0));
+    aim.clear();
+    return { sent: sent.map(({ id, args }) => [id, args.joints[0]]), heard, told };
+    """
+    found = run("aim.js", AIM + body, {"open": True})
+
+    assert found["sent"] == [[1, 1], [2, 4]]
+    assert found["told"] == [1, 2, None]
+    assert found["heard"] == [1, 2]
+
+
+def test_an_answer_that_comes_after_the_target_was_dropped_shows_no_ghost() -> None:
+    body = """
+    const asked = aim.ask({ pose: "home" });
+    aim.clear();
+    aim.answered({ id: 1, ok: true });
+    aim.answered({ id: 9, ok: true });
+    return { told, ok: (await asked).ok };
+    """
+
+    assert run("aim.js", AIM + body, {"open": True}) == {"told": [None], "ok": True}
+
+
+def test_without_a_connection_a_target_has_no_answer_but_a_sentence() -> None:
+    body = "const { ok, reason } = await aim.ask({ pose: 'home' }); return { ok, reason }"
+
+    assert run("aim.js", AIM + body, {"open": False}) == {"ok": False, "reason": "no connection to the lab"}
+
+
+# --- set-up, robot, keys -----------------------------------------------------------------------------------
+
+
+def test_stages_are_shown_while_they_go_on_and_after_one_failed() -> None:
+    failed = [{"name": "connect", "state": "failed", "seconds": 5.0}]
+    done = [{"name": "connect", "state": "done", "seconds": 0.2}]
+    snapshots = [
+        {"state": "setting_up", "stages": done},
+        {"state": "idle", "stages": failed},
+        {"state": "idle", "stages": done},
+        {"state": "ready", "stages": done},
+        {"state": "idle"},
+    ]
+
+    assert run("setup.js", "return given.map((snapshot) => m.unfinished(snapshot))", snapshots) == [
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]
+
+
+def test_a_stage_says_how_long_it_took() -> None:
+    stages = [
+        {"state": "done", "seconds": 0.24},
+        {"state": "active", "seconds": 75.0},
+        {"state": "waiting", "seconds": 0.0},
+        {"state": "skipped", "seconds": 0.0},
+    ]
+
+    assert run("setup.js", "return given.map((stage) => m.spent(stage))", stages) == ["0.2 s", "1:15", "", ""]
+
+
+def test_drives_and_grippers_say_what_is_the_matter() -> None:
+    drives = [{}, {"enabled": True, "faults": []}, {"enabled": False, "faults": []}]
+    drives.append({"enabled": False, "faults": ["overheated"]})
+    words = run("robot_panel.js", "return given.map((drives) => m.driveWords(drives))", drives)
+    grippers = [{"locked": True, "at": 0.05}, {"locked": False, "at": 0.1}, {"locked": False, "at": None}]
+
+    assert [one["weight"] for one in words] == ["", "good", "warn", "bad"]
+    assert words[3]["text"] == "Fault: overheated"
+    assert run("robot_panel.js", "return given.map((one) => m.gripperWords(one))", grippers) == [
+        "locked at 0.050",
+        "at 0.100",
+        "not known",
+    ]
+
+
+def test_a_key_with_shift_is_its_own_and_else_the_key_without() -> None:
+    pressed = [
+        {"key": "s"},
+        {"key": "S", "shiftKey": True},
+        {"key": "S"},
+        {"key": "ArrowLeft", "shiftKey": True},
+        {"key": "?", "shiftKey": True},
+        {"key": "Enter", "ctrlKey": True, "shiftKey": True},
+    ]
+
+    assert run("keys.js", "return given.map((event) => m.namesOf(event))", pressed) == [
+        ["s"],
+        ["shift+s", "s"],
+        ["s"],
+        ["shift+arrowleft", "arrowleft"],
+        ["?"],
+        ["ctrl+enter"],
+    ]
+
+
+def test_keys_are_written_as_they_stand_on_a_keyboard() -> None:
+    keys = ["s", "shift+i", "shift+pageup", "ctrl+enter", ","]
+
+    assert run("keys.js", "return given.map((key) => m.label(key))", keys) == [
+        "S",
+        "⇧I",
+        "⇧PgUp",
+        "Ctrl + Enter",
+        ",",
+    ]
