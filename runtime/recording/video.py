@@ -22,8 +22,10 @@ from runtime.recording.settings import RecordingSettings
 from runtime.types import UInt8
 
 GOP_SECONDS = 0.5
-FRAGMENT_SECONDS = 0.2  # what a kill can take, besides the encoder's look-ahead
-LOOKAHEAD_SECONDS = 0.1  # a few frames keep x264's macroblock tree; more would only wait in memory
+FRAGMENT_SECONDS = 0.2  # what a kill can take
+# Every frame goes to the muxer at once. x264's look-ahead would halve the size of still scenes, and keep each frame
+# for as many periods; without force-cfr it keeps one more to learn its duration.
+_AT_ONCE = "scenecut=0:bframes=0:open-gop=0:rc-lookahead=0:mbtree=0:force-cfr=1"
 _FRAGMENTS = "frag_keyframe+empty_moov+default_base_moof"
 
 
@@ -67,7 +69,7 @@ class FragmentedVideo:
         self._store()
 
     def close(self) -> None:
-        """Encode what is still in the encoder's look-ahead and end the file; the descriptor stays open."""
+        """End the file; the descriptor stays open."""
         self._mux(self._stream.encode(None))
         self._container.close()
         self._store()
@@ -79,7 +81,6 @@ class FragmentedVideo:
 
     def _open_stream(self, size: tuple[int, int], settings: RecordingSettings) -> Any:
         gop = max(1, min(settings.gop, int(GOP_SECONDS * self._rate)))
-        lookahead = round(LOOKAHEAD_SECONDS * self._rate)
         stream: Any = self._container.add_stream(settings.codec, rate=self._rate)
         stream.height, stream.width = size
         stream.pix_fmt = "yuv420p"
@@ -87,7 +88,7 @@ class FragmentedVideo:
         context.time_base = 1 / self._rate
         context.thread_count = 1
         context.colorspace, context.color_range = Colorspace.ITU601, ColorRange.MPEG
-        groups = f"keyint={gop}:min-keyint=1:scenecut=0:bframes=0:open-gop=0:rc-lookahead={lookahead}"
+        groups = f"keyint={gop}:min-keyint=1:{_AT_ONCE}"
         context.options = {"preset": settings.preset, "crf": str(settings.crf), "x264-params": groups}
         return stream
 

@@ -220,3 +220,14 @@ def test_pictures_whose_capture_is_unknown_give_no_such_figure(tmp_path: Path) -
     assert encoder.drain(time.monotonic() + 30.0)
     assert encoder.muxed_ms is None
     encoder.file.close()
+
+
+def test_each_frame_goes_to_the_muxer_at_once(tmp_path: Path) -> None:
+    file = AppendFile(tmp_path / "a.mp4")
+    video = FragmentedVideo(file, SIZE, 30.0, SETTINGS)
+    for k in range(20):
+        video.encode(numbered(k))
+        assert len(video.muxed) == k + 1
+    video.close()
+    file.close()
+    assert len(video.muxed) == 20
