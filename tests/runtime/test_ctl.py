@@ -219,7 +219,8 @@ def test_every_outcome_can_be_had_as_json(run, capsys):
     assert json.loads(capsys.readouterr().out)["state"] == "ready"
     run(Script([running(), running(), status()]), "run", "--json")
     assert json.loads(capsys.readouterr().out)["state"] == "ready"
-    run(Script([running(step=1), running("waiting", 9)], events=[event(1)]), "step", "--wait", "--json")
+    steps = [running(step=1), *[running("waiting", step, newest_event=1) for step in (1, 9)]]
+    run(Script(steps, events=[event(1)]), "step", "--wait", "--json")
     assert json.loads(capsys.readouterr().out)["phase"] == "waiting"
 
 
