@@ -42,6 +42,7 @@ log = logging.getLogger(__name__)
 _REPORT_PERIOD = 0.2
 _RATE_WINDOW = 40  # arrivals per stream
 _LAST_S = 8.0  # for the last episode, before the supervisor's patience ends
+_EXPORT_S = 3.0  # of it, for the exports that are under way; the worker, or a person, makes up for them
 _CLOSING_S = 1.0  # how long a new episode waits for the one before it; longer is a disk in trouble
 
 
@@ -327,7 +328,7 @@ def main() -> None:
         media.end("interrupted", "the station's supervisor ended")
         ended = clock.now()
         media.finish(_LAST_S)
-        exports.finish(_LAST_S - (clock.now() - ended))
+        exports.finish(min(_EXPORT_S, _LAST_S - (clock.now() - ended)))
         source.close()
 
 

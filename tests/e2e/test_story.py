@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 
 import pytest
 
@@ -119,6 +120,31 @@ def test_the_episode_plays_back_on_one_clock(trial, operator):
     assert share(before, white) > 0.003
     assert moved(before, pixels(scene)) > 0.002
     assert page.locator("canvas").count() >= 2
+
+
+def test_the_playback_says_whose_step_it_is_and_gives_the_streams_away(trial, operator):
+    page = operator.open(f"/replay/{trial['trial']['episode']}/").page
+    over = page.locator("#curves .u-over")
+    over.wait_for()
+    told = page.locator("#chunk")
+    box = over.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    eventually(lambda: "delay" in told.inner_text(), 30, "the chunk under the pointer is told")
+    found = re.search(
+        r"chunk (\d+) · (\w+)delay \d+ steps? \(\d+ ms\)rows \d+ to \d+ of \d+", told.inner_text()
+    )
+    assert found, told.inner_text()
+    assert found[2] in ("async", "sync", "ensemble", "naive", "rtc")
+    for _ in range(3):
+        page.keyboard.press("ArrowRight")  # the pointer wins over the clock while it is there
+    assert f"chunk {found[1]} " in told.inner_text()
+    assert {"chunk", "overlap"} <= set(page.locator("#legend .legend-mark").all_inner_texts())
+    table = page.locator("#table a")
+    table.wait_for()
+    answer = page.request.get(f"{operator.demo.url}{table.get_attribute('href')}")
+    assert answer.body()[:4] == answer.body()[-4:] == b"PAR1"
+    assert operator.errors == []
 
 
 def test_space_on_a_page_that_is_not_a_stations_stops_no_robot(trial, operator):
