@@ -36,6 +36,10 @@ class Stage(StrEnum):
     APPROACH = "approaching the policy's first action"
 
 
+class DrivesDisabledError(SetupError):
+    """The robot can be seen, and cannot move."""
+
+
 class SetUp:
     """A set-up in progress; `pump` advances it and is cheap."""
 
@@ -155,7 +159,7 @@ class SetUp:
         drives = self._media().drives
         if self._plan.capabilities.moves_robot and drives.get("enabled") is False:
             faults = ", ".join(map(str, drives.get("faults", ()))) or "no fault named"
-            raise SetupError(f"the robot says that its drives are disabled ({faults}): enable them")
+            raise DrivesDisabledError(f"the robot says that its drives are disabled ({faults}): enable them")
 
     def _waited(self) -> float:
         return self._clock.now() - self._since
@@ -164,14 +168,14 @@ class SetUp:
         settings = self._plan.deployment.setup
         try:
             self._require_family()
-            self._check_drives()
             self._inference.asking.observe()
+            self._check_drives()
         except (PolicyError, SetupError) as error:
-            if self._waited() > settings.observation_timeout_s:
-                raise SetupError(
-                    f"no complete observation within {settings.observation_timeout_s:g} s: {error}"
-                ) from None
-            return False
+            if self._waited() <= settings.observation_timeout_s:
+                return False
+            waited = f"within {settings.observation_timeout_s:g} s: {error}"
+            missing = "ready drives" if isinstance(error, DrivesDisabledError) else "complete observation"
+            raise SetupError(f"no {missing} {waited}") from None
         if settings.home and self._plan.capabilities.moves_robot:
             self._go_home()
         else:
