@@ -29,6 +29,7 @@ from runtime.messages import (
 from runtime.operations import Operations, Parts
 from runtime.orders import Orders
 from runtime.page import Page
+from runtime.punctuality import Punctuality
 from runtime.run import Provenance, Run
 from runtime.runner import Runner
 from runtime.runs import Runs
@@ -67,6 +68,10 @@ class Director:
         )
         self.setup = SetUp(plan, self.inference, self._orders, page, clock, lambda: self.media_report)
         self._watch = Watch(plan, page, self.lease, clock)
+        control = settings.control
+        self._punctuality = Punctuality(
+            page, plan.rate, control.realtime_priority, control.realtime == "auto"
+        )
         provenance = Provenance(plan, self.boot)
         self.runs = Runs(
             plan,
@@ -106,6 +111,8 @@ class Director:
                 self._hear(decode(payload))
         for noticed in self._watch.notice(self.session.state, self.runs.open):
             self._observe(noticed.happening, noticed.reason)
+        for event in self._punctuality.look(self.clock.now()):
+            self.say(event)
         self._advance_setup()
         self._advance_inference()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import resource
 import struct
 
 _PR_SET_TIMERSLACK = 29
@@ -16,7 +17,8 @@ _SLICE_NS = 100_000
 def enter(priority: int) -> str:
     """Make this process as punctual as permitted; returns what it got, for the status.
 
-    SCHED_FIFO where permitted; else a scheduler slice of 0.1 ms (recent kernels); else the ordinary class.
+    SCHED_FIFO at `priority`, or at the highest that the user's rtprio limit permits; else a scheduler slice of
+    0.1 ms (Linux 6.12 and later); else the ordinary class. "unlocked": its memory may be paged out.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
@@ -24,18 +26,42 @@ def enter(priority: int) -> str:
     gc.collect()
     gc.freeze()
     gc.disable()
-    suffix = "" if locked else " unlocked"
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except (PermissionError, OSError):
-        return ("slice 0.1 ms" if _short_slice(libc) else "ordinary") + suffix
-    return f"FIFO {priority}" + suffix
+    got = _fifo(priority) or ("slice 0.1 ms" if _short_slice(libc) else "ordinary")
+    return got if locked else f"{got} unlocked"
+
+
+def advice(scheduling: str, priority: int) -> str:
+    """How a station whose control got `scheduling` is made punctual, in one sentence; "" where it is."""
+    if scheduling.startswith("FIFO"):
+        return ""
+    return (
+        f"control runs in the class {scheduling!r}: SCHED_FIFO is not permitted, so that ticks can be milliseconds "
+        f"late on a busy machine; give the station's user an rtprio limit of {priority} (LimitRTPRIO={priority} "
+        "where systemd starts it), then start the station anew: docs/administrator.md, Real time"
+    )
+
+
+def _fifo(priority: int) -> str:
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    for wanted in (priority, min(priority, limit)):
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(wanted))
+        except OSError:  # not permitted, or no priority of this kernel: what is next best is asked for
+            continue
+        return f"FIFO {wanted}"
+    return ""
 
 
 def _short_slice(libc: ctypes.CDLL) -> bool:
+    """A slice of its own (sched_setattr(2)): who asks for less at a time is let in sooner by EEVDF."""
     number = _SYS_SCHED_SETATTR.get(os.uname().machine)
     if number is None:
         return False
     # struct sched_attr: size, policy, flags, nice, priority, runtime (the slice), deadline, period
-    attributes = struct.pack("@IIQiIQQQ", 48, os.SCHED_OTHER, 0, 0, 0, _SLICE_NS, 0, 0)
-    return int(libc.syscall(number, 0, attributes, 0)) == 0
+    nice = os.getpriority(os.PRIO_PROCESS, 0)
+    attributes = struct.pack("@IIQiIQQQ", 48, os.SCHED_OTHER, 0, nice, 0, _SLICE_NS, 0, 0)
+    if int(libc.syscall(number, 0, attributes, 0)) != 0:
+        return False
+    taken = ctypes.create_string_buffer(48)
+    read = int(libc.syscall(number + 1, 0, taken, 48, 0))
+    return read == 0 and struct.unpack("@IIQiIQQQ", taken.raw)[5] == _SLICE_NS

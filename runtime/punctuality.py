@@ -1,0 +1,52 @@
+"""Says when control cannot be punctual here, or is not; once each, never once per tick."""
+
+from __future__ import annotations
+
+from runtime import realtime
+from runtime.messages import Event
+from runtime.page import Page
+
+_LATE_S, _PUNCTUAL_S = 1e-3, 0.5e-3  # p99: from here on it is told, below the other it is over
+_MEASURED_S = 2.0  # of ticks before they are judged
+_LOOK_S = 1.0
+
+
+class Punctuality:
+    """Looks at control's own figures once a second; `asked`: control asks for the real-time class."""
+
+    def __init__(self, page: Page, rate: float, priority: int, asked: bool) -> None:
+        self._page = page
+        self._rate = rate
+        self._priority = priority
+        self._asked = asked
+        self._next = 0.0
+        self._class = ""  # that was told of
+        self._late = False
+
+    def look(self, now: float) -> list[Event]:
+        """What is news; nothing before control has ticked for a while."""
+        if now < self._next:
+            return []
+        self._next = now + _LOOK_S
+        status = self._page.control.read()
+        scheduling = bytes(status["scheduling"]).decode()
+        if not scheduling or int(status["ticks"]) < _MEASURED_S * self._rate:
+            return []
+        told = [*self._judge_class(scheduling), *self._judge(float(status["lateness_p99"]))]
+        return [Event(kind, text, now) for kind, text in told]
+
+    def _judge_class(self, scheduling: str) -> list[tuple[str, str]]:
+        if scheduling == self._class:
+            return []
+        self._class = scheduling
+        advice = realtime.advice(scheduling, self._priority) if self._asked else ""
+        return [("scheduling", advice)] if advice else []
+
+    def _judge(self, p99: float) -> list[tuple[str, str]]:
+        if not self._late and p99 > _LATE_S:
+            self._late = True
+            return [("late_ticks", f"one tick in a hundred begins more than {p99 * 1000:.1f} ms late")]
+        if self._late and p99 < _PUNCTUAL_S:
+            self._late = False
+            return [("punctual", f"ticks are on time again: 99 of 100 within {p99 * 1000:.2f} ms")]
+        return []
