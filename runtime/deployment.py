@@ -52,12 +52,12 @@ def assigned(
 ) -> Resolved:
     """The deployment in `tree`, which is changed, with `key=value` assignments on top, as in `load`."""
     parsed = [(*_assignment(text), f"--set {text}") for text in assignments]
-    for key, value, source in sorted(parsed, key=lambda one: one[0][-1] != "kind"):
-        _put(tree, key, value, source)
+    for key, value, option in sorted(parsed, key=lambda one: one[0][-1] != "kind"):
+        _put(tree, key, value, option)
         origin = {known: where for known, where in origin.items() if known[: len(key)] != key}
         for depth in range(1, len(key)):
-            origin.setdefault(key[:depth], source)
-        origin[key] = source
+            origin.setdefault(key[:depth], option)
+        origin[key] = option
     return resolve(tree, origin, source)
 
 
