@@ -280,7 +280,10 @@ def test_an_unknown_table_is_an_unknown_key(small):
         ("policy.kind=mok", "policy.kind = 'mok': must be one of 'mock', 'openpi', 'replay'"),
         ("policy.kind=5", "policy.kind = 5: must be one of 'mock', 'openpi', 'replay'"),
         ("policy={horizon=3}", "policy.kind is missing: must be one of 'mock', 'openpi', 'replay'"),
-        ("strategy={kind=['sync']}", "strategy.kind = ['sync']: must be one of 'async', 'sync'"),
+        (
+            "strategy={kind=['sync']}",
+            "strategy.kind = ['sync']: must be one of 'ensemble', 'naive', 'async', 'rtc', 'sync'",
+        ),
         ("safety.workspace=3", "safety.workspace = 3: must be a table"),
         ("policy.horizon=x", "policy.horizon = 'x': Input should be a valid integer"),
     ],
