@@ -30,6 +30,9 @@ class ByHand:
         self._runs = runs
         self._targets = Targets(plan, spaces, plan.kinematics())
         self.grippers = Grippers(plan)
+        status = page.control.read()
+        if bytes(status["behaviour"]):  # a predecessor that died may have locked some
+            self.grippers.locks = np.array(status["locked"], np.float64)
 
     def require_robot(self, what: str) -> None:
         """Refuse where the transport moves no robot."""

@@ -43,7 +43,7 @@ from runtime.watch import Watch
 
 log = logging.getLogger(__name__)
 # Control's own reasons to hold, as events of these kinds.
-_HOLDS = ("refusals", "starvation", "unmeasured", "family", "orphaned")
+_HOLDS = ("refusals", "starvation", "unmeasured", "family", "orphaned", "too_far")
 
 
 class Director:
@@ -154,6 +154,13 @@ class Director:
         elif isinstance(message, MediaReport):
             self.media_report = message
 
+    def _unlock(self) -> None:
+        """A restarted control knows of no locks, one that was not may have some: none, in either case."""
+        try:
+            self.by_hand.unlock()
+        except RuntimeFault as error:
+            log.error("grippers may still be locked: %s", error)
+
     def _hear_event(self, event: Event) -> None:
         self._log(event)  # control and media write their own events into the episode
         self.setup.heard(event)
@@ -192,7 +199,7 @@ class Director:
         if happening is Happening.FAMILY_DIED:
             self.say(Event("family_died", reason, self.clock.now()))
             self.runs.lost()
-            self.by_hand.grippers.forget()  # a restarted control knows of no locks
+            self._unlock()
         before = self.session.state
         if self.session.observe(happening, reason):
             text = f"{before} -> {self.session.state}: {reason}"

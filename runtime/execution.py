@@ -47,10 +47,14 @@ def strategy(section: Mapping[str, Any], dims: Dims) -> Strategy:
 
 
 class Joined(NamedTuple):
-    """What became of a chunk; `far` says how far from where the robot stood it began, "" where it is near."""
+    """What became of a chunk; `far` says how far from where the robot stood it began, "" where it is near.
+
+    `too_far`: it was not used for that.
+    """
 
     merged: ChunkMerged
     far: str = ""
+    too_far: bool = False
 
 
 class Follow(Behaviour):
@@ -92,7 +96,12 @@ class Follow(Behaviour):
             shape = f"it has the shape {list(rows.shape)}; expected [H, {dim}], H from 1 on"
             return Joined(dropped(chunk, step, shape))
         arrival = Arrival(chunk.chunk_id, chunk.observation_step, rows.astype(np.float64), chunk.waited)
-        away, far = self._away(arrival, step, commanded)
+        safety = self._settings.safety
+        away, where = self._away(arrival, step, commanded)
+        if away > safety.jump:
+            far = f"{where}, allowed {safety.jump:g} (safety.jump): approach it, or start elsewhere"
+            return Joined(dropped(chunk, step, far), far, too_far=True)
+        far = f"{where}: blended in" if away > safety.first_action_far else ""
         held = commanded if away > _JOINED_AT_ONCE or self.starved else None
         switched, self._expecting = (
             self._switched,
@@ -112,15 +121,14 @@ class Follow(Behaviour):
         return Joined(self._told(chunk, merged), far)
 
     def _away(self, arrival: Arrival, step: int, commanded: Float64) -> tuple[float, str]:
-        """How far from where the robot stands a run's first action is [rad], and a sentence where that is far."""
+        """How far from where the robot stands a run's first action is [rad], and that in words; 0 for later ones."""
         settings, placed = self._settings, self._strategy.merge.place(self.timeline, arrival, step)
         if not self._expecting or settings.safety.report_only or not len(placed.rows):
             return 0.0, ""
         apart = difference(placed.rows[0], commanded, settings.dims.wrapping)
         away = np.where(settings.limits.grippers, 0.0, np.abs(apart))
         worst, name = float(away.max()), settings.limits.names[int(away.argmax())]
-        far = f"{name}: the first action is {worst:.2f} rad from where the robot stands: blended in"
-        return worst, far if worst > settings.safety.first_action_far else ""
+        return worst, f"{name}: the first action is {worst:.2f} rad from where the robot stands"
 
     def _told(self, chunk: PostedChunk, merged: Merged) -> ChunkMerged:
         return ChunkMerged(

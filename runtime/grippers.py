@@ -33,10 +33,6 @@ class Grippers:
         self._robot = plan.robot.name
         self.locks: Float64 = np.full(plan.robot.dim, np.nan)
 
-    def forget(self) -> None:
-        """Nothing is locked."""
-        self.locks = np.full(len(self.locks), np.nan)
-
     def asked(self, request: GripperRequest, commanded: Float64, free: bool) -> Grip:
         """`free`: nothing else moves the arms, so that a gripper can be moved; else opening and closing lock it there.
 

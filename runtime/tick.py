@@ -151,7 +151,10 @@ class Tick:
             return
         joined = run.join(chunk, step, lane.actuator.commanded)
         self._report.merged(joined.merged)
-        self._answer("far_start", joined.far)
+        if joined.too_far:
+            lane.hold_because("too_far", joined.far)
+        else:
+            self._answer("far_start", joined.far)
 
     def _tune(self, section: Mapping[str, Any], step: int) -> None:
         try:
@@ -159,19 +162,21 @@ class Tick:
         except ConfigurationError as error:
             self._report.say("tune_refused", str(error))
             return
-        self._strategy, run = chosen, self._led.run
+        before, self._strategy, run = self._strategy.kind, chosen, self._led.run
         if run is not None:
             run.tune(chosen, step)
-        self._report.say("tuned", f"chunks are merged by {chosen.kind} from now on")
+        if chosen.kind != before:
+            self._report.say("tuned", f"chunks are merged by {chosen.kind} from now on")
 
     def _lock(self, values: Float64) -> None:
-        refusal = self._locks.set(values)
+        before, refusal = str(self._locks), self._locks.set(values)
         if refusal:
             self._report.say("lock_refused", refusal)
             return
         for lane in self._lanes:
             lane.relock()
-        self._report.say("locked", str(self._locks))
+        if str(self._locks) != before:
+            self._report.say("locked", str(self._locks))
 
     def _follow_order(self, order: Order, now: float) -> None:
         self._report.limiting.close()

@@ -58,8 +58,6 @@ def test_a_lock_keeps_it_where_it_is_told_to_be_and_unlocking_gives_it_back() ->
     hand.locks = hand.asked(GripperRequest(arm="left_arm", action="unlock"), at(), free=False).locks
     assert np.isnan(hand.locks[LEFT])
     assert not np.isnan(hand.locks[RIGHT])
-    hand.forget()
-    assert np.isnan(hand.locks).all()
 
 
 def test_a_locked_gripper_that_is_opened_by_hand_stays_locked_there() -> None:

@@ -417,3 +417,21 @@ def test_the_outcome_of_a_run_tells_how_the_policy_did(tmp_path: Path) -> None:
     assert policy["answers"] > 5
     assert policy["starved"] == 0
     station.close()
+
+
+@pytest.mark.parametrize("strategy", ["async", "sync", "naive", "ensemble"])
+def test_a_run_whose_first_action_is_farther_than_a_jump_moves_nothing_and_holds(
+    tmp_path: Path, strategy: str
+) -> None:
+    station = Station(plan(tmp_path, lambda o, n: ramp(400, 20), strategy=strategy)).ready()
+    station.command("run")
+    station.reach(State.HOLDING)
+    assert "allowed 0.5 (safety.jump): approach it, or start elsewhere" in station.reason
+    assert np.allclose(station.robot.sent, STANDS, atol=1e-6)
+    station.command("stop")
+    station.command("approach")
+    station.reach(State.READY)
+    station.command("run")
+    station.go(20)
+    assert station.state is State.RUNNING, station.reason
+    station.close()
