@@ -35,6 +35,7 @@ SCHEMA = pa.schema(
         pa.field("step", pa.int64()),  # control step that the row is about; raw: null where it was dropped
         pa.field("time", pa.float64()),  # when that step was planned [s since manifest.started_monotonic]
         pa.field("sent", pa.float64()),  # executed: when it was sent, on the same clock
+        pa.field("woke", pa.float64()),  # executed: when the loop woke for it; null in lockstep
         pa.field("chunk_id", pa.int64()),  # raw: of the row; else the chunk with the largest weight
         pa.field("observation_step", pa.int64()),  # raw
         pa.field("arrival_step", pa.int64()),  # raw: null where it never reached the control loop
@@ -212,7 +213,7 @@ def _smoothed(run: _Run) -> dict[str, Any]:
 
 def _executed(run: _Run) -> dict[str, Any]:
     ticks = run.ticks
-    same = ("step", "sent", "control_source", "changes", "refused")
+    same = ("step", "sent", "woke", "control_source", "changes", "refused")
     return {name: ticks[name] for name in same} | {
         "stream": ["executed"] * ticks.num_rows,
         "time": ticks["planned"],

@@ -1,6 +1,7 @@
 """One table per run: everything of the three streams at its place, and the place never outside the data folder."""
 
 import json
+import os
 import threading
 import uuid
 from dataclasses import replace
@@ -33,6 +34,7 @@ def recorded(root: Path, **changes: Any) -> Path:
         made = {"chunk_ids": (0, 1), "weights": (0.75, 0.25)} if k == 4 else {}
         made |= {"smoothed": None, "chunk_ids": (), "weights": (), "changes": ()} if k < 4 else {}
         made |= {"executed": None, "refused": True} if k == 7 else {}
+        made |= {"woke": STARTED + k / 100 + 0.0005} if k == 5 else {}
         journal.append(tick(k, **made))
     known, lost = chunk(1), chunk(3)
     journal.append(replace(known, strategy="rtc", overlap=5, mistimed=2))
@@ -106,6 +108,8 @@ def test_an_executed_step_says_what_safety_did(exported: Path) -> None:
     assert executed[5]["measured"] == [5.0] * DIM
     assert (executed[5]["changes"], executed[5]["refused"]) == (["speed"], False)
     assert executed[5]["sent"] - executed[5]["time"] == pytest.approx(0.001)
+    assert executed[5]["woke"] - executed[5]["time"] == pytest.approx(0.0005)
+    assert "woke" not in executed[6], "as in lockstep"
     assert executed[7]["refused"] is True
     assert "action" not in executed[7]
 
@@ -133,7 +137,7 @@ def test_exporting_again_writes_nothing_until_the_episode_was_repaired(tmp_path:
     assert first.stat().st_mtime_ns == before.st_mtime_ns
     assert first.stat().st_ino == before.st_ino
     content = first.read_bytes()
-    (folder / "outcome.json").touch()
+    os.utime(folder / "outcome.json", ns=(before.st_mtime_ns + 1, before.st_mtime_ns + 1))
     assert not is_exported(folder, first)
     export(folder, tmp_path)
     assert first.stat().st_ino != before.st_ino
