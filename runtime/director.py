@@ -43,7 +43,7 @@ from runtime.watch import Watch
 
 log = logging.getLogger(__name__)
 # Control's own reasons to hold, as events of these kinds.
-_HOLDS = ("refusals", "starvation", "unmeasured", "family", "orphaned", "too_far")
+_HOLDS = ("refusals", "unmeasured", "family", "orphaned", "too_far")
 
 
 class Director:
@@ -168,8 +168,11 @@ class Director:
         if event.kind == "motion_done":
             self.runs.arrived()
         self.inference.tally.starved += event.kind == "starved"
-        if event.kind == "starvation" and settings.faults.starvation == "stop":
-            self._observe(Happening.RUN_FAILED, event.text)
+        if event.kind == "starvation":
+            failure = self.inference.failure
+            stops = settings.faults.starvation == "stop"
+            why = f"{event.text}: {failure}" if failure else event.text
+            self._observe(Happening.RUN_FAILED if stops else Happening.HELD, why)
         elif event.kind in _HOLDS or (
             event.kind == "recording_failed" and settings.recording.on_failure == "hold"
         ):

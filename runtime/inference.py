@@ -83,6 +83,7 @@ class Inference:
         self.proposal: Made | None = None  # shown, and neither committed nor cancelled
         self.shown: ShownChunk | None = None
         self._planned: ShownChunk | None = None  # the newest that control has merged
+        self.failure = ""  # why the policy is being tried again
         self.rtc_warning = ""
         self._given: Conditioning | None = None  # with the newest request
         self._strategy = strategy
@@ -147,7 +148,7 @@ class Inference:
         self.pause()
         self.asking.exchange(policy, task)
         self.tally.forget()
-        self._back_off.forget()
+        self._forget_failures()
 
     def tune(self, strategy: Strategy, task: str) -> None:
         """Go on with another strategy, other parameters, another instruction; a request in flight stays."""
@@ -165,7 +166,7 @@ class Inference:
             self.tally.forget()
             self.shown = self._planned = None
         self._commitment.clear()
-        self._back_off.forget()
+        self._forget_failures()
         self._stale_since = None
         self._wanted, self.proposal = False, None
         self._unmerged.clear()
@@ -240,7 +241,7 @@ class Inference:
     def retries(self, error: RuntimeFault) -> bool:
         """Whether the policy will be tried again after `error`; False where patience is at its end."""
         now = self._clock.now()
-        first = self._back_off.since is None
+        first, self.failure = self._back_off.since is None, str(error)
         self._back_off.failed(now)
         self.tally.lost += isinstance(error, PolicyLostError)
         if self._back_off.lasts(now) > self._patience.lost:
@@ -328,7 +329,11 @@ class Inference:
     def _recovered(self) -> None:
         if self._back_off.since is not None:
             self._note("policy_back", f"the policy answers again after {self.lost_for:.1f} s")
+        self._forget_failures()
+
+    def _forget_failures(self) -> None:
         self._back_off.forget()
+        self.failure = ""
 
     def _note(self, kind: str, text: str) -> None:
         self.notes.append(Event(kind, text, self._clock.now()))
