@@ -3,10 +3,12 @@
 import { ChunkDots } from "./scene_chunk.js";
 import { Ghosts } from "./scene_ghosts.js";
 import { Preview } from "./scene_preview.js";
-import { rendererIn } from "./scene_renderer.js";
+import { lightenWork, rendererIn } from "./scene_renderer.js";
 import { block, css, place, plate, robotParts, SIZE, table, three } from "./scene_shapes.js";
 import { Tips } from "./scene_tips.js";
 import { Views } from "./scene_views.js";
+
+const STILL = 2e-5; // m, and about as much of a turn: less than a pixel
 
 /** `element` is filled by it; throws where the browser has no WebGL. */
 export class Scene3D {
@@ -22,6 +24,7 @@ export class Scene3D {
   #geometry;
   #shown = { ghost: false, frames: false, path: true, chunk: true };
   #simulated = false;
+  #drawn = new Float32Array(0); // the numbers of all parts as they were drawn last
   #framed = false;
 
   constructor(element, geometry) {
@@ -42,10 +45,12 @@ export class Scene3D {
   /** Where every part is: [count * P * 16]; the second is where it was told to be, the third a simulated robot. */
   setPoses(numbers, count) {
     const size = this.#parts.length * SIZE;
+    const film = this.#preview.at(performance.now());
+    if (!film && this.#framed && !this.#moved(numbers)) return; // drawn already, as it is
     place(this.#parts, numbers, 0);
     this.#ghosts.pose("commanded", count > 1 ? numbers : null, size);
     this.#ghosts.pose("simulated", count > 2 ? numbers : null, 2 * size);
-    this.#ghosts.pose("chunk", this.#preview.at(performance.now()));
+    this.#ghosts.pose("chunk", film);
     if (!this.#framed) this.#frame();
     this.#follow();
     this.#viewer.set_dirty();
@@ -103,11 +108,13 @@ export class Scene3D {
     this.#ghosts.allow("commanded", this.#shown.ghost);
     this.#ghosts.allow("chunk", this.#shown.chunk);
     if (!this.#shown.chunk) this.#dots.show(null);
+    this.#drawn = new Float32Array(0); // what is shown now may never have been placed
     this.#viewer.set_dirty();
     return this.#shown[what];
   }
 
   #add(path, object) {
+    if (this.software) lightenWork(object);
     this.#viewer.set_object(path.split("/"), object);
     return object;
   }
@@ -146,6 +153,17 @@ export class Scene3D {
     this.#ghosts.allow("commanded", false);
     this.#tips = new Tips(geometry.tips ?? [], add);
     this.#dots.objects.forEach((points, index) => add(`chunk/${index}`, points));
+  }
+
+  /** Whether anything is elsewhere than it was drawn last. */
+  #moved(numbers) {
+    const before = this.#drawn;
+    let same = numbers.length === before.length;
+    for (let at = 0; same && at < numbers.length; at += 1) {
+      same = Math.abs(numbers[at] - before[at]) <= STILL || Object.is(numbers[at], before[at]); // there may be NaN
+    }
+    if (!same) this.#drawn = numbers.slice();
+    return !same;
   }
 
   /** The robot that acts: in a simulation the simulated one. */

@@ -22,3 +22,19 @@ function bySoftware(renderer) {
   const names = gl.getExtension("WEBGL_debug_renderer_info");
   return names !== null && /swiftshader|llvmpipe|software/i.test(gl.getParameter(names.UNMASKED_RENDERER_WEBGL));
 }
+
+const cheaper = new WeakMap(); // by the material it stands for
+
+/** Light the object corner by corner instead of pixel by pixel: what a processor can draw fifteen times a second. */
+export function lightenWork(object) {
+  object.traverse((mesh) => {
+    if (!mesh.material?.isMeshPhongMaterial) return;
+    if (!cheaper.has(mesh.material)) cheaper.set(mesh.material, byCorner(mesh.material));
+    mesh.material = cheaper.get(mesh.material);
+  });
+}
+
+function byCorner({ color, transparent, opacity, depthWrite, polygonOffset, polygonOffsetFactor, polygonOffsetUnits }) {
+  const look = { color, transparent, opacity, depthWrite, polygonOffset, polygonOffsetFactor, polygonOffsetUnits };
+  return new (three().MeshLambertMaterial)(look);
+}
