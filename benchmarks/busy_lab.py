@@ -20,6 +20,7 @@ _PATIENT = (
     "safety.joint_age_s=10.0",
     "safety.picture_age_s=10.0",
     "safety.following_error=3.0",
+    "safety.jump=3.0",
     "safety.refusals_to_hold=1000",
     "control.starvation_hold_s=30.0",
     "control.heartbeat_timeout_s=10.0",

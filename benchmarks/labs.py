@@ -33,13 +33,19 @@ class RunningLab:
     announced: Mapping[str, Any]
     process: psutil.Process
     data: Path
+    environment: Mapping[str, str]  # of its processes
 
 
 @contextmanager
-def lab(program: Sequence[str], ready_file: Path) -> Iterator[RunningLab]:
-    """Start `python PROGRAM`, which is to announce its lab in `ready_file`; its data lie beside that file."""
+def lab(
+    program: Sequence[str], ready_file: Path, extra: Mapping[str, str] | None = None
+) -> Iterator[RunningLab]:
+    """Start `python PROGRAM`, which is to announce its lab in `ready_file`; its data lie beside that file.
+
+    `extra` is for its environment.
+    """
     data = ready_file.parent / "data"
-    environment = os.environ | {"EVA_DATA_DIR": str(data), "EVA_LOG_LEVEL": "WARNING"}
+    environment = os.environ | {"EVA_DATA_DIR": str(data), "EVA_LOG_LEVEL": "WARNING"} | dict(extra or {})
     child = subprocess.Popen([sys.executable, *program], cwd=ROOT, env=environment, stdout=subprocess.DEVNULL)
     try:
         while not ready_file.exists():
@@ -49,18 +55,22 @@ def lab(program: Sequence[str], ready_file: Path) -> Iterator[RunningLab]:
         announced = json.loads(ready_file.read_text())
         visitor = Visitor(announced["url"])
         visitor.login("operator", announced["passwords"]["operator"])
-        yield RunningLab(visitor, announced, psutil.Process(child.pid), data)
+        yield RunningLab(visitor, announced, psutil.Process(child.pid), data, environment)
     finally:
         child.send_signal(signal.SIGINT)
         child.wait(_END_S)
 
 
 @contextmanager
-def busy_lab(folder: Path, assignments: Sequence[str]) -> Iterator[RunningLab]:
-    """The lab of `benchmarks.busy_lab`, with these settings on top of its deployment."""
+def busy_lab(folder: Path, assignments: Sequence[str], without: str = "") -> Iterator[RunningLab]:
+    """The lab of `benchmarks.busy_lab`, with these settings on top of its deployment.
+
+    `without` names measures of runtime.realtime that its control is to do without, separated by commas.
+    """
     sets = [part for assignment in assignments for part in ("--set", assignment)]
     ready = folder / "ready.json"
-    with lab(["-m", "benchmarks.busy_lab", str(ready), *sets], ready) as running:
+    patched = {"PYTHONPATH": str(ROOT / "benchmarks" / "without"), "EVA_WITHOUT": without} if without else {}
+    with lab(["-m", "benchmarks.busy_lab", str(ready), *sets], ready, patched) as running:
         yield running
 
 
@@ -100,6 +110,33 @@ class Processors:
                 continue
             found[name] = found.get(name, 0.0) + times.user + times.system
         return found
+
+
+class Scheduling:
+    """What the kernel did to one process of a lab from now on."""
+
+    def __init__(self, lab: psutil.Process, module: str) -> None:
+        (self._process,) = (p for p in lab.children(recursive=True) if _name(p.cmdline()) == module)
+        self._begun = time.monotonic()
+        self._before = self._counts()
+
+    def figures(self) -> dict[str, float]:
+        """Per second: time on a processor and waiting for one [ms], switches against its will, page faults."""
+        seconds = time.monotonic() - self._begun
+        now = self._counts()
+        return {name: (value - self._before[name]) / seconds for name, value in now.items()}
+
+    def _counts(self) -> dict[str, float]:
+        folder = Path("/proc") / str(self._process.pid)
+        ran, waited = (int(part) / 1e6 for part in (folder / "schedstat").read_text().split()[:2])
+        fields = (folder / "stat").read_text().rpartition(") ")[2].split()  # proc(5): from field 3 on
+        return {
+            "ran_ms": ran,
+            "waited_ms": waited,
+            "preempted": float(self._process.num_ctx_switches().involuntary),
+            "minor_faults": float(fields[7]),
+            "major_faults": float(fields[9]),
+        }
 
 
 def _busy() -> float:

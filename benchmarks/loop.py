@@ -21,7 +21,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.labs import ROOT, STATION, Processors, RunningLab, busy_lab, only_episode, set_up, watch
+from benchmarks.labs import (
+    ROOT,
+    STATION,
+    Processors,
+    RunningLab,
+    Scheduling,
+    busy_lab,
+    only_episode,
+    set_up,
+    watch,
+)
 from benchmarks.report import Figure, Report
 from evaweb.lab.visitor import LivePage
 from runtime.recording.reader import Episode
@@ -39,7 +49,7 @@ Steps = NDArray[np.int64]
 
 def measure(seconds: float, assignments: Sequence[str] = ()) -> Report:
     """`lateness_*_ms.HZ`, `missed_ticks.HZ`, `rate_error_ppm.HZ`, `ratio_to_bare_loop.HZ`; all of them per tick."""
-    rows = [_case(rate, seconds, assignments) for rate in RATES]
+    rows = [case(rate, seconds, assignments) for rate in RATES]
     return Report("loop", [figure for row in rows for figure in _figures(row)], rows)
 
 
@@ -62,42 +72,42 @@ def _figures(row: Mapping[str, Any]) -> list[Figure]:
     ]
 
 
-def _case(rate: float, seconds: float, assignments: Sequence[str]) -> dict[str, Any]:
+def case(rate: float, seconds: float, assignments: Sequence[str], without: str = "") -> dict[str, Any]:
+    """One lab, one run; `without` takes measures away from control: see benchmarks.measures."""
     settings = [f"control.rate={rate}", "recording.fps=30.0", f"run.duration_s={seconds}", *assignments]
     with tempfile.TemporaryDirectory() as folder:
-        with busy_lab(Path(folder), settings) as lab:
-            state, beside, percent = _run(lab, rate, seconds)
+        with busy_lab(Path(folder), settings, without) as lab:
+            priority = [] if "control.realtime=off" in assignments else [str(_PRIORITY)]
+            sleepers = [["deadlines", str(rate), str(seconds), *priority], ["rest", str(rate), str(seconds)]]
+            state, beside, used = _run(lab, sleepers, seconds)
             episode = only_episode(lab.data)
-        return {"rate": rate, "cpu_percent": percent, **_judged(episode, rate, state["control"], beside)}
+        return {"rate": rate, **used, **_judged(episode, rate, state["control"], beside)}
 
 
 def _run(
-    lab: RunningLab, rate: float, seconds: float
-) -> tuple[Mapping[str, Any], list[Any], dict[str, float]]:
-    """One run that is watched; the state afterwards, what the loops beside it measured, processor time."""
+    lab: RunningLab, sleepers: Sequence[Sequence[str]], seconds: float
+) -> tuple[Mapping[str, Any], list[Any], dict[str, Any]]:
+    """One run that is watched; the state afterwards, what the loops beside it measured, what it took."""
     with closing(LivePage(lab.visitor, STATION)) as page:
-        scheduling = set_up(page)["control"]["scheduling"]
+        set_up(page)
         watching = watch(lab.visitor, seconds + 2 * _MARGIN_S, reading=VIEWERS)
-        loops = [
-            _sleeper("deadlines", rate, seconds, scheduling),
-            _sleeper("rest", rate, seconds, "ordinary"),
-        ]
+        loops = [_sleeper(arguments, lab.environment) for arguments in sleepers]
         page.command("run")
         page.wait(lambda state: state["state"] == "running", 10.0, "starting the run")
-        processors = Processors(lab.process)
+        processors, scheduler = Processors(lab.process), Scheduling(lab.process, "runtime.control")
         state = page.wait(lambda state: state["state"] != "running", seconds + 30.0, "the run")
-        percent = processors.percent()
+        percent, scheduled = processors.percent(), scheduler.figures()
         watching.communicate()
     if state["state"] != "ready":
         raise SystemExit(f"the run ended {state['state']}: {state['reason']}")
-    return state, [json.loads(loop.communicate()[0]) for loop in loops], percent
+    beside = [json.loads(loop.communicate()[0]) for loop in loops]
+    return state, beside, {"cpu_percent": percent, "scheduled": scheduled}
 
 
-def _sleeper(how: str, rate: float, seconds: float, scheduling: str) -> subprocess.Popen[str]:
-    """A loop beside ours; in a class of its own where control got one."""
-    command = [sys.executable, "-m", "benchmarks.sleeper", how, str(rate), str(seconds)]
-    priority = [] if scheduling.startswith("ordinary") else [str(_PRIORITY)]
-    return subprocess.Popen(command + priority, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+def _sleeper(arguments: Sequence[str], environment: Mapping[str, str]) -> subprocess.Popen[str]:
+    """A loop beside ours, with the same measures."""
+    command = [sys.executable, "-m", "benchmarks.sleeper", *arguments]
+    return subprocess.Popen(command, cwd=ROOT, env=dict(environment), stdout=subprocess.PIPE, text=True)
 
 
 def _judged(

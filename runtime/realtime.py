@@ -21,11 +21,9 @@ def enter(priority: int) -> str:
     0.1 ms (Linux 6.12 and later); else the ordinary class. "unlocked": its memory may be paged out.
     """
     libc = ctypes.CDLL(None, use_errno=True)
-    libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    locked = libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) == 0
-    gc.collect()
-    gc.freeze()
-    gc.disable()
+    _fine_timers(libc)
+    locked = _locked_memory(libc)
+    _quiet_gc()
     got = _fifo(priority) or ("slice 0.1 ms" if _short_slice(libc) else "ordinary")
     return got if locked else f"{got} unlocked"
 
@@ -39,6 +37,22 @@ def advice(scheduling: str, priority: int) -> str:
         f"late on a busy machine; give the station's user an rtprio limit of {priority} (LimitRTPRIO={priority} "
         "where systemd starts it), then start the station anew: docs/administrator.md, Real time"
     )
+
+
+def _fine_timers(libc: ctypes.CDLL) -> None:
+    """Wake up when asked, and not up to 50 us later together with others (the real-time class always does)."""
+    libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+
+
+def _locked_memory(libc: ctypes.CDLL) -> bool:
+    return int(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE)) == 0
+
+
+def _quiet_gc() -> None:
+    """What is imported is never looked through again; the loop collects by itself, between two ticks."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
 
 
 def _fifo(priority: int) -> str:

@@ -1,0 +1,32 @@
+"""What each measure for a steady tick brings: `loop` at one rate, with measures of runtime.realtime taken away.
+
+The bare loop beside it does without them too.
+"""
+
+from __future__ import annotations
+
+from benchmarks.loop import case
+from benchmarks.report import Figure, Report
+
+SECONDS = 20.0
+_RATE = 200.0
+# Which are taken away; without the real-time class control asks for a short slice, without that it is ordinary.
+_VARIANTS = ("", "lock", "gc", "fifo", "fifo,timers", "fifo,gc", "fifo,slice", "fifo,slice,lock,gc,timers")
+
+
+def measure(seconds: float) -> Report:
+    """`lateness_*_ms.WITHOUT`, `missed_ticks.WITHOUT`, `waited_ms.WITHOUT` (for a processor, per second)."""
+    figures, rows = [], []
+    for without in _VARIANTS:
+        row = case(_RATE, seconds, [], without)
+        rows.append({"without": without, **row})
+        name = f"without_{without.replace(',', '_')}" if without else "all"
+        late = row["lateness_ms"]
+        figures += [Figure(f"lateness_{q}_ms.{name}", value, "ms") for q, value in late.items()]
+        figures += [
+            Figure(f"missed_ticks.{name}", row["missed"], ""),
+            Figure(f"ratio_to_bare_loop.{name}", row["ratio"], ""),
+            Figure(f"waited_ms.{name}", row["scheduled"]["waited_ms"], "ms/s"),
+            Figure(f"other_cpu_percent.{name}", row["cpu_percent"]["others"], "%"),
+        ]
+    return Report("measures", figures, rows)

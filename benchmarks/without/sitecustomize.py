@@ -1,0 +1,25 @@
+"""On PYTHONPATH, takes measures of runtime.realtime away from control and from the bare loop: those that EVA_WITHOUT names.
+
+For benchmarks.measures alone: the runtime itself has no such switch.
+"""
+
+import os
+import sys
+
+
+def _take_away(names: list[str]) -> None:
+    from runtime import realtime
+
+    nothing = {
+        "fifo": ("_fifo", lambda priority: ""),
+        "slice": ("_short_slice", lambda libc: False),
+        "lock": ("_locked_memory", lambda libc: False),
+        "gc": ("_quiet_gc", lambda: None),
+        "timers": ("_fine_timers", lambda libc: None),
+    }
+    for name in names:
+        setattr(realtime, *nothing[name])
+
+
+if {"runtime.control", "benchmarks.sleeper"} & set(sys.orig_argv):
+    _take_away(os.environ["EVA_WITHOUT"].split(","))
