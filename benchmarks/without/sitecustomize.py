@@ -1,4 +1,4 @@
-"""On PYTHONPATH, takes measures of runtime.realtime away from control and from the bare loop: those that EVA_WITHOUT names.
+"""On PYTHONPATH, takes the measures of runtime.realtime that EVA_WITHOUT names from control and from the bare loop.
 
 For benchmarks.measures alone: the runtime itself has no such switch.
 """
