@@ -19,7 +19,6 @@ from runtime.plugins import variants
 from runtime.runs import Runs
 from runtime.session import Session
 from runtime.setup import SetUp, Stage, first_action
-from runtime.tally import quantile
 from runtime.transitions import State
 from runtime.types import Float64
 
@@ -143,7 +142,6 @@ def _run(view: View) -> dict[str, Any]:
 
 def _inference(view: View) -> dict[str, Any]:
     tally = view.inference.tally
-    latencies, delays = tally.latencies, tally.delays
     return {
         "name": view.setup.info.name if view.setup.info else "",
         "answers": tally.answers,
@@ -151,10 +149,6 @@ def _inference(view: View) -> dict[str, Any]:
         "lost": view.inference.lost_for > 0,
         "retry_in_s": view.inference.retry_in,
         "rtc": view.inference.rtc,
-        "latency_p50_ms": quantile(latencies, 50) * 1000,
-        "latency_p90_ms": quantile(latencies, 90) * 1000,
-        "delay_p50": quantile(delays, 50),
-        "delay_max": max(delays, default=math.nan),
     }
 
 

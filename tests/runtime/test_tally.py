@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from runtime.messages import ChunkMerged
 from runtime.tally import Tally, quantile
@@ -33,7 +35,9 @@ def test_without_a_measurement_there_is_no_figure() -> None:
     tally = Tally()
     assert tally.figures()["latency_ms"] is None
     assert tally.figures()["delay_steps"] is None
-    assert tally.newest() == {"latencies_ms": [], "delays": []}
+    newest = tally.newest()
+    assert (newest["latencies_ms"], newest["delays"]) == ([], [])
+    assert all(math.isnan(newest[name]) for name in ("latency_p50_ms", "delay_p50", "delay_max"))
     assert math.isnan(quantile([], 50))
 
 
@@ -60,6 +64,23 @@ def test_how_old_an_observation_was_when_the_policy_was_asked_is_a_figure() -> N
         "p99": pytest.approx(29.8),
         "max": 30.0,
     }
+
+
+def test_a_page_is_told_the_spread_of_the_newest_three_hundred() -> None:
+    tally = Tally()
+    for number in range(1000):
+        tally.answered(number / 1000)
+        tally.merged(merged(1000 - number))
+    told = tally.newest()
+    assert told["latency_p50_ms"] == pytest.approx(849.5)
+    assert told["latency_p90_ms"] == pytest.approx(969.1)
+    assert (told["delay_p50"], told["delay_max"]) == (150.5, 300)
+    assert tally.figures()["latency_ms"]["p50"] == pytest.approx(499.5)
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=50), st.floats(0, 100))
+def test_a_quantile_is_that_of_numpy(values: list[float], percent: float) -> None:
+    assert quantile(values, percent) == pytest.approx(float(np.percentile(values, percent)), abs=1e-6)
 
 
 def test_a_new_run_begins_anew() -> None:
