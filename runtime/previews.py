@@ -40,5 +40,4 @@ class Previews:
         """By a whole factor, each pixel the mean of those that it stands for."""
         factor = max(1, picture.shape[0] // self._height)
         size = (-(-picture.shape[1] // factor), -(-picture.shape[0] // factor))
-        small = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-        return small
+        return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
