@@ -26,6 +26,8 @@ def test_every_table_and_every_variant_has_its_section():
     for name, field in Deployment.model_fields.items():
         if name in ("station", "robot", "task", "operator", "data_dir"):
             assert f"| `{name}` | string" in text
+        elif name == "tasks":
+            assert "| `tasks` | list of string | `[]` |" in text
         else:
             assert f"## `[{name}]`" in text, field
     for package, part in (("transports", "transport"), ("policies", "policy"), ("strategies", "strategy")):
