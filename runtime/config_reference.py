@@ -68,7 +68,7 @@ def _section(title: str, model: type[BaseModel]) -> Iterator[str]:
     """A heading and a table of keys."""
     schema = model.model_json_schema()
     yield f"## {title}\n\n{_first_line(model)}\n\n| key | type | default | meaning |\n|---|---|---|---|"
-    for name, field in model.model_fields.items():
+    for name, field in _own_first(model):
         tells = name == "kind" and _kind(model) != ""
         cells = (
             f"`{name}`",
@@ -78,6 +78,12 @@ def _section(title: str, model: type[BaseModel]) -> Iterator[str]:
         )
         yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
     yield ""
+
+
+def _own_first(model: type[BaseModel]) -> list[tuple[str, FieldInfo]]:
+    """Its own keys, then those that it shares with others."""
+    own = model.__annotations__
+    return sorted(model.model_fields.items(), key=lambda key: key[0] not in own)
 
 
 def _first_line(model: type[BaseModel]) -> str:

@@ -20,13 +20,11 @@ from runtime.clock import Clock
 from runtime.errors import CodecError, ConfigurationError, PolicyError
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.link import WebsocketLink
-from runtime.policies.pictures import Layout, Resize
-from runtime.policies.request import RequestLayout, width_of
+from runtime.policies.request import RequestLayout, RequestSettings, width_of
 from runtime.policies.rows import action_rows
 from runtime.policies.rtc.async_rtc import AsyncRtc, Schedule
 from runtime.policies.rtc.base import Dialect, Plain
 from runtime.policies.rtc.prev_action import PrevAction
-from runtime.section import Section
 from runtime.types import ActionChunk, ActionMode, Conditioning, Observation, RelativeFrame, Space
 
 if TYPE_CHECKING:
@@ -34,15 +32,12 @@ if TYPE_CHECKING:
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Rate = Annotated[float, Field(ge=1, le=1000)]
-Pixels = Annotated[int, Field(ge=8, le=4096)]
-Size = Annotated[list[Pixels], Field(min_length=2, max_length=2)]
-Dims = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
 
 ANSWER_LIMIT = 64 * 1024 * 1024  # bytes; a chunk of 50 rows is some kilobytes
 _SPACES: dict[object, Space] = {"joint": "joint", "qpos": "joint", "eef": "eef"}
 
 
-class Config(Section):
+class Config(RequestSettings):
     """A policy server that speaks the openpi websocket protocol."""
 
     kind: Literal["openpi"] = "openpi"
@@ -72,24 +67,6 @@ class Config(Section):
     """With async_rtc: how the weight of the rows before falls after the predicted delay."""
     max_guidance_weight: Positive = 10.0
     """With async_rtc: most that those rows may bend an inference."""
-    observation_space: Space = "joint"
-    """What is sent as state: joints, or poses."""
-    cameras: dict[str, str] | None = None
-    """Observation key = request key; without it all pictures that there are, under their own keys."""
-    images_key: str = "images"
-    """The map that holds the pictures; "" puts them into the request itself (DROID, LIBERO)."""
-    image_size: Size | None = Field(default_factory=lambda: [224, 224])
-    """Height and width the policy was trained with."""
-    resize: Resize | Literal["none"] = "pad"
-    """"pad" keeps the aspect on black, "stretch" does not, "none" sends pictures as they are."""
-    image_layout: Layout = "chw"
-    """Axes of a picture: channels first or last."""
-    state_key: str = "state"
-    """Request key of the state; "" sends no whole state."""
-    state_parts: dict[str, Dims] = Field(default_factory=dict)
-    """Further request keys and the places of the state vector they take (DROID: joints and gripper apart)."""
-    prompt_key: str = "prompt"
-    """Request key of the instruction."""
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> OpenpiPolicy:

@@ -2,27 +2,55 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from runtime.errors import ConfigurationError, PolicyError
-from runtime.policies.pictures import fitted, laid_out
+from runtime.policies.pictures import Layout, Resize, fitted, laid_out
+from runtime.section import Section
 from runtime.types import Float32, Observation, Space
 
 if TYPE_CHECKING:
     from robots import Robot
-    from runtime.policies.openpi import Config
+
+Pixels = Annotated[int, Field(ge=8, le=4096)]
+Size = Annotated[list[Pixels], Field(min_length=2, max_length=2)]
+Dims = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
+
+
+class RequestSettings(Section):
+    """How a policy server wants observations: the keys of its request, and what goes under them."""
+
+    observation_space: Space = "joint"
+    """What is sent as state: joints, or poses."""
+    cameras: dict[str, str] | None = None
+    """Observation key = request key; without it all pictures that there are, under their own keys."""
+    images_key: str = "images"
+    """The map that holds the pictures; "" puts them into the request itself (DROID, LIBERO)."""
+    image_size: Size | None = Field(default_factory=lambda: [224, 224])
+    """Height and width the policy was trained with."""
+    resize: Resize | Literal["none"] = "pad"
+    """"pad" keeps the aspect on black, "stretch" does not, "none" sends pictures as they are."""
+    image_layout: Layout = "chw"
+    """Axes of a picture: channels first or last."""
+    state_key: str = "state"
+    """Request key of the state; "" sends no whole state."""
+    state_parts: dict[str, Dims] = Field(default_factory=dict)
+    """Further request keys and the places of the state vector they take (DROID: joints and gripper apart)."""
+    prompt_key: str = "prompt"
+    """Request key of the instruction."""
 
 
 class RequestLayout:
     """Where state, pictures and instruction go; ConfigurationError where that does not fit the robot."""
 
-    def __init__(self, config: Config, robot: Robot) -> None:
-        self._config = config
-        self._cameras = _cameras(config, robot)
-        self._state_width = width_of(config.observation_space, robot)
-        for key, dims in config.state_parts.items():
+    def __init__(self, settings: RequestSettings, robot: Robot) -> None:
+        self._settings = settings
+        self._cameras = _cameras(settings, robot)
+        self._state_width = width_of(settings.observation_space, robot)
+        for key, dims in settings.state_parts.items():
             if max(dims) >= self._state_width:
                 raise ConfigurationError(
                     f"policy.state_parts.{key} = {dims} leaves the state; allowed: 0 to {self._state_width - 1}"
@@ -30,19 +58,19 @@ class RequestLayout:
 
     def of(self, observation: Observation) -> dict[str, Any]:
         """The request map; PolicyError where the observation lacks what belongs into it."""
-        config = self._config
+        settings = self._settings
         state = self._state(observation)
-        request: dict[str, Any] = {config.state_key: state} if config.state_key else {}
-        request |= {key: state[dims] for key, dims in config.state_parts.items()}
+        request: dict[str, Any] = {settings.state_key: state} if settings.state_key else {}
+        request |= {key: state[dims] for key, dims in settings.state_parts.items()}
         cameras = self._cameras if self._cameras is not None else {key: key for key in observation.pictures}
         pictures = {key: self._picture(observation, camera) for camera, key in cameras.items()}
-        request |= {config.images_key: pictures} if config.images_key else pictures
-        if config.prompt_key:
-            request[config.prompt_key] = observation.prompt
+        request |= {settings.images_key: pictures} if settings.images_key else pictures
+        if settings.prompt_key:
+            request[settings.prompt_key] = observation.prompt
         return request
 
     def _state(self, observation: Observation) -> Float32:
-        state = observation.qpos if self._config.observation_space == "joint" else observation.eef
+        state = observation.qpos if self._settings.observation_space == "joint" else observation.eef
         if state is None:
             raise PolicyError('policy.observation_space is "eef" but the observation has no poses')
         if state.shape != (self._state_width,):
@@ -54,10 +82,10 @@ class RequestLayout:
         if picture is None:
             given = ", ".join(observation.pictures) or "none"
             raise PolicyError(f"the observation has no picture {camera!r}; it has {given}")
-        config = self._config
-        if config.image_size is not None and config.resize != "none":
-            picture = fitted(picture, config.image_size[0], config.image_size[1], config.resize)
-        return laid_out(picture, config.image_layout)
+        settings = self._settings
+        if settings.image_size is not None and settings.resize != "none":
+            picture = fitted(picture, settings.image_size[0], settings.image_size[1], settings.resize)
+        return laid_out(picture, settings.image_layout)
 
 
 def width_of(space: Space, robot: Robot) -> int:
@@ -65,14 +93,14 @@ def width_of(space: Space, robot: Robot) -> int:
     return robot.dim if space == "joint" else robot.eef_dim
 
 
-def _cameras(config: Config, robot: Robot) -> dict[str, str] | None:
+def _cameras(settings: RequestSettings, robot: Robot) -> dict[str, str] | None:
     """The named cameras; None for whatever the observation has: a deployment may do without some."""
-    if config.cameras is None:
+    if settings.cameras is None:
         return None
     known = [camera.key for camera in robot.cameras]
-    unknown = [key for key in config.cameras if key not in known]
+    unknown = [key for key in settings.cameras if key not in known]
     if unknown:
         raise ConfigurationError(
             f"policy.cameras names {', '.join(unknown)}; cameras of {robot.name}: {', '.join(known)}"
         )
-    return dict(config.cameras)
+    return dict(settings.cameras)
