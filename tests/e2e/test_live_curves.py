@@ -30,6 +30,16 @@ class Live(BenchPage):
         """The sentence in the corner of a pane about what is drawn there, "" where there is none."""
         return " ".join(self.page.locator(f"[data-tag={name}]").all_inner_texts())
 
+    def sets_up(self):
+        """Set up with the checkpoint that is chosen; again where this machine was late."""
+        for _ in range(3):
+            self.press("setup")
+            self.reaches("SETTING UP")
+            eventually(lambda: "SETTING UP" not in self.state(), 90, "the set-up ends")
+            if "READY" in self.state():
+                return
+        raise AssertionError(f"it is not set up: {self.page.locator('[data-show=stage]').inner_text()}")
+
     def runs(self, mode):
         """Run in a mode."""
         self.page.locator(f"input[name=mode][value={mode}]").locator("..").click()
@@ -40,6 +50,7 @@ class Live(BenchPage):
         """Whether it runs; resumed where this machine was late."""
         if "HOLDING" in self.state() and self.page.locator("[data-command=resume]:visible:enabled").count():
             self.press("resume")
+            eventually(lambda: "HOLDING" not in self.state(), 20, "it goes on")
         return "RUNNING" in self.state()
 
     def control(self):
@@ -81,8 +92,7 @@ def bench(browser, shared):
     live.page.keyboard.press("6")
     live.page.select_option("#checkpoint", label=SKILLED)
     live.page.fill("#seed", "1")
-    live.press("setup")
-    live.reaches("READY", 90)
+    live.sets_up()
     yield live
     if live.state() not in ("READY", "IDLE"):
         live.press("stop")
@@ -125,13 +135,18 @@ def test_chunks_are_seen_in_the_curves_which_stand_still_while_the_data_goes_on(
     bench.page.get_by_label("Ask at").fill("3")
     bench.press("tune")
     bench.runs("continuous")
-    eventually(lambda: bench.moves() and bench.chunk > 8, 60, "chunks follow each other")
+    plot = bench.page.locator("#curves .u-over")
+    eventually(
+        lambda: bench.moves() and columns(pixels(plot), band) > 10, 60, "bands stand where chunks overlap"
+    )
+    eventually(
+        lambda: bench.moves() and columns(pixels(plot), hairline) >= 5, 60, "hairlines stand between chunks"
+    )
     bench.page.click("#curves-pause")
     eventually(lambda: "paused" in bench.tag("paused"), 5, "the page says that the curves are paused")
-    plot = bench.page.locator("#curves .u-over")
     stood, chunk = pixels(plot), bench.chunk
-    assert columns(stood, band) > 10
-    assert columns(stood, hairline) >= 5
+    assert columns(stood, band) >= 3
+    assert columns(stood, hairline) >= 3
     ticks = bench.control()["ticks"]
     eventually(lambda: bench.control()["ticks"] > ticks + 45, 30, "the run goes on")
     assert np.array_equal(pixels(plot)[TAGS:], stood[TAGS:])
@@ -142,10 +157,18 @@ def test_chunks_are_seen_in_the_curves_which_stand_still_while_the_data_goes_on(
 
 def test_the_cursor_names_the_chunk_that_led_then(bench):
     box = bench.page.locator("#curves .u-over").bounding_box()
+    newest = eventually(lambda: bench.moves() and max(0, bench.chunk), 30, "the newest chunk is named")
     bench.page.click("#curves-pause")
-    newest = bench.chunk
-    bench.page.mouse.move(box["x"] + box["width"] - 60, box["y"] + 30)
-    eventually(lambda: 0 < bench.chunk < newest, 5, "an older chunk is named")
+
+    def older():
+        """Whether the cursor, going back in time, comes upon a chunk from before."""
+        for back in range(20, int(box["width"]), 20):
+            bench.page.mouse.move(box["x"] + box["width"] - back, box["y"] + 60)
+            if 0 < bench.chunk < newest:
+                return True
+        return False
+
+    eventually(older, 10, "an older chunk is named")
     bench.page.mouse.move(5, 5)
     bench.page.click("#curves-pause")
 
