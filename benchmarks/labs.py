@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,28 +88,38 @@ class Processors:
     def __init__(self, lab: psutil.Process) -> None:
         self._lab = lab
         self._begun = time.monotonic()
-        self._busy = _busy()
         self._before = self._times()
 
     def percent(self) -> dict[str, float]:
-        """By process, of one processor [%]; `lab` is their sum, `others` everything else on this machine."""
+        """By process, of one processor [%].
+
+        `lab` is the sum of its processes, `measuring` the benchmark's own (pages and loops beside it), `others`
+        everything else on this machine.
+        """
         seconds = time.monotonic() - self._begun
-        taken = {
-            name: (used - self._before.get(name, 0.0)) / seconds * 100.0
-            for name, used in self._times().items()
-        }
-        whole = sum(taken.values())
-        return {**taken, "lab": whole, "others": (_busy() - self._busy) / seconds * 100.0 - whole}
+        now, before = self._times(), self._before
+        taken = {name: (used - before.get(name, 0.0)) / seconds * 100.0 for name, used in now.items()}
+        busy, ours = taken.pop("busy"), taken.pop("ours")
+        lab = sum(taken.values())
+        return {**taken, "lab": lab, "measuring": ours - lab, "others": busy - ours}
 
     def _times(self) -> dict[str, float]:
-        found: dict[str, float] = {}
-        for process in (self._lab, *self._lab.children(recursive=True)):
-            try:
-                name, times = _name(process.cmdline()), process.cpu_times()
-            except psutil.NoSuchProcess:  # it has ended since it was listed: nothing of it can be asked
-                continue
-            found[name] = found.get(name, 0.0) + times.user + times.system
-        return found
+        """Processor time of the lab's processes by their name, of all of ours, of the machine [s]."""
+        lab = _used([self._lab, *self._lab.children(recursive=True)])
+        me = psutil.Process()
+        return {**lab, "ours": sum(_used([me, *me.children(recursive=True)]).values()), "busy": _busy()}
+
+
+def _used(processes: Iterable[psutil.Process]) -> dict[str, float]:
+    """User and system time by what a process runs [s]."""
+    found: dict[str, float] = {}
+    for process in processes:
+        try:
+            name, times = _name(process.cmdline()), process.cpu_times()
+        except psutil.NoSuchProcess:  # it has ended since it was listed: nothing of it can be asked
+            continue
+        found[name] = found.get(name, 0.0) + times.user + times.system
+    return found
 
 
 class Scheduling:
