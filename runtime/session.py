@@ -56,6 +56,16 @@ class Session:
             commands.extend(CANCELLING)
         return [*commands, "estop"]
 
+    def guarded(self) -> dict[str, str]:
+        """The commands of this state that would be refused just now, each with the reason."""
+        situation = self._effects.situation
+        reasons = {
+            kind: rule.guard(self.state, situation)
+            for kind, rule in COMMANDS.items()
+            if self.state in rule.allowed
+        }
+        return {kind: reason for kind, reason in reasons.items() if reason}
+
     def handle(self, command: Command) -> Ack:
         """The answer to `command`; repeated uuids get the first answer again.
 

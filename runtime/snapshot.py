@@ -55,6 +55,7 @@ def snapshot(view: View) -> dict[str, Any]:
         "state": str(session.state),
         "reason": session.reason,
         "allowed": session.allowed(),
+        "guarded": session.guarded(),
         "mode": view.runs.open.mode if view.runs.open else settings.run.mode,
         "sim_state": "simulated" if view.inference.asking.sight.simulated else "live",
         "phase": _phase(view),

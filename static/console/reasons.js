@@ -3,12 +3,7 @@
 import { STOPPING } from "./stops.js";
 import { verb, words } from "./words.js";
 
-const MODES = { step: ["step", "preview"], commit: ["preview"], cancel: ["step", "preview", "manual"], move: ["manual"] };
-const BUSY = {
-  asking: "the policy is being asked",
-  executing: "the last chunk is still being executed",
-  proposed: "a chunk is shown: commit or cancel it first",
-};
+const MODES = { step: "step or preview", commit: "preview", cancel: "step, preview or manual", move: "manual" };
 
 /** Why this page cannot give `kind` now, "" where it can. To stop it needs no news, only the lease it last had. */
 export function refusal(kind, { fresh, role, lease, snapshot }) {
@@ -20,34 +15,11 @@ export function refusal(kind, { fresh, role, lease, snapshot }) {
   return whyNot(kind, snapshot);
 }
 
-/** "" where the station allows `kind`. */
-export function whyNot(kind, snapshot) {
-  const { allowed, state, phase = "" } = snapshot;
+/** "" where the station allows `kind`; its own sentence where it is only not allowed just now. */
+export function whyNot(kind, { allowed, guarded = {}, state }) {
   if (allowed.includes(kind)) return "";
-  return ofMode(kind, snapshot) || ofKind(kind, { state, phase, mode: snapshot.mode }) || generic(allowed, state);
-}
-
-function ofMode(kind, { state, mode }) {
-  const modes = MODES[kind];
-  if (!modes) return "";
-  if (state === "holding") return "the robot holds: resume or stop first";
-  if (state !== "running") return `run in the mode ${modes.join(" or ")} first`;
-  if (modes.includes(mode)) return kind === "commit" ? "no chunk is shown: show one first" : "";
-  return `this is for ${modes.join(" and ")}; the run's mode is ${mode}`;
-}
-
-function ofKind(kind, { state, phase, mode }) {
-  if (kind === "step") return BUSY[phase] ?? "";
-  if (kind === "approach") {
-    if (state === "ready") return "the policy's first action is not known: set up again";
-    return state === "running" && mode === "preview" ? "no chunk is shown: show one first" : "";
-  }
-  const always = { tune: ["idle", "ready", "running", "holding"], gripper: ["ready", "running", "holding"] }[kind];
-  if (always?.includes(state)) return "a trial is being run: what is measured may not be changed";
-  return "";
-}
-
-function generic(allowed, state) {
+  if (guarded[kind]) return guarded[kind];
+  if (MODES[kind]) return state === "holding" ? "the robot holds: resume or stop first" : `run in the mode ${MODES[kind]} first`;
   const possible = allowed.filter((one) => one !== "estop").map(verb).join(", ") || "nothing";
   return `not while ${words(state)}; possible now: ${possible}`;
 }

@@ -125,6 +125,7 @@ class StandIn:
             "state": str(self.session.state),
             "reason": self.session.reason,
             "allowed": self.session.allowed(),
+            "guarded": self.session.guarded(),
             "lease": {
                 "holder": held.holder if held else "",
                 "epoch": held.epoch if held else self.lease.epoch,

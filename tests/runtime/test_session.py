@@ -182,7 +182,11 @@ def test_what_is_allowed_in_a_state_is_what_its_guards_say_in_every_situation(st
     bench = Bench(state)
     for situation in SITUATIONS:
         bench.effects.situation = situation
-        assert set(bench.session.allowed()) == allowed_in(state, situation), situation
+        allowed, guarded = set(bench.session.allowed()), bench.session.guarded()
+        assert allowed == allowed_in(state, situation), situation
+        of_the_state = {kind for kind, rule in COMMANDS.items() if state in rule.allowed}
+        assert set(guarded) == of_the_state - allowed, situation
+        assert all(guarded.values()), situation
 
 
 @pytest.mark.parametrize(("kind", "state"), list(product(COMMANDS, State)))

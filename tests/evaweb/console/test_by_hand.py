@@ -134,19 +134,13 @@ def test_who_does_not_command_is_told_how_to() -> None:
 @pytest.mark.parametrize(
     ("kind", "situation", "reason"),
     [
-        ("step", {"mode": "continuous"}, "this is for step and preview; the run's mode is continuous"),
-        ("step", {"mode": "step", "phase": "asking"}, "the policy is being asked"),
-        ("step", {"mode": "step", "phase": "executing"}, "the last chunk is still being executed"),
-        ("step", {"mode": "preview", "phase": "proposed"}, "a chunk is shown: commit or cancel it first"),
+        ("step", {"guarded": {"step": "the policy is being asked"}}, "the policy is being asked"),
         ("step", {"state": "ready"}, "run in the mode step or preview first"),
-        ("commit", {"mode": "preview"}, "no chunk is shown: show one first"),
-        ("commit", {"mode": "step"}, "this is for preview; the run's mode is step"),
+        ("commit", {"state": "idle"}, "run in the mode preview first"),
         ("move", {"state": "holding"}, "the robot holds: resume or stop first"),
-        ("move", {"state": "idle"}, "run in the mode manual first"),
-        ("approach", {"state": "ready"}, "the policy's first action is not known: set up again"),
-        ("tune", {"state": "running"}, "a trial is being run: what is measured may not be changed"),
-        ("gripper", {"state": "ready"}, "a trial is being run: what is measured may not be changed"),
         ("home", {"allowed": ["stop", "estop"]}, "not while running; possible now: Stop"),
+        ("home", {"allowed": ["estop"]}, "not while running; possible now: nothing"),
+        ("stop", {"allowed": ["stop"]}, ""),
     ],
 )
 def test_a_button_that_is_dead_says_why(kind: str, situation: dict[str, Any], reason: str) -> None:
