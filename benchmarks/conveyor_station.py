@@ -19,12 +19,12 @@ from runtime.clock import Clock
 from runtime.family import Plan
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.sim.bench import BenchState, camera_arm
-from runtime.sim.chase import SPEED, Chase, Places
+from runtime.sim.chase import Chase, Places
+from runtime.sim.continuing import Prefix, continued
 from runtime.sim.conveyor import CONVEYOR, Conveyor
 from runtime.sim.link import Link
 from runtime.sim.node import Node, parser
 from runtime.sim.plant import Plant
-from runtime.sim.prefix import continued
 from runtime.sim.render import Renderer
 from runtime.sim.surroundings import Surroundings
 from runtime.sim.tabletop import Reset
@@ -91,8 +91,8 @@ class Gallery(Surroundings):
 class Seeing(Policy):
     """A script as a policy in this process, which is shown developed pictures."""
 
-    def __init__(self, script: Chase, rate: float, gallery: Gallery) -> None:
-        self._script, self._rate, self._gallery = script, rate, gallery
+    def __init__(self, script: Chase, gallery: Gallery) -> None:
+        self._script, self._gallery = script, gallery
         self._answer = script.begin()
 
     def connect(self) -> PolicyInfo:
@@ -104,8 +104,8 @@ class Seeing(Policy):
         pictures = self._gallery.develop(observation.pictures[self._script.overhead.key])
         rows = self._answer(observation.qpos.astype(np.float64), pictures, observation.prompt)
         if conditioning is not None:
-            prefix = conditioning.left_over[: conditioning.predicted_delay]
-            rows = continued(rows, prefix, SPEED / self._rate)
+            left = conditioning.left_over.astype(np.float64)
+            rows = continued(rows, Prefix(left, conditioning.predicted_delay, len(left)))
         return ActionChunk(rows)
 
     def reset(self) -> None:
@@ -149,7 +149,7 @@ class ConveyorPlan(Plan):
 
     def _policy(self, config: object, robot: Robot, clock: Clock, rate: float) -> Seeing:
         script = Chase(robot, HORIZON, rate, clock=clock, places=_places(robot.name))
-        return Seeing(script, rate, self.gallery)
+        return Seeing(script, self.gallery)
 
 
 def plan(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -> ConveyorPlan:

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from robots import load
 from runtime.sim.continuing import ModelSpace, Prefix, continued
+from runtime.types import Float32
 
 ROBOT = load("agilex_piper")
+ROWS = arrays(np.float32, (12, 2), elements=st.floats(-3, 3, width=32))
 
 
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 50), st.integers(0, 50))
@@ -30,6 +33,26 @@ def test_the_first_rows_are_the_prefix_and_the_last_are_the_plans_own(
 def test_the_plan_takes_over_bit_by_bit() -> None:
     made = continued(np.ones((6, 1), np.float32), Prefix(np.zeros((6, 1)), 2, 5))
     np.testing.assert_allclose(made[:, 0], [0, 0, 0.25, 0.5, 0.75, 1])
+
+
+@given(ROWS, ROWS, st.integers(0, 12), st.integers(0, 12))
+def test_every_row_is_the_prefixs_or_the_plans_or_between_the_two(
+    plan: Float32, before: Float32, delay: int, end: int
+) -> None:
+    made = continued(plan, Prefix(before.astype(np.float64), delay, end))
+    assert np.all(made >= np.minimum(plan, before))
+    assert np.all(made <= np.maximum(plan, before))
+    np.testing.assert_array_equal(made[:delay], before[:delay])
+
+
+def test_without_a_prefix_the_rows_are_the_plans_own() -> None:
+    plan = np.arange(12, dtype=np.float32).reshape(6, 2)
+    np.testing.assert_array_equal(continued(plan, Prefix(np.zeros((0, 2)), 0, 0)), plan)
+
+
+def test_a_prefix_as_long_as_the_chunk_is_all_of_it() -> None:
+    made = continued(np.zeros((4, 2), np.float32), Prefix(np.ones((6, 2)), 6, 6))
+    np.testing.assert_array_equal(made, np.ones((4, 2)))
 
 
 @given(st.lists(st.floats(-3, 3), min_size=14, max_size=14))
