@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, wait
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import Any
 
 from runtime.clock import Clock, MonotonicClock
 from runtime.closing import Close, at_once, in_background
-from runtime.drives import Drives
-from runtime.errors import RecordingError, RuntimeFault, TransportError
+from runtime.errors import RecordingError, RuntimeFault
 from runtime.exports import Exports
 from runtime.family import Plan, join
+from runtime.intake import Intake
 from runtime.leftovers import start_repair
 from runtime.messages import (
     BeginEpisode,
@@ -40,7 +39,6 @@ from runtime.types import Observation
 
 log = logging.getLogger(__name__)
 _REPORT_PERIOD = 0.2
-_RATE_WINDOW = 40  # arrivals per stream
 _LAST_S = 8.0  # for the last episode, before the supervisor's patience ends
 _EXPORT_S = 3.0  # of it, for the exports that are under way; the worker, or a person, makes up for them
 _CLOSING_S = 1.0  # how long a new episode waits for the one before it; longer is a disk in trouble
@@ -60,32 +58,19 @@ class Media:
         on_disk: Callable[[Path], None] = lambda folder: None,
     ) -> None:
         self._page = page
-        self._source = source
         self._recorder = recorder
         self._clock = clock
-        self._preview = preview
+        self._intake = Intake(page, source, clock, self._say, recorder.see, preview)
         self._closer = closer
         self._on_disk = on_disk  # hears of every episode that was closed
         self._closing: Future[Closed] | None = None
         self._closing_uuid = ""
         self._waiting: BeginEpisode | None = None  # for the episode before it to be closed
         self._waiting_since = 0.0
-        self._numbers: Counter[str] = Counter({c: self._newest(c) for c in page.layout.cameras})
-        self._captured: dict[str, float] = {}
-        self._arrivals: dict[str, deque[float]] = {}
         self._next_report = 0.0
-        self._faults: dict[str, int] = {}
-        self._too_large: Counter[str] = Counter()
-        self._source_failure = ""
-        self._truth: Mapping[str, Any] = {}  # what a simulated bench last said of itself
-        self._drives = Drives()
         for ring in ("minutes", "ticks"):
             for _ in page.rings[ring].drain():
                 pass  # addressed to a predecessor that died
-
-    def _newest(self, camera: str) -> int:
-        record = self._page.observation.read()
-        return int(record["picture_number"][self._page.layout.cameras.index(camera)])
 
     @property
     def recording(self) -> bool:
@@ -93,9 +78,7 @@ class Media:
 
     def pump(self, timeout: float) -> None:
         """Take one observation if there is one within `timeout` seconds, then all that the family says."""
-        observation = self._receive(timeout)
-        if observation is not None:
-            self._take(observation)
+        self._intake.pump(timeout)
         self.digest()
 
     def digest(self) -> None:
@@ -126,57 +109,6 @@ class Media:
         self._waiting = None
         self._begin(waiting)
         return True
-
-    # --- observations --------------------------------------------------------------------------------------
-
-    def _receive(self, timeout: float) -> Observation | None:
-        """What the source has; a failure is said once, and control holds when what it sees is old."""
-        try:
-            observation = self._source.receive(timeout)
-        except TransportError as error:
-            if str(error) != self._source_failure:
-                self._source_failure = str(error)
-                log.error("%s", error)
-                self._say(Event("source_failed", str(error), self._clock.now()))
-            self._clock.sleep_until(self._clock.now() + timeout)
-            return None
-        if observation is not None:
-            self._source_failure = ""
-        return observation
-
-    def _take(self, observation: Observation) -> None:
-        for camera, picture in observation.pictures.items():
-            captured = observation.captured.get(camera, observation.arrived)
-            if camera in self._numbers and captured != self._captured.get(camera):
-                self._captured[camera] = captured
-                self._count(camera, observation.arrived)
-                if picture.nbytes > self._page.layout.picture_bytes:
-                    self._too_large[f"picture_too_large_{camera}"] += 1
-                    continue
-                self._numbers[camera] += 1
-                self._page.pictures[camera].write(self._numbers[camera], picture)
-        self._count("joints", observation.arrived)
-        self._truth = observation.truth or {}
-        self._see_drives(observation)
-        self._recorder.see(observation)
-        self._page.publish_observation(observation, self._numbers)
-        self._preview(observation)
-
-    def _see_drives(self, observation: Observation) -> None:
-        change = self._drives.see(observation.drives, observation.arrived)
-        if change:
-            self._say(Event("drives", change, observation.arrived, data=dict(self._drives.newest)))
-
-    def _count(self, stream: str, arrived: float) -> None:
-        self._arrivals.setdefault(stream, deque(maxlen=_RATE_WINDOW)).append(arrived)
-
-    def _rate(self, stream: str, now: float) -> float:
-        times = self._arrivals[stream]
-        if len(times) < 2 or now - times[-1] > 2.0:
-            return 0.0
-        return (len(times) - 1) / max(times[-1] - times[0], 1e-9)
-
-    # --- what the family says ------------------------------------------------------------------------------
 
     def _hear(self, message: Message) -> None:
         try:
@@ -213,10 +145,7 @@ class Media:
             except RecordingError as fault:
                 error = str(fault)
         if not error and message.run:
-            self._source.begin_run()
-            first = self._receive(0.0)  # so that the run's first tick sees its first frame
-            if first is not None:
-                self._take(first)
+            self._intake.begin_run()
         self._tell(EpisodeOpened(message.run, identity, str(path), error))
 
     def end(self, status: str, reason: str, details: Mapping[str, Any] | None = None) -> None:
@@ -251,25 +180,18 @@ class Media:
         self.end("failed", str(error))
 
     def _report(self, now: float) -> None:
-        faults = self._source.faults() | dict(self._too_large)
-        for name, count in faults.items():
-            if count > self._faults.get(name, 0):
-                text = f"source: {name.replace('_', ' ')} ({count} so far)"
-                self._say(Event(f"source_{name}", text, now, data={"count": count}))
-        self._faults = dict(faults)
-        rates = {stream: self._rate(stream, now) for stream in self._arrivals}
-        recorder = self._recorder
+        intake, recorder = self._intake, self._recorder
+        faults, rates = intake.faults(), intake.rates()
         recording = recorder.recording or self._closing_uuid  # until it is on disk
         rows, repeated = recorder.rows, recorder.repeated
-        self._tell(
-            MediaReport(now, rates, faults, rows, recording, repeated, self._truth, self._drives.newest)
-        )
+        self._tell(MediaReport(now, rates, faults, rows, recording, repeated, intake.truth, intake.drives))
 
     def _say_truth(self) -> None:
         """How a simulated bench is left: what the episode is scored by."""
-        if self._truth:
-            how = "success" if self._truth["success"] else "no success"
-            data = {**self._truth, "episode": self._recorder.recording}
+        truth = self._intake.truth
+        if truth:
+            how = "success" if truth["success"] else "no success"
+            data = {**truth, "episode": self._recorder.recording}
             self._say(Event("truth", f"the simulated bench says: {how}", self._clock.now(), data=data))
 
     def _say(self, event: Event) -> None:

@@ -1,0 +1,131 @@
+"""What media receives: observations into the page, with their rates, faults, drives and truth."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from runtime.clock import Clock
+from runtime.drives import Drives
+from runtime.errors import TransportError
+from runtime.messages import Event
+from runtime.page import Page
+from runtime.transports.base import Source
+from runtime.types import Observation
+
+log = logging.getLogger(__name__)
+_RATE_WINDOW = 40  # arrivals per stream
+_SILENT_S = 2.0  # after which a stream has no rate any more
+
+
+class Intake:
+    """The way of an observation: pictures into their slots, `see`, numbers into the page, `preview`.
+
+    `truth` is what a simulated bench last said of itself. Events are given to `say`.
+    """
+
+    def __init__(
+        self,
+        page: Page,
+        source: Source,
+        clock: Clock,
+        say: Callable[[Event], None],
+        see: Callable[[Observation], None],
+        preview: Callable[[Observation], None],
+    ) -> None:
+        self._page = page
+        self._source = source
+        self._clock = clock
+        self._say, self._see, self._preview = say, see, preview
+        self._numbers: Counter[str] = Counter({c: self._newest(c) for c in page.layout.cameras})
+        self._captured: dict[str, float] = {}
+        self._arrivals: dict[str, deque[float]] = {}
+        self._faults: dict[str, int] = {}
+        self._too_large: Counter[str] = Counter()
+        self._failure = ""
+        self._drives = Drives()
+        self.truth: Mapping[str, Any] = {}
+
+    @property
+    def drives(self) -> Mapping[str, Any]:
+        """What the node last said of its drives; {} while it does not say."""
+        return self._drives.newest
+
+    def pump(self, timeout: float) -> None:
+        """Take one observation if there is one within `timeout` seconds."""
+        observation = self._receive(timeout)
+        if observation is not None:
+            self._take(observation)
+
+    def begin_run(self) -> None:
+        """The source begins a run; its first frame is taken here, so that the run's first tick sees it."""
+        self._source.begin_run()
+        self.pump(0.0)
+
+    def faults(self) -> dict[str, int]:
+        """How often what went wrong; every count that has grown since the last call is an event."""
+        now, faults = self._clock.now(), {**self._source.faults(), **self._too_large}
+        for name, count in faults.items():
+            if count > self._faults.get(name, 0):
+                text = f"source: {name.replace('_', ' ')} ({count} so far)"
+                self._say(Event(f"source_{name}", text, now, data={"count": count}))
+        self._faults = faults
+        return dict(faults)
+
+    def rates(self) -> dict[str, float]:
+        """Arrivals per second [Hz] by stream, over the newest 40; 0 after 2 s of silence."""
+        now = self._clock.now()
+        return {stream: _rate(times, now) for stream, times in self._arrivals.items()}
+
+    def _newest(self, camera: str) -> int:
+        record = self._page.observation.read()
+        return int(record["picture_number"][self._page.layout.cameras.index(camera)])
+
+    def _receive(self, timeout: float) -> Observation | None:
+        """What the source has; a failure is said once, and control holds when what it sees is old."""
+        try:
+            observation = self._source.receive(timeout)
+        except TransportError as error:
+            if str(error) != self._failure:
+                self._failure = str(error)
+                log.error("%s", error)
+                self._say(Event("source_failed", str(error), self._clock.now()))
+            self._clock.sleep_until(self._clock.now() + timeout)
+            return None
+        if observation is not None:
+            self._failure = ""
+        return observation
+
+    def _take(self, observation: Observation) -> None:
+        for camera, picture in observation.pictures.items():
+            captured = observation.captured.get(camera, observation.arrived)
+            if camera in self._numbers and captured != self._captured.get(camera):
+                self._captured[camera] = captured
+                self._count(camera, observation.arrived)
+                if picture.nbytes > self._page.layout.picture_bytes:
+                    self._too_large[f"picture_too_large_{camera}"] += 1
+                    continue
+                self._numbers[camera] += 1
+                self._page.pictures[camera].write(self._numbers[camera], picture)
+        self._count("joints", observation.arrived)
+        self.truth = observation.truth or {}
+        self._hear_drives(observation)
+        self._see(observation)
+        self._page.publish_observation(observation, self._numbers)
+        self._preview(observation)
+
+    def _hear_drives(self, observation: Observation) -> None:
+        change = self._drives.see(observation.drives, observation.arrived)
+        if change:
+            self._say(Event("drives", change, observation.arrived, data=dict(self._drives.newest)))
+
+    def _count(self, stream: str, arrived: float) -> None:
+        self._arrivals.setdefault(stream, deque(maxlen=_RATE_WINDOW)).append(arrived)
+
+
+def _rate(times: deque[float], now: float) -> float:
+    if len(times) < 2 or now - times[-1] > _SILENT_S:
+        return 0.0
+    return (len(times) - 1) / max(times[-1] - times[0], 1e-9)

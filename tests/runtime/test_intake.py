@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import mmap
+from collections import deque
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.clock import VirtualClock
+from runtime.errors import TransportError
+from runtime.intake import Intake
+from runtime.messages import Event
+from runtime.page import Page, PageLayout
+from runtime.types import Observation
+from tests.runtime.test_media import FakeSource
+
+RATE = 30.0
+
+
+class Gate:
+    """An intake with one camera; `order` says who heard of which observation, one after the other."""
+
+    def __init__(self) -> None:
+        layout = PageLayout(2, 8, ("cam",), 75)
+        self.page = Page(layout, mmap.mmap(-1, Page.size(layout)))
+        self.clock, self.source = VirtualClock(100.0), FakeSource()
+        self.said: list[Event] = []
+        self.order: list[tuple[str, int, bool]] = []
+        self.intake = Intake(
+            self.page, self.source, self.clock, self.said.append, self.hears("see"), self.hears("preview")
+        )
+
+    def hears(self, name: str) -> Any:
+        return lambda seen: self.order.append((name, seen.sequence, self.published() == seen.sequence))
+
+    def published(self) -> int:
+        seen = self.page.read_observation(())
+        return -1 if seen is None else int(seen.sequence)
+
+    def observation(self, sequence: int, **changes: Any) -> Observation:
+        now = self.clock.now()
+        fields: dict[str, Any] = {
+            "sequence": sequence,
+            "arrived": now,
+            "captured": {"joints": now, "cam": now},
+            "qpos": np.zeros(2, np.float32),
+            "pictures": {"cam": np.zeros((5, 5, 3), np.uint8)},
+        }
+        return Observation(**(fields | changes))
+
+    def receive(self, count: int, **changes: Any) -> None:
+        for sequence in range(1, count + 1):
+            self.source.waiting.append(self.observation(sequence, **changes))
+            self.intake.pump(0.0)
+            self.clock.advance(1 / RATE)
+
+
+@pytest.fixture
+def gate() -> Gate:
+    return Gate()
+
+
+def test_the_recorder_sees_an_observation_before_anybody_else_and_the_preview_comes_last(gate: Gate) -> None:
+    gate.receive(1)
+    assert gate.order == [("see", 1, False), ("preview", 1, True)]
+
+
+def test_rates_are_those_of_arrivals_and_none_after_a_silence(gate: Gate) -> None:
+    assert gate.intake.rates() == {}
+    gate.receive(1)
+    assert gate.intake.rates() == {"cam": 0.0, "joints": 0.0}
+    gate.receive(50)
+    assert gate.intake.rates() == pytest.approx({"cam": RATE, "joints": RATE})
+    gate.clock.advance(2.1)
+    assert gate.intake.rates() == {"cam": 0.0, "joints": 0.0}
+
+
+def test_a_fault_is_said_when_its_count_has_grown(gate: Gate) -> None:
+    gate.source.counts["frozen_cam"] = 2
+    assert gate.intake.faults() == {"frozen_cam": 2}
+    gate.intake.faults()
+    gate.source.counts["frozen_cam"] = 3
+    gate.intake.faults()
+    assert [(event.kind, event.text) for event in gate.said] == [
+        ("source_frozen_cam", "source: frozen cam (2 so far)"),
+        ("source_frozen_cam", "source: frozen cam (3 so far)"),
+    ]
+
+
+def test_a_picture_that_has_no_room_is_counted_and_not_written(gate: Gate) -> None:
+    gate.receive(2, pictures={"cam": np.zeros((6, 6, 3), np.uint8)})
+    assert gate.intake.faults() == {"picture_too_large_cam": 2}
+    assert gate.page.observation.read()["picture_number"].tolist() == [0]
+
+
+def test_a_source_that_fails_is_said_once_and_again_after_it_came_back(gate: Gate) -> None:
+    failure = TransportError("the node is gone")
+    gate.source.waiting = deque([failure, failure])
+    gate.intake.pump(0.0)
+    gate.intake.pump(0.0)
+    gate.receive(1)
+    gate.source.waiting.append(failure)
+    gate.intake.pump(0.0)
+    assert [event.text for event in gate.said] == ["the node is gone", "the node is gone"]
+
+
+def test_truth_and_drives_are_those_of_the_newest_observation(gate: Gate) -> None:
+    gate.receive(1, truth={"success": True}, drives={"enabled": False, "faults": []})
+    assert gate.intake.truth == {"success": True}
+    assert gate.intake.drives == {"enabled": False, "faults": []}
+    assert [event.text for event in gate.said] == ["drives disabled"]
+    gate.receive(1)
+    assert (gate.intake.truth, gate.intake.drives) == ({}, {})
+
+
+def test_a_run_begins_with_the_sources_first_frame(gate: Gate) -> None:
+    gate.source.first = gate.observation(7)
+    gate.intake.begin_run()
+    assert (gate.source.begun, gate.published()) == (1, 7)
