@@ -12,16 +12,15 @@ export class ModePanel {
   #chosen = "";
   #primary = "run";
   #changed = -Infinity;
-  #picked;
 
   /** `picked(mode)` hears what a person chose. */
   constructor(store, commands, picked) {
     this.#store = store;
     this.#commands = commands;
-    this.#picked = picked;
     this.#chosen = this.#form.elements.mode.value; // as a draft had it
     this.#form.addEventListener("submit", (event) => event.preventDefault());
     this.#form.addEventListener("change", (event) => this.#choose(event));
+    this.#form.addEventListener("click", ({ target }) => target.name === "mode" && picked(target.value)); // the same again too
     part("seen").addEventListener("change", () => this.draw());
     commands.provide("run", () => this.#runs());
     store.on(["snapshot", "second"], () => this.draw());
@@ -34,10 +33,7 @@ export class ModePanel {
   }
 
   #choose({ target }) {
-    if (target.name === "mode") {
-      this.#chosen = target.value;
-      this.#picked(target.value);
-    }
+    if (target.name === "mode") this.#chosen = target.value;
     this.draw();
   }
 

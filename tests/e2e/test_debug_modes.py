@@ -1,0 +1,285 @@
+"""The Debug tab by hand, in every mode, with the real processes: what is pressed, what is said, what moves."""
+
+import pytest
+
+from tests.e2e.bench_page import BenchPage
+from tests.e2e.lab import STATION, WIDE
+from tests.processes import eventually
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+MODE_KEYS = {"sim": "1", "step": "2", "preview": "3", "continuous": "4", "manual": "5"}
+SOON_S = 30
+
+
+class ByHand(BenchPage):
+    """Somebody at the Debug tab who uses keys wherever there are some."""
+
+    def snapshot(self):
+        return self.api(f"stations/{STATION}")["snapshot"]
+
+    def keys(self, *pressed):
+        for key in pressed:
+            self.page.keyboard.press(key)
+
+    def says(self, part, words, seconds=SOON_S):
+        """The part of the page says these words."""
+        place = self.page.locator(part)
+        eventually(lambda: words in place.inner_text(), seconds, f"{part} says {words!r}")
+
+    def quiet(self, part):
+        self.page.locator(part).wait_for(state="hidden")
+
+    def set_up(self):
+        if self.state() == "HOLDING":
+            self.press("stop")
+        self.at_rest()
+        began = self.snapshot()["sequence"]
+        self.press("setup")
+        eventually(lambda: self.snapshot()["sequence"] > began + 1, 60, "the set-up has begun and ended")
+        self.reaches("READY")
+        self.at_the_pose()
+
+    def at_the_pose(self):
+        """The page has seen the robot where the set-up has brought it."""
+        pose = self.snapshot()["facts"]["home"][:7]
+        there = pytest.approx(pose, abs=0.02)
+        eventually(lambda: self.joints() == there, SOON_S, f"the page shows the robot at {pose}")
+
+    def run_in(self, mode):
+        """Choose the mode and begin."""
+        self.reaches("READY")
+        self.keys(MODE_KEYS[mode])
+        self.press("run")
+        self.reaches("RUNNING")
+        begun = self.page.locator("[data-grip=open][aria-disabled=false]").first  # its recording is open
+        begun.wait_for(state="attached")
+        assert self.snapshot()["mode"] == mode
+
+    def stop(self):
+        self.press("stop")
+        self.reaches("READY")
+
+    def joints(self):
+        """Where the left arm is told to be, as the sliders show it while nobody moves them [rad]."""
+        fields = self.page.locator("#joints input[type=number]")
+        return fields.evaluate_all("all => all.map((field) => Number(field.value))")
+
+    def moved_from(self, before, by=0.02):
+        return max(abs(now - then) for now, then in zip(self.joints(), before, strict=True)) > by
+
+    def said(self):
+        """What is said of the target."""
+        return self.page.locator("[data-target=said]").inner_text()
+
+
+@pytest.fixture(scope="module")
+def bench(browser, demo):
+    bench = ByHand(browser, demo, "operator", WIDE).open(f"/stations/{STATION}/debug/")
+    bench.at_rest()
+    bench.take()
+    yield bench
+    assert bench.errors == []
+    bench.close()
+
+
+@pytest.fixture
+def ready(bench):
+    """Set up, at the start pose, and left so that the next test can begin."""
+    bench.take_again()
+    bench.set_up()
+    yield bench
+    if bench.state() in ("RUNNING", "HOLDING"):
+        bench.stop()
+
+
+def test_the_set_up_shows_its_stages_and_can_be_cancelled_and_repeated(bench):
+    bench.keys("u")
+    active = bench.page.locator("[data-stages] [data-state=active]")
+    active.first.wait_for()
+    assert bench.page.locator("[data-stages] li").count() >= 4
+    bench.keys("s")
+    bench.reaches("IDLE")
+    assert "cancelled" in bench.snapshot()["reason"]
+    bench.keys("u")
+    bench.reaches("READY")
+    bench.quiet("[data-stages]")
+
+
+def test_sim_says_what_the_policy_sees_and_moves_nothing(ready):
+    before, block = ready.joints(), ready.truth()
+    ready.keys("1", "q")
+    ready.run_in("sim")
+    ready.says("[data-mode=note]", "The policy sees the simulated robot's joints and the live cameras.")
+    ready.says("[data-mode=phase]", "executing")
+    eventually(lambda: ready.snapshot()["policy"]["answers"] > 4, SOON_S, "the policy is asked")
+    assert not ready.moved_from(before)
+    assert ready.truth()["milestones"] == block["milestones"]
+    ready.stop()
+    ready.keys("Shift+Q")
+    ready.run_in("sim")
+    ready.says("[data-mode=note]", "the real robot's joints, which do not follow it")
+    assert ready.snapshot()["sim_state"] == "live"
+    ready.stop()
+    ready.keys("q")
+
+
+def test_step_moves_the_robot_by_one_chunk_for_each_press(ready):
+    before = ready.joints()
+    ready.run_in("step")
+    ready.says("[data-mode=phase]", "waiting for you")
+    assert not ready.moved_from(before)
+    ready.press("step")
+    eventually(lambda: ready.moved_from(before), SOON_S, "the robot moves")
+    ready.says("[data-mode=phase]", "waiting for you")
+    rest = ready.joints()
+    ready.page.wait_for_timeout(500)
+    assert ready.joints() == rest
+    ready.press("step")
+    eventually(lambda: ready.moved_from(rest), SOON_S, "it goes on")
+
+
+def test_preview_shows_a_chunk_that_is_cancelled_or_committed(ready):
+    before = ready.joints()
+    ready.run_in("preview")
+    ready.press("step")
+    ready.says("[data-mode=note]", "Chunk")
+    ready.says("[data-mode=phase]", "a chunk is shown")
+    ready.page.locator("[data-primary=commit]").wait_for()
+    ready.keys("x")
+    ready.quiet("[data-mode=note]")
+    assert ready.snapshot()["proposal"] == {}
+    assert not ready.moved_from(before)
+    ready.press("step")
+    ready.says("[data-mode=note]", "Chunk")
+    ready.press("commit")
+    eventually(lambda: ready.moved_from(before), SOON_S, "the committed chunk is executed")
+    ready.says("[data-mode=phase]", "waiting for you")
+
+
+def test_strategy_and_prompt_are_switched_while_the_robot_moves(ready):
+    page = ready.page
+    ready.keys("6")
+    ready.run_in("continuous")
+    page.select_option("#strategy-kind", "ensemble")
+    page.fill("#parameter-ensemble_horizon", "4")
+    page.fill("#task", "put it on the plate, slowly")
+    ready.says("[data-tune=edited]", "Strategy, Ensemble of, Prompt")
+    ready.says("[data-tune=unused]", "Not used by ensemble: ")
+    page.keyboard.press("Enter")
+    ready.says("[data-tune=task]", "In force: “put it on the plate, slowly”")
+    found = ready.snapshot()
+    assert (found["tuning"]["kind"], found["tuning"]["ensemble_horizon"]) == ("ensemble", 4)
+    assert (found["task"], found["state"]) == ("put it on the plate, slowly", "running")
+    page.fill("#parameter-ensemble_horizon", "0")
+    ready.says("[data-tune=edited]", "a whole number from 1")
+    assert page.locator("[data-command=tune]").get_attribute("aria-disabled") == "true"
+    page.locator("[data-tune=undo]").click()
+    page.locator("[data-tune=deployed]").click()
+    ready.keys("d")
+    eventually(lambda: ready.snapshot()["tuning"]["kind"] == "async", SOON_S, "the deployment's own again")
+    assert ready.snapshot()["state"] == "running"
+
+
+def test_by_hand_the_target_is_shown_first_and_moves_the_robot_when_sent(ready):
+    page = ready.page
+    before = ready.joints()
+    ready.run_in("manual")
+    page.locator("#panel-manual").wait_for()
+    send = page.locator("[data-command=move]")
+    eventually(
+        lambda: "target is where the robot is" in send.get_attribute("title"), SOON_S, "Send says why not"
+    )
+    ready.keys("i", *["ArrowRight"] * 20)
+    target = ready.joints()
+    assert target[0] == pytest.approx(before[0] + 0.2, abs=0.02)
+    eventually(lambda: "rad from the robot" in ready.said(), SOON_S, "the station says how far that is")
+    assert ready.snapshot()["phase"] == "waiting"
+    page.keyboard.press("m")
+    eventually(lambda: "has arrived" in ready.said(), SOON_S, "the robot is where it was sent")
+    arrived = pytest.approx(target[0], abs=0.01)
+    eventually(lambda: ready.joints()[0] == arrived, SOON_S, f"the page shows the joint at {target[0]}")
+
+
+def test_the_hand_goes_by_steps_as_far_as_it_reaches(ready):
+    page = ready.page
+    ready.run_in("manual")
+    before = ready.joints()
+    ready.keys("Shift+H", "PageUp")
+    eventually(lambda: ready.moved_from(before, 0.005), SOON_S, "the target is a step higher")
+    ready.says("[data-target=at]", "mm")
+    ready.press("move")
+    eventually(lambda: "has arrived" in ready.said(), SOON_S, "the robot is a step higher")
+    page.select_option("#jog-mm", "50")
+    there = ready.joints()
+    higher = page.locator("[data-jog='z+']:not([data-turn])")
+
+    def beyond():
+        reached = ready.joints()
+        higher.click()
+        return "Out of reach" in ready.said() and ready.joints() == reached
+
+    eventually(beyond, SOON_S, "a step that is out of reach is said, and leaves the target where it was")
+    ready.keys("0")
+    eventually(lambda: not ready.moved_from(there), SOON_S, "the target is where the robot is")
+    ready.keys("Shift+J")
+
+
+def test_grippers_close_open_and_lock_where_they_are(ready):
+    ready.run_in("manual")
+    ready.keys("8")
+    left = ready.page.locator(".gripper").first
+
+    def at(value):
+        eventually(
+            lambda: ready.snapshot()["grippers"]["left_arm"]["at"] == pytest.approx(value, abs=0.005),
+            SOON_S,
+            f"the gripper is at {value}",
+        )
+
+    ready.keys(".")
+    at(0.0)
+    left.locator("[data-grip=lock]").click()
+    eventually(lambda: "locked" in left.inner_text(), SOON_S, "it says that it is locked")
+    assert ready.snapshot()["grippers"]["left_arm"]["locked"] is True
+    ready.keys("-")
+    eventually(lambda: "locked" not in left.inner_text(), SOON_S, "it is free again")
+    ready.keys(",")
+    at(0.1)
+    ready.says("[data-drives=said]", "enabled, no fault")
+
+
+def test_a_first_action_that_is_far_is_warned_of_and_approached(ready):
+    page = ready.page
+    ready.quiet("[data-mode=far]")
+    ready.run_in("manual")
+    page.select_option("#speed", "1")
+    page.select_option("#pose", "home")
+    eventually(lambda: "rad from the robot" in ready.said(), SOON_S, "the pose is a target")
+    ready.press("move")
+    eventually(lambda: "has arrived" in ready.said(), SOON_S, "the robot is at the named pose")
+    ready.stop()
+    ready.keys("4")
+    ready.says("[data-mode=far-text]", "The policy's first action is")
+    ready.keys("b")
+    ready.reaches("SETTING UP")
+    ready.reaches("READY")
+    ready.quiet("[data-mode=far]")
+    assert ready.snapshot()["first_action"]["far"] is False
+
+
+def test_space_on_a_button_and_escape_in_a_field_are_the_e_stop_and_nothing_else(ready):
+    page = ready.page
+    ready.keys("6")
+    before = ready.snapshot()["last_run"]
+    for focused, key in (("[data-command=run]", "Space"), ("#strategy-kind", "Space"), ("#task", "Escape")):
+        page.locator(focused).focus()
+        page.keyboard.press(key)
+        ready.reaches("FAULTED")
+        ready.press("release")
+        ready.reaches("IDLE")
+    page.fill("#task", "two words")
+    page.locator("#task").press("Space")
+    page.locator("#task").blur()
+    page.fill("#task", "")
+    assert ready.state() == "IDLE"
+    assert ready.snapshot()["last_run"] == before
