@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import zmq
 
 from runtime import codecs
 from runtime.clock import Clock, MonotonicClock
@@ -27,8 +26,8 @@ from runtime.sim.drives import Drives
 from runtime.sim.gate import Accepted, Gate
 from runtime.sim.gestures import Gesture
 from runtime.sim.plant import Plant, poses
+from runtime.sim.sockets import Sockets
 from runtime.sim.tabletop import Reset
-from runtime.transports.zmq import is_loopback
 from runtime.types import Float64, UInt8
 
 if TYPE_CHECKING:
@@ -37,8 +36,6 @@ if TYPE_CHECKING:
     from robots import Robot
     from runtime.sim.surroundings import Surroundings
 
-_QUEUED_FRAMES = 4
-_DRAINED_COMMANDS = 1000  # per tick; a flood must not stop the publishing
 _LONGEST_STEP = 0.2  # s; a node that was stopped does not make up for it in one leap
 _GARBAGE = b"\x85\xa1t"  # a map of five that ends after half an entry
 _NO_LEADER = "the simulated node has no leader arm"
@@ -70,19 +67,18 @@ class Node:
         self._frozen: UInt8 | None = None
         self._holding = True
         self._sequence = 0
-        self._publisher: zmq.Socket[bytes] | None = None
-        self._subscriber: zmq.Socket[bytes] | None = None
+        self._sockets: Sockets | None = None
 
     def open(self) -> dict[str, str]:
         """Bind both sockets and return their real addresses."""
-        self._publisher = self._bound(zmq.PUB, self._options.obs_endpoint)
-        self._subscriber = self._bound(zmq.SUB, self._options.action_endpoint)
-        self._subscriber.setsockopt(zmq.SUBSCRIBE, b"")
-        return {"obs_endpoint": _address(self._publisher), "action_endpoint": _address(self._subscriber)}
+        options = self._options
+        self._sockets = Sockets(options.obs_endpoint, options.action_endpoint, options.insecure_link)
+        return self._sockets.addresses
 
     def tick(self, seconds: float) -> None:
         """Obey, move for `seconds`, publish."""
-        self._publish(self.exchange(self._commands(), seconds))
+        assert self._sockets is not None
+        self._sockets.publish(self.exchange(self._sockets.received(), seconds))
 
     def exchange(self, payloads: Sequence[bytes], seconds: float) -> bytes:
         """Obey what has come and move for `seconds`; returns the observation that is then to be published."""
@@ -97,24 +93,9 @@ class Node:
 
     def close(self) -> None:
         """Release the sockets; safe to call twice."""
-        for socket in (self._publisher, self._subscriber):
-            if socket is not None:
-                socket.close(linger=0)
-        self._publisher = self._subscriber = None
-
-    def _bound(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
-        if not self._options.insecure_link and not is_loopback(endpoint):
-            raise SetupError(
-                f"{endpoint} can be reached from other machines; add --insecure-link to allow it"
-            )
-        socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
-        socket.setsockopt(zmq.SNDHWM, _QUEUED_FRAMES)
-        try:
-            socket.bind(endpoint)
-        except zmq.ZMQError as error:
-            socket.close(linger=0)
-            raise SetupError(f"cannot bind {endpoint}: {error}") from error
-        return socket
+        if self._sockets is not None:
+            self._sockets.close()
+        self._sockets = None
 
     def _obey(self, payloads: Sequence[bytes]) -> None:
         """Judge everything that has come; of the targets only the newest counts."""
@@ -133,14 +114,6 @@ class Node:
             self._gate.refused["collecting"] += 1
         elif newest is not None:
             self._plant.target = newest
-
-    def _commands(self) -> list[bytes]:
-        assert self._subscriber is not None
-        payloads: list[bytes] = []
-        with contextlib.suppress(zmq.Again):
-            while len(payloads) < _DRAINED_COMMANDS:
-                payloads.append(self._subscriber.recv(zmq.NOBLOCK))
-        return payloads
 
     def _control(self, accepted: Accepted) -> None:
         """Control words come several times; a repetition changes nothing."""
@@ -171,13 +144,6 @@ class Node:
             self._plant.hold()
         self._holding = silent and self._leader_phase is None
         self._surroundings.move(self._plant, seconds)
-
-    def _publish(self, payload: bytes) -> None:
-        assert self._publisher is not None
-        # libzmq by itself notes only once a millisecond what was taken, and drops while a queue looks full.
-        self._publisher.poll(0, zmq.POLLOUT)
-        with contextlib.suppress(zmq.Again):  # nobody takes them fast enough: the next frame is newer
-            self._publisher.send(payload, zmq.NOBLOCK, copy=False)
 
     def _observation(self) -> dict[str, object]:
         robot, q = self._robot, self._plant.q
@@ -293,12 +259,6 @@ def _start(robot: Robot, name: str) -> Float64:
     if name not in robot.poses:
         raise SetupError(f"{robot.name} has no pose {name!r}; it has {', '.join(robot.poses)}")
     return robot.poses[name]
-
-
-def _address(socket: zmq.Socket[bytes]) -> str:
-    raw = socket.getsockopt(zmq.LAST_ENDPOINT)
-    assert isinstance(raw, bytes)
-    return raw.rstrip(b"\0").decode()
 
 
 def _positive(text: str) -> float:

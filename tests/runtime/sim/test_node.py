@@ -55,8 +55,9 @@ class Bench:
         self.commands.connect(ready["action_endpoint"])
         self._join()
         self.inbox: list[bytes] = []
-        self.drain = self.node._commands
-        self.node._commands = self._arrived  # type: ignore[method-assign]
+        assert self.node._sockets is not None
+        self.drain = self.node._sockets.received
+        self.node._sockets.received = self._arrived  # type: ignore[method-assign]
 
     def tick(self, count: int = 1) -> dict[str, Any]:
         """Ticks of one period each; the last observation."""
@@ -92,12 +93,13 @@ class Bench:
             self.node.tick(0.0)
         while self.frames.poll(100):
             self.frames.recv()
-        assert self.node._subscriber is not None
-        while not self.node._subscriber.poll(20):
+        assert self.node._sockets is not None
+        commands = self.node._sockets._subscriber
+        while not commands.poll(20):
             assert time.monotonic() < deadline
             self.commands.send(codecs.pack({"t": 0.0, "target": "sim", "master": "joiner"}))
-        while self.node._subscriber.poll(100):
-            self.node._subscriber.recv()
+        while commands.poll(100):
+            commands.recv()
 
     def close(self) -> None:
         self.node.close()

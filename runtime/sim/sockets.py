@@ -1,0 +1,70 @@
+"""The two sockets of a simulated node: observations go out, commands come in."""
+
+from __future__ import annotations
+
+import contextlib
+
+import zmq
+
+from runtime.errors import SetupError
+from runtime.transports.zmq import is_loopback
+
+_QUEUED_FRAMES = 4
+_DRAINED_COMMANDS = 1000  # at once; a flood must not stop the publishing
+
+
+class Sockets:
+    """Bound on construction; SetupError where an address is taken, or open to others without `insecure`."""
+
+    def __init__(self, observations: str, commands: str, insecure: bool) -> None:
+        self._publisher = _bound(zmq.PUB, observations, insecure)
+        try:
+            self._subscriber = _bound(zmq.SUB, commands, insecure)
+        except SetupError:
+            self._publisher.close(linger=0)
+            raise
+        self._subscriber.setsockopt(zmq.SUBSCRIBE, b"")
+
+    @property
+    def addresses(self) -> dict[str, str]:
+        """Where they really are."""
+        return {"obs_endpoint": _address(self._publisher), "action_endpoint": _address(self._subscriber)}
+
+    def received(self) -> list[bytes]:
+        """The commands that have come, in order."""
+        payloads: list[bytes] = []
+        with contextlib.suppress(zmq.Again):
+            while len(payloads) < _DRAINED_COMMANDS:
+                payloads.append(self._subscriber.recv(zmq.NOBLOCK))
+        return payloads
+
+    def publish(self, payload: bytes) -> None:
+        """Send one observation; dropped where nobody takes them fast enough, because the next one is newer."""
+        # libzmq by itself notes only once a millisecond what was taken, and drops while a queue looks full.
+        self._publisher.poll(0, zmq.POLLOUT)
+        with contextlib.suppress(zmq.Again):
+            self._publisher.send(payload, zmq.NOBLOCK, copy=False)
+
+    def close(self) -> None:
+        """Release them; safe to call twice."""
+        for socket in (self._publisher, self._subscriber):
+            socket.close(linger=0)
+
+
+def _bound(kind: int, endpoint: str, insecure: bool) -> zmq.Socket[bytes]:
+    if not insecure and not is_loopback(endpoint):
+        raise SetupError(f"{endpoint} can be reached from other machines; add --insecure-link to allow it")
+    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
+    socket.setsockopt(zmq.SNDHWM, _QUEUED_FRAMES)
+    try:
+        socket.bind(endpoint)
+    except zmq.ZMQError as error:
+        socket.close(linger=0)
+        raise SetupError(f"cannot bind {endpoint}: {error}") from error
+    return socket
+
+
+def _address(socket: zmq.Socket[bytes]) -> str:
+    raw = socket.getsockopt(zmq.LAST_ENDPOINT)
+    assert isinstance(raw, bytes)
+    return raw.rstrip(b"\0").decode()
