@@ -55,7 +55,8 @@ function show(dialog) {
     list.append(name, meaning);
   }
   dialog.show(); // never modal: that would put the e-stop out of reach
-  dialog.querySelector("button").focus();
+  dialog.querySelector("button").focus({ preventScroll: true });
+  dialog.scrollTop = 0;
 }
 
 /** What is pressed with it: the first that is on the page and visible. */

@@ -60,7 +60,7 @@ export class ModePanel {
       radio.checked = radio.value === mode;
       refuse(radio, open ? "the run is open: stop it first" : offered && !offered.includes(radio.value) ? "this station has no such mode" : "");
     }
-    part("seen").hidden = mode !== "sim";
+    part("seen").hidden = mode !== "sim" || open; // while it runs the note says it
     for (const radio of this.#form.elements.sim_state) {
       if (open && mode === "sim") radio.checked = radio.value === this.#store.snapshot.sim_state;
       refuse(radio, open ? "the run is open: stop it first" : "");

@@ -48,7 +48,7 @@ export function phase({ state, phase: now, control, rate }) {
   if (!now || !["running", "setting_up", "holding"].includes(state)) return "";
   if (now !== "executing") return PHASES[now] ?? words(now);
   const left = control?.remaining ?? 0;
-  return left > 0 && rate ? `executing, ${(left / rate).toFixed(1)} s planned` : "executing";
+  return left > 0 && rate ? `executing, ${(left / rate).toFixed(1)} s ahead` : "executing";
 }
 
 /** How far a chunk's first row, or the policy's first action, is from where the robot is commanded. */

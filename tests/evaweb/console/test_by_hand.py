@@ -79,7 +79,7 @@ def test_what_the_run_does_is_said_in_words() -> None:
         ],
     )
 
-    assert said == ["executing, 1.5 s planned", "asking the policy", "something new", "", ""]
+    assert said == ["executing, 1.5 s ahead", "asking the policy", "something new", "", ""]
 
 
 def test_a_proposed_chunk_is_described_with_how_far_it_begins() -> None:
