@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,6 +19,8 @@ from runtime.setup import first_action
 from runtime.spaces import Spaces
 from runtime.targets import Targets, told
 from runtime.types import Float64
+
+log = logging.getLogger(__name__)
 
 
 class ByHand:
@@ -67,6 +70,15 @@ class ByHand:
         if grip.goal is not None:
             self._runs.move(grip.goal, 1.0)
         return {"grippers": self.grippers.told(self.commanded())}
+
+    def stand(self) -> None:
+        """Whatever is stopped stops grippers too: one on its way to its lock is locked where it is."""
+        locks = self.grippers.standing(self.commanded())
+        if not np.array_equal(locks, self.grippers.locks, equal_nan=True):
+            try:
+                self.lock(locks)
+            except RuntimeFault as error:  # a stop is not refused for it
+                log.error("a gripper goes on to its lock: %s", error)
 
     def unlock(self) -> None:
         """Give all grippers back."""

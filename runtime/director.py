@@ -43,7 +43,7 @@ from runtime.watch import Watch
 
 log = logging.getLogger(__name__)
 # Control's own reasons to hold, as events of these kinds.
-_HOLDS = ("refusals", "unmeasured", "family", "orphaned", "too_far")
+_HOLDS = ("refusals", "unmeasured", "family", "orphaned", "too_far", "moved_away")
 
 
 class Director:
@@ -155,7 +155,7 @@ class Director:
             self.media_report = message
 
     def _unlock(self) -> None:
-        """A restarted control knows of no locks, one that was not may have some: none, in either case."""
+        """A control that was restarted, or obeys the e-stop, knows of no locks, another may: none, in any case."""
         try:
             self.by_hand.unlock()
         except RuntimeFault as error:
@@ -202,6 +202,7 @@ class Director:
         if happening is Happening.FAMILY_DIED:
             self.say(Event("family_died", reason, self.clock.now()))
             self.runs.lost()
+        if happening in (Happening.FAMILY_DIED, Happening.ESTOPPED):
             self._unlock()
         before = self.session.state
         if self.session.observe(happening, reason):

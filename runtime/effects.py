@@ -24,6 +24,7 @@ class Situation:
     executing: bool = False  # steps are planned
     first_action: bool = False  # the last set-up knows the policy's first action
     opening: bool = False  # the open run has not begun: its recording is being opened
+    approaching: bool = False  # the robot is on its way to where the chunk that is shown begins
 
 
 class Effects(ABC):

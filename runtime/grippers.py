@@ -13,6 +13,8 @@ from runtime.family import Plan
 from runtime.requests import GripperRequest
 from runtime.types import Float64
 
+_REACHED = 1e-3  # of its travel: a gripper that is so near to its lock is there
+
 
 @dataclass(frozen=True, slots=True)
 class Grip:
@@ -31,6 +33,7 @@ class Grippers:
     def __init__(self, plan: Plan) -> None:
         self._groups = [group for group in plan.robot.groups if group.gripper is not None]
         self._robot = plan.robot.name
+        self._limits = plan.limits
         self.locks: Float64 = np.full(plan.robot.dim, np.nan)
 
     def asked(self, request: GripperRequest, commanded: Float64, free: bool) -> Grip:
@@ -54,6 +57,12 @@ class Grippers:
                     locks[dim] = goal[dim]
         moves = free and request.action in ("open", "close")
         return Grip(locks, goal if moves else None)
+
+    def standing(self, commanded: Float64) -> Float64:
+        """The locks float64 [D], those that a gripper is still on its way to moved to where it was told to be."""
+        travel = self._limits.upper - self._limits.lower
+        away = np.abs(self.locks - commanded) > _REACHED * travel  # NaN, what is free, is not
+        return np.where(away, commanded, self.locks)
 
     def _chosen(self, name: str | None) -> list[Group]:
         if name is None and self._groups:

@@ -52,6 +52,12 @@ class Lane:
         """The run it executes, None where it does something else."""
         return self.behaviour if isinstance(self.behaviour, Follow) else None
 
+    @property
+    def stands(self) -> bool:
+        """Whether it is to stay where it is: it holds, or a run of its has come to a stand."""
+        waits = self.run is not None and self._standing is not None and self._standing.standing
+        return waits or isinstance(self.behaviour, Hold)
+
     def silence(self) -> None:
         """Send nothing any more: the robot is not ours."""
         self._standing = None

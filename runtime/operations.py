@@ -89,6 +89,7 @@ class Operations(Effects):
     def cancel_setup(self, reason: str) -> None:
         self.setup.cancel()
         self._orders.give("hold", reason=reason)
+        self.by_hand.stand()
 
     def begin_run(self, asked: RunRequest) -> Told:
         self._require_family()
@@ -96,6 +97,8 @@ class Operations(Effects):
             self._require_comparable(asked)
         if (asked.mode or self.plan.deployment.run.mode) == "manual":
             self.by_hand.require_robot("run in the mode manual")
+        # A control that was restarted during the set-up merges as the deployment says until it is told.
+        self._orders.tune(self.plan.deployment.strategy.model_dump())
         return {"episode": self.runs.begin(self.setup.info, asked)}
 
     def _require_comparable(self, asked: RunRequest) -> None:
@@ -121,6 +124,7 @@ class Operations(Effects):
             executing=int(control["remaining"]) > 0,
             first_action=self.setup.first_action is not None and self.plan.capabilities.moves_robot,
             opening=run is not None and run.begun is None,
+            approaching=run is not None and run.approaching,
         )
 
     def tune(self, asked: TuneRequest) -> Told:
@@ -128,6 +132,8 @@ class Operations(Effects):
         settings = plan.deployment
         strategy = settings.strategy.model_dump()
         self._orders.tune(strategy)
+        if settings.task != self.plan.deployment.task:
+            self.setup.first_action = None  # it answered another instruction
         self.plan, self._tuned = plan, True
         self.runs.provenance = replace(self.runs.provenance, plan=plan)
         self.inference.tune(strategy_of(plan), settings.task)
@@ -144,12 +150,17 @@ class Operations(Effects):
 
     def cancel(self) -> None:
         self.runs.cancel()
+        self.by_hand.stand()
 
     def move(self, asked: MoveRequest) -> Told:
         return self.by_hand.move(asked)
 
     def grip(self, asked: GripperRequest) -> Told:
         run = self.runs.open
+        if run is not None and run.mode == "sim" and asked.action in ("open", "close"):
+            raise RuntimeFault(
+                f"gripper: {asked.action} would move the robot's own, and the run's mode is sim; allowed: lock, unlock"
+            )
         free = run is None or run.mode == "manual" or self._state() is State.HOLDING
         return self.by_hand.grip(asked, free)
 
@@ -165,6 +176,7 @@ class Operations(Effects):
 
     def hold(self, reason: str) -> None:
         self.runs.hold(reason)
+        self.by_hand.stand()
 
     def resume_run(self) -> None:
         self._require_family()
@@ -172,6 +184,7 @@ class Operations(Effects):
 
     def end_run(self, status: str, reason: str) -> None:
         self.runs.end(status, reason)
+        self.by_hand.stand()
 
     def go_home(self) -> None:
         self.by_hand.require_robot("home")

@@ -15,6 +15,7 @@ from runtime.transitions import (
     CANCELLING,
     COMMANDS,
     HAPPENINGS,
+    MOVED_BY_HAND,
     REASONS,
     STOPPING,
     Happening,
@@ -97,6 +98,8 @@ class Session:
         A RuntimeFault of an effect passes through, with the state as it was: nobody is there to be refused.
         """
         after = HAPPENINGS.get((happening, self.state))
+        if happening is Happening.LEASE_ENDED and self.state in MOVED_BY_HAND:
+            self._effects.hold(reason)
         if after is None or (after is self.state and reason == self.reason):
             return False
         before = self.state

@@ -9,7 +9,7 @@ import numpy as np
 
 from runtime.actuator import Actuator, RobotActuator, Sent, SimulatedActuator, TickSettings
 from runtime.alarms import Displacement, silent_sibling
-from runtime.behaviour import EStopped, Hold
+from runtime.behaviour import EStopped
 from runtime.errors import CodecError, ConfigurationError
 from runtime.execution import Follow, Strategy, dropped, strategy
 from runtime.lane import Lane
@@ -247,6 +247,8 @@ class Tick:
         if latched and stopped is None:
             # Before it was ever engaged nothing is known to send, until the robot has been measured.
             stopped = EStopped(self._actuator.commanded.copy() if self._actuator.engaged else None)
+            # Or a gripper that is on its way to its lock would go on after the release.
+            self._lock(np.full(len(self._locks.on), np.nan))
             self._robot.behaviour, self._simulated = stopped, None
             self._report.say("estopped", "e-stop")
         elif not latched and stopped is not None:
@@ -270,11 +272,16 @@ class Tick:
 
     def _check_displaced(self, now: float) -> None:
         """Hold where the robot is, and not where it was told to hold, once these are far apart."""
-        held = isinstance(self._robot.behaviour, Hold) and self._actuator.engaged
+        behaviour, run = self._robot.behaviour, self._robot.run
+        held = (self._robot.stands or isinstance(behaviour, EStopped)) and self._actuator.engaged
         where = self._displacement(self._actuator, self._seen, now, held)
-        if where is not None:
-            away = self._displacement.distance(self._actuator, where)
-            self._actuator.engage(where)
-            self._robot.hold_here()
-            text = f"the robot is {away:.2f} rad from where it was told to hold: holding where it is"
-            self._report.say("displaced", text)
+        if where is None:
+            return
+        away = self._displacement.distance(self._actuator, where)
+        self._actuator.engage(where)
+        if isinstance(behaviour, EStopped):
+            behaviour.position = self._actuator.commanded.copy()
+            return
+        self._robot.hold_here()
+        text = f"the robot is {away:.2f} rad from where it was told to hold: holding where it is"
+        self._report.say("displaced" if run is None else "moved_away", text)

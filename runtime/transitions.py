@@ -103,6 +103,8 @@ def _may_step(state: State, situation: Situation) -> str:
 def _may_commit(state: State, situation: Situation) -> str:
     if situation.mode != "preview":
         return f"the run's mode is {situation.mode}, and commit is for preview"
+    if situation.approaching:  # control would not take the chunk, and it would be gone
+        return "the robot is on its way to where the chunk begins: wait, or cancel"
     return "" if situation.proposed else "no chunk is shown: step first"
 
 
@@ -185,6 +187,8 @@ HAPPENINGS: dict[tuple[Happening, State], State] = {
     **{(Happening.FAMILY_DIED, state): S.IDLE for state in (S.READY, S.RUNNING, S.HOLDING, S.SETTING_UP)},
 }
 
+# A gripper may be on its way in these, although no run goes on: the end of the lease stops it, and no more.
+MOVED_BY_HAND = (S.READY, S.HOLDING)
 CANCELLED = "set-up cancelled by the operator"
 CANCEL = Rule((S.SETTING_UP,), S.IDLE, lambda e, _: e.cancel_setup(CANCELLED), None)
 REASONS = {

@@ -21,7 +21,9 @@ def robot() -> Any:
 
 
 def grippers() -> Grippers:
-    plan: Any = SimpleNamespace(robot=robot())
+    made = robot()
+    limits = SimpleNamespace(lower=made.lower, upper=made.upper)
+    plan: Any = SimpleNamespace(robot=made, limits=limits)
     return Grippers(plan)
 
 
@@ -71,3 +73,12 @@ def test_a_locked_gripper_that_is_opened_by_hand_stays_locked_there() -> None:
 def test_an_arm_without_a_gripper_is_refused_with_those_that_have_one() -> None:
     with pytest.raises(RuntimeFault, match=r"arm = 'head'; agilex_piper has grippers on left_arm, right_arm"):
         grippers().asked(GripperRequest(arm="head", action="open"), at(), free=True)
+
+
+def test_what_is_still_on_its_way_to_its_lock_is_locked_where_it_is() -> None:
+    hand = grippers()
+    hand.locks[LEFT], hand.locks[RIGHT] = 0.1, 0.05
+    standing = hand.standing(at(0.05))
+    assert (standing[LEFT], standing[RIGHT]) == (0.05, 0.05)
+    assert np.isnan(np.delete(standing, [LEFT, RIGHT])).all()
+    assert hand.locks[LEFT] == 0.1  # asked, not changed

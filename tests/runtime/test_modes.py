@@ -435,3 +435,169 @@ def test_a_run_whose_first_action_is_farther_than_a_jump_moves_nothing_and_holds
     station.go(20)
     assert station.state is State.RUNNING, station.reason
     station.close()
+
+
+def closed_gripper(station: Station) -> Station:
+    """Its left gripper is at one end of its travel, so that there is a way to go."""
+    station.command("gripper", arm="left_arm", action="close")
+    station.go(30)
+    return station
+
+
+def left_gripper(station: Station) -> float:
+    return float(station.robot.position[LEFT_GRIPPER])
+
+
+@pytest.mark.parametrize("state", [State.READY, State.HOLDING])
+@pytest.mark.parametrize("locked", [False, True])
+def test_the_end_of_the_lease_stops_a_gripper_that_is_on_its_way(
+    tmp_path: Path, state: State, locked: bool
+) -> None:
+    station = closed_gripper(begun(tmp_path, "continuous"))
+    station.command("halt" if state is State.HOLDING else "stop")
+    station.go(5)
+    if locked:
+        station.command("gripper", arm="left_arm", action="lock")
+    station.command("gripper", arm="left_arm", action="open")
+    station.go(3)
+    station.main.lease.give_up("lockstep", station.main.lease.epoch, station.clock.now())
+    station.tick()
+    at = left_gripper(station)
+    for _ in range(40):
+        station.tick()
+    assert station.state is state
+    assert 0.0 < at < 0.05
+    assert abs(left_gripper(station) - at) < 0.01
+    station.close()
+
+
+@pytest.mark.parametrize("command", ["halt", "stop"])
+def test_a_stop_stops_a_gripper_that_is_on_its_way_to_its_lock(tmp_path: Path, command: str) -> None:
+    station = closed_gripper(begun(tmp_path, "continuous"))
+    station.command("gripper", arm="left_arm", action="open")
+    station.go(1)
+    at = left_gripper(station)
+    station.command(command)
+    station.go(40)
+    assert 0.0 < at < 0.05
+    assert abs(left_gripper(station) - at) < 0.01
+    told = station.main.snapshot()["grippers"]["left_arm"]
+    assert told["locked"]
+    assert told["at"] == pytest.approx(left_gripper(station), abs=1e-6)
+    station.close()
+
+
+def test_an_e_stop_forgets_locks_on_both_sides(tmp_path: Path) -> None:
+    station = closed_gripper(begun(tmp_path, "continuous"))
+    station.command("gripper", arm="left_arm", action="open")
+    station.go(2)
+    station.guard.press("lockstep", "a test")
+    station.go(20)
+    at = left_gripper(station)
+    assert station.state is State.FAULTED
+    station.command("release")
+    station.go(30)
+    assert station.state is State.IDLE
+    assert left_gripper(station) == at
+    assert not station.main.snapshot()["grippers"]["left_arm"]["locked"]
+    station.close()
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_in_simulation_no_gripper_of_the_real_robot_is_opened_or_closed(tmp_path: Path, held: bool) -> None:
+    station = Station(plan(tmp_path, setup={"home": True})).ready()
+    station.command("run", mode="sim")
+    station.go(5)
+    if held:
+        station.command("halt")
+        station.go(5)
+    before = station.robot.position.copy()
+    for action in ("open", "close"):
+        with pytest.raises(SetupError, match=r"the run's mode is sim; allowed: lock, unlock"):
+            station.command("gripper", action=action)
+    station.command("gripper", action="lock")
+    station.go(20)
+    assert np.allclose(station.robot.position, before, atol=1e-6)
+    station.close()
+
+
+def test_a_chunk_is_not_committed_while_the_robot_is_on_its_way_to_it(tmp_path: Path) -> None:
+    station = begun(tmp_path, "preview", lambda o, n: ramp(400, 5))
+    station.command("step")
+    station.go(2)
+    station.command("approach")
+    station.go(2)
+    with pytest.raises(SetupError, match=r"on its way to where the chunk begins: wait, or cancel"):
+        station.command("commit")
+    station.until(lambda: phase(station) == "proposed", 20.0, "to arrive")
+    station.command("commit")
+    station.go(3)
+    assert not station.events("chunk_dropped")
+    station.close()
+
+
+@pytest.mark.parametrize("mode", ["step", "preview"])
+def test_an_arm_that_was_moved_while_a_person_looks_holds_the_run(tmp_path: Path, mode: str) -> None:
+    station = begun(tmp_path, mode)
+    station.command("step")
+    station.go(30)
+    station.robot.blocked = True
+    station.robot.position = station.robot.position + np.eye(14)[0]
+    station.go(5)
+    assert station.state is State.HOLDING
+    assert "from where it was told to hold" in station.reason
+    assert station.main.inference.proposal is None
+    if station.robot.commands:
+        assert np.allclose(station.robot.sent[-1], station.robot.position, atol=1e-6)
+    station.close()
+
+
+def test_another_instruction_makes_the_first_action_of_the_set_up_unknown(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, lambda o, n: ramp(400, 20))).ready()
+    station.command("tune", strategy={"blend_window": 4})
+    assert "approach" in station.main.snapshot()["allowed"]
+    station.command("tune", task="something else")
+    assert station.main.snapshot()["first_action"] == {}
+    with pytest.raises(SetupError, match=r"first action is not known: set up again"):
+        station.command("approach")
+    station.close()
+
+
+def test_a_run_is_merged_by_the_strategy_it_was_set_up_with_also_by_a_control_that_was_restarted(
+    tmp_path: Path,
+) -> None:
+    station = Station(plan(tmp_path)).ready()
+    station.command("setup", strategy={"kind": "sync"})
+    for _ in station.page.rings["orders"].drain():
+        pass  # a control that begins knows the deployment alone
+    station.reach(State.READY)
+    station.command("run", trial={"id": 1})
+    station.go(20)
+    assert set(column(station.stop().raw, "strategy")) <= {"sync", ""}
+    station.close()
+
+
+def test_a_chunk_that_is_too_long_is_named_as_such(tmp_path: Path) -> None:
+    station = begun(tmp_path, "continuous", lambda o, n: ramp(o.step, 20 if n < 6 else 5000))
+    station.go(30)
+    assert station.state is State.HOLDING
+    assert station.reason == "the policy answered with 5000 rows; allowed: at most 2000 in one chunk"
+    station.close()
+
+
+def test_a_failure_that_was_cancelled_is_not_held_against_the_next_question(tmp_path: Path) -> None:
+    def rows(observation: Any, number: int) -> Any:
+        raise PolicyLostError("no answer")
+
+    station = begun(tmp_path, "step", faults={"policy_lost": "slow"})
+    station.policy._plan = plan(tmp_path / "other", rows)
+    station.command("step")
+    station.go(15)
+    assert station.main.snapshot()["policy"]["lost"]
+    station.command("cancel")
+    assert not station.main.snapshot()["policy"]["lost"]
+    station.go(200)
+    station.command("step")
+    station.go(15)
+    assert station.state is State.RUNNING, station.reason
+    station.close()

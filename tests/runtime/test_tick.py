@@ -3,7 +3,7 @@ import pytest
 
 from runtime.messages import ChunkMerged, NodeRequest, Order, decode, encode
 from runtime.page import EStop
-from tests.runtime.tick_bench import PERIOD, Bench, following, wave
+from tests.runtime.tick_bench import PERIOD, WITH_GRIPPER, Bench, following, wave
 
 
 @pytest.fixture
@@ -84,6 +84,62 @@ def test_the_e_stop_repeats_the_last_position_where_the_measurement_is_old(bench
     bench.measured = np.array([1.0, 1.0])
     bench.run(1)
     assert (bench.sink.sent[-1] == last).all()
+
+
+def test_an_arm_that_comes_back_elsewhere_under_e_stop_is_not_pulled_to_where_it_was(bench):
+    """It was switched off and on again after the e-stop, as one does."""
+    bench.say("motion", goal=np.zeros(2))
+    bench.run(3)
+    bench.page.set_estop(EStop.LATCHED)
+    bench.run(30)
+    bench.feed = False
+    bench.run(40)
+    bench.feed, bench.measured = True, np.array([0.3, 0.0])
+    bench.moved_by_hand = bench.measured
+    told = len(bench.sink.sent)
+    bench.run(5)
+    assert bench.sent[told:] == pytest.approx(np.tile([0.3, 0.0], (5, 1)), abs=1e-6)
+    bench.page.set_estop(EStop.CLEAR)
+    bench.run(5)
+    assert bench.sent[-1] == pytest.approx([0.3, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["step", "preview", "continuous"])
+@pytest.mark.parametrize("unseen", [False, True])
+def test_an_arm_that_was_moved_while_a_run_waits_is_held_where_it_is(mode, unseen):
+    bench = Bench({"kind": "sync"})
+    bench.say("follow", run=1, mode=mode)
+    bench.chunk(1, wave(10, 0.1), waited=True)
+    bench.run(30)
+    assert bench.status["waiting"]
+    if unseen:
+        bench.feed = False
+        bench.run(40)
+        bench.feed = True
+    bench.measured = bench.moved_by_hand = bench.sent[-1] + (0.3 if unseen else 1.0)
+    bench.said()
+    bench.run(1)
+    told = len(bench.sink.sent)
+    bench.run(5)
+    assert bench.behaviour == "hold"
+    assert [event.kind for event in bench.said()] == ["moved_away"]
+    assert bench.sent[told:] == pytest.approx(np.tile(bench.measured, (5, 1)), abs=1e-6)
+
+
+def test_a_gripper_that_was_on_its_way_to_its_lock_does_not_go_on_after_an_e_stop():
+    bench = Bench(limits=WITH_GRIPPER)
+    bench.say("motion", goal=np.zeros(3))
+    bench.run(3)
+    bench.lock(float("nan"), float("nan"), 0.1)
+    bench.run(2)
+    bench.page.set_estop(EStop.LATCHED)
+    bench.run(10)
+    stood = bench.sent[-1]
+    assert 0.0 < stood[2] < 0.09
+    bench.page.set_estop(EStop.CLEAR)
+    bench.run(30)
+    assert bench.sent[-1] == pytest.approx(stood, abs=1e-6)
+    assert np.isnan(bench.status["locked"]).all()
 
 
 def test_releasing_the_e_stop_holds_and_does_not_go_on(bench):
