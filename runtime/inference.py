@@ -191,8 +191,9 @@ class Inference:
             self._post(made)
 
     def cancel(self) -> None:
-        """Forget the chunk that is asked for, or shown, or under way to control."""
-        self._flight = None
+        """Forget the chunk that is asked for, or shown, or under way to control, and what has failed meanwhile."""
+        self._flight, self._stale_since = None, None
+        self._forget_failures()
         self._wanted, self.proposal, self.shown, self._planned = False, None, None, None
         self._unmerged.clear()
         self._commitment.clear()

@@ -97,7 +97,7 @@ class TuneRequest(Section):
     task: Annotated[str, Field(max_length=2000)] | None = None
 
 
-Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
+Triple = Annotated[list[Annotated[float, Field(ge=-10, le=10)]], Field(min_length=3, max_length=3)]
 
 
 class Jog(Section):
@@ -131,7 +131,7 @@ class MoveRequest(Section):
 
     joints: list[float] | None = None
     pose: str | None = None
-    speed: float = Field(default=1.0, gt=0, le=1)
+    speed: float = Field(default=1.0, ge=0.01, le=1)
 
 
 class GripperRequest(Section):

@@ -139,9 +139,10 @@ class Runs:
             self.last = {"number": run.number, "uuid": run.uuid, "status": status, "reason": reason}
             policy = self._inference.tally.figures()
             details = {"run_seconds": seconds, "control": run.figures(self._figures()), "policy": policy}
-            self._tell(EndEpisode(status, reason, details))
+            self.note(EndEpisode(status, reason, details))  # a stop is not refused because media hangs
         if self._alone and status != "finished":
-            self._end_alone(status, reason)
+            self.note(self._end_alone(status, reason))
+            self._alone = ""
 
     def _start(self, run: Run) -> None:
         run.begin(self._clock.now())
@@ -205,11 +206,11 @@ class Runs:
         """Close it."""
         if not self._alone:
             raise RuntimeFault("no recording is open; a run's own recording ends with the run")
-        self._end_alone("finished", "stopped by the operator")
-
-    def _end_alone(self, status: str, reason: str) -> None:
+        self._tell(self._end_alone("finished", "stopped by the operator"))
         self._alone = ""
-        self._tell(EndEpisode(status, reason, {"control": self._figures()}))
+
+    def _end_alone(self, status: str, reason: str) -> EndEpisode:
+        return EndEpisode(status, reason, {"control": self._figures()})
 
     def lost(self) -> None:
         """Media was restarted: what it recorded was closed by repair."""

@@ -15,6 +15,7 @@ from runtime.resampling import resample
 from runtime.types import EEF_WIDTH, ActionChunk, Float32, Float64, Observation
 
 _GRIPPER = EEF_WIDTH - 1
+_LONGEST = 2000  # rows of a chunk, given and at control rate: they are solved one by one, and fit the ring to control
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,7 @@ class Spaces:
         """
         rows = self._checked(chunk)
         rate = chunk.rate or self._control_rate
+        _check_length(len(rows), max(1.0, self._control_rate / rate))
         qpos = np.asarray(observation.qpos, dtype=np.float64)
         if chunk.space == "joint":
             rows = self._unwrapped(self._absolute_joints(rows, chunk, qpos), qpos)
@@ -142,3 +144,11 @@ class Spaces:
                 f"({len(wrong)} such numbers); allowed: finite numbers"
             )
         return rows
+
+
+def _check_length(count: int, stretched: float) -> None:
+    if count * stretched > _LONGEST:
+        at_rate = "" if stretched == 1.0 else f", {count * stretched:.0f} at control rate"
+        raise PolicyError(
+            f"the policy answered with {count} rows{at_rate}; allowed: at most {_LONGEST} in one chunk"
+        )

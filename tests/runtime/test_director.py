@@ -89,6 +89,20 @@ def test_the_snapshot_says_how_the_last_run_ended(tmp_path: Path) -> None:
     station.close()
 
 
+@pytest.mark.parametrize("how", ["stop", "estop"])
+def test_a_media_that_does_not_read_keeps_nobody_from_stopping(tmp_path: Path, how: str) -> None:
+    station = Station(plan(tmp_path)).running(10)
+    station.page.rings["minutes"].push = lambda payload: False
+    if how == "stop":
+        station.command("stop")
+    else:
+        station.guard.press("anna", "a test")
+    station.go(10)
+    assert station.state is (State.READY if how == "stop" else State.FAULTED)
+    assert station.main.run is None
+    station.close()
+
+
 def test_a_query_with_nonsense_is_refused_and_nothing_ends(tmp_path: Path) -> None:
     station = Station(plan(tmp_path))
     ack = station.main.handle(Command("1", "events_since", {"number": "seven"}))

@@ -19,7 +19,7 @@ REFUSED = {
     "an unknown key": (
         SetUpRequest,
         {"polcy": {}},
-        "say: polcy = {}: unknown key (did you mean policy?); allowed here: bench, checkpoint, policy, task",
+        "say: polcy = {}: unknown key (did you mean policy?); allowed here: bench, checkpoint, policy, strategy, task",
     ),
     "an unknown key of a table": (
         SetUpRequest,
