@@ -18,7 +18,7 @@ from runtime.clock import Clock, MonotonicClock
 from runtime.errors import SetupError
 from runtime.sim.bench import Belt, Bench
 from runtime.sim.pick_place import ScriptError
-from runtime.sim.routes import Planner
+from runtime.sim.postures import Postures
 from runtime.sim.script import Answer, Script
 from runtime.sim.sight import Overhead
 from runtime.types import Float32, Float64, UInt8
@@ -109,9 +109,9 @@ class Places:
         self.belt = belt
         self._x = np.linspace(belt.x[0] - _BEYOND, belt.x[1] + _BEYOND, _NODES[0])
         self._y = belt.y + np.linspace(-_ACROSS, _ACROSS, _NODES[1])
-        planner = Planner(robot, robot.control_rate, Bench(belt=belt))
+        postures = Postures(robot, Bench(belt=belt))
         for arm in robot.arms:
-            solved = self._solved(robot, planner, arm)
+            solved = self._solved(robot, postures, arm)
             if solved is not None:
                 self._joints = solved
                 return
@@ -129,14 +129,14 @@ class Places:
         upper = left[pick, row + 1] + right * (more[pick, row + 1] - left[pick, row + 1])
         return np.asarray(lower + up * (upper - lower))
 
-    def _solved(self, robot: Robot, planner: Planner, arm: Group) -> Float64 | None:
+    def _solved(self, robot: Robot, postures: Postures, arm: Group) -> Float64 | None:
         """Joints [along, across, D]; None where the arm does not reach one of the places."""
         rest = robot.poses.get("ready", robot.poses["home"])
         dx, dy, height = self.belt.beside
         found = []
         for x in self._x:
             for y in self._y:
-                joints = planner.hover(arm, rest, (float(x + dx), float(y + dy)), height)
+                joints = postures.hover(arm, rest, (float(x + dx), float(y + dy)), height)
                 if joints is None:
                     return None
                 found.append(joints)

@@ -19,7 +19,8 @@ import numpy as np
 from runtime.clock import Clock, MonotonicClock
 from runtime.errors import RuntimeFault
 from runtime.sim.bench import Bench
-from runtime.sim.routes import Planner, Route, Slip, gripper_dim
+from runtime.sim.postures import gripper_dim
+from runtime.sim.routes import Planner, Route, Slip
 from runtime.sim.script import Answer, Script
 from runtime.sim.sight import Overhead, Sight
 from runtime.types import Float32, Float64, UInt8

@@ -2,17 +2,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import robots
-from runtime.errors import SetupError
 from runtime.sim import bench
 from runtime.sim.bench import Bench
 from runtime.sim.layout import layout_of
-from runtime.sim.routes import CLEAR, Planner, Slip, gripper_dim, jaws
+from runtime.sim.postures import CLEAR, gripper_dim
+from runtime.sim.routes import Planner, Slip
 
 ROBOT = robots.load("agilex_piper")
 LEFT, RIGHT = ROBOT.arms
@@ -145,9 +144,3 @@ def test_a_route_from_the_table_rises_first():
     route = planned(q=low)
     assert route.legs[0].name == "rise"
     assert bench.tip_in_world(LEFT, route.legs[0].end)[2, 3] == pytest.approx(CLEAR, abs=0.003)
-
-
-def test_a_gripper_whose_number_is_no_length_cannot_pick():
-    arm = replace(LEFT, gripper=replace(jaws(LEFT), unit="percent"))
-    with pytest.raises(SetupError, match="left_arm cannot pick things up"):
-        Planner(replace(ROBOT, groups=(arm, RIGHT)), RATE, Bench())

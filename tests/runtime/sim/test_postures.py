@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import robots
+from runtime.errors import SetupError
+from runtime.sim.bench import Bench, tip_in_world
+from runtime.sim.postures import CLEAR, TILTS, Postures, closed, gripper_dim, jaws, opened
+
+ROBOT = robots.load("agilex_piper")
+LEFT, RIGHT = ROBOT.arms
+READY, HOME = ROBOT.poses["ready"], ROBOT.poses["home"]
+POSTURES = Postures(ROBOT, Bench())
+BLOCK, PLATE = (-0.1, 0.26, 0.4), (-0.05, 0.38)
+
+
+def test_fingertips_hover_where_they_are_asked_to_with_open_jaws():
+    q = POSTURES.hover(LEFT, HOME, PLATE, 0.05)
+    assert q is not None
+    tip = tip_in_world(LEFT, q)
+    np.testing.assert_allclose(tip[:3, 3], [*PLATE, 0.05], atol=1e-3)
+    assert -tip[2, 2] == pytest.approx(math.cos(TILTS[0][1]), abs=0.01)
+    assert q[gripper_dim(LEFT)] == pytest.approx(0.95 * jaws(LEFT).open + 0.05 * jaws(LEFT).close)
+    np.testing.assert_array_equal(q[RIGHT.slice], HOME[RIGHT.slice])
+
+
+def test_what_is_out_of_reach_has_no_posture():
+    assert POSTURES.hover(LEFT, HOME, (0.0, 0.9), 0.05) is None
+    assert POSTURES.stations(LEFT, HOME, (0.0, 0.9, 0.0), PLATE, 0.0, TILTS[0]) == (None, None)
+    down, over = POSTURES.stations(LEFT, HOME, BLOCK, (0.0, 0.9), 0.0, TILTS[0])
+    assert down is not None
+    assert over is None
+
+
+def test_the_stations_go_straight_down_on_block_and_plate():
+    down, over = POSTURES.stations(LEFT, READY, BLOCK, PLATE, 0.0, TILTS[0])
+    for way, place in ((down, BLOCK[:2]), (over, PLATE)):
+        tips = np.stack([tip_in_world(LEFT, q)[:3, 3] for q in way])
+        np.testing.assert_allclose(tips[:, :2], np.broadcast_to(place, (4, 2)), atol=2e-3)
+        assert tips[0, 2] == pytest.approx(CLEAR, abs=2e-3)
+        assert np.all(np.diff(tips[:, 2]) < 0)
+
+
+def test_an_arm_that_is_low_rises_where_it_is_and_one_that_is_high_stays():
+    low = POSTURES.hover(LEFT, HOME, PLATE, 0.02)
+    risen = POSTURES.risen(LEFT, low)
+    np.testing.assert_allclose(tip_in_world(LEFT, risen)[:3, 3], [*PLATE, CLEAR], atol=2e-3)
+    np.testing.assert_array_equal(POSTURES.risen(LEFT, READY), READY)
+
+
+def test_an_arm_rests_as_the_robot_does_when_it_is_ready():
+    q = POSTURES.rested(LEFT, HOME)
+    np.testing.assert_array_equal(q[list(LEFT.joint_dims)], READY[list(LEFT.joint_dims)])
+    np.testing.assert_array_equal(q[RIGHT.slice], HOME[RIGHT.slice])
+
+
+def test_jaws_open_and_close_nearly_as_far_as_they_go():
+    way = jaws(LEFT).open - jaws(LEFT).close
+    rows = np.stack([HOME, READY])
+    dim = gripper_dim(LEFT)
+    np.testing.assert_allclose(opened(LEFT, rows)[:, dim] - jaws(LEFT).close, 0.95 * way)
+    np.testing.assert_allclose(closed(LEFT, rows)[:, dim] - jaws(LEFT).close, 0.05 * way)
+    others = np.delete(np.arange(ROBOT.dim), dim)
+    np.testing.assert_array_equal(opened(LEFT, rows)[:, others], rows[:, others])
+
+
+def test_a_gripper_whose_number_is_no_length_cannot_pick():
+    arm = replace(LEFT, gripper=replace(jaws(LEFT), unit="percent"))
+    with pytest.raises(SetupError, match="left_arm cannot pick things up"):
+        Postures(replace(ROBOT, groups=(arm, RIGHT)), Bench())
