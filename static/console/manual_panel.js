@@ -1,5 +1,6 @@
 // Moving by hand: a target made with sliders, numbers, named poses and steps of the hand, shown as a ghost, and sent.
 
+import { groupButtons } from "./group_buttons.js";
 import { JointRows } from "./joint_rows.js";
 import { arrived, groups, handAt, jog, start, verdict } from "./targets.js";
 
@@ -12,6 +13,7 @@ export class ManualPanel {
   #target = null; // [D] where the robot would be sent
   #pose = ""; // the named pose that the target is, as long as nobody changes it
   #edited = false; // else the target follows the robot
+  #held = new Set(); // grippers that are part of the target; others stay as they are told by their own buttons
   #sent = false; // the target is where the robot was sent
   #clipped = ""; // what was said of the last edit
   #rows;
@@ -60,6 +62,7 @@ export class ManualPanel {
   /** The target is where the robot is, and goes with it. */
   reset(said = "The target is where the robot is.") {
     this.#edited = this.#sent = false;
+    this.#held.clear();
     this.#pose = this.#clipped = "";
     this.#poses.selectedIndex = 0;
     this.#aim.clear();
@@ -90,8 +93,7 @@ export class ManualPanel {
 
   #choose(group) {
     this.#group = group;
-    const next = (group + 1) % this.#groups.length;
-    document.getElementById("groups").replaceChildren(...this.#groups.map(({ name }, index) => groupButton(name, index, group, next)));
+    document.getElementById("groups").replaceChildren(...groupButtons(this.#groups, group));
     this.#rows.build(this.#groups[group].joints);
     const hand = this.#arm !== undefined;
     document.querySelector('[data-target="no-hand"]').hidden = hand;
@@ -110,9 +112,14 @@ export class ManualPanel {
     const { joints } = this.#store;
     if (!joints || !this.#groups.length) return;
     this.#rows.now(joints.measured);
-    if (this.#edited) return;
-    this.#target = start(joints);
+    const now = start(joints);
+    if (!this.#edited) this.#target = now;
+    else for (const index of this.#grippers) if (!this.#held.has(index)) this.#target[index] = now[index];
     this.#show();
+  }
+
+  get #grippers() {
+    return this.#store.snapshot.facts.gripper_dims;
   }
 
   #show() {
@@ -122,6 +129,7 @@ export class ManualPanel {
   #typed(index, value, said) {
     if (!this.#target) return;
     this.#target[index] = value;
+    if (this.#grippers.includes(index)) this.#held.add(index);
     this.#changed();
     this.#clipped = said;
     this.#look();
@@ -157,7 +165,10 @@ export class ManualPanel {
   async #toPose() {
     const pose = this.#poses.value;
     const answer = await this.#aim.ask({ pose });
-    if (answer.ok) this.#take(answer.joints, pose);
+    if (answer.ok) {
+      this.#held = new Set(this.#grippers);
+      this.#take(answer.joints, pose);
+    }
     this.#heard(answer);
   }
 
@@ -194,21 +205,4 @@ export class ManualPanel {
 
 function part(name) {
   return document.querySelector(`[data-target="${name}"]`);
-}
-
-/** The key stands on the group that it chooses. */
-function groupButton(name, index, chosen, next) {
-  const button = document.createElement("button");
-  Object.assign(button, { type: "button", className: "segment" });
-  button.dataset.group = index;
-  button.setAttribute("aria-pressed", String(index === chosen));
-  const text = document.createElement("span");
-  text.textContent = name.replaceAll("_", " ");
-  button.append(text);
-  if (index !== next || next === chosen) return button;
-  Object.assign(button.dataset, { key: "shift+a", keyText: "Next arm" });
-  const cap = document.createElement("kbd");
-  cap.textContent = "⇧A";
-  button.append(" ", cap);
-  return button;
 }

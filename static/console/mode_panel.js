@@ -68,7 +68,7 @@ export class ModePanel {
   }
 
   #drawPrimary(snapshot, mode) {
-    const now = primary({ ...snapshot, mode: snapshot.mode ?? mode });
+    const now = primary({ ...snapshot, mode });
     if (now !== this.#primary) {
       this.#primary = now;
       this.#changed = performance.now();
@@ -79,7 +79,7 @@ export class ModePanel {
       button.hidden = button.dataset.primary !== now;
       button.toggleAttribute("data-settling", settling);
     }
-    for (const [name, text] of Object.entries(labels(snapshot.mode || mode))) write(name, text);
+    for (const [name, text] of Object.entries(labels(mode))) write(name, text);
     this.#commands.gate();
   }
 
