@@ -53,14 +53,8 @@ _SLOW = 4  # number of the request that takes too long, in the run with a spike
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
-    """One strategy under one set of circumstances."""
-
-    strategy: str
-    control_hz: float
-    inference_hz: float | None
-    horizon: int
-    delay: int
+class Cell(Case):
+    """A case with what is known of it beforehand."""
 
     @property
     def interval(self) -> int:

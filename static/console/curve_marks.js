@@ -36,15 +36,3 @@ function stretches(times, numbers, least) {
   }
   return found;
 }
-
-/** The index of the sample that holds at time `t` [s], -1 before the first. */
-export function sampleAt(times, t) {
-  let low = 0;
-  let high = times.length;
-  while (low < high) {
-    const middle = (low + high) >> 1;
-    if (times[middle] <= t) low = middle + 1;
-    else high = middle;
-  }
-  return low - 1;
-}

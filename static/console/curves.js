@@ -1,7 +1,8 @@
 // Curves of one joint over the last seconds: where it is, what the policy wants, what was planned, what was sent.
 
+import { last } from "../site/ascending.js";
 import { KINDS, axes, series, spread } from "./curve_kinds.js";
-import { marks, sampleAt } from "./curve_marks.js";
+import { marks } from "./curve_marks.js";
 import { Paint } from "./curve_paint.js";
 import { keep } from "./decimate.js";
 import { Trace } from "./trace.js";
@@ -149,7 +150,7 @@ export class Curves {
   #sample(time) {
     if (!this.#columns || time === undefined) return null;
     const { times, ...columns } = this.#columns;
-    const at = sampleAt(times, time + 1e-6);
+    const at = last(times, time + 1e-6);
     return at < 0 ? null : Object.fromEntries(Object.entries(columns).map(([name, numbers]) => [name, numbers[at]]));
   }
 

@@ -1,6 +1,6 @@
 // Which chunk owns each step, which steps several chunks made, and what is known of a chunk.
 
-import { last } from "./data.js";
+import { last } from "../site/ascending.js";
 
 const NONE = -1;
 

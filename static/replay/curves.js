@@ -1,8 +1,9 @@
 // The pane of the curves: which joint, what its values are at the clock, and the plot.
 
 import { Legend } from "../console/curve_legend.js";
+import { last } from "../site/ascending.js";
 import { Chunks } from "./chunks.js";
-import { joint, last, message } from "./data.js";
+import { joint, message } from "./data.js";
 import { Plot, tunes } from "./plot.js";
 import { readout, write } from "./readout.js";
 

@@ -195,9 +195,9 @@ def test_every_sample_that_safety_changed_is_marked() -> None:
 
 
 def test_the_sample_at_the_cursor_is_the_last_that_began() -> None:
-    body = "return [-1, 0, 0.5, 1, 7].map((t) => m.sampleAt([0, 1, 2], t))"
+    body = "return [-1, 0, 0.5, 1, 7].map((t) => m.last([0, 1, 2], t))"
 
-    assert run("curve_marks.js", body) == [-1, 0, 0, 1, 2]
+    assert run("../site/ascending.js", body) == [-1, 0, 0, 1, 2]
 
 
 @pytest.mark.parametrize(

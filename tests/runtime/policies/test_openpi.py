@@ -582,35 +582,34 @@ def test_a_connection_that_ends_within_an_answer_is_opened_anew() -> None:
         assert row_zero_starts_at(policy.infer(observation(0.2)), 0.2)
 
 
-def test_a_server_that_came_back_is_found_again() -> None:
+@contextlib.contextmanager
+def left_by_its_server(**config: Any) -> Iterator[tuple[OpenpiPolicy, int]]:
+    """A policy whose server was there for one answer, and the port that it listened at."""
     server = OpenpiServer(ROBOT, Behaviour())
-    url = str(server.start()["url"])
-    with policy_at(url, first_inference_deadline=10.0, inference_deadline=5.0) as policy:
+    address = server.start()
+    with policy_at(str(address["url"]), **config) as policy:
         policy.connect()
         policy.infer(observation())
         server.close()
         with pytest.raises(PolicyGone):
             policy.infer(observation())
+        yield policy, int(str(address["port"]))
+
+
+def test_a_server_that_came_back_is_found_again() -> None:
+    with left_by_its_server(first_inference_deadline=10.0, inference_deadline=5.0) as (policy, port):
         for _ in range(2):
             with pytest.raises(PolicyLostError, match="no policy server listens"):
                 policy.infer(observation())
-        port = int(url.rpartition(":")[2])
         with contextlib.closing(OpenpiServer(ROBOT, Behaviour(), port)) as again:
             again.start()
             assert row_zero_starts_at(policy.infer(observation(0.3)), 0.3)
 
 
 def test_during_a_run_a_server_that_came_back_mute_is_found_out_by_the_short_deadline() -> None:
-    server = OpenpiServer(ROBOT, Behaviour())
-    url = str(server.start()["url"])
-    with policy_at(url, first_inference_deadline=60.0, inference_deadline=0.2) as policy:
-        policy.connect()
-        policy.infer(observation())
-        server.close()
-        with pytest.raises(PolicyGone):
-            policy.infer(observation())
+    with left_by_its_server(first_inference_deadline=60.0, inference_deadline=0.2) as (policy, port):
         mute = Behaviour(fault=Fault("mute_on_infer"))
-        with contextlib.closing(OpenpiServer(ROBOT, mute, int(url.rpartition(":")[2]))) as again:
+        with contextlib.closing(OpenpiServer(ROBOT, mute, port)) as again:
             again.start()
             with pytest.raises(PolicyTimeout, match=r"within 0\.2 s"):
                 policy.infer(observation())
