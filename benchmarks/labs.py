@@ -69,7 +69,8 @@ def busy_lab(folder: Path, assignments: Sequence[str], without: str = "") -> Ite
     """
     sets = [part for assignment in assignments for part in ("--set", assignment)]
     ready = folder / "ready.json"
-    patched = {"PYTHONPATH": str(ROOT / "benchmarks" / "without"), "EVA_WITHOUT": without} if without else {}
+    path = f"{ROOT / 'benchmarks' / 'without'}{os.pathsep}{ROOT}"
+    patched = {"PYTHONPATH": path, "EVA_WITHOUT": without} if without else {}
     with lab(["-m", "benchmarks.busy_lab", str(ready), *sets], ready, patched) as running:
         yield running
 
