@@ -110,11 +110,27 @@ def test_every_setting_from_the_environment_is_documented_and_every_documented_o
     assert read == table
 
 
+def cap(key):
+    """A key of a page as it stands on a keyboard, and as pages show it."""
+    drawn = {
+        "Arrowleft": "←",
+        "Arrowright": "→",
+        "Arrowup": "↑",
+        "Arrowdown": "↓",
+        "Pageup": "PgUp",
+        "Pagedown": "PgDn",
+    }
+    parts = [part.capitalize() for part in key.split("+")]
+    return "+".join(drawn.get(part, part) for part in parts).replace("Shift+", "⇧")
+
+
 def test_every_key_of_a_page_is_in_the_operators_document():
     pages = "\n".join(path.read_text("utf-8") for path in (ROOT / "templates").rglob("*.html"))
-    keys = set(re.findall(r'data-key="([^"{]+)"', pages))
-    caps = {"+".join(part.capitalize() for part in key.split("+")) for key in keys}
-    documented = set(re.findall(r"`([^`]+)`", text("docs/operator.md").partition("## Keys")[2]))
+    caps = {cap(key) for key in re.findall(r'data-key="([^"{]+)"', pages)}
+    keys = text("docs/operator.md").partition("## Keys")[2].partition("\n## ")[0]
+    documented = set(re.findall(r"`([^`]+)`", keys))
+    for first, last in re.findall(r"`(\d)` to `(\d)`", keys):
+        documented |= {str(number) for number in range(int(first), int(last))}
     assert len(caps) > 10
     assert caps - documented == set()
 
