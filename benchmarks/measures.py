@@ -27,6 +27,7 @@ def measure(seconds: float) -> Report:
             Figure(f"missed_ticks.{name}", row["missed"], ""),
             Figure(f"ratio_to_bare_loop.{name}", row["ratio"], ""),
             Figure(f"waited_ms.{name}", row["scheduled"]["waited_ms"], "ms/s"),
+            Figure(f"faults_per_s.{name}", row["scheduled"]["minor_faults"], "1/s"),
             Figure(f"other_cpu_percent.{name}", row["cpu_percent"]["others"], "%"),
         ]
     return Report("measures", figures, rows)

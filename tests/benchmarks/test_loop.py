@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from types import SimpleNamespace
 from typing import Any
 
@@ -24,10 +25,13 @@ def episode(steps: list[int], late: list[float], worked: float = 0.0003) -> Any:
     return SimpleNamespace(ticks=table, outcome=outcome, frames=len(steps))
 
 
-def judged(steps: list[int], late: list[float], scheduling: str = "FIFO 20") -> dict[str, Any]:
+def judged(
+    steps: list[int], late: list[float], scheduling: str = "FIFO 20", others: float = 3.0
+) -> dict[str, Any]:
     control = {"scheduling": scheduling}
     row = _judged(episode(steps, late), RATE, control, (BARE, COMMON))
-    return {**row, "rate": RATE, "cpu_percent": {"lab": 90.0, "others": 3.0}}
+    used = {"lab": 40.0 * (os.cpu_count() or 1), "measuring": 5.0, "others": others}
+    return {**row, "rate": RATE, "cpu_percent": used}
 
 
 def test_lateness_is_of_every_tick_and_compared_with_the_bare_loop() -> None:
@@ -61,3 +65,7 @@ def test_the_class_decides_what_is_wanted() -> None:
     assert other["lateness_p99_ms.100"] is True
     assert other["ratio_to_bare_loop.100"] is False
     assert other["missed_ticks.100"] is None
+    full = judged(list(range(100)), late, "slice 0.1 ms", others=60.0 * (os.cpu_count() or 1))
+    saturated = {f.name: f.holds for f in _figures(full)}
+    assert saturated["lateness_p99_ms.100"] is None
+    assert saturated["ratio_to_bare_loop.100"] is False
