@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import queue
 import subprocess
 import sys
 import threading
@@ -10,42 +11,58 @@ import time
 from pathlib import Path
 
 log = logging.getLogger(__name__)
+_LOOK_S = 0.02
 
 
 class Exports:
-    """Exports into one data folder; each of its processes ends with ours, however that ends."""
+    """Exports into one data folder, one episode after the other; its process ends with ours, however that ends."""
 
     def __init__(self, data: Path) -> None:
         self._data = data
-        self._under_way: list[threading.Thread] = []
+        self._waiting: queue.Queue[Path] = queue.Queue()
+        self._thread: threading.Thread | None = None
 
     def start(self, folder: Path) -> None:
-        """Export the closed episode in `folder`; returns at once, what goes wrong is logged."""
-        command = (sys.executable, "-m", "runtime.recording", "export", str(folder), "--to", str(self._data))
-        try:
-            child = subprocess.Popen(
-                (*command, "--background"),
-                stdin=subprocess.PIPE,  # its end is ours
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-            )
-        except OSError as error:
-            log.error("%s is not exported: %s", folder, error)
-            return
-        attending = threading.Thread(target=_attend, args=(child, folder), name="export", daemon=True)
-        attending.start()
-        self._under_way = [*(one for one in self._under_way if one.is_alive()), attending]
+        """Export the closed episode in `folder` in its turn; returns at once, what goes wrong is logged."""
+        self._waiting.put(folder)
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._work, name="export", daemon=True)
+            self._thread.start()
 
     def finish(self, seconds: float) -> None:
-        """Wait for what is under way, at most so long; the rest is exported when it is asked for again."""
+        """Wait for what has been asked for, at most so long; the rest is exported when it is asked for again."""
         deadline = time.monotonic() + seconds
-        for attending in self._under_way:
-            attending.join(max(0.0, deadline - time.monotonic()))
+        while self._waiting.unfinished_tasks and time.monotonic() < deadline:
+            time.sleep(_LOOK_S)
 
+    def _work(self) -> None:
+        while True:
+            folder = self._waiting.get()
+            try:
+                self._export(folder)
+            except OSError as error:
+                log.error("%s is not exported: %s", folder, error)
+            finally:
+                self._waiting.task_done()
 
-def _attend(child: subprocess.Popen[str], folder: Path) -> None:
-    assert child.stderr is not None
-    said = child.stderr.read().strip()  # not communicate(), which would close its standard input
-    if child.wait():
-        log.error("%s is not exported: %s", folder, said or f"its process ended with {child.returncode}")
+    def _export(self, folder: Path) -> None:
+        child = subprocess.Popen(
+            (
+                sys.executable,
+                "-m",
+                "runtime.recording",
+                "export",
+                str(folder),
+                "--to",
+                str(self._data),
+                "--background",
+            ),
+            stdin=subprocess.PIPE,  # its end is ours
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert child.stderr is not None
+        said = child.stderr.read().strip()  # not communicate(), which would close its standard input
+        if child.wait():
+            log.error("%s is not exported: %s", folder, said or f"its process ended with {child.returncode}")

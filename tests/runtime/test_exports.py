@@ -40,8 +40,35 @@ def test_a_process_that_cannot_be_started_is_logged(folder, tmp_path, monkeypatc
     monkeypatch.setattr(module.subprocess, "Popen", full)
     exports = Exports(tmp_path)
     exports.start(folder)
-    exports.finish(0.0)
+    exports.finish(PATIENCE_S)
     assert "is not exported: [Errno 11] Resource temporarily unavailable" in caplog.text
+
+
+def test_of_many_episodes_one_is_exported_at_a_time_in_the_order_they_were_closed(tmp_path, monkeypatch):
+    alive, order = [], []
+
+    class Child:
+        returncode = 0
+
+        def __init__(self, command, **how):
+            alive.append(self)
+            order.append(Path(command[4]).name)
+            assert len(alive) == 1
+            self.stderr = self
+
+        def read(self):
+            return ""
+
+        def wait(self):
+            alive.remove(self)
+            return 0
+
+    monkeypatch.setattr(module.subprocess, "Popen", Child)
+    exports = Exports(tmp_path)
+    for number in range(20):
+        exports.start(tmp_path / str(number))
+    exports.finish(PATIENCE_S)
+    assert order == [str(number) for number in range(20)]
 
 
 @pytest.mark.slow
