@@ -120,6 +120,8 @@ class RecordingChoice(RecordingSettings):
     """Rows per second of the dataset grid; the control rate where it is not given."""
     kind: Literal["rollout", "demonstration"] = "rollout"
     """What the episodes are, for the manifest and the dataset."""
+    export: bool = True
+    """Whether the streams of every run are exported as one table when it is closed."""
     on_failure: Literal["hold", "continue"] = "hold"
     """What a run does when its recording fails: an unrecorded run is no evidence."""
 

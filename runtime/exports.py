@@ -15,15 +15,21 @@ _LOOK_S = 0.02
 
 
 class Exports:
-    """Exports into one data folder, one episode after the other; its process ends with ours, however that ends."""
+    """Exports into one data folder, one episode after the other; its process ends with ours, however that ends.
 
-    def __init__(self, data: Path) -> None:
+    Where exports are not `wanted` it does nothing.
+    """
+
+    def __init__(self, data: Path, wanted: bool = True) -> None:
         self._data = data
+        self._wanted = wanted
         self._waiting: queue.Queue[Path] = queue.Queue()
         self._thread: threading.Thread | None = None
 
     def start(self, folder: Path) -> None:
         """Export the closed episode in `folder` in its turn; returns at once, what goes wrong is logged."""
+        if not self._wanted:
+            return
         self._waiting.put(folder)
         if self._thread is None:
             self._thread = threading.Thread(target=self._work, name="export", daemon=True)

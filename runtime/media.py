@@ -226,7 +226,7 @@ def main() -> None:
     plan, page = member.plan, member.page
     clock = MonotonicClock()
     page.beat("media", clock.now())
-    exports = Exports(plan.deployment.data)
+    exports = Exports(plan.deployment.data, plan.deployment.recording.export)
     start_repair(plan.deployment.episodes_dir, plan.deployment.station, exports.start)
     source: Source = plan.transport.source(plan.deployment.transport, plan.robot, clock)
     media = Media(

@@ -67,6 +67,7 @@ class Lab:
             f'data_dir="{self.data}"',
             "run.duration_s=600",
             "recording.min_free_bytes=0",
+            "recording.export=false",
             "bus.preview_rate=0",
             *assignments,
         ]
