@@ -58,8 +58,10 @@ class ByHand:
         return {"duration_s": self._targets.duration(start, goal, asked.speed)}
 
     def checked(self, what: str, goal: Float64) -> Float64:
-        """`goal` [D] where a motion there is allowed all the way."""
+        """`goal` [D], a policy's action, where a motion there is allowed all the way; grippers within their travel."""
         self.require_robot(what)
+        limits = self._plan.limits
+        goal = np.where(limits.grippers, np.clip(goal, limits.lower, limits.upper), goal)
         return self._targets.checked(what, goal, self.commanded())
 
     def grip(self, asked: GripperRequest, free: bool) -> dict[str, Any]:

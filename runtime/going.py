@@ -7,6 +7,7 @@ import numpy as np
 from runtime.clock import Clock
 from runtime.errors import SetupError
 from runtime.family import Plan
+from runtime.messages import Event
 from runtime.motion import Trajectory
 from runtime.orders import Orders
 from runtime.page import Page
@@ -30,16 +31,19 @@ class Going:
         self._goal, self._where = goal, where
         self._allowed = self._motion_time() + _SETTLE_S
         self._since = self._clock.now()
-        self._orders.give("motion", goal=np.array(goal, np.float64))
+        self._order = self._orders.give("motion", goal=np.array(goal, np.float64))
 
     def require_progress(self) -> None:
         """SetupError where control should have been there by now."""
         if self._clock.now() - self._since > self._allowed:
             raise SetupError(f"control has not come to {self._where} within {self._allowed:.1f} s")
 
-    def done(self) -> None:
-        """Control has sent the end of it: from now on the arm is waited for."""
-        self._since = self._clock.now()
+    def done(self, event: Event) -> bool:
+        """Whether `event` says that control has sent the end of this motion, and not of one before; then the arm is due."""
+        over = event.kind == "motion_done" and event.data.get("order") == self._order
+        if over:
+            self._since = self._clock.now()
+        return over
 
     def arrived(self) -> bool:
         """Whether the arm is there; SetupError, naming the joint, where it does not come."""

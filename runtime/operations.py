@@ -169,7 +169,7 @@ class Operations(Effects):
         if self._state() is not State.READY and made is not None:
             self.runs.approach(self.by_hand.checked("approach", made.rows[0]))
         elif first is not None:
-            self.by_hand.checked("approach", first)
+            self.setup.first_action = self.by_hand.checked("approach", first)
             self.setup.begin_approach()
 
     # --- what goes on -------------------------------------------------------------------------------

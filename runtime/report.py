@@ -84,8 +84,8 @@ class Report:
         self._step, self._planned, self._woke = step, planned, woke
 
     def say(self, kind: str, text: str) -> None:
-        """An event, told at the end of the tick."""
-        self._outbox.append(Event(kind, text, self._planned, self._step))
+        """An event, told at the end of the tick, with the order that control was carrying out."""
+        self._outbox.append(Event(kind, text, self._planned, self._step, {"order": self.order}))
 
     def merged(self, merged: ChunkMerged) -> None:
         """Where a chunk fell, told at the end of the tick."""

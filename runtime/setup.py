@@ -116,8 +116,7 @@ class SetUp:
 
     def heard(self, event: Event) -> None:
         """Control's events: the one that says that the motion is done."""
-        if self.stage in (Stage.HOME, Stage.APPROACH) and event.kind == "motion_done":
-            self._going.done()
+        if self.stage in (Stage.HOME, Stage.APPROACH) and self._going.done(event):
             self._enter(Stage.SETTLE)
         self.bench.heard(event)
 

@@ -601,3 +601,36 @@ def test_a_failure_that_was_cancelled_is_not_held_against_the_next_question(tmp_
     station.go(15)
     assert station.state is State.RUNNING, station.reason
     station.close()
+
+
+def test_the_end_of_a_motion_before_is_not_taken_for_the_end_of_homing(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path)).ready()
+    station.command("gripper", action="open")
+    station.until(lambda: station.page.control.read()["behaviour"] == b"hold", 5.0, "the gripper to be open")
+    station.command("home")  # control has said that it is done, main has not heard it yet
+    station.go(3)
+    assert station.main.setup.stage == "going to the pose"
+    station.reach(State.READY)
+    assert np.abs(station.robot.position[~station.plan.limits.grippers]).max() < 1e-3
+    station.close()
+
+
+def test_a_gripper_that_a_policy_wants_beyond_its_travel_is_no_obstacle_to_an_approach(
+    tmp_path: Path,
+) -> None:
+    def rows(observation: Any, number: int) -> Any:
+        wanted = ramp(400, 5)
+        wanted[:, LEFT_GRIPPER] = -0.002
+        return wanted
+
+    station = Station(plan(tmp_path, rows)).ready()
+    station.command("approach")
+    station.reach(State.READY)
+    assert left_gripper(station) == pytest.approx(0.0, abs=1e-6)
+    station.command("run", mode="preview")
+    station.go(3)
+    station.command("step")
+    station.go(3)
+    station.command("approach")
+    station.until(lambda: phase(station) == "proposed", 20.0, "to arrive")
+    station.close()
