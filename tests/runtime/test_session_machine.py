@@ -1,0 +1,311 @@
+"""Whatever is asked of a station, and whatever fails, in whatever order: it moves only when somebody asked."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
+
+from runtime.control import make_tick
+from runtime.director import Director
+from runtime.errors import PolicyError, PolicyLostError
+from runtime.messages import ChunkMerged, TickDone, decode
+from runtime.page import EStop
+from runtime.transitions import COMMANDS, State
+from runtime.types import Float64
+from tests.runtime.station import DIM, STANDS, Station, plan
+
+PERIOD = 1 / 30
+COMES_TO_A_STAND = 10  # ticks: from full speed
+MODES = ("continuous", "step", "preview", "sim", "manual")
+STRATEGIES = ("sync", "async", "naive", "ensemble", "rtc")
+SET_GOING = ("commit", "approach", "step", "move", "gripper")  # by a person, within a run or beside it
+joint = st.integers(0, DIM - 1)
+ticks = st.integers(1, 12)
+deeds = st.one_of(  # of a person within a run
+    st.tuples(st.sampled_from(["step", "step", "commit", "cancel", "approach"]), st.just({})),
+    st.tuples(
+        st.just("gripper"),
+        st.fixed_dictionaries({"action": st.sampled_from(["open", "close", "lock", "unlock"])}),
+    ),
+    st.tuples(
+        st.just("tune"),
+        st.fixed_dictionaries(
+            {
+                "strategy": st.fixed_dictionaries(
+                    {
+                        "kind": st.sampled_from(STRATEGIES),
+                        "execution_horizon": st.sampled_from([None, 1, 7]),
+                        "inference_rate": st.sampled_from([None, 3.0]),
+                        "k_max": st.sampled_from([None, 0, 2]),
+                    }
+                )
+            }
+        ),
+    ),
+    st.builds(
+        lambda index, away, speed: ("move", {"joints": _aside(index, away).tolist(), "speed": speed}),
+        joint,
+        st.floats(-1.0, 1.0),
+        st.floats(0.1, 1.0),
+    ),
+)
+commands = st.one_of(
+    st.tuples(st.sampled_from(["halt", "resume", "stop", "home", "setup", "approach"]), st.just({})),
+    st.tuples(st.just("run"), st.fixed_dictionaries({"mode": st.sampled_from(MODES)})),
+    st.tuples(st.just("run"), st.just({"trial": {"id": 1}})),
+)
+behaviours = st.sampled_from(["ramp", "wild", "nan", "error", "lost", "far", "short"])
+
+
+def _aside(index: int, away: float) -> Float64:
+    goal = STANDS.copy()
+    goal[index] += away if index not in (6, 13) else 0.0
+    return goal
+
+
+class Machine(RuleBasedStateMachine):
+    """A lockstep station, the hands of several people, and a witness that looks at it after every tick."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = tempfile.TemporaryDirectory()
+        self.does = "ramp"
+        self.keeps_lease = True
+        self.still = 0  # ticks for which nobody has asked for a motion
+        self.going = False  # a person has set something going
+        self.merged: set[tuple[str, int]] = set()
+
+    @initialize(delay=st.integers(0, 4), home=st.booleans(), strategy=st.sampled_from(STRATEGIES))
+    def begin(self, delay: int, home: bool, strategy: str) -> None:
+        self.station = station = Station(
+            plan(
+                Path(self.folder.name),
+                self.rows,
+                strategy=strategy,
+                delay=delay,
+                setup={"home": home},
+                recording={"enabled": False},
+                faults={"policy_error": "slow"},
+            )
+        )
+        self.limits = station.plan.limits
+        self.records: list[Any] = []
+        ring = station.page.rings["ticks"]
+        push = ring.push
+        ring.push = lambda payload: self.records.append(decode(payload)) or push(payload)  # type: ignore[method-assign]
+        self.speed: Float64 = np.zeros(DIM)
+        self.tick(3)
+
+    def rows(self, observation: Any, number: int) -> Any:
+        """What the policy answers just now."""
+        if self.does in ("error", "lost"):
+            raise (PolicyError if self.does == "error" else PolicyLostError)(self.does)
+        here = np.asarray(observation.qpos, np.float64)
+        if self.does == "far":
+            here = here + 0.4
+        chunk = here + np.outer(np.arange(1, 3 if self.does == "short" else 16), 0.01 * np.ones(DIM))
+        if self.does == "wild":
+            chunk += np.random.default_rng(number).normal(0.0, 0.3, chunk.shape)
+        if self.does == "nan":
+            chunk[2:, 3] = np.nan
+        return chunk
+
+    # --- what happens --------------------------------------------------------------------------------------
+
+    @rule(given=deeds, wait=st.integers(1, 40))
+    def deed(self, given: tuple[str, dict[str, Any]], wait: int) -> None:
+        self.command(given, wait)
+
+    @rule(given=commands, wait=ticks)
+    def command(self, given: tuple[str, dict[str, Any]], wait: int) -> None:
+        kind, arguments = given
+        session = self.station.main.session
+        allowed, before = session.allowed(), session.state
+        if self.keeps_lease:
+            self.station._handle("lease_claim")
+        ack = self.station._handle(kind, arguments)
+        if kind not in allowed or not self.keeps_lease:
+            assert ack.status == "refused", (kind, before)
+        if ack.status == "accepted":
+            after = COMMANDS[kind].next(before) or before
+            cancelled = before is State.SETTING_UP
+            assert session.state is (State.IDLE if cancelled else after)
+            self.going = kind in SET_GOING or (self.going and kind == "tune")
+        else:
+            assert ack.reason
+            assert session.state is before
+        self.tick(wait)
+
+    @rule(arguments=st.dictionaries(st.text(max_size=5), st.integers() | st.text(max_size=3), max_size=2))
+    def nonsense(self, arguments: dict[str, Any]) -> None:
+        for kind in ("setup", "run", "tune", "move", "gripper", "aim"):
+            ack = self.station._handle(kind, {"x": 1} | arguments)
+            assert ack.status == "refused"
+
+    @rule(wait=st.integers(1, 60))
+    def time_passes(self, wait: int) -> None:
+        self.tick(wait)
+
+    @rule(mode=st.sampled_from(MODES), wait=ticks)
+    def work(self, mode: str, wait: int) -> None:
+        """Whatever is in the way of a run is cleared away, so that not every example ends where nothing moves."""
+        robot = self.station.robot
+        robot.blocked = robot.silent = False
+        self.does, self.keeps_lease = "ramp", True
+        if self.station.state is State.FAULTED:
+            self.release(3)
+        for kind, arguments in (("stop", {}), ("setup", {}), ("run", {"mode": mode})):
+            self.tick(3)
+            if kind in self.station.main.session.allowed():
+                self.command((kind, arguments), 1)
+            for _ in range(200):
+                if self.station.state is State.SETTING_UP:
+                    self.tick(1)
+        self.tick(wait)
+
+    @rule(does=behaviours)
+    def policy_changes(self, does: str) -> None:
+        self.does = does
+
+    @rule(
+        kind=st.sampled_from(["e-stop", "release", "lease", "control", "main", "blocked", "silent"]),
+        wait=st.integers(1, 40),
+    )
+    def trouble(self, kind: str, wait: int) -> None:
+        robot, main = self.station.robot, self.station.main
+        if kind == "e-stop":
+            self.station.guard.press("anna", "a test")
+            self.going = False
+        elif kind == "release" and self.station.state is State.FAULTED:
+            self.release(1)
+        elif kind == "lease":
+            self.keeps_lease = not self.keeps_lease
+            main.lease.give_up("lockstep", main.lease.epoch, self.station.clock.now())
+            self.going = False
+        elif kind == "control":
+            self.restart_control()
+        elif kind == "main":
+            self.restart_main()
+        elif kind == "blocked":
+            robot.blocked = not robot.blocked
+        elif kind == "silent":
+            robot.silent = not robot.silent
+        self.tick(wait)
+
+    @rule(index=joint, away=st.floats(-1.5, 1.5), wait=ticks)
+    def moved_by_hand(self, index: int, away: float, wait: int) -> None:
+        if index not in (6, 13):
+            self.station.robot.position[index] += away
+        self.tick(wait)
+
+    def release(self, wait: int) -> None:
+        self.keeps_lease, self.going = True, False
+        self.station._handle("lease_claim")
+        self.station._handle("release")
+        self.tick(wait)
+
+    def restart_control(self) -> None:
+        station = self.station
+        for _ in station.page.rings["orders"].drain():
+            pass
+        station._tick = make_tick(station.plan, station.page, station._sink, station.clock.now)
+        station.page.set_generation("control", station.page.generation("control") + 1)
+        self.going, self.speed = False, np.zeros(DIM)
+
+    def restart_main(self) -> None:
+        station = self.station
+        station.page.beat("main", 0.0)
+        told = len(station.robot.commands)
+        station._tick(station.step, station.clock.now())  # control sees that nobody is there
+        self.look(station.page.observation.read()["qpos"].astype(np.float64), told)
+        station.step += 1
+        station.clock.sleep_until(station.step / station.plan.rate)
+        station.main = Director(station.plan, station.page, station.clock, station._runner)
+        self.going = False
+        self.merged.clear()
+
+    # --- the witness ---------------------------------------------------------------------------------------
+
+    def tick(self, count: int) -> None:
+        station = self.station
+        for _ in range(count):
+            if self.keeps_lease:
+                held = station.main.lease.current(station.clock.now())
+                station._handle("lease_renew" if held else "lease_claim")
+            told = len(station.robot.commands)
+            station.tick()
+            self.look(station.page.observation.read()["qpos"].astype(np.float64), told)
+
+    def look(self, measured: Float64, told: int) -> None:
+        station = self.station
+        status = station.page.control.read()
+        new = station.robot.commands[told:]
+        assert len(new) == int(status["engaged"])
+        self.weigh()
+        station.main.snapshot()
+        asked = self.asked()
+        self.still = 0 if asked else self.still + 1
+        if not new:
+            return
+        sent = new[-1].action.astype(np.float64)
+        before = station.robot.commands[told - 1].action.astype(np.float64) if told else measured
+        arms = ~self.limits.grippers
+        if np.allclose(sent[arms], measured[arms], atol=1e-6):  # it is held where it is
+            self.speed = np.zeros(DIM)
+            return
+        self.limit(sent, before)
+        if self.still > COMES_TO_A_STAND:
+            assert sent == pytest.approx(before, abs=1e-6), (station.state, station.reason)
+
+    def limit(self, sent: Float64, before: Float64) -> None:
+        limits = self.limits
+        assert (sent >= np.minimum(limits.lower, before) - 1e-5).all()
+        assert (sent <= np.maximum(limits.upper, before) + 1e-5).all()
+        speed = (sent - before) / PERIOD
+        assert (np.abs(speed) <= limits.velocity * 1.001 + 1e-4).all()
+        if self.station.page.estop is EStop.CLEAR:
+            rate = 60.0 * limits.reach * PERIOD
+            assert (np.abs(speed - self.speed) <= rate * 1.06 + 1e-3).all()
+        self.speed = speed
+
+    def asked(self) -> bool:
+        """Whether somebody wants the real robot to move just now."""
+        main = self.station.main
+        run, state = main.run, main.session.state
+        if state is State.SETTING_UP:
+            return True
+        if state is State.RUNNING and run is not None and run.mode == "continuous":
+            return True
+        return self.going and state in (State.READY, State.RUNNING, State.HOLDING)
+
+    def weigh(self) -> None:
+        for record in self.records:
+            if isinstance(record, TickDone) and record.chunk_ids:
+                assert sum(record.weights) == pytest.approx(1.0)
+                assert min(record.weights) > 0
+            if isinstance(record, ChunkMerged) and not record.dropped:
+                assert (record.strategy, record.chunk_id) not in self.merged  # executed once
+                self.merged.add((record.strategy, record.chunk_id))
+                assert record.targets.max() >= record.arrival_step
+        self.records.clear()
+
+    def teardown(self) -> None:
+        if hasattr(self, "station"):
+            self.station.close()
+        self.folder.cleanup()
+
+
+TestStation = Machine.TestCase
+TestStation.settings = settings(
+    max_examples=25,
+    stateful_step_count=25,
+    deadline=None,
+    suppress_health_check=list(HealthCheck),
+)
