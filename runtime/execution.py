@@ -97,10 +97,13 @@ class Follow(Behaviour):
             return Joined(dropped(chunk, step, shape))
         arrival = Arrival(chunk.chunk_id, chunk.observation_step, rows.astype(np.float64), chunk.waited)
         safety = self._settings.safety
-        away, where = self._away(arrival, step, commanded)
-        if away > safety.jump:
+        # A policy that means to begin elsewhere is told by its first row; a late one has gone on by the first used.
+        meant, where = self._away(arrival.rows[0], commanded)
+        if meant > safety.jump:
             far = f"{where}, allowed {safety.jump:g} (safety.jump): approach it, or start elsewhere"
             return Joined(dropped(chunk, step, far), far, too_far=True)
+        placed = self._strategy.merge.place(self.timeline, arrival, step)
+        away, where = self._away(placed.rows[0], commanded) if len(placed.rows) else (0.0, "")
         far = f"{where}: blended in" if away > safety.first_action_far else ""
         held = commanded if away > _JOINED_AT_ONCE or self.starved else None
         switched, self._expecting = (
@@ -120,12 +123,12 @@ class Follow(Behaviour):
         self._switched = switched and bool(merged.dropped)
         return Joined(self._told(chunk, merged), far)
 
-    def _away(self, arrival: Arrival, step: int, commanded: Float64) -> tuple[float, str]:
+    def _away(self, row: Float64, commanded: Float64) -> tuple[float, str]:
         """How far from where the robot stands a run's first action is [rad], and that in words; 0 for later ones."""
-        settings, placed = self._settings, self._strategy.merge.place(self.timeline, arrival, step)
-        if not self._expecting or settings.safety.report_only or not len(placed.rows):
+        settings = self._settings
+        if not self._expecting or settings.safety.report_only:
             return 0.0, ""
-        apart = difference(placed.rows[0], commanded, settings.dims.wrapping)
+        apart = difference(row, commanded, settings.dims.wrapping)
         away = np.where(settings.limits.grippers, 0.0, np.abs(apart))
         worst, name = float(away.max()), settings.limits.names[int(away.argmax())]
         return worst, f"{name}: the first action is {worst:.2f} rad from where the robot stands"

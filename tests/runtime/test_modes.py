@@ -634,3 +634,18 @@ def test_a_gripper_that_a_policy_wants_beyond_its_travel_is_no_obstacle_to_an_ap
     station.command("approach")
     station.until(lambda: phase(station) == "proposed", 20.0, "to arrive")
     station.close()
+
+
+def test_a_late_policy_that_means_to_begin_where_the_robot_stands_begins(tmp_path: Path) -> None:
+    """Its first row that is not stale is farther than a jump: it has gone on meanwhile, within its speed."""
+
+    def rows(observation: Any, number: int) -> Any:
+        return ramp(observation.step, 50, speed=0.02)
+
+    station = Station(plan(tmp_path, rows, delay=28)).ready()
+    station.command("run", duration_s=1.3)
+    station.go(38)
+    assert station.state is State.RUNNING, station.reason
+    assert station.events("far_start")
+    assert np.abs(np.diff(station.robot.sent, axis=0)).max() < 0.15
+    station.close()
