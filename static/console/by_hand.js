@@ -1,6 +1,7 @@
 // The controls of the Debug page, put together.
 
 import { Aim } from "./aim.js";
+import { config } from "./config.js";
 import { ManualPanel } from "./manual_panel.js";
 import { ModePanel } from "./mode_panel.js";
 import { panels } from "./panels.js";
@@ -14,12 +15,17 @@ export function byHand(store, socket, commands) {
   new ModePanel(store, commands, (mode) => shown.open(mode === "manual" ? "manual" : "policy"));
   new TuningPanel(store, commands);
   new ManualPanel(store, commands, aim);
-  robotPanel(store, commands);
+  robotPanel(store, commands, gripperUnit);
   commands.provide("setup", bench);
   document.getElementById("hand").addEventListener("keydown", ({ key, target }) => {
     if (key === "Enter" && target.matches("input")) target.blur(); // what was typed counts, and the keys are free again
   });
   return { aimed: (answer) => aim.answered(answer) };
+}
+
+/** The unit of a group's gripper; joints and units stand in the same order. */
+function gripperUnit({ joint_names: names = [], gripper_dims: grippers = [] } = {}, group) {
+  return config.units[grippers.find((index) => names[index]?.startsWith(`${group}.`))] ?? "";
 }
 
 /** How a simulated bench is to be laid out at set-up; nothing where it is to stay as it lies. */

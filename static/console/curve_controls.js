@@ -33,7 +33,7 @@ export async function curvePane(store) {
   const tags = new Tags(document.querySelector(".curves-pane"), "curves-tags");
   store.on("second", () => {
     tags.show("paused", curves.paused && `paused ${duration(curves.pausedFor)} ago; the data goes on`);
-    tags.show("simulated", curves.simulated && "executed by the simulated robot", GHOSTS.simulated.colour);
+    tags.show("simulated", curves.simulated && "under the bar: executed by the simulated robot", GHOSTS.simulated.colour);
   });
   return {
     add: (samples) => curves.add(samples),

@@ -1,26 +1,81 @@
 // Events in words: the runtime's kinds and sentences as a person reads them, and how much they weigh.
 
-const BAD = new Set(["estopped", "family_died", "policy_failed", "policy_lost", "recording_failed", "source_failed", "displaced"]);
-const WARN = new Set(["refused", "word_refused", "refusals", "starved", "starvation", "limited", "far_start", "chunk_dropped", "ik_unreached", "not_journalled", "unmeasured"]);
-const NAMES = { estopped: "e-stop", family_died: "process ended", ik_unreached: "out of reach", truth: "bench says", limited: "safety", limited_sum: "safety" };
+import { verb, words } from "./words.js";
+
+const BAD = new Set(["estopped", "family_died", "policy_failed", "policy_lost", "recording_failed", "source_failed", "displaced", "moved_away", "too_far"]);
+const WARN = new Set(["refused", "word_refused", "tune_refused", "lock_refused", "refusals", "starved", "starvation", "limited", "far_start", "chunk_dropped", "ik_unreached", "not_journalled", "unmeasured", "unreadable", "rtc_warning", "late_ticks", "scheduling"]);
+const GOOD = new Set(["policy_back", "recovered", "punctual", "released"]); // a trouble is over
+const NAMES = {
+  chunk_dropped: "chunk not used",
+  displaced: "arm was moved",
+  episode_closed: "recording ended",
+  episode_opened: "recording",
+  estopped: "e-stop",
+  family_died: "process ended",
+  far_start: "far from robot",
+  ik_unreached: "out of reach",
+  late_ticks: "control late",
+  limited: "safety",
+  limited_sum: "safety",
+  lock_refused: "lock refused",
+  locked: "gripper lock",
+  motion_done: "motion",
+  moved_away: "arm was moved",
+  not_journalled: "not in journal",
+  policy_back: "policy is back",
+  policy_failed: "policy failed",
+  policy_lost: "policy lost",
+  punctual: "control on time",
+  recording_failed: "recording failed",
+  recovered: "actions again",
+  refusals: "actions refused",
+  refused: "action refused",
+  released: "e-stop released",
+  rtc_warning: "RTC",
+  scheduling: "real time",
+  setup: "set-up",
+  source_failed: "robot link",
+  starvation: "out of actions",
+  starved: "out of actions",
+  too_far: "too far",
+  truth: "bench says",
+  tune_refused: "strategy refused",
+  tuned: "strategy in force",
+  tuned_to: "strategy asked",
+  unmeasured: "joints not seen",
+  unreadable: "not understood",
+  word_refused: "robot refused",
+};
+const UUID = /\b([0-9a-f]{8})-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b/g; // its beginning is enough to read
 const HOLDER = /\bweb:([^\s:]+):([A-Za-z0-9_-]{1,4})[A-Za-z0-9_-]*/g; // a page of a person
+
+/** Sentences that begin with a word of the runtime's, with the one that the page has for it. */
+const PLAIN = {
+  state: (said) => said.replace(/^\w+ -> \w+/, words),
+  command: (said) => said.replace(/^\w+(?= by )/, verb),
+  source: (said) => said.replace(/^source: /, ""),
+  truth: (said) => said.replace(/^the simulated bench says: /, ""),
+  episode_opened: (said) => said.replace(/^recording /, "begun: "),
+};
 
 /** The kind in words. */
 export function kindWords(kind) {
-  return NAMES[kind] ?? kind.replaceAll("_", " ");
+  return NAMES[kind] ?? (kind.startsWith("source_") ? NAMES.source_failed : words(kind));
 }
 
-/** The sentence, with arrows as arrows and people by their names. */
+/** The sentence, with arrows as arrows and people by their names, commands as their buttons say them. */
 export function sentence({ kind, text }) {
   if (kind === "setup" && text === "idle") return "the set-up is over";
-  const said = kind === "state" ? text.replace(/^\w+ -> \w+/, (change) => change.replaceAll("_", " ")) : text;
-  return said.replaceAll(" -> ", " → ").replace(HOLDER, "$1 (page $2)");
+  const plain = PLAIN[kind] ?? (kind.startsWith("source_") ? PLAIN.source : (said) => said);
+  return plain(text).replaceAll(" -> ", " → ").replace(HOLDER, "$1 (page $2)").replace(UUID, "$1");
 }
 
-/** "bad" for what endangers robot or record, "warn" for what a person should have seen, else "". */
+/** "bad" for what endangers robot or record, "warn" for what a person should have seen, "good" where that is over, else "". */
 export function weight({ kind, text, data = {} }) {
   if (BAD.has(kind) || (kind === "state" && data.state === "faulted")) return "bad";
   if (WARN.has(kind) || kind.startsWith("source_")) return "warn";
+  if (kind === "drives") return data.enabled === false || data.faults?.length ? "bad" : "good";
+  if (GOOD.has(kind)) return "good";
   if (kind === "state") return ["holding", "disconnected"].includes(data.state) ? "warn" : "";
   return kind === "command" && /: (refused|failed)\b/.test(text) ? "warn" : "";
 }

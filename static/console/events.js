@@ -63,6 +63,7 @@ export class Events {
     name.title = kindWords(kind);
     const words = document.createElement("span");
     words.textContent = text;
+    words.title = event.text;
     row.append(time, name, words);
     return row;
   }

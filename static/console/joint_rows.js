@@ -1,5 +1,6 @@
 // A slider and a number for each joint of a group, within its limits.
 
+import { config } from "./config.js";
 import { stepOf, within } from "./targets.js";
 
 export class JointRows {
@@ -50,9 +51,11 @@ export class JointRows {
     Object.assign(number, { step, min: joint.lower, max: joint.upper });
     label.htmlFor = slider.id;
     label.textContent = joint.gripper ? "gripper" : joint.name;
-    row.title = `${joint.full}: ${joint.lower} to ${joint.upper}`;
+    const unit = config.units[joint.index] ?? "";
+    row.title = `${joint.full}: ${joint.lower} to ${joint.upper} ${unit}`;
+    row.querySelector(".joint-unit").textContent = unit;
     slider.setAttribute("aria-label", joint.full);
-    number.setAttribute("aria-label", `${joint.full}, as a number`);
+    number.setAttribute("aria-label", `${joint.full} in ${unit}, as a number`);
     slider.addEventListener("input", () => this.#set(joint, slider.valueAsNumber, number));
     slider.addEventListener("keydown", (event) => this.#arrow(event, joint, slider, number));
     number.addEventListener("input", () => this.#type(joint, number.valueAsNumber, slider));

@@ -4,11 +4,11 @@ import { words } from "./words.js";
 
 /** In the order of the keys that choose them. */
 export const MODES = {
-  sim: "Drives a simulated robot; the real one holds.",
+  sim: "Drives a simulated robot, in 3D only.",
   step: "Each press moves the robot by one chunk.",
   preview: "Each press shows a chunk; Commit moves.",
   continuous: "The policy drives the robot until Stop.",
-  manual: "You move the robot; the policy is not asked.",
+  manual: "You move the robot, not the policy.",
 };
 
 /** What the policy sees in the mode sim, to be said while it runs. */

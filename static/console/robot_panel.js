@@ -6,8 +6,8 @@ const KEYS = [
 ];
 
 /** Where a gripper is, in words. */
-export function gripperWords({ locked, at }) {
-  const place = Number.isFinite(at) ? `at ${at.toFixed(3)}` : "";
+export function gripperWords({ locked, at }, unit = "") {
+  const place = Number.isFinite(at) ? `at ${at.toFixed(3)} ${unit}`.trim() : "";
   return locked ? `locked ${place}`.trim() : place || "not known";
 }
 
@@ -18,14 +18,14 @@ export function driveWords(drives) {
   return drives.enabled ? { text: "enabled, no fault", weight: "good" } : { text: "disabled: the robot does not follow", weight: "warn" };
 }
 
-/** Keeps the panel true. */
-export function robotPanel(store, commands) {
+/** Keeps the panel true; `unit(facts, name)` is that of the gripper of the group `name`. */
+export function robotPanel(store, commands, unit) {
   const list = document.getElementById("grippers");
   const rows = new Map();
-  store.on("snapshot", ({ grippers = {}, drives }) => {
+  store.on("snapshot", ({ grippers = {}, drives, facts }) => {
     const names = Object.keys(grippers);
     if (names.join() !== [...rows.keys()].join()) build(list, rows, names, commands);
-    for (const [name, row] of rows) draw(row, grippers[name]);
+    for (const [name, row] of rows) draw(row, grippers[name], unit(facts, name));
     drawDrives(driveWords(drives));
   });
 }
@@ -55,9 +55,9 @@ function named(button, arm, keys) {
   button.append(" ", cap);
 }
 
-function draw(row, gripper) {
+function draw(row, gripper, unit) {
   const state = row.querySelector(".gripper-state");
-  const said = gripperWords(gripper);
+  const said = gripperWords(gripper, unit);
   if (state.textContent !== said) state.textContent = said;
   state.dataset.locked = String(Boolean(gripper.locked));
   const lock = row.querySelector('[data-grip="lock"]');

@@ -35,7 +35,7 @@ export class ShownChunk {
   get proposal() {
     if (this.#chunk?.state !== "proposed") return "";
     const rows = this.#chunk.targets?.length ?? 0;
-    return `chunk ${this.#chunk.chunk}, proposed: ${rows} rows, ${(rows / this.#rate()).toFixed(1)} s`;
+    return `chunk ${this.#chunk.chunk}, proposed: ${rows} steps, ${(rows / this.#rate()).toFixed(1)} s`;
   }
 
   #set(chunk) {

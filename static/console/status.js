@@ -99,6 +99,12 @@ function drawStage({ state, stage, reason }) {
 
 /** The latency as a small distribution: a bar to the 90th percentile with a mark at the median. */
 function drawPolicy(policy) {
+  for (const element of shown("policy")) element.toggleAttribute("data-lost", Boolean(policy.lost));
+  if (policy.lost) {
+    write("policy", "policy lost, trying again");
+    for (const element of shown("policy")) element.title = `The policy's server does not answer; next try in ${figure(policy.retry_in_s, 1, "s")}`;
+    return;
+  }
   const { latency_p50_ms: p50, latency_p90_ms: p90, answers } = policy;
   if (!answers || p50 === null) {
     write("policy", "policy: no answer yet");

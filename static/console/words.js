@@ -43,6 +43,8 @@ export const VERBS = {
   move: "Send",
   gripper: "Gripper",
   approach: "Approach",
+  lease_claim: "Station taken",
+  lease_give_up: "Station given up",
 };
 
 export function words(state) {

@@ -414,9 +414,9 @@ def test_drives_and_grippers_say_what_is_the_matter() -> None:
 
     assert [one["weight"] for one in words] == ["", "good", "warn", "bad"]
     assert words[3]["text"] == "Fault: overheated"
-    assert run("robot_panel.js", "return given.map((one) => m.gripperWords(one))", grippers) == [
-        "locked at 0.050",
-        "at 0.100",
+    assert run("robot_panel.js", "return given.map((one) => m.gripperWords(one, 'm'))", grippers) == [
+        "locked at 0.050 m",
+        "at 0.100 m",
         "not known",
     ]
 

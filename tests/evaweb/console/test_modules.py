@@ -447,6 +447,13 @@ def test_an_event_is_said_in_words_with_its_weight() -> None:
         {"kind": "limited", "text": "left_arm.joint1 limited"},
         {"kind": "limited_sum", "text": "12 actions were limited"},
         {"kind": "policy_lost", "text": "no answer within 2 s"},
+        {"kind": "policy_back", "text": "the policy answers again after 1.2 s"},
+        {"kind": "tuned_to", "text": "strategy sync, task 'x'"},
+        {"kind": "rtc_warning", "text": "the server does not know a prefix"},
+        {"kind": "drives", "text": "drives disabled", "data": {"enabled": False, "faults": []}},
+        {"kind": "drives", "text": "drives enabled", "data": {"enabled": True, "faults": []}},
+        {"kind": "episode_opened", "text": "recording 0a5624d8-64f2-4530-9518-f914c2fefd90"},
+        {"kind": "a_new_kind", "text": "said"},
     ]
     body = "return given.map((event) => [m.kindWords(event.kind), m.sentence(event), m.weight(event)])"
 
@@ -454,15 +461,22 @@ def test_an_event_is_said_in_words_with_its_weight() -> None:
         ["state", "setting up → ready: 50 rows", ""],
         ["state", "running → holding: halted", "warn"],
         ["state", "running → faulted: e-stop", "bad"],
-        ["command", "run by ann: accepted", ""],
-        ["command", "run by bob: refused, ann (page 6b9c) holds the lease", "warn"],
-        ["source frames lost", "source: frames lost (3 so far)", "warn"],
+        ["command", "Run by ann: accepted", ""],
+        ["command", "Run by bob: refused, ann (page 6b9c) holds the lease", "warn"],
+        ["robot link", "frames lost (3 so far)", "warn"],
         ["recording failed", "the disk is full", "bad"],
         ["e-stop", "by ann", "bad"],
-        ["setup", "the set-up is over", ""],
+        ["set-up", "the set-up is over", ""],
         ["safety", "left_arm.joint1 limited", "warn"],
         ["safety", "12 actions were limited", ""],
         ["policy lost", "no answer within 2 s", "bad"],
+        ["policy is back", "the policy answers again after 1.2 s", "good"],
+        ["strategy asked", "strategy sync, task 'x'", ""],
+        ["RTC", "the server does not know a prefix", "warn"],
+        ["drives", "drives disabled", "bad"],
+        ["drives", "drives enabled", "good"],
+        ["recording", "begun: 0a5624d8", ""],
+        ["a new kind", "said", ""],
     ]
 
 
