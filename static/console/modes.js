@@ -8,7 +8,7 @@ export const MODES = {
   step: "Each press moves the robot by one chunk.",
   preview: "Each press shows a chunk; Commit moves.",
   continuous: "The policy drives the robot until Stop.",
-  manual: "You move the robot, not the policy.",
+  manual: "You move the robot; no policy is asked.",
 };
 
 /** What the policy sees in the mode sim, to be said while it runs. */
