@@ -16,6 +16,7 @@ from runtime.messages import (
     EpisodeClosed,
     EpisodeOpened,
     Event,
+    LockGrippers,
     MediaReport,
     Message,
     NodeRequest,
@@ -23,6 +24,7 @@ from runtime.messages import (
     PolicyAnswer,
     PostedChunk,
     TickDone,
+    Tune,
     decode,
     encode,
     event_row,
@@ -36,6 +38,10 @@ MESSAGES = [
     Order(2, "motion", 7, ROWS[0], "going home"),
     PostedChunk(1, 7, 40, ROWS),
     NodeRequest("scene_reset", {"id": "r", "seed": 3}),
+    Order(3, "follow", 7, mode="preview"),
+    Order(4, "motion", 7, ROWS[0], speed=0.5),
+    Tune({"kind": "sync", "execution_horizon": None, "blend_window": "all"}),
+    LockGrippers(np.array([np.nan, 0.05])),
     TickDone(5, 7, 1.25, 1.5, 9, "policy", Q, Q + 1, Q + 2, [1, 2], [0.25, 0.75], ["speed"], False),
     TickDone(5, 0, 1.25, 1.5, 9, "none", Q, None, None, [], [], [], True),
     ChunkMerged(1, 7, 42, 2, TARGETS, 0, ""),
@@ -54,7 +60,7 @@ MESSAGES = [
 
 def same(a, b):
     if isinstance(a, np.ndarray):
-        return isinstance(b, np.ndarray) and a.dtype == b.dtype and np.array_equal(a, b)
+        return isinstance(b, np.ndarray) and a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
     if isinstance(a, dict):
         return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
     return type(a) is type(b) and a == b
