@@ -39,7 +39,7 @@ class Going:
             raise SetupError(f"control has not come to {self._where} within {self._allowed:.1f} s")
 
     def done(self, event: Event) -> bool:
-        """Whether `event` says that control has sent the end of this motion, and not of one before; then the arm is due."""
+        """Whether control says by `event` that it has sent the end of this motion: then the arm is waited for."""
         over = event.kind == "motion_done" and event.data.get("order") == self._order
         if over:
             self._since = self._clock.now()
