@@ -32,7 +32,8 @@ class Locks:
         self.values = np.clip(values.astype(np.float64), limits.lower, limits.upper)
         self.on = ~np.isnan(self.values)
         self._notes = {
-            int(i): f"{limits.names[i]} locked at {round(float(self.values[i]), 4):g}" for i in np.flatnonzero(self.on)
+            int(i): f"{limits.names[i]} locked at {round(float(self.values[i]), 4):g}"
+            for i in np.flatnonzero(self.on)
         }
         return ""
 
