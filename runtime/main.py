@@ -16,6 +16,7 @@ from runtime.family import join
 from runtime.inference import ShownChunk
 from runtime.messages import Event
 from runtime.runner import ThreadRunner
+from runtime.transitions import STOPPING
 
 _NOT_JOURNALLED = ("status", "events_since", "aim", "lease_renew")
 
@@ -43,9 +44,13 @@ class Service:
         while (received := self._server.receive()) is not None:
             address, command = received
             ack = self._main.handle(command)
+            stops = command.kind in STOPPING  # who stops a robot waits for no disk; to stop it twice does no harm
+            if stops:
+                self._server.answer(address, ack)
             if command.kind not in _NOT_JOURNALLED:
                 self._tell_once(self._journal.append(command, ack))
-            self._server.answer(address, ack)
+            if not stops:
+                self._server.answer(address, ack)
         self._publish()
 
     def _tell_once(self, failure: str) -> None:

@@ -239,7 +239,7 @@ def main() -> None:
             page.beat("media", now)
             connected = connected or _connect(source, now)
             if connected:
-                media.pump(0.005)
+                media.pump(0.002)
             else:
                 media.digest()
                 clock.sleep_until(now + 0.1)
