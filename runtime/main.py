@@ -44,7 +44,8 @@ class Service:
         while (received := self._server.receive()) is not None:
             address, command = received
             ack = self._main.handle(command)
-            stops = command.kind in STOPPING  # who stops a robot waits for no disk; to stop it twice does no harm
+            # Who stops a robot waits for no disk; to stop it twice does no harm.
+            stops = command.kind in STOPPING
             if stops:
                 self._server.answer(address, ack)
             if command.kind not in _NOT_JOURNALLED:
