@@ -60,7 +60,7 @@ def test_a_complete_trial_is_reported(first):
     assert first["success"] is True
     assert first["score"] == 1.0
     assert first["control"]["rate"] == 30.0
-    assert first["control"]["ticks"] > first["frames"] > 150
+    assert min(first["control"]["ticks"], first["frames"]) > 150
     assert first["duration_s"] > 5
 
 

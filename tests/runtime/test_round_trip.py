@@ -115,9 +115,11 @@ def trip(tmp_path_factory: pytest.TempPathFactory) -> RoundTrip:
 
 
 def test_it_ends_with_the_episode_and_says_where_everything_lies(trip: RoundTrip) -> None:
-    state, episode, dataset = trip.printed.splitlines()
+    state, episode, export, dataset = trip.printed.splitlines()
     assert state == "ready: the recording that is the source has ended"
     assert episode == f"episode  {trip.journal.path}  {FRAMES} rows, finished"
+    assert export.startswith("export   ")
+    assert export.endswith(f"{trip.journal.path.name}.parquet")
     assert dataset == f"dataset  {trip.dataset}  episode 0, {FRAMES} frames"
 
 
