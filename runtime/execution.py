@@ -102,8 +102,7 @@ class Follow(Behaviour):
         if meant > safety.jump:
             far = f"{where}, allowed {safety.jump:g} (safety.jump): approach it, or start elsewhere"
             return Joined(dropped(chunk, step, far), far, too_far=True)
-        placed = self._strategy.merge.place(self.timeline, arrival, step)
-        away, where = self._away(placed.rows[0], commanded) if len(placed.rows) else (0.0, "")
+        away, where = self._away_where_used(arrival, step, commanded)
         far = f"{where}: blended in" if away > safety.first_action_far else ""
         held = commanded if away > _JOINED_AT_ONCE or self.starved else None
         switched, self._expecting = (
@@ -122,6 +121,13 @@ class Follow(Behaviour):
         )
         self._switched = switched and bool(merged.dropped)
         return Joined(self._told(chunk, merged), far)
+
+    def _away_where_used(self, arrival: Arrival, step: int, commanded: Float64) -> tuple[float, str]:
+        """The same of the first row that is not stale."""
+        if not self._expecting:
+            return 0.0, ""
+        placed = self._strategy.merge.place(self.timeline, arrival, step)
+        return self._away(placed.rows[0], commanded) if len(placed.rows) else (0.0, "")
 
     def _away(self, row: Float64, commanded: Float64) -> tuple[float, str]:
         """How far from where the robot stands a run's first action is [rad], and that in words; 0 for later ones."""
