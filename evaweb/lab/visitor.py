@@ -150,7 +150,7 @@ class LivePage:
                 max_size=_LARGEST_FRAME,
                 proxy=None,
             )
-        except (OSError, InvalidHandshake) as error:
+        except (OSError, InvalidHandshake, ConnectionClosed) as error:  # closed while it was being opened
             raise VisitFailed(f"the live connection to {self.station} does not open: {error}") from error
 
     def wait(
