@@ -1,16 +1,19 @@
 """Robots, declared and not coded: a folder each with robot.toml, URDF and README; loader; chain."""
 
+from robots.body import Body
 from robots.chain import Chain
 from robots.errors import RobotError
-from robots.loading import load, names
+from robots.loading import GripperChoice, load, names
 from robots.robot import EEF_FIELDS, Camera, Gripper, Group, Robot
 from robots.visuals import RobotScene, Visual, scene_of
 
 __all__ = [
     "EEF_FIELDS",
+    "Body",
     "Camera",
     "Chain",
     "Gripper",
+    "GripperChoice",
     "Group",
     "Robot",
     "RobotError",

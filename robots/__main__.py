@@ -54,10 +54,9 @@ def _summary(robot: Robot) -> list[str]:
         note = "  home is on a limit" if home[index] in (low, high) else ""
         lines.append(f"  {name:24} {low:9.4f} to {high:9.4f}, at most {robot.velocity[index]:g}/s{note}")
     for arm in robot.arms:
-        if arm.chain is not None:
-            pose = [f"{value:.5f}" for value in arm.chain.pose(home[arm.joint_dims])]
-            place = f"position {', '.join(pose[:3])} m, wxyz {', '.join(pose[3:])}"
-            lines.append(f"{arm.name}: {arm.eef_link} in {arm.frame} at home: {place}")
+        pose = [f"{value:.5f}" for value in arm.pose(home)]
+        place = f"position {', '.join(pose[:3])} m, wxyz {', '.join(pose[3:])}"
+        lines.append(f"{arm.name}: {arm.eef_link} in {arm.frame} at home: {place}")
     return lines
 
 
@@ -71,15 +70,17 @@ def _forward(robot: Robot, name: str, q: list[float]) -> dict[str, object]:
         raise RobotError(
             f"{name} was given {q}; needed: {group.chain.size} finite numbers, {', '.join(group.urdf_joints)}"
         )
-    joints = np.array(q)
-    pose = group.chain.pose(joints)
+    joints = robot.poses["home"].copy()  # what carries the arm stands as at home
+    joints[group.joint_dims] = q
+    pose = group.pose(joints)
+    own = joints[group.joint_dims]
     low, high = robot.lower[group.joint_dims], robot.upper[group.joint_dims]
     return {
         "position": pose[:3].tolist(),
         "wxyz": pose[3:].tolist(),
         "frame": group.frame,
         "link": group.eef_link,
-        "within_limits": bool(((joints >= low) & (joints <= high)).all()),
+        "within_limits": bool(((own >= low) & (own <= high)).all()),
     }
 
 

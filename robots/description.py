@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
@@ -17,6 +17,8 @@ Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
 Quadruple = Annotated[list[float], Field(min_length=4, max_length=4)]
 Positive = Annotated[float, Field(gt=0)]
 Reason = Annotated[str, Field(min_length=1)]
+Kind = Literal["arm", "hand", "head", "torso", "base", "other"]
+Measured = Literal["velocity", "effort", "eef"]
 
 
 class Table(BaseModel):
@@ -65,15 +67,58 @@ class GripperTable(Table):
     """Where a binary gripper switches; a value at or above it means open if `open` is above `close`."""
     fingers: dict[str, Pair] = {}
     """URDF joints that move with it: their values [rad or m] at `lower` and at `upper`; drawing only."""
+    apart: Pair | None = None
+    """How far its fingers are apart [m] at `close` and at `open`; else the number itself where `unit` is "m"."""
     tip: TipTable | None = None
     """Where its fingertips are; else read off the fingers of the URDF, the sliding children of `eef_link`."""
 
 
-class MountTable(Table):
-    """Where the group's `frame` stands in the scene: drawings and the simulated bench, never kinematics."""
+class PlaceTable(Table):
+    """Where something stands."""
 
     xyz: Triple
     wxyz: Quadruple
+
+
+class CapsuleTable(Table):
+    """A capsule that stands for a link in the collision check, in the link's frame [m]."""
+
+    start: Triple
+    end: Triple
+    radius: Positive
+
+
+class CollisionTable(Table):
+    """What the coarse collision check looks at; without it, a capsule per link from its shapes."""
+
+    capsules: dict[str, CapsuleTable] = {}
+    """Links with a capsule of their own instead of the one that their shapes give."""
+    without: list[str] = []
+    """Links that are left out: fingers that touch each other, covers, cameras."""
+    ignore: list[Annotated[list[str], Field(min_length=2, max_length=2)]] = []
+    """Pairs of links that may come close: neighbours beyond a joint are left out anyway."""
+
+
+class RosGroupTable(Table):
+    """The topics of one group; what is absent the robot's stack does not have."""
+
+    state: str | None = None
+    command: str | None = None
+    eef: str | None = None
+    eef_command: str | None = None
+    gripper_state: str | None = None
+    gripper_command: str | None = None
+    simulation: str | None = None
+    leader: str | None = None
+
+
+class RosTable(Table):
+    """The topics of the robot's own ROS stack."""
+
+    version: Literal[1, 2]
+    cameras: dict[Name, str] = {}
+    """Logical camera name = topic."""
+    groups: dict[Name, RosGroupTable] = {}
 
 
 class OverrideTable(Table):
@@ -93,15 +138,21 @@ class GroupTable(Table):
     joints: Annotated[list[str], Field(min_length=1)]
     """Names on the wire, the gripper's included."""
     urdf_joints: list[str]
-    """Their names in the URDF, in the same order, without the gripper."""
+    """Their names in the URDF, in the same order, without the gripper; "" for a number that moves no link of it
+    (a base's speed), whose limits are then an override."""
+    kind: Kind | None = None
+    """What it is, for pages; "arm" where it has an end effector, else "other"."""
+    optional: bool = False
+    """Part of the robot only where a deployment's `groups` names it."""
     gripper: GripperTable | None = None
     frame: str | None = None
     """The link in which the end effector's pose is expressed."""
     eef_link: str | None = None
     """The link that is the end effector."""
     pinned: dict[str, float] = {}
-    """Values of URDF joints between `frame` and `eef_link` that the group does not move."""
-    mount: MountTable | None = None
+    """Values of URDF joints between `frame` and `eef_link` that no group moves (a frozen torso)."""
+    mount: PlaceTable | None = None
+    """Where the root of its copy of the URDF stands in `mount_frame`."""
     overrides: list[OverrideTable] = []
 
 
@@ -117,6 +168,14 @@ class RobotTable(Table):
     """Commands per second that the robot is run at unless a deployment says otherwise."""
     cameras: dict[Name, Name]
     """Logical name = observation key."""
+    measures: list[Measured] = []
+    """What its node reports besides the positions of its joints."""
+    mount_frame: Name = "world"
+    """Name of the frame in which mounts are given: one that all arms have in common."""
+    stand: PlaceTable | None = None
+    """Where `mount_frame` stands in the scene, whose z = 0 is the table: drawings and the simulated bench."""
+    collision: CollisionTable = CollisionTable()
+    ros: RosTable | None = None
     groups: Annotated[list[GroupTable], Field(min_length=1)]
     poses: dict[Name, dict[str, list[float]]]
     """Named poses, a vector per group; "home" is required."""

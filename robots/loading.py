@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from robots import description, urdf
 from robots.chain import Chain
-from robots.description import GripperTable, GroupTable, MountTable, OverrideTable, RobotTable
+from robots.copies import copy_of
+from robots.description import GripperTable, GroupTable, OverrideTable, PlaceTable, RobotTable
 from robots.errors import RobotError
 from robots.robot import Camera, Gripper, Group, Robot
 from robots.rotations import Float64, matrix_of_quaternion
@@ -25,20 +26,40 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in _HERE.glob(f"*/{_FILE}")))
 
 
-def load(robot: str | Path) -> Robot:
-    """The robot of that name or in that folder; RobotError says which file and key, given, allowed."""
+@dataclass(frozen=True, slots=True)
+class GripperChoice:
+    """What a deployment says otherwise of a gripper; None keeps what the robot's description says."""
+
+    binary: bool | None = None
+    threshold: float | None = None
+    open: float | None = None
+    close: float | None = None
+
+
+def load(
+    robot: str | Path,
+    groups: Sequence[str] | None = None,
+    grippers: Mapping[str, GripperChoice] | None = None,
+) -> Robot:
+    """The robot of that name or in that folder; RobotError says which file and key, given, allowed.
+
+    `groups` are those that are part of it, in the description's order; without, all that are not optional.
+    `grippers` are choices by the name of their group.
+    """
     folder = _folder(robot)
     file = folder / _FILE
     table = description.read(file)
     tree = urdf.read(folder / table.urdf)
     _refuse_twice(file, "groups", [group.name for group in table.groups])
     _refuse_twice(file, "cameras", list(table.cameras.values()))
-    groups: list[Group] = []
-    limits: list[_Limits] = []
-    for entry in table.groups:
-        group = _group(file, tree, entry, start=groups[-1].slice.stop if groups else 0)
-        groups.append(group)
-        limits.append(_limits(file, tree, entry))
+    _check_ros(file, table)
+    chosen = _with_grippers(file, _chosen(file, table, groups), grippers or {})
+    starts = np.cumsum([0, *(len(entry.joints) for entry in chosen)]).tolist()
+    made = tuple(_group(file, tree, entry, start) for entry, start in zip(chosen, starts, strict=False))
+    made = tuple(
+        _with_chain(file, tree, entry, group, made) for entry, group in zip(chosen, made, strict=True)
+    )
+    limits = [_limits(file, tree, entry) for entry in chosen]
     lower, upper, velocity = (
         _frozen([number for part in limits for number in getattr(part, side)])
         for side in ("lower", "upper", "velocity")
@@ -48,16 +69,65 @@ def load(robot: str | Path) -> Robot:
         title=table.title,
         folder=folder,
         urdf=tree.path,
-        groups=tuple(groups),
+        groups=made,
         cameras=tuple(Camera(name, key) for name, key in table.cameras.items()),
-        poses=_poses(file, table, groups, lower, upper),
+        poses=_poses(file, table, made, lower, upper),
         lower=lower,
         upper=upper,
         velocity=velocity,
         control_rate=table.control_rate,
         limits_source=table.limits_source,
         overrides=tuple(sentence for part in limits for sentence in part.overrides),
+        measures=frozenset(table.measures),
+        mount_frame=table.mount_frame,
+        stand=_place(f"{file}: stand", table.stand),
+        collision=table.collision,
+        ros=table.ros,
     )
+
+
+def _chosen(file: Path, table: RobotTable, groups: Sequence[str] | None) -> list[GroupTable]:
+    """The groups that are part of the robot, in the file's order."""
+    known = [group.name for group in table.groups]
+    unknown = [name for name in groups or () if name not in known]
+    if unknown or (groups is not None and not groups):
+        raise RobotError(f"{file}: groups {unknown or groups} were chosen; allowed: {', '.join(known)}")
+    if groups is None:
+        return [group for group in table.groups if not group.optional]
+    return [group for group in table.groups if group.name in groups]
+
+
+def _with_grippers(
+    file: Path, groups: list[GroupTable], choices: Mapping[str, GripperChoice]
+) -> list[GroupTable]:
+    having = [group.name for group in groups if group.gripper is not None]
+    unknown = sorted(set(choices) - set(having))
+    if unknown:
+        raise RobotError(
+            f"{file}: grippers of {', '.join(unknown)} were chosen; groups with a gripper: {', '.join(having)}"
+        )
+    return [_with_gripper(group, choices[group.name]) if group.name in choices else group for group in groups]
+
+
+def _with_gripper(group: GroupTable, choice: GripperChoice) -> GroupTable:
+    assert group.gripper is not None
+    given = {key: value for key in GripperChoice.__slots__ if (value := getattr(choice, key)) is not None}
+    if choice.binary is False:
+        given["threshold"] = None
+    return group.model_copy(update={"gripper": group.gripper.model_copy(update=given)})
+
+
+def _check_ros(file: Path, table: RobotTable) -> None:
+    """Topics may name only cameras and groups that there are."""
+    if table.ros is None:
+        return
+    for key, given, known in (
+        ("cameras", table.ros.cameras, list(table.cameras)),
+        ("groups", table.ros.groups, [group.name for group in table.groups]),
+    ):
+        unknown = [name for name in given if name not in known]
+        if unknown:
+            raise RobotError(f"{file}: ros.{key} names {', '.join(unknown)}; allowed: {', '.join(known)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +168,7 @@ def _group(file: Path, tree: Urdf, table: GroupTable, start: int) -> Group:
         raise RobotError(
             f"{key}.urdf_joints names {len(table.urdf_joints)} joints; allowed: {movers}, one per joint"
         )
-    for name in table.urdf_joints:
+    for name in filter(None, table.urdf_joints):
         joint = tree.joint(name)
         if joint.kind == "fixed" or joint.mimic is not None:
             raise RobotError(
@@ -106,13 +176,16 @@ def _group(file: Path, tree: Urdf, table: GroupTable, start: int) -> Group:
             )
     return Group(
         name=table.name,
+        kind=table.kind or ("other" if table.eef_link is None else "arm"),
         joints=tuple(table.joints),
         urdf_joints=tuple(table.urdf_joints),
         gripper=gripper,
         eef_link=table.eef_link,
         frame=table.frame,
-        chain=_chain(key, tree, table),
-        mount=_mount(key, table.mount),
+        chain=None,
+        carrier=None,
+        carrier_dims=np.empty(0, dtype=np.intp),
+        mount=_place(f"{key}.mount", table.mount),
         tip=_tip(key, tree, table),
         slice=slice(start, start + len(table.joints)),
     )
@@ -132,8 +205,19 @@ def _gripper(key: str, tree: Urdf, table: GripperTable, dof: int) -> Gripper:
     if table.threshold is not None and not low < table.threshold < high:
         raise RobotError(f"{key}.gripper.threshold = {table.threshold}; allowed: between {low} and {high}")
     return Gripper(
-        **table.model_dump(exclude={"velocity", "tip", "fingers"}), fingers=_fingers(key, tree, table.fingers)
+        **table.model_dump(exclude={"velocity", "tip", "fingers", "apart"}),
+        fingers=_fingers(key, tree, table.fingers),
+        apart=_apart(key, table),
     )
+
+
+def _apart(key: str, table: GripperTable) -> tuple[float, float] | None:
+    if table.apart is None:
+        return (0.0, abs(table.open - table.close)) if table.unit == "m" else None
+    closed, opened = table.apart
+    if not 0 <= closed < opened:
+        raise RobotError(f"{key}.gripper.apart = {table.apart}; allowed: 0 <= at close < at open [m]")
+    return closed, opened
 
 
 def _fingers(key: str, tree: Urdf, table: Mapping[str, list[float]]) -> dict[str, tuple[float, float]]:
@@ -146,20 +230,41 @@ def _fingers(key: str, tree: Urdf, table: Mapping[str, list[float]]) -> dict[str
     return {name: (at_lower, at_upper) for name, (at_lower, at_upper) in table.items()}
 
 
-def _chain(key: str, tree: Urdf, table: GroupTable) -> Chain | None:
+def _with_chain(file: Path, tree: Urdf, table: GroupTable, group: Group, groups: Sequence[Group]) -> Group:
+    """The group with the chain of its own joints, and with the chain that carries it where others move it."""
     if table.eef_link is None and table.frame is None and not table.pinned:
-        return None
-    if table.eef_link is None or table.frame is None or table.gripper is None:
-        raise RobotError(
-            f"{key}: eef_link, frame and gripper make an arm together; allowed: all three or no eef_link"
-        )
-    return Chain(tree, table.frame, table.eef_link, table.urdf_joints, table.pinned)
+        return group
+    key = f"{file}: groups.{table.name}"
+    if table.eef_link is None or table.frame is None:
+        raise RobotError(f"{key}: eef_link and frame make an arm together; allowed: both or neither")
+    if "" in table.urdf_joints:
+        raise RobotError(f'{key}.urdf_joints has ""; allowed for an arm: joints of the URDF')
+    way = tree.between(table.frame, table.eef_link)
+    movers = {
+        name: int(dim)
+        for other in copy_of(group, groups)
+        if other is not group
+        for name, dim in zip(other.urdf_joints, other.joint_dims, strict=True)
+    }
+    carried = [joint.name for joint in way if joint.name in movers]
+    if not carried:
+        return replace(group, chain=Chain(tree, table.frame, table.eef_link, table.urdf_joints, table.pinned))
+    root = next(joint.parent for joint in way if joint.name in table.urdf_joints)
+    pinned = {name: value for name, value in table.pinned.items() if name not in carried}
+    if beyond := [joint.name for joint in tree.between(root, table.eef_link) if joint.name in movers]:
+        raise RobotError(f"{key}: {', '.join(beyond)} of other groups lie among its own joints")
+    return replace(
+        group,
+        chain=Chain(tree, root, table.eef_link, table.urdf_joints, pinned),
+        carrier=Chain(tree, table.frame, root, carried, pinned),
+        carrier_dims=np.array([movers[name] for name in carried], dtype=np.intp),
+    )
 
 
-def _mount(key: str, table: MountTable | None) -> Float64:
+def _place(key: str, table: PlaceTable | None) -> Float64:
     if table is None:
         return _frozen([0, 0, 0, 1, 0, 0, 0])
-    return _frozen([*table.xyz, *_unit(f"{key}.mount.wxyz", table.wxyz)])
+    return _frozen([*table.xyz, *_unit(f"{key}.wxyz", table.wxyz)])
 
 
 def _unit(key: str, wxyz: list[float]) -> list[float]:
@@ -216,11 +321,11 @@ def _limits(file: Path, tree: Urdf, table: GroupTable) -> _Limits:
     limits = _Limits([], [], [], [])
     for name, urdf_name in zip(wire, table.urdf_joints, strict=True):
         for side, values in (("lower", limits.lower), ("upper", limits.upper), ("velocity", limits.velocity)):
-            given: float | None = getattr(tree.joint(urdf_name), side)
+            given: float | None = getattr(tree.joint(urdf_name), side) if urdf_name else None
             value = _overridden(f"{table.name}.{name}", side, given, overrides.get(name), limits.overrides)
             if value is None:
                 raise RobotError(
-                    f"{key}: joint {name!r}: the URDF gives no {side} for {urdf_name}; needed: an override"
+                    f"{key}: joint {name!r}: the URDF gives no {side} for {urdf_name or 'it'}; needed: an override"
                 )
             values.append(value)
         if limits.lower[-1] >= limits.upper[-1] or limits.velocity[-1] <= 0:
@@ -246,10 +351,14 @@ def _overridden(
 
 
 def _poses(
-    file: Path, table: RobotTable, groups: list[Group], lower: Float64, upper: Float64
+    file: Path, table: RobotTable, groups: Sequence[Group], lower: Float64, upper: Float64
 ) -> dict[str, Float64]:
     if "home" not in table.poses:
         raise RobotError(f"{file}: poses: {', '.join(table.poses) or 'none'} given; needed: home")
+    known = [group.name for group in table.groups]
+    for name, parts in table.poses.items():
+        if list(parts) != known:
+            raise RobotError(f"{file}: poses.{name} gives {', '.join(parts)}; needed: {', '.join(known)}")
     return {
         name: _pose(f"{file}: poses.{name}", parts, groups, lower, upper)
         for name, parts in table.poses.items()
@@ -257,12 +366,8 @@ def _poses(
 
 
 def _pose(
-    key: str, parts: dict[str, list[float]], groups: list[Group], lower: Float64, upper: Float64
+    key: str, parts: dict[str, list[float]], groups: Sequence[Group], lower: Float64, upper: Float64
 ) -> Float64:
-    if list(parts) != [group.name for group in groups]:
-        raise RobotError(
-            f"{key} gives {', '.join(parts)}; needed: {', '.join(group.name for group in groups)}"
-        )
     for group in groups:
         if len(parts[group.name]) != group.dof:
             raise RobotError(f"{key}.{group.name} has {len(parts[group.name])} numbers; needed: {group.dof}")

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robots.chain import Chain
+from robots.description import CollisionTable, RosTable
 from robots.errors import RobotError
-from robots.rotations import Float64
+from robots.rotations import Float64, quaternion_of_matrix
 
 EEF_FIELDS = ("x", "y", "z", "qw", "qx", "qy", "qz", "gripper")
 
@@ -22,7 +23,8 @@ EEF_FIELDS = ("x", "y", "z", "qw", "qx", "qy", "qz", "gripper")
 class Gripper:
     """One number of a group in the robot's own `unit`; `index` is its place inside the group.
 
-    `fingers` are URDF joints and their values [rad or m] where the number is `lower` and where it is `upper`.
+    `fingers` are URDF joints and their values [rad or m] where the number is `lower` and where it is `upper`;
+    `apart` is how far the fingers are apart [m] at `close` and at `open`, None where nobody said.
     """
 
     index: int
@@ -34,26 +36,31 @@ class Gripper:
     binary: bool
     threshold: float | None
     fingers: Mapping[str, tuple[float, float]]
+    apart: tuple[float, float] | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Group:
     """Joints that travel together; `joints` are names on the wire, `slice` their place in the robot's vector.
 
-    `urdf_joints` name the same joints in the URDF, without the gripper; `chain` leads from `frame` to
-    `eef_link`; all three are None where the group has no end effector. `mount` [7] (x, y, z, qw, qx, qy, qz)
-    places the frame in drawings and on the simulated bench; kinematics never uses it. `tip` [4, 4] in
-    `eef_link` lies between the fingertips, z the way they point, y the way they open; None where there is no
-    end effector.
+    `urdf_joints` name the same joints in the URDF, without the gripper, "" for what moves no link. An arm has
+    an end effector: `eef_link`, whose pose is given in `frame`. Its `chain` of own joints begins at `frame`, or,
+    where other groups of the robot move what lies between (a torso), at the end of `carrier`, which leads there
+    from `frame` and is driven by `carrier_dims` of the robot's vector. `mount` [7] (x, y, z, qw, qx, qy, qz) places
+    the root of the group's copy of the URDF in the robot's mount frame. `tip` [4, 4] in `eef_link` lies between
+    the fingertips, z the way they point, y the way they open; None where there is no gripper.
     """
 
     name: str
+    kind: str
     joints: tuple[str, ...]
     urdf_joints: tuple[str, ...]
     gripper: Gripper | None
     eef_link: str | None
     frame: str | None
     chain: Chain | None
+    carrier: Chain | None
+    carrier_dims: NDArray[np.intp]
     mount: Float64
     tip: Float64 | None
     slice: builtins.slice
@@ -74,6 +81,24 @@ class Group:
         dims = np.arange(self.slice.start, self.slice.stop)
         return dims if self.gripper is None else np.delete(dims, self.gripper.index)
 
+    def carried(self, q: Float64) -> Float64:
+        """Where the chain begins, in `frame`: transforms [..., 4, 4] for the robot's vector [..., D]."""
+        if self.carrier is None:
+            return np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
+        return self.carrier.forward(q[..., self.carrier_dims])
+
+    def transform(self, q: Float64) -> Float64:
+        """The end effector in `frame`, [..., 4, 4], for the robot's vector [..., D]; RobotError if it has none."""
+        if self.chain is None:
+            raise RobotError(f"group {self.name} has no end effector")
+        own = self.chain.forward(q[..., self.joint_dims])
+        return own if self.carrier is None else self.carried(q) @ own
+
+    def pose(self, q: Float64) -> Float64:
+        """The same as [..., 7] = x, y, z [m], unit quaternion w, x, y, z with w >= 0."""
+        transform = self.transform(q)
+        return np.concatenate([transform[..., :3, 3], quaternion_of_matrix(transform[..., :3, :3])], axis=-1)
+
 
 @dataclass(frozen=True, slots=True)
 class Camera:
@@ -88,7 +113,8 @@ class Robot:
     """A robot description; vectors are in group order, rad and rad/s, grippers in their own unit.
 
     `lower`, `upper`, `velocity` and every pose are read-only float64 [dim]. `overrides` are sentences, one
-    for each limit that differs from the URDF.
+    for each limit that differs from the URDF. `mount_frame` names what mounts are given in, `stand` [7] places
+    it in the scene, whose z = 0 is the table. `measures` is what the node reports besides joint positions.
     """
 
     name: str
@@ -104,6 +130,11 @@ class Robot:
     control_rate: float
     limits_source: str
     overrides: tuple[str, ...]
+    measures: frozenset[str]
+    mount_frame: str
+    stand: Float64
+    collision: CollisionTable
+    ros: RosTable | None
 
     @property
     def dim(self) -> int:
@@ -112,7 +143,7 @@ class Robot:
 
     @property
     def arms(self) -> tuple[Group, ...]:
-        """The groups with a gripper and an end-effector link; each has one 8-vector."""
+        """The groups with an end effector; each has one 8-vector, whose last number is 0 without a gripper."""
         return tuple(group for group in self.groups if group.chain is not None)
 
     @property

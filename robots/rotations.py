@@ -65,6 +65,15 @@ def matrix_of_quaternion(quaternion: Float64) -> Float64:
     return matrix
 
 
+def transform_of(pose: Float64) -> Float64:
+    """The transforms [..., 4, 4] of poses [..., 7] = x, y, z, unit quaternion w, x, y, z."""
+    transform = np.zeros((*pose.shape[:-1], 4, 4))
+    transform[..., :3, :3] = matrix_of_quaternion(pose[..., 3:])
+    transform[..., :3, 3] = pose[..., :3]
+    transform[..., 3, 3] = 1.0
+    return transform
+
+
 def quaternion_of_matrix(matrix: Float64) -> Float64:
     """Unit quaternions [..., 4] with w >= 0 of rotations [..., 3, 3].
 

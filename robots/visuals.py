@@ -1,24 +1,14 @@
-"""What a robot looks like and where every piece of it stands, for drawing; kinematics never uses it.
-
-A robot whose URDF describes one of several equal arms is shown as one copy of the tree per arm; a URDF with
-the whole body is shown once.
-"""
+"""What a robot looks like, for drawing; kinematics never uses it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from robots import shapes, urdf
-from robots.chain import motion_table, motions
-from robots.errors import RobotError
-from robots.robot import Group, Robot
-from robots.rotations import Float64, matrix_of_quaternion
+from robots import shapes
+from robots.body import Body
+from robots.robot import Robot
+from robots.rotations import Float64
 from robots.shapes import Colour
-from robots.urdf import Joint, Urdf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,189 +26,18 @@ class Visual:
     colour: Colour
 
 
-class RobotScene:
-    """The `parts` ("left_arm/link2", ...) of a robot, the `visuals` they carry, and their `poses`.
-
-    `jaws` names, for each group with a gripper, the indices of the parts that its fingers are.
-    """
+class RobotScene(Body):
+    """A robot's body with the `visuals` that its parts carry."""
 
     def __init__(self, robot: Robot) -> None:
-        tree = urdf.read(robot.urdf)
-        copies = [_Copy(robot, tree, groups) for groups in _copies(robot)]
-        names = [[copy.part(link) for link in copy.links] for copy in copies]
-        self.parts = tuple(name for part in names for name in part)
-        starts = np.cumsum([0, *(len(part) for part in names[:-1])]).tolist()
-        placed = list(zip(starts, copies, strict=True))
-        seen = shapes.read(robot.urdf)
+        super().__init__(robot)
         self.visuals = tuple(
-            Visual(start + copy.links.index(shape.link), shape.kind, shape.size, shape.origin, shape.colour)
-            for start, copy in placed
-            for shape in seen
+            Visual(part, shape.kind, shape.size, shape.origin, shape.colour)
+            for shape in shapes.read(robot.urdf)
+            for part in self.parts_of(shape.link)
         )
-        self.jaws = {
-            name: tuple(start + copy.links.index(link) for link in links)
-            for start, copy in placed
-            for name, links in copy.fingers.items()
-        }
-        self._dim = robot.dim
-        self._name = robot.name
-        self._coupling = np.concatenate([copy.coupling for copy in copies])  # [P, D]
-        self._offsets = np.concatenate([copy.offsets for copy in copies])  # [P]
-        self._low, self._high = np.concatenate([copy.bounds for copy in copies], axis=1)
-        self._tables = np.concatenate([copy.tables for copy in copies])  # [P, 4, 16]
-        self._layers = _layers(np.concatenate([copy.above_from(start) for start, copy in placed]))
-
-    def part(self, name: str) -> int:
-        """The index of a part; RobotError lists the names where there is none."""
-        if name not in self.parts:
-            raise RobotError(f"{self._name} has no part {name!r}; it has {', '.join(self.parts)}")
-        return self.parts.index(name)
-
-    def poses(self, q: Float64) -> Float64:
-        """Where the parts are, world <- part [..., P, 4, 4], for the robot's vector q [..., D]."""
-        if q.shape[-1:] != (self._dim,):
-            raise RobotError(
-                f"{self._name}: joints of shape {q.shape} were given; allowed: [..., {self._dim}]"
-            )
-        values = np.clip(q @ self._coupling.T + self._offsets, self._low, self._high)
-        poses = motions(values, self._tables)
-        for parts, above in self._layers:
-            poses[..., parts, :, :] = poses[..., above, :, :] @ poses[..., parts, :, :]
-        return poses
 
 
 def scene_of(robot: Robot) -> RobotScene:
     """The robot's parts and shapes; RobotError where its URDF shows what is no box, cylinder or sphere."""
     return RobotScene(robot)
-
-
-def _copies(robot: Robot) -> list[list[Group]]:
-    """The groups, sorted into copies of the URDF such that no joint is moved twice in one copy."""
-    copies: list[tuple[set[str], list[Group]]] = []
-    for group in robot.groups:
-        joints = {*group.urdf_joints, *(group.gripper.fingers if group.gripper else ())}
-        for taken, groups in copies:
-            if not taken & joints:
-                taken |= joints
-                groups.append(group)
-                break
-        else:
-            copies.append((joints, [group]))
-    return [groups for _, groups in copies]
-
-
-class _Copy:
-    """One copy of the tree: its links outwards from the root, and the table that places each in its parent."""
-
-    def __init__(self, robot: Robot, tree: Urdf, groups: Sequence[Group]) -> None:
-        self._tree = tree
-        self._groups = groups
-        joints = _outwards(tree)
-        self._movers = {joint.child: joint for joint in joints}
-        self.links = [tree.root, *self._movers]
-        self.coupling = np.zeros((len(self.links), robot.dim))
-        self.offsets = np.zeros(len(self.links))
-        self.bounds = np.array([[-np.inf], [np.inf]]) * np.ones(len(self.links))
-        self.tables = np.zeros((len(self.links), 4, 16))
-        self.tables[0, 0] = self._placement().ravel()
-        for index, joint in enumerate(joints, 1):
-            if joint.kind == "fixed":
-                self.tables[index, 0] = joint.origin.ravel()
-            else:
-                self.tables[index] = motion_table(joint.origin, joint)
-                self._drive(index, joint)
-
-    @property
-    def fingers(self) -> dict[str, list[str]]:
-        """The links that a gripper moves, by the name of its group."""
-        return {
-            group.name: [
-                link
-                for link, joint in self._movers.items()
-                if _master(self._tree, joint)[0].name in group.gripper.fingers
-            ]
-            for group in self._groups
-            if group.gripper is not None
-        }
-
-    def above_from(self, start: int) -> NDArray[np.intp]:
-        """For each link the index of the one it hangs on, where this copy's first is `start`; the root's is -1."""
-        parents = [self.links.index(joint.parent) for joint in self._movers.values()]
-        return np.array([-1, *(start + parent for parent in parents)], dtype=np.intp)
-
-    def part(self, link: str) -> str:
-        """The link's name behind that of the group that moves it (of the first group, where none does)."""
-        at = link
-        while at in self._movers:
-            master, _, _ = _master(self._tree, self._movers[at])
-            for group in self._groups:
-                if master.name in group.urdf_joints or (
-                    group.gripper and master.name in group.gripper.fingers
-                ):
-                    return f"{group.name}/{link}"
-            at = self._movers[at].parent
-        return f"{self._groups[0].name}/{link}"
-
-    def _placement(self) -> Float64:
-        """World <- root: the mount of the first group whose frame is the root, else the world's origin."""
-        for group in self._groups:
-            if group.frame == self._tree.root:
-                pose = np.eye(4)
-                pose[:3, :3] = matrix_of_quaternion(group.mount[3:])
-                pose[:3, 3] = group.mount[:3]
-                return pose
-        return np.eye(4)
-
-    def _drive(self, index: int, joint: Joint) -> None:
-        """The joint's value is coupling . q + offset within bounds; what no group moves stays as pinned or 0."""
-        master, factor, offset = _master(self._tree, joint)
-        for group in self._groups:
-            if group.chain is not None and joint.name in group.chain.pinned:
-                self.offsets[index] = group.chain.pinned[joint.name]
-                return
-            if master.name in group.urdf_joints:
-                dim = group.joint_dims[group.urdf_joints.index(master.name)]
-                self.coupling[index, dim] = factor
-                self.offsets[index] = offset
-                return
-            if group.gripper is not None and master.name in group.gripper.fingers:
-                gripper, ends = group.gripper, np.array(group.gripper.fingers[master.name])
-                slope = (ends[1] - ends[0]) / (gripper.upper - gripper.lower)
-                self.coupling[index, group.gripper_dim] = factor * slope
-                self.offsets[index] = factor * (ends[0] - slope * gripper.lower) + offset
-                self.bounds[:, index] = np.sort(factor * ends + offset)
-                return
-        self.offsets[index] = offset
-
-
-def _master(tree: Urdf, joint: Joint) -> tuple[Joint, float, float]:
-    """The joint that this one follows (itself, unless it is a mimic): value = factor * its value + offset."""
-    factor, offset, seen = 1.0, 0.0, [joint.name]
-    while joint.mimic is not None:
-        offset += factor * joint.mimic.offset
-        factor *= joint.mimic.multiplier
-        joint = tree.joint(joint.mimic.joint)
-        if joint.name in seen:
-            raise RobotError(f"{tree.path}: joints {', '.join(seen)} mimic each other in a circle")
-        seen.append(joint.name)
-    return joint, factor, offset
-
-
-def _outwards(tree: Urdf) -> list[Joint]:
-    """The joints in an order in which every parent link comes before its children."""
-    order: list[Joint] = []
-    links = [tree.root]
-    for link in links:  # grows while it is walked
-        below = [joint for joint in tree.joints.values() if joint.parent == link]
-        order += below
-        links += [joint.child for joint in below]
-    return order
-
-
-def _layers(above: NDArray[np.intp]) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Parts and the parts they hang on, layer by layer away from the roots (those on part -1)."""
-    depth = np.zeros(len(above), dtype=np.intp)
-    for part, parent in enumerate(above):  # parents come first
-        depth[part] = 0 if parent < 0 else depth[parent] + 1
-    layers = [np.flatnonzero(depth == layer) for layer in range(1, int(depth.max()) + 1)]
-    return [(parts, above[parts]) for parts in layers]

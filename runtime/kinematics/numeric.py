@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from robots import Chain, Group, Robot
-from robots.rotations import matrix_of_quaternion, rotation_vector
+from robots.rotations import rotation_vector, transform_of
 from runtime.kinematics.base import IkResult, Kinematics, KinematicsError
 from runtime.section import Section
 from runtime.types import Float64
@@ -55,7 +55,7 @@ class NumericKinematics(Kinematics):
             raise KinematicsError(f"joints of shape {q.shape} were given; allowed: [..., {self._robot.dim}]")
         poses = np.empty((*q.shape[:-1], len(self._arms), 7))
         for index, arm in enumerate(self._arms):
-            poses[..., index, :] = arm.chain.pose(q[..., arm.dims])
+            poses[..., index, :] = arm.group.pose(q)
         return poses
 
     def solve(self, targets: Float64, seed: Float64, dt: float | None = None) -> IkResult:
@@ -67,12 +67,12 @@ class NumericKinematics(Kinematics):
         targets, seed = self._checked(targets, seed, dt)
         q = np.repeat(seed[None], len(targets), axis=0)
         for index, arm in enumerate(self._arms):
-            goals = _transforms(targets[:, index])
+            goals = np.linalg.inv(arm.group.carried(seed)) @ transform_of(targets[:, index])
             q[:, arm.dims] = arm.follow(goals, seed[arm.dims], dt, self._config.max_iterations)
         return self._result(q, targets)
 
     def _result(self, q: Float64, targets: Float64) -> IkResult:
-        wanted, found = _transforms(targets), _transforms(self.forward(q))
+        wanted, found = transform_of(targets), transform_of(self.forward(q))
         position_error = np.linalg.norm(wanted[..., :3, 3] - found[..., :3, 3], axis=-1)
         apart = rotation_vector(wanted[..., :3, :3] @ np.swapaxes(found[..., :3, :3], -1, -2))
         rotation_error = np.linalg.norm(apart, axis=-1)
@@ -104,6 +104,7 @@ class _Arm:
     """One arm's chain, its places in the robot's vector, its limits."""
 
     def __init__(self, robot: Robot, group: Group, chain: Chain) -> None:
+        self.group = group
         self.chain = chain
         self.dims = group.joint_dims
         self._lower = robot.lower[self.dims]
@@ -216,12 +217,3 @@ def _step_in_box(system: Float64, gradient: Float64, lower: Float64, upper: Floa
             break
         free[np.argmax(np.where(leaving, np.abs(slope), 0.0))] = True
     return step
-
-
-def _transforms(poses: Float64) -> Float64:
-    """Transforms [..., 4, 4] of poses [..., 7]."""
-    transforms = np.zeros((*poses.shape[:-1], 4, 4))
-    transforms[..., :3, :3] = matrix_of_quaternion(poses[..., 3:])
-    transforms[..., :3, 3] = poses[..., :3]
-    transforms[..., 3, 3] = 1.0
-    return transforms

@@ -67,6 +67,12 @@ class ByHand(BenchPage):
     def moved_from(self, before, by=0.02):
         return max(abs(now - then) for now, then in zip(self.joints(), before, strict=True)) > by
 
+    def stands(self):
+        """Whether what the robot is told does not change; the phase may still be that of before a press."""
+        before = self.joints()
+        self.page.wait_for_timeout(400)
+        return self.joints() == before
+
     def said(self):
         """What is said of the target."""
         return self.page.locator("[data-target=said]").inner_text()
@@ -130,6 +136,7 @@ def test_step_moves_the_robot_by_one_chunk_for_each_press(ready):
     assert not ready.moved_from(before)
     ready.press("step")
     eventually(lambda: ready.moved_from(before), SOON_S, "the robot moves")
+    eventually(ready.stands, SOON_S, "the robot stands after one chunk")
     ready.says("[data-mode=phase]", "waiting for you")
     rest = ready.joints()
     ready.page.wait_for_timeout(500)

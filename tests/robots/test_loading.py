@@ -88,7 +88,7 @@ def test_a_robot_travels_between_processes() -> None:
         ('"joint5", "joint6"]\nframe', '"joint5", "joint8"]\nframe', "joint8 is fixed or a mimic"),
         ('"joint5", "joint6"]\nframe', '"joint5", "joint7"]\nframe', "'joint6' lies between base_link and"),
         (FIRST, 'eef_link = "hand"\n', "no link 'hand'"),
-        (FIRST, "", "eef_link, frame and gripper make an arm together"),
+        (FIRST, "", "eef_link and frame make an arm together"),
         ("index = 6", "index = 7", "left_arm.gripper.index = 7; allowed: 0 to 6"),
         ("open = 0.1", "open = 0.2", "left_arm.gripper.open = 0.2; allowed: 0.0 to 0.1"),
         ("open = 0.1", "open = 0.0", "open = 0.0 is also close"),
