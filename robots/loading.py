@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,8 +23,18 @@ _FILE = "robot.toml"
 
 
 def names() -> tuple[str, ...]:
-    """The robots that come with the program."""
-    return tuple(sorted(path.parent.name for path in _HERE.glob(f"*/{_FILE}")))
+    """The robots that come with the program, and those in the folders of $EVA_ROBOTS (as in a search path)."""
+    return tuple(sorted(_known()))
+
+
+def _known() -> dict[str, Path]:
+    """Folders by name; what comes with the program is never replaced by another of the same name."""
+    further = [Path(part).expanduser() for part in os.environ.get("EVA_ROBOTS", "").split(os.pathsep) if part]
+    found: dict[str, Path] = {}
+    for root in (_HERE, *further):
+        for file in sorted(root.glob(f"*/{_FILE}")):
+            found.setdefault(file.parent.name, file.parent.resolve())
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,11 +150,12 @@ class _Limits:
 
 
 def _folder(robot: str | Path) -> Path:
-    if isinstance(robot, str) and robot in names():
-        return _HERE / robot
+    known = _known()
+    if isinstance(robot, str) and robot in known:
+        return known[robot]
     folder = Path(robot)
     if not (folder / _FILE).is_file():
-        raise RobotError(f"no robot {str(robot)!r}; known: {', '.join(names())}, or a folder with {_FILE}")
+        raise RobotError(f"no robot {str(robot)!r}; known: {', '.join(known)}, or a folder with {_FILE}")
     return folder.resolve()
 
 

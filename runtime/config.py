@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from runtime.kinematics.base import KinematicsSettings
 from runtime.messages import Mode
 from runtime.plugins import variants
 from runtime.recording.settings import RecordingSettings
@@ -35,6 +36,11 @@ if TYPE_CHECKING:
     TransportConfig = Variant
     PolicyConfig = Variant
 
+    class KinematicsConfig(KinematicsSettings):
+        """Any backend's section."""
+
+        kind: str
+
     class StrategyConfig(StrategyParameters):
         """Any strategy's section."""
 
@@ -43,6 +49,7 @@ else:
     TransportConfig = _variants_of("runtime.transports")
     PolicyConfig = _variants_of("runtime.policies")
     StrategyConfig = _variants_of("runtime.strategies")
+    KinematicsConfig = _variants_of("runtime.kinematics")
 
 
 def _loopback(host: str) -> str:
@@ -166,13 +173,30 @@ class LockstepSettings(Section):
     """Ticks between an observation and the arrival of its chunk."""
 
 
+class GripperSettings(Section):
+    """What a deployment says otherwise of one gripper than the robot's description."""
+
+    binary: bool | None = None
+    """Whether it knows only open and close."""
+    threshold: float | None = None
+    """Where a binary gripper switches, in its own unit."""
+    open: float | None = None
+    """Its number when open."""
+    close: float | None = None
+    """Its number when closed."""
+
+
 class Deployment(Section):
     """One station: a robot, a way to it, a policy, and how they are brought together."""
 
     station: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")
     """Name of the station, and of its folder in the data folder."""
     robot: str
-    """Name of a folder in robots/, or a path to such a folder."""
+    """Name of a robot that comes with the program or lies in a folder of $EVA_ROBOTS, or a path to a robot's folder."""
+    groups: list[str] | None = None
+    """Groups of its joints that are part of this station; all that are not optional where they are not given."""
+    grippers: dict[str, GripperSettings] = Field(default_factory=dict)
+    """By the name of the group, what this station's grippers have otherwise."""
     task: str = ""
     """The instruction given to the policy."""
     tasks: list[str] = Field(default_factory=list)
@@ -183,6 +207,9 @@ class Deployment(Section):
     """Where episodes and datasets lie; $EVA_DATA_DIR or ./data where it is not given."""
     transport: TransportConfig
     policy: PolicyConfig
+    kinematics: KinematicsConfig = Field(
+        default_factory=lambda: variants("runtime.kinematics")["numeric"].Config()
+    )
     strategy: StrategyConfig = Field(default_factory=lambda: variants("runtime.strategies")["async"].Config())
     control: ControlSettings = ControlSettings()
     setup: SetupSettings = SetupSettings()

@@ -20,7 +20,6 @@ from runtime.clock import Clock
 from runtime.config import Deployment
 from runtime.deployment import Resolved
 from runtime.errors import ConfigurationError, RuntimeFault, SetupError
-from runtime.kinematics import numeric
 from runtime.kinematics.base import Kinematics
 from runtime.page import Page, PageLayout
 from runtime.plugins import variants
@@ -116,7 +115,9 @@ class Plan:
 
     def kinematics(self) -> Kinematics:
         """Forward and inverse kinematics of the robot."""
-        return numeric.build(numeric.Config(), self.robot)
+        settings = self.deployment.kinematics
+        made: Kinematics = variants("runtime.kinematics")[settings.kind].build(settings, self.robot)
+        return made
 
     def spaces(self) -> Spaces:
         """The robot's action spaces, with its kinematics."""
@@ -127,7 +128,10 @@ def plan(resolved: Resolved) -> Plan:
     """Check that the parts of a deployment fit each other; raises ConfigurationError or SetupError."""
     settings = resolved.deployment
     try:
-        robot = robots.load(settings.robot)
+        grippers = {
+            name: robots.GripperChoice(**given.model_dump()) for name, given in settings.grippers.items()
+        }
+        robot = robots.load(settings.robot, settings.groups, grippers)
     except robots.RobotError as error:
         raise ConfigurationError(str(error)) from None
     made = Plan(resolved, robot)

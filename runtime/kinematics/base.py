@@ -2,32 +2,76 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from enum import IntFlag
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from runtime.errors import RuntimeFault
+from runtime.section import Section
 from runtime.types import Float64
+
+Positive = Annotated[float, Field(gt=0)]
 
 
 class KinematicsError(RuntimeFault):
     """Joints, poses or a seed of the wrong shape, or numbers that no pose can have."""
 
 
+class IkFlag(IntFlag):
+    """What is to be known of a solved frame; bits of IkResult.flags."""
+
+    OVER_TOLERANCE = 1
+    AT_LIMIT = 2  # a joint rests on its limit
+    AT_VELOCITY = 4  # a joint moves as fast as it may
+    NEAR_SINGULAR = 8  # some direction of the end effector can hardly be moved in
+
+
+class KinematicsSettings(Section):
+    """What every backend lets a deployment choose."""
+
+    position_weight: Positive = 50.0
+    """Cost of a metre beside the pose."""
+    rotation_weight: Positive = 10.0
+    """Cost of a radian beside it."""
+    rest_weight: Annotated[float, Field(ge=0)] = 0.02
+    """Cost of a radian away from the frame before: holds still what the pose leaves open. At 1, reachable poses
+    are missed by millimetres."""
+    position_tolerance: Positive = 1e-3
+    """Metres within which a target counts as reached."""
+    rotation_tolerance: Positive = math.radians(0.5)
+    """Radians within which a target counts as reached."""
+    max_iterations: Annotated[int, Field(ge=1)] = 60
+    """Per frame and arm."""
+    velocity_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Part of the joint velocities that solved frames may use."""
+    singular_below: Annotated[float, Field(ge=0)] = 0.02
+    """Smallest singular value of the Jacobian (m and rad alike) under which a frame counts as near singular."""
+
+
 @dataclass(frozen=True, slots=True)
 class IkResult:
     """Joints for a sequence of targets.
 
-    `q` float64 [T, D] full robot vectors; `position_error` [T, arms] in m, `rotation_error` [T, arms] in rad;
-    `reached` bool [T, arms]: both within tolerance.
+    `q` float64 [T, D] full robot vectors; `position_error` [T, arms] in m, `rotation_error` [T, arms] in rad, of
+    the joints that are returned; `flags` uint8 [T, arms], bits of IkFlag.
     """
 
     q: Float64
     position_error: Float64
     rotation_error: Float64
-    reached: NDArray[np.bool_]
+    flags: NDArray[np.uint8]
+
+    @property
+    def reached(self) -> NDArray[np.bool_]:
+        """bool [T, arms]: both errors within tolerance."""
+        within: NDArray[np.bool_] = (self.flags & IkFlag.OVER_TOLERANCE) == 0
+        return within
 
 
 class Kinematics(ABC):
@@ -38,10 +82,20 @@ class Kinematics(ABC):
         """Poses [..., arms, 7] (x, y, z, qw, qx, qy, qz with qw >= 0) for joint vectors [..., D]."""
 
     @abstractmethod
-    def solve(self, targets: Float64, seed: Float64, dt: float | None = None) -> IkResult:
+    def solve(
+        self,
+        targets: Float64,
+        seed: Float64,
+        dt: float | None = None,
+        anchor: Float64 | None = None,
+        anchor_row: int = 0,
+    ) -> IkResult:
         """Joints for poses [T, arms, 7], each frame started from the one before, the first from `seed` [D].
 
-        Dimensions of `seed` that no arm's chain uses (grippers, head) are passed through. No joint leaves its
-        limits; where `dt` [s] between frames is given, none moves faster than its velocity limit from one
-        frame to the next. What is not reached is reported, never hidden.
+        Dimensions of `seed` that no arm's chain uses (grippers, head) are passed through, and carriers (a torso)
+        stand as in `seed`. No joint leaves its limits. Where `dt` [s] between frames is given, none moves faster than
+        its velocity limit from one frame to the next; `anchor` [D] is what is commanded in the step before row
+        `anchor_row`, the first that will be executed: that row is bound to it by the same velocity, and the rows
+        before it, which are stale, by joint limits alone. Without an anchor the first row is bound by joint limits
+        alone. What is not reached is flagged, never hidden.
         """

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from robots import Chain, Group, Robot
 from robots.rotations import rotation_vector, transform_of
-from runtime.kinematics.base import IkResult, Kinematics, KinematicsError
-from runtime.section import Section
+from runtime.kinematics.base import IkFlag, IkResult, Kinematics, KinematicsError, KinematicsSettings
 from runtime.types import Float64
 
 _POSITION_WEIGHT = 50.0  # per m
@@ -23,16 +20,10 @@ _CLOSE_ENOUGH = 1e-9  # weighted squared error: below 1 um and 5 urad
 _STALLED = 1e-4  # a relative fall of the cost below which another iteration is not worth its time
 
 
-class Config(Section):
+class Config(KinematicsSettings):
     """Damped least squares in numpy: no extra package, a few hundred microseconds per frame and arm."""
 
     kind: Literal["numeric"] = "numeric"
-    position_tolerance: Annotated[float, Field(gt=0)] = 1e-3
-    """Metres within which a target counts as reached."""
-    rotation_tolerance: Annotated[float, Field(gt=0)] = math.radians(0.5)
-    """Radians within which a target counts as reached."""
-    max_iterations: Annotated[int, Field(ge=1)] = 60
-    """Per frame and arm."""
 
 
 def build(config: Config, robot: Robot) -> NumericKinematics:
@@ -58,7 +49,14 @@ class NumericKinematics(Kinematics):
             poses[..., index, :] = arm.group.pose(q)
         return poses
 
-    def solve(self, targets: Float64, seed: Float64, dt: float | None = None) -> IkResult:
+    def solve(
+        self,
+        targets: Float64,
+        seed: Float64,
+        dt: float | None = None,
+        anchor: Float64 | None = None,
+        anchor_row: int = 0,
+    ) -> IkResult:
         """Joints for poses [T, arms, 7]; the errors are measured on the joints that are returned.
 
         Quaternions are normalised. Raises KinematicsError for wrong shapes, numbers that are not finite, a
@@ -68,7 +66,10 @@ class NumericKinematics(Kinematics):
         q = np.repeat(seed[None], len(targets), axis=0)
         for index, arm in enumerate(self._arms):
             goals = np.linalg.inv(arm.group.carried(seed)) @ transform_of(targets[:, index])
-            q[:, arm.dims] = arm.follow(goals, seed[arm.dims], dt, self._config.max_iterations)
+            start = None if anchor is None else np.asarray(anchor, dtype=np.float64)[arm.dims]
+            q[:, arm.dims] = arm.follow(
+                goals, seed[arm.dims], dt, start, anchor_row, self._config.max_iterations
+            )
         return self._result(q, targets)
 
     def _result(self, q: Float64, targets: Float64) -> IkResult:
@@ -78,7 +79,8 @@ class NumericKinematics(Kinematics):
         rotation_error = np.linalg.norm(apart, axis=-1)
         near = position_error <= self._config.position_tolerance
         aligned = rotation_error <= self._config.rotation_tolerance
-        return IkResult(q, position_error, rotation_error, near & aligned)
+        flags = np.where(near & aligned, 0, int(IkFlag.OVER_TOLERANCE)).astype(np.uint8)
+        return IkResult(q, position_error, rotation_error, flags)
 
     def _checked(self, targets: Float64, seed: Float64, dt: float | None) -> tuple[Float64, Float64]:
         targets, seed = np.array(targets, dtype=np.float64), np.asarray(seed, dtype=np.float64)
@@ -111,20 +113,29 @@ class _Arm:
         self._upper = robot.upper[self.dims]
         self._velocity = robot.velocity[self.dims]
 
-    def follow(self, goals: Float64, seed: Float64, dt: float | None, max_iterations: int) -> Float64:
-        """Joints [T, n] for transforms [T, 4, 4], each frame started from the one before.
-
-        The first frame starts at the seed and is bound by the joint limits alone: a policy's first row leads
-        the measured joints by more than one period.
-        """
+    def follow(
+        self,
+        goals: Float64,
+        seed: Float64,
+        dt: float | None,
+        anchor: Float64 | None,
+        anchor_row: int,
+        max_iterations: int,
+    ) -> Float64:
+        """Joints [T, n] for transforms [T, 4, 4], each frame started from the one before."""
         path = np.empty((len(goals), len(self.dims)))
         q = np.clip(seed, self._lower, self._upper)
-        lower, upper = self._lower, self._upper
+        before = None
         for index, goal in enumerate(goals):
+            before = anchor if index == anchor_row and anchor is not None else before
+            lower, upper = self._lower, self._upper
+            if dt is not None and before is not None:
+                before = np.clip(before, self._lower, self._upper)
+                lower = np.maximum(lower, before - self._velocity * dt)
+                upper = np.minimum(upper, before + self._velocity * dt)
+                q = np.clip(q, lower, upper)
             q = path[index] = _solve(self.chain, goal, q, lower, upper, max_iterations)
-            if dt is not None:
-                lower = np.maximum(self._lower, q - self._velocity * dt)
-                upper = np.minimum(self._upper, q + self._velocity * dt)
+            before = None if anchor is not None and index < anchor_row else q
         return path
 
 
