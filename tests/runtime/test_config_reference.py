@@ -28,8 +28,10 @@ def test_every_table_and_every_variant_has_its_section():
             assert f"| `{name}` | string" in text
         elif name == "tasks":
             assert "| `tasks` | list of string | `[]` |" in text
+        elif name == "groups":
+            assert "| `groups` | list of string | none |" in text
         else:
-            assert f"## `[{name}]`" in text, field
+            assert f"## `[{name}]`" in text or f"## `[{name}.NAME]`" in text, field
     for package, part in (("transports", "transport"), ("policies", "policy"), ("strategies", "strategy")):
         for kind in variants(f"runtime.{package}"):
             assert f"## `[{part}]` of kind `{kind}`" in text
