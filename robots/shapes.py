@@ -1,26 +1,30 @@
-"""Reads the visible shapes of a URDF's links: boxes, cylinders and spheres with their colours."""
+"""Reads the visible shapes of a URDF's links: boxes, cylinders, spheres and meshes with their colours."""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from robots import meshes
 from robots.errors import RobotError
 from robots.rotations import Float64
 from robots.urdf import document, numbers, origin_of, text_of
 
 Colour = tuple[float, float, float, float]
-KINDS = ("box", "cylinder", "sphere")
+KINDS = ("box", "cylinder", "sphere", "mesh")
 PLAIN: Colour = (0.7, 0.7, 0.7, 1.0)  # of a shape without a material
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
-    """One shape of a link: box (x, y, z), cylinder (radius, length along z) or sphere (radius,) in m.
+    """One shape of a link: box (x, y, z), cylinder (radius, length along z) or sphere (radius,) in m, or a mesh.
 
-    `origin` [4, 4] places its centre in the link; `colour` is red, green, blue, opacity, 0 to 1.
+    A mesh is what `file` shows, its axes stretched by `size` (x, y, z); simple shapes have no file. `origin` [4, 4]
+    places its centre (a mesh's origin) in the link; `colour` is red, green, blue, opacity, 0 to 1, of a mesh too.
     """
 
     link: str
@@ -28,10 +32,41 @@ class Shape:
     size: tuple[float, ...]
     origin: Float64
     colour: Colour
+    file: Path | None = None
+
+    def bounds(self) -> tuple[Float64, Float64]:
+        """The least and the greatest corner [3] of the shape's box in its own frame [m], before `origin`."""
+        return bounds_of(self.kind, self.size, self.file)
+
+
+def bounds_of(kind: str, size: tuple[float, ...], file: Path | None) -> tuple[Float64, Float64]:
+    """The corners [3] of the box around a shape in its own frame [m]; RobotError where a mesh cannot be read."""
+    if kind == "mesh":
+        assert file is not None  # a mesh is read from a file
+        corners = np.array(meshes.bounds(file)) * size
+        return corners.min(axis=0), corners.max(axis=0)
+    if kind == "box":
+        half = np.array(size) / 2
+    else:
+        radius = size[0]
+        half = np.array([radius, radius, size[1] / 2 if kind == "cylinder" else radius])
+    return -half, half
 
 
 def read(path: Path) -> tuple[Shape, ...]:
-    """The shapes in the file's order; RobotError names the file, the link and what is wrong with it."""
+    """The shapes in the file's order; RobotError names the file, the link and what is wrong with it.
+
+    They are the same whatever the environment holds, except for links that show meshes, which may lie there.
+    """
+    return _read(path, everywhere=False)
+
+
+def shown(path: Path) -> tuple[Shape, ...]:
+    """The same for drawing: every link with a mesh of its name under $EVA_ROBOT_MESHES shows that and nothing else."""
+    return _read(path, everywhere=True)
+
+
+def _read(path: Path, *, everywhere: bool) -> tuple[Shape, ...]:
     robot = document(path)
     materials = {
         text_of(path, element, "name"): _colour(path, f"material {element.get('name')!r}", colour)
@@ -39,10 +74,25 @@ def read(path: Path) -> tuple[Shape, ...]:
         if (colour := element.find("color")) is not None
     }
     return tuple(
-        _shape(path, text_of(path, link, "name"), visual, materials)
+        shape
         for link in robot.findall("link")
-        for visual in link.findall("visual")
+        for shape in _shapes(
+            path, link, materials, everywhere or link.find("visual/geometry/mesh") is not None
+        )
     )
+
+
+def _shapes(
+    path: Path, link: ET.Element, materials: Mapping[str, Colour], replaceable: bool
+) -> Iterator[Shape]:
+    name = text_of(path, link, "name")
+    visuals = link.findall("visual")
+    file = meshes.replacement(path.parent, name) if replaceable else None
+    if file is None:
+        yield from (_shape(path, name, visual, materials) for visual in visuals)
+    else:
+        colour = _material(path, f"link {name!r}", visuals[0], materials) if visuals else PLAIN
+        yield Shape(name, "mesh", (1.0, 1.0, 1.0), np.eye(4), colour, file)
 
 
 def _shape(path: Path, link: str, visual: ET.Element, materials: Mapping[str, Colour]) -> Shape:
@@ -52,12 +102,23 @@ def _shape(path: Path, link: str, visual: ET.Element, materials: Mapping[str, Co
     if len(given) != 1 or given[0].tag not in KINDS:
         tags = ", ".join(f"<{element.tag}>" for element in given) or "nothing"
         raise RobotError(f"{path}: {owner}: a visual shows {tags}; allowed: one of {', '.join(KINDS)}")
-    size = _size(path, owner, given[0])
+    element = given[0]
+    size = _size(path, owner, element)
+    file = None
+    if element.tag == "mesh":
+        file = meshes.named(path.parent, f"{path}: {owner}", text_of(path, element, "filename"))
     colour = _material(path, owner, visual, materials)
-    return Shape(link, given[0].tag, size, origin_of(path, owner, visual), colour)
+    return Shape(link, element.tag, size, origin_of(path, owner, visual), colour, file)
 
 
 def _size(path: Path, owner: str, element: ET.Element) -> tuple[float, ...]:
+    """Lengths in m, of a mesh the factors along its axes (1 where nothing is said; below zero they mirror)."""
+    if element.tag == "mesh":
+        text = element.get("scale", "1 1 1")
+        scale = numbers(path, owner, "mesh scale", text, 3)
+        if 0 in scale:
+            raise RobotError(f"{path}: {owner}: mesh scale {text}; allowed: factors other than zero")
+        return tuple(scale)
     keys = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",)}[element.tag]
     count = 3 if element.tag == "box" else 1
     texts = [text_of(path, element, key) for key in keys]

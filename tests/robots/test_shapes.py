@@ -35,8 +35,8 @@ def test_every_kind_is_read_with_size_origin_and_colour(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("body", "said"),
     [
-        ("", "link 'a': a visual shows nothing; allowed: one of box, cylinder, sphere"),
-        ('<geometry><mesh filename="a.stl"/></geometry>', "link 'a': a visual shows <mesh>"),
+        ("", "link 'a': a visual shows nothing; allowed: one of box, cylinder, sphere, mesh"),
+        ('<geometry><capsule radius="1"/></geometry>', "link 'a': a visual shows <capsule>; allowed: one of"),
         ('<geometry><box size="1 2"/></geometry>', "link 'a': box size is '1 2'; allowed: 3 finite number"),
         ('<geometry><cylinder radius="1"/></geometry>', "a <cylinder> has no 'length'"),
         ('<geometry><sphere radius="0"/></geometry>', "link 'a': sphere 0; allowed: lengths above zero"),
@@ -53,6 +53,24 @@ def test_what_is_wrong_is_named(tmp_path: Path, body: str, said: str) -> None:
         shapes.read(path)
     assert said in str(error.value)
     assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("body", "half"),
+    [
+        (BOX, (0.5, 1, 1.5)),
+        ('<geometry><cylinder radius="0.1" length="0.4"/></geometry>', (0.1, 0.1, 0.2)),
+        ('<geometry><sphere radius="0.2"/></geometry>', (0.2, 0.2, 0.2)),
+    ],
+)
+def test_bounds_are_around_the_shape_in_its_own_frame(
+    tmp_path: Path, body: str, half: tuple[float, ...]
+) -> None:
+    origin = '<origin xyz="1 2 3" rpy="1 0 0"/>'
+    (shape,) = shapes.read(write(tmp_path, VISUAL.format(body=origin + body)))
+    lower, upper = shape.bounds()
+    np.testing.assert_allclose(lower, np.negative(half))
+    np.testing.assert_allclose(upper, half)
 
 
 @pytest.mark.parametrize("name", names())

@@ -1,0 +1,87 @@
+"""Reads the points of a COLLADA file where its scene puts them, in m; what they look like is for those who draw it."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from robots.rotations import Float64
+
+_NAMESPACE = "{*}"
+
+
+def points(path: Path) -> Float64:
+    """All points [n, 3] of the geometries that the scene shows, units applied; ValueError where it is no COLLADA.
+
+    The file's up axis is left as it is, as robots' viewers do.
+    """
+    try:
+        root = ET.parse(path).getroot()
+    except ET.ParseError as error:
+        raise ValueError(str(error)) from error
+    geometries = {f"#{one.get('id')}": _positions(one) for one in root.iterfind(f".//{_NAMESPACE}geometry")}
+    library = {f"#{one.get('id')}": one for one in root.iterfind(f".//{_NAMESPACE}node")}
+    unit = root.find(f"{_NAMESPACE}asset/{_NAMESPACE}unit")
+    metres = 1.0 if unit is None else float(unit.get("meter", "1"))
+    found = [
+        geometries[url] @ place[:3, :3].T + place[:3, 3]
+        for scene in root.iterfind(f".//{_NAMESPACE}visual_scene")
+        for node in scene.iterfind(f"{_NAMESPACE}node")
+        for url, place in _instances(node, np.eye(4), library, 0)
+        if url in geometries
+    ]
+    return np.concatenate(found) * metres if found else np.empty((0, 3))
+
+
+def _positions(geometry: ET.Element) -> Float64:
+    """The points [n, 3] of a geometry's meshes."""
+    sources = {f"#{one.get('id')}": one for one in geometry.iterfind(f".//{_NAMESPACE}source")}
+    parts = []
+    for element in geometry.iterfind(f".//{_NAMESPACE}vertices/{_NAMESPACE}input"):
+        source = sources.get(element.get("source", ""))
+        numbers = None if source is None else source.find(f"{_NAMESPACE}float_array")
+        if element.get("semantic") == "POSITION" and numbers is not None:
+            parts.append(np.array((numbers.text or "").split(), dtype=np.float64).reshape(-1, 3))
+    return np.concatenate(parts) if parts else np.empty((0, 3))
+
+
+def _instances(
+    node: ET.Element, above: Float64, library: dict[str, ET.Element], depth: int
+) -> Iterator[tuple[str, Float64]]:
+    """The geometries that a node and those below it show, and where."""
+    if depth > 64:
+        raise ValueError("nodes that contain each other")
+    place = above
+    for element in node:
+        kind = element.tag.rpartition("}")[2]
+        if kind in ("matrix", "translate", "rotate", "scale"):
+            place = place @ _motion(kind, np.array((element.text or "").split(), dtype=np.float64))
+    for element in node:
+        kind = element.tag.rpartition("}")[2]
+        if kind == "instance_geometry":
+            yield element.get("url", ""), place
+        elif kind == "node":
+            yield from _instances(element, place, library, depth + 1)
+        elif kind == "instance_node" and (shown := library.get(element.get("url", ""))) is not None:
+            yield from _instances(shown, place, library, depth + 1)
+
+
+def _motion(kind: str, numbers: Float64) -> Float64:
+    """The transform [4, 4] of one element of a node."""
+    motion = np.eye(4)
+    if kind == "matrix":
+        return numbers.reshape(4, 4)
+    if kind == "translate":
+        motion[:3, 3] = numbers
+    elif kind == "scale":
+        motion[:3, :3] = np.diag(numbers)
+    else:
+        x, y, z = numbers[:3] / np.linalg.norm(numbers[:3])
+        angle = math.radians(numbers[3])
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        motion[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return motion

@@ -1,0 +1,120 @@
+"""Files with meshes: where a robot's lie, and how far what they show reaches."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+
+from robots import collada
+from robots.errors import RobotError
+from robots.rotations import Float64
+
+ENVIRONMENT = "EVA_ROBOT_MESHES"
+SUFFIXES = (".stl", ".obj", ".dae")
+Bounds = tuple[Float64, Float64]
+
+
+def roots(folder: Path) -> tuple[Path, ...]:
+    """The folders in which meshes of the robot in `folder` may lie: its own and $EVA_ROBOT_MESHES/<its name>."""
+    given = os.environ.get(ENVIRONMENT, "")
+    if not given:
+        return (folder.resolve(),)
+    meshes = Path(given).expanduser()
+    if not meshes.is_dir():
+        raise RobotError(f"{ENVIRONMENT} = {given!r} is no folder; needed: one with a folder per robot")
+    return folder.resolve(), (meshes / folder.name).resolve()
+
+
+def named(folder: Path, owner: str, filename: str) -> Path:
+    """The file that a URDF in `folder` names for `owner`: relative to the URDF, package://NAME/... or file://...
+
+    It has to lie in one of the `roots`, links followed; RobotError says where it was looked for.
+    """
+    if Path(filename).suffix.lower() not in SUFFIXES:
+        raise RobotError(f"{owner}: mesh {filename!r}; allowed: files {', '.join(SUFFIXES)}")
+    allowed = roots(folder)
+    places = [place for root in allowed for place in _places(root, owner, filename)]
+    for place in places:
+        if not any(place.is_relative_to(root) for root in allowed):
+            raise RobotError(
+                f"{owner}: mesh {filename!r} is {place}; allowed: files in {' or '.join(map(str, allowed))}"
+            )
+    for place in places:
+        if place.is_file():
+            return place
+    raise RobotError(
+        f"{owner}: mesh {filename!r} is missing; looked for {', '.join(map(str, dict.fromkeys(places)))}"
+        f"; put it there, or under ${ENVIRONMENT}/{folder.name}"
+    )
+
+
+def replacement(folder: Path, link: str) -> Path | None:
+    """$EVA_ROBOT_MESHES/<robot>/<link>.stl, .obj or .dae, which is shown instead of what the URDF says; else None."""
+    for root in roots(folder)[1:]:
+        for suffix in SUFFIXES:
+            place = (root / f"{link}{suffix}").resolve()
+            if place.is_file() and place.is_relative_to(root):
+                return place
+    return None
+
+
+def bounds(path: Path) -> Bounds:
+    """The least and the greatest corner [3] of what the file shows, in its own axes [m]; RobotError if unreadable."""
+    try:
+        return _bounds(path, path.stat().st_mtime_ns)
+    except (OSError, ValueError) as error:
+        raise RobotError(f"{path}: cannot be read as a mesh: {error}") from error
+
+
+def _places(root: Path, owner: str, filename: str) -> Iterator[Path]:
+    """Where in `root` the file may lie; a package is the folder of its name in there, or the root itself."""
+    scheme, separator, rest = filename.partition("://")
+    if not separator:
+        yield (root / filename).resolve()
+    elif scheme == "file":
+        yield Path(unquote(rest)).resolve()
+    elif scheme == "package":
+        _, _, inside = rest.partition("/")
+        yield (root / rest).resolve()
+        yield (root / inside).resolve()
+    else:
+        raise RobotError(f"{owner}: mesh {filename!r}; allowed: a path, package://... or file://...")
+
+
+@lru_cache(maxsize=512)
+def _bounds(path: Path, _changed: int) -> Bounds:
+    suffix = path.suffix.lower()
+    if suffix == ".dae":
+        points = collada.points(path)
+    else:
+        points = _stl(path.read_bytes()) if suffix == ".stl" else _obj(path.read_text(errors="replace"))
+    if points.size == 0 or not np.isfinite(points).all():
+        raise ValueError("no points, or some that are not finite")
+    corners = points.min(axis=0), points.max(axis=0)
+    for corner in corners:
+        corner.setflags(write=False)
+    return corners
+
+
+def _stl(content: bytes) -> Float64:
+    """The corners [n, 3] of an STL's triangles: binary where its length says so, else text."""
+    count = int.from_bytes(content[80:84], "little")
+    if len(content) >= 84 and len(content) == 84 + 50 * count:
+        triangle = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+        return np.frombuffer(content, triangle, count, 84)["corners"].reshape(-1, 3).astype(np.float64)
+    if not content.lstrip().startswith(b"solid"):
+        raise ValueError("neither a binary STL of the length that it says nor a text one")
+    found = re.findall(r"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)", content.decode(errors="replace"), re.MULTILINE)
+    return np.array(found, dtype=np.float64).reshape(-1, 3)
+
+
+def _obj(text: str) -> Float64:
+    """The vertices [n, 3] of an OBJ."""
+    found = re.findall(r"^\s*v\s+(\S+)\s+(\S+)\s+(\S+)", text, re.MULTILINE)
+    return np.array(found, dtype=np.float64).reshape(-1, 3)
