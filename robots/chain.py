@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,6 +13,21 @@ from robots.urdf import Joint, Urdf
 
 _NEXT = np.array([1, 2, 0])
 _AFTER = np.array([2, 0, 1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovingJoint:
+    """A joint that turns about the unit vector `axis` [3], or `slides` along it, by factor * q[drive] + offset.
+
+    `origin` [4, 4] places it behind the moving joint before it, at the value 0.
+    """
+
+    origin: Float64
+    axis: Float64
+    slides: bool
+    drive: int
+    factor: float
+    offset: float
 
 
 class Chain:
@@ -41,6 +57,28 @@ class Chain:
     def size(self) -> int:
         """How many numbers drive the chain."""
         return len(self.joints)
+
+    @property
+    def moving(self) -> tuple[MovingJoint, ...]:
+        """The joints that move, from the frame outwards."""
+        return tuple(
+            MovingJoint(
+                origin=(table[0] + table[1]).reshape(4, 4),
+                axis=axis[:, 0],
+                slides=bool(slides[0]),
+                drive=(drive := int(np.flatnonzero(row)[0])),
+                factor=float(row[drive]),
+                offset=float(offset),
+            )
+            for table, axis, slides, row, offset in zip(
+                self._table, self._axes, self._slides, self._coupling, self._offsets, strict=True
+            )
+        )
+
+    @property
+    def tail(self) -> Float64:
+        """What lies between the last moving joint and the tip, [4, 4]."""
+        return self._tail
 
     def forward(self, q: Float64) -> Float64:
         """The tip in the frame, transforms [..., 4, 4], for joints [..., n]."""
