@@ -37,8 +37,16 @@ demo: setup ## a small lab on this machine, no robot needed; ARGS="--once --json
 lab: setup ## web, worker and stations of this machine; ARGS="deployments/MINE.toml"
 	$(PY) manage.py lab $(ARGS)
 
+# Tests that need real seconds or a browser run one at a time, the others beside each other.
 test: setup-dev ## every test; ARGS="-m 'not slow'" for the quick ones
+ifeq ($(strip $(ARGS)),)
+	@failed=0; \
+	$(PY) -m pytest -n auto --dist loadfile -m "not slow" || failed=1; \
+	$(PY) -m pytest -m slow || failed=1; \
+	exit $$failed
+else
 	$(PY) -m pytest $(ARGS)
+endif
 
 lint: setup-dev ## ruff and mypy
 	$(PY) -m ruff check .
