@@ -1,6 +1,7 @@
 """The simulated bench: what lies on its table and where, and where its cameras are; no robot, no physics.
 
-World frame: z up, the table's surface at z = 0, the plane on which the arms are mounted; metres, radians.
+World frame: the robot's scene, z up, the table's surface at z = 0; metres, radians. Robots stand at its near side,
+where y is below that of the area.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robots.rotations import matrix_of_quaternion
 from runtime.errors import RuntimeFault
+from runtime.sim.limbs import limbs
 from runtime.types import Float64
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ _OVERHEAD_EYE, _OVERHEAD_AIM = (0.0, 0.36, 0.85), (0.0, 0.27, 0.0)
 _OVERHEAD_FOCAL = 1.0  # per picture width
 _WRIST_EYE, _WRIST_AIM = (-0.095, 0.0, -0.125), (-0.005, 0.0, 0.03)  # in the tip's frame
 _WRIST_FOCAL = 0.75
-_OVERHEAD_CAMERA = "front"
 
 
 class BenchError(RuntimeFault):
@@ -136,35 +136,20 @@ def yaw_of(pose: Float64) -> float:
     return math.atan2(-pose[0, 1], pose[1, 1])
 
 
-def eef_in_world(arm: Group, q: Float64) -> Float64:
-    """The arm's end-effector link in the world, [4, 4], at the robot's joints q [D]."""
-    if arm.chain is None:
-        raise BenchError(f"group {arm.name} has no end effector; allowed: an arm")
-    return mount_of(arm) @ arm.chain.forward(q[arm.joint_dims])
-
-
-def tip_in_world(arm: Group, q: Float64) -> Float64:
-    """The arm's fingertips in the world, [4, 4], at the robot's joints q [D]: z ahead, y the way they open."""
-    eef = eef_in_world(arm, q)
-    return eef if arm.tip is None else eef @ arm.tip
-
-
-def mount_of(group: Group) -> Float64:
-    """The frame of a group in the world, [4, 4]."""
-    mount = np.eye(4)
-    mount[:3, :3] = matrix_of_quaternion(group.mount[3:])
-    mount[:3, 3] = group.mount[:3]
-    return mount
+def tip_in_world(robot: Robot, arm: Group, q: Float64) -> Float64:
+    """An arm's fingertips in the world, [4, 4], at the robot's joints q [D]: z ahead, y the way they open."""
+    return limbs(robot)[arm.name].tip(q)
 
 
 def camera_arm(robot: Robot, camera: Camera) -> Group | None:
-    """The arm that carries a camera: its name without "_arm" begins the camera's; None for the overhead one."""
-    if camera.name == _OVERHEAD_CAMERA:
-        return None
+    """The arm that carries a camera; None for one that looks from above, which all others do.
+
+    The arm's name without "_arm" begins the camera's, or the camera is called after a wrist and there is one arm.
+    """
     for arm in robot.arms:
         if camera.name.startswith(arm.name.removesuffix("_arm")):
             return arm
-    return None
+    return robot.arms[0] if "wrist" in camera.name and len(robot.arms) == 1 else None
 
 
 def cameras(robot: Robot, q: Float64, width: int, height: int) -> dict[str, PinholeCamera]:
@@ -173,7 +158,7 @@ def cameras(robot: Robot, q: Float64, width: int, height: int) -> dict[str, Pinh
     return {
         key: overhead_camera(width, height)
         if arm is None
-        else wrist_camera(tip_in_world(arm, q), width, height)
+        else wrist_camera(tip_in_world(robot, arm, q), width, height)
         for key, arm in carriers.items()
     }
 

@@ -7,15 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.sim.bench import BenchError, tip_in_world
+from runtime.sim.bench import BenchError
+from runtime.sim.limbs import limbs
 from runtime.types import Float64
 
 if TYPE_CHECKING:
-    from robots import Group
+    from robots import Gripper, Group, Robot
 
 FINGER_RADIUS = 0.01  # m; a finger is a row of balls whose inner sides are as far apart as the jaws are open
 _ALONG = np.array([-0.01, -0.03, -0.05, -0.07])  # m from the tip, where these balls are
-_UNMEASURED_JAWS = 0.1  # m between the fingers of an open gripper whose number is no length
+_UNMEASURED_JAWS = 0.1  # m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,22 +46,41 @@ class Hand:
 class Jaws:
     """Turns an arm's place in the robot's vector into a Hand, and holds its gripper up at a width."""
 
-    def __init__(self, arm: Group) -> None:
+    def __init__(self, robot: Robot, arm: Group) -> None:
         if arm.gripper is None or arm.gripper_dim is None:
-            raise BenchError(f"group {arm.name} has no gripper; allowed: an arm")
+            raise BenchError(f"group {arm.name} has no gripper; allowed: an arm with one")
         self.name = arm.name
-        self._arm = arm
+        self._limb = limbs(robot)[arm.name]
         self._dim = arm.gripper_dim
-        self._close, self._way = arm.gripper.close, arm.gripper.open - arm.gripper.close
-        self._widest = abs(self._way) if arm.gripper.unit == "m" else _UNMEASURED_JAWS
+        self._opening = Opening(arm.gripper)
 
     def hand(self, q: Float64, before: Hand | None, seconds: float) -> Hand:
         """The fingers at joints q [D]; `before` is where they were `seconds` ago."""
-        tip = tip_in_world(self._arm, q)
+        tip = self._limb.tip(q)
         way = 0.0 if before is None else float(np.linalg.norm(tip[:2, 3] - before.tip[:2, 3]))
-        opening = max(0.0, float((q[self._dim] - self._close) / self._way * self._widest))
+        opening = max(0.0, self._opening.metres(float(q[self._dim])))
         return Hand(self.name, tip, opening, way / seconds if seconds > 0 else 0.0)
 
     def stop(self, q: Float64, opening: float) -> None:
         """Write into q [D] that the jaws are `opening` [m] apart."""
-        q[self._dim] = self._close + opening / self._widest * self._way
+        q[self._dim] = self._opening.number(opening)
+
+
+class Opening:
+    """How far the fingers of a gripper are apart [m], and its number on the wire, in proportion.
+
+    Where a description does not say it, they are taken to be 0.1 m apart when open.
+    """
+
+    def __init__(self, gripper: Gripper) -> None:
+        self._close, self._way = gripper.close, gripper.open - gripper.close
+        self._least, most = gripper.apart or (0.0, _UNMEASURED_JAWS)
+        self._most = most - self._least
+
+    def metres(self, number: float) -> float:
+        """Between the fingers at a number of the wire."""
+        return self._least + (number - self._close) / self._way * self._most
+
+    def number(self, metres: float) -> float:
+        """Of the wire, at which the fingers are so far apart."""
+        return self._close + (metres - self._least) / self._most * self._way

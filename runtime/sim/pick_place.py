@@ -19,7 +19,8 @@ import numpy as np
 from runtime.clock import Clock, MonotonicClock
 from runtime.errors import RuntimeFault
 from runtime.sim.bench import Bench
-from runtime.sim.postures import gripper_dim
+from runtime.sim.hands import Opening
+from runtime.sim.postures import gripper_dim, jaws
 from runtime.sim.routes import Planner, Route, Slip
 from runtime.sim.script import Answer, Script
 from runtime.sim.sight import Overhead, Sight
@@ -252,8 +253,7 @@ class Pursuit:
     def _opening(self, q: Float64) -> float:
         """Of the jaws at work [m]."""
         arm = self._on().arm
-        assert arm.gripper is not None
-        return abs(float(q[gripper_dim(arm)]) - arm.gripper.close)
+        return Opening(jaws(arm)).metres(float(q[gripper_dim(arm)]))
 
     def _ahead(self, route: Route) -> Float32:
         """The next rows of the route; its last one is repeated."""

@@ -10,7 +10,7 @@ import numpy as np
 from runtime.types import EEF_WIDTH, Float32, Float64
 
 if TYPE_CHECKING:
-    from robots import Robot
+    from robots import Group, Robot
 
 LAG = 0.06  # s, the time constant of each joint
 
@@ -36,15 +36,13 @@ class Plant:
 
 
 def poses(robot: Robot, q: Float64) -> dict[str, Float32]:
-    """The end-effector vector float32 [8] of each arm at joints [D]: its pose and its gripper."""
-    return {arm.name: _pose(robot, arm.name, q) for arm in robot.arms}
+    """The end-effector vector float32 [8] of each arm at joints [D]: its pose and its gripper, 0 without one."""
+    return {arm.name: _pose(arm, q) for arm in robot.arms}
 
 
-def _pose(robot: Robot, name: str, q: Float64) -> Float32:
-    arm = robot.group(name)
-    assert arm.chain is not None
-    assert arm.gripper_dim is not None
-    vector = np.empty(EEF_WIDTH, np.float32)
-    vector[:7] = arm.chain.pose(q[arm.joint_dims])
-    vector[7] = q[arm.gripper_dim]
+def _pose(arm: Group, q: Float64) -> Float32:
+    vector = np.zeros(EEF_WIDTH, np.float32)
+    vector[:7] = arm.pose(q)
+    if arm.gripper_dim is not None:
+        vector[7] = q[arm.gripper_dim]
     return vector

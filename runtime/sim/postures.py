@@ -1,21 +1,23 @@
 """Where an arm's joints are for its fingertips over a block or a plate, pointing down.
 
-Four points of every vertical way are solved by inverse kinematics.
+Four points of every vertical way are solved by inverse kinematics, from a posture of the arm with its fingers down
+that is found once: turned about an upright first joint, or led from place to place where there is none.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robots.rotations import quaternion_of_matrix
 from runtime.errors import SetupError
-from runtime.kinematics.numeric import NumericKinematics
-from runtime.sim import bench
+from runtime.kinematics.compiled import CompiledKinematics
 from runtime.sim.bench import Bench
+from runtime.sim.limbs import limbs
 from runtime.types import Float64
 
 if TYPE_CHECKING:
@@ -26,24 +28,93 @@ TILTS = ((0.0, 0.26), (0.26, 0.26), (0.4, 0.4))  # rad outwards from straight do
 _GRASP = 0.45  # of the block's edge: the height of the fingertips that grasp it
 _DROP = 0.003  # m between block and plate when the jaws open
 _MARGIN = 0.05  # of the jaws' whole way, at both ends
-_AHEAD = 0.3  # m from an arm's base to the place over which searches begin
-_TRIES = 200
+_AHEAD = (
+    0.3  # m from an arm's shoulder to the place over which searches begin, away from the table's near side
+)
+_ASIDE = 0.05  # m beyond the area, where they may begin too
+_TRIES = 60  # postures that a search begins from
+_ENOUGH = 0.8  # of the places that an arm is asked for, with which a search is content
 _STATIONS = 4
 _ACROSS = math.pi / 2
+_STRIDE, _SWING = 0.04, 0.25  # m and rad between two points of the way from place to place
 
 Place = tuple[float, float]
 Tilts = tuple[float, float]
 
 
+@dataclass(frozen=True, slots=True)
+class Down:
+    """Fingertips over a place at a height [m], pointing down, `tilt` [rad] outwards along `bearing` from the arm.
+
+    The jaws open along `yaw`.
+    """
+
+    place: Place
+    height: float
+    yaw: float
+    bearing: float
+    tilt: float
+
+    def tip(self) -> Float64:
+        """Their frame [4, 4] in the world."""
+        sine, cosine = math.sin(self.tilt), math.cos(self.tilt)
+        ahead = np.array([sine * math.cos(self.bearing), sine * math.sin(self.bearing), -cosine])
+        across = np.array([math.cos(self.yaw), math.sin(self.yaw), 0.0])
+        across -= ahead * (across @ ahead)
+        across /= np.linalg.norm(across)
+        tip = np.eye(4)
+        tip[:3, :3] = np.column_stack([np.cross(across, ahead), across, ahead])
+        tip[:3, 3] = *self.place, self.height
+        return tip
+
+    def towards(self, other: Down) -> Iterator[Down]:
+        """The points on the way to another one, without either end."""
+        numbers = np.array([*self.place, self.height, self.yaw, self.bearing, self.tilt])
+        way = np.array([*other.place, other.height, other.yaw, other.bearing, other.tilt]) - numbers
+        way[3:5] = [math.remainder(turn, 2 * math.pi) for turn in way[3:5]]
+        count = max(
+            math.ceil(float(np.linalg.norm(way[:3])) / _STRIDE),
+            math.ceil(float(np.abs(way[3:]).max()) / _SWING),
+        )
+        for step in range(1, count):
+            x, y, *rest = (numbers + way * step / count).tolist()
+            yield Down((x, y), *rest)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Nominal:
+    """A posture of an arm's `joints` [n] with its fingertips `down`; the jaws open `across` its bearing there."""
+
+    joints: Float64
+    down: Down
+    across: float
+
+
 class Postures:
-    """Those of one robot at one bench; SetupError where an arm of it cannot pick things up."""
+    """Those of one robot at one bench; SetupError where no arm of it can pick things up.
+
+    `arms` are those that can.
+    """
 
     def __init__(self, robot: Robot, table: Bench) -> None:
         self._robot = robot
         self._table = table
-        self._kinematics = NumericKinematics(robot)
+        self._kinematics = CompiledKinematics(robot)
         self._rest = robot.poses.get("ready", robot.poses["home"])
-        self._nominal = {arm.name: self._search(arm) for arm in robot.arms}
+        self._limbs = limbs(robot)
+        self._shoulders = {name: limb.shoulder(self._rest)[:2, 3] for name, limb in self._limbs.items()}
+        self._nominal: dict[str, Nominal] = {}
+        faults = [fault for arm in robot.arms if (fault := self._learn(arm))]
+        if not self._nominal:
+            raise SetupError(f"{robot.name} cannot pick things up: {'; '.join(faults) or 'it has no arm'}")
+
+    @property
+    def arms(self) -> tuple[Group, ...]:
+        return tuple(arm for arm in self._robot.arms if arm.name in self._nominal)
+
+    def distance(self, arm: Group, place: Sequence[float]) -> float:
+        """From an arm's shoulder to a place, over the table [m]."""
+        return math.dist(self._shoulders[arm.name], place[:2])
 
     def hover(self, arm: Group, q: Float64, place: Place, height: float) -> Float64 | None:
         """Joints [D] with an arm's fingertips over a place at a height, its jaws open; None where it cannot reach."""
@@ -60,26 +131,35 @@ class Postures:
         short: float,
         tilts: Tilts,
     ) -> tuple[Float64 | None, Float64 | None]:
-        """Joints [stations, D] from above to below the block, and the same over the plate."""
-        base = arm.mount[:2]
+        """Joints [stations, D] from above to below the block, and the same over the plate.
+
+        The jaws take those sides of the block that they are turned to most, else the other two.
+        """
+        base = self._shoulders[arm.name]
         reach = math.dist(base, block[:2])
         x, y = base + (np.array(block[:2]) - base) * (1 - short / reach)
         bearing = self._bearing(arm, (x, y))
         twist = math.remainder(block[2] - bearing, math.pi / 2)  # of the jaws, from across the arm
         low = _GRASP * self._table.block_edge
         put = self._table.plate_height + low + _DROP
-        down = self._down(arm, q, (x, y), twist, (low, CLEAR), tilts)
-        return down, down if down is None else self._down(arm, q, plate, twist, (put, CLEAR), tilts)
+        first: tuple[Float64 | None, Float64 | None] = None, None
+        for turned in (twist, twist - math.copysign(math.pi / 2, twist)):
+            down = self._down(arm, q, (x, y), turned, (low, CLEAR), tilts)
+            over = None if down is None else self._down(arm, q, plate, turned, (put, CLEAR), tilts)
+            if over is not None:
+                return down, over
+            first = first if first[0] is not None else (down, over)
+        return first
 
     def risen(self, arm: Group, q: Float64) -> Float64:
         """Joints [D] with the fingertips straight up from where they are; q where they are high or cannot."""
-        tip = bench.tip_in_world(arm, q)
+        tip = self.tip(arm, q)
         if tip[2, 3] >= CLEAR:
             return q
         place = float(tip[0, 3]), float(tip[1, 3])
         yaw, bearing = math.atan2(tip[1, 1], tip[0, 1]), self._bearing(arm, place)
         for _, tilt in TILTS:
-            found = self._solved(arm, [_tip(place, CLEAR, yaw, bearing, tilt)], q)
+            found = self._solved(arm, [Down(place, CLEAR, yaw, bearing, tilt)], q)
             if found is not None:
                 return np.asarray(found[0])
         return q
@@ -90,63 +170,137 @@ class Postures:
         rest[arm.slice] = self._rest[arm.slice]
         return opened(arm, rest)
 
+    def tip(self, arm: Group, q: Float64) -> Float64:
+        """An arm's fingertips in the world, [4, 4], at joints q [D]."""
+        return self._limbs[arm.name].tip(q)
+
     def _down(
         self, arm: Group, q: Float64, place: Place, twist: float, heights: tuple[float, float], tilts: Tilts
     ) -> Float64 | None:
         """Joints [stations, D] of an arm with open jaws, the others as in q [D]; None where it cannot reach."""
         bearing = self._bearing(arm, place)
-        seed, across = self._nominal[arm.name]
-        start = opened(arm, q)
-        start[arm.joint_dims] = seed
-        start[arm.joint_dims[0]] += bearing - self._bearing(arm, self._ahead(arm))
-        start = np.clip(start, self._robot.lower, self._robot.upper)
-        yaw = bearing + across + twist
+        yaw = bearing + self._nominal[arm.name].across + twist
         way = np.linspace((heights[1], tilts[1]), (heights[0], tilts[0]), _STATIONS)
-        tips = [_tip(place, height, yaw, bearing, tilt) for height, tilt in way]
-        return self._solved(arm, tips, start)
+        stations = [Down(place, height, yaw, bearing, tilt) for height, tilt in way.tolist()]
+        return self._descent(arm, q, self._nominal[arm.name], stations)
 
-    def _solved(self, arm: Group, tips: Sequence[Float64], seed: Float64) -> Float64 | None:
-        """Joints [T, D] for the fingertips' transforms in the world; None where one of them is not reached."""
+    def _descent(self, arm: Group, q: Float64, nominal: Nominal, stations: Sequence[Down]) -> Float64 | None:
+        """Joints [stations, D]: from the nominal posture turned about an upright shoulder, else led there."""
+        start = opened(arm, q)
+        start[arm.joint_dims] = nominal.joints
+        if upright := self._limbs[arm.name].upright:
+            turned = start.copy()
+            turned[arm.joint_dims[0]] += upright * (stations[0].bearing - nominal.down.bearing)
+            found = self._solved(arm, stations, np.clip(turned, self._robot.lower, self._robot.upper))
+            if found is not None:
+                return found
+        return self._solved(arm, stations, start, list(nominal.down.towards(stations[0])))
+
+    def _solved(
+        self, arm: Group, stations: Sequence[Down], seed: Float64, before: Sequence[Down] = ()
+    ) -> Float64 | None:
+        """Joints [T, D] for the stations, by way of what comes `before`; None where one of them is not reached."""
         index = self._robot.arms.index(arm)
-        assert arm.tip is not None
-        eef = np.linalg.inv(bench.mount_of(arm)) @ np.stack(tips) @ np.linalg.inv(arm.tip)
+        frame = self._limbs[arm.name].frame(seed)
+        tip = np.eye(4) if arm.tip is None else arm.tip
+        eef = (
+            np.linalg.inv(frame)
+            @ np.stack([down.tip() for down in (*before, *stations)])
+            @ np.linalg.inv(tip)
+        )
         targets = np.repeat(self._kinematics.forward(seed)[None], len(eef), axis=0)
         targets[:, index, :3] = eef[:, :3, 3]
         targets[:, index, 3:] = quaternion_of_matrix(eef[:, :3, :3])
         result = self._kinematics.solve(targets, seed)
-        return result.q if result.reached[:, index].all() else None
+        return result.q[len(before) :] if result.reached[len(before) :, index].all() else None
 
-    def _search(self, arm: Group) -> tuple[Float64, float]:
-        """The arm's joints with its fingertips down ahead of it, and the jaws' turn from its bearing there.
+    def _learn(self, arm: Group) -> str:
+        """Find an arm's nominal posture; returns why it has none, "" where it has."""
+        if arm.tip is None or arm.gripper is None or arm.gripper.apart is None:
+            return f"{arm.name} needs fingertips and a gripper that says how far it opens (apart)"
+        wanted = self._wanted(arm)
+        best, reached = None, 0
+        for nominal in self._found(arm):
+            count = sum(self._reaches(arm, nominal, place) for place in wanted)
+            if best is None or count > reached:
+                best, reached = nominal, count
+            if reached >= _ENOUGH * len(wanted):
+                break
+        if best is None:
+            return f"{arm.name} cannot hold its fingertips down {CLEAR} m above the table"
+        self._nominal[arm.name] = best
+        return ""
 
-        From the rest posture, then from random ones; SetupError where the arm cannot do it or has no jaws.
-        """
-        if arm.tip is None or jaws(arm).unit != "m":
-            raise SetupError(f"{arm.name} cannot pick things up: it needs fingertips and a gripper in m")
+    def _found(self, arm: Group) -> Iterator[Nominal]:
+        """Postures with the fingertips down: from the rest posture, then from more and more random ones."""
         chance = np.random.default_rng(0)
-        place, seed = self._ahead(arm), self._rest
-        bearing = self._bearing(arm, place)
-        for _ in range(_TRIES):
-            for across in (_ACROSS, -_ACROSS):
-                tip = _tip(place, CLEAR, bearing + across, bearing, TILTS[0][1])
-                found = self._solved(arm, [tip], seed)
-                if found is not None:
-                    return found[0, arm.joint_dims], across
-            seed = chance.uniform(self._robot.lower, self._robot.upper)
-        raise SetupError(f"{arm.name} cannot hold its fingertips down {_AHEAD} m ahead of it")
+        seed = self._rest
+        low, high = np.maximum(self._robot.lower, -math.pi), np.minimum(self._robot.upper, math.pi)
+        for number in range(_TRIES):
+            for place in self._ahead(arm):
+                bearing = self._bearing(arm, place)
+                for across in (_ACROSS, -_ACROSS):
+                    down = Down(place, CLEAR, bearing + across, bearing, TILTS[0][1])
+                    found = self._solved(arm, [down], seed)
+                    if found is not None:
+                        yield Nominal(found[0, arm.joint_dims], down, across)
+            share = min(1.0, 2 * (number + 1) / _TRIES)
+            seed = np.clip(
+                (1 - share) * self._rest + share * chance.uniform(low, high),
+                self._robot.lower,
+                self._robot.upper,
+            )
 
-    def _ahead(self, arm: Group) -> Place:
-        x, y = (bench.mount_of(arm) @ [_AHEAD, 0.0, 0.0, 1.0])[:2]
-        return float(x), float(y)
+    def _reaches(self, arm: Group, nominal: Nominal, place: Place) -> bool:
+        """Whether the fingertips go straight down on a place of the table."""
+        bearing = self._bearing(arm, place)
+        low = _GRASP * self._table.block_edge
+        above = Down(place, CLEAR, bearing + nominal.across, bearing, TILTS[0][1])
+        below = replace(above, height=low, tilt=TILTS[0][0])
+        return self._descent(arm, self._rest, nominal, [above, below]) is not None
+
+    def _wanted(self, arm: Group) -> list[Place]:
+        """Places of the area that are this arm's: nearer to it than to any other."""
+        x_from, x_to, y_from, y_to = self._table.area
+        places = [
+            (float(x), float(y)) for x in np.linspace(x_from, x_to, 5) for y in np.linspace(y_from, y_to, 3)
+        ]
+        return [
+            place
+            for place in places
+            if self.distance(arm, place)
+            <= min(self.distance(other, place) for other in self._robot.arms) + 1e-6
+        ]
+
+    def _ahead(self, arm: Group) -> list[Place]:
+        """Where searches begin: straight ahead of the shoulder, and in the middle of the area."""
+        x_from, x_to, y_from, y_to = self._table.area
+        x, y = self._shoulders[arm.name]
+        ahead = (
+            float(np.clip(x, x_from - _ASIDE, x_to + _ASIDE)),
+            float(np.clip(y + _AHEAD, y_from, y_to)),
+        )
+        return [ahead, ((x_from + x_to) / 2, (y_from + y_to) / 2)]
 
     def _bearing(self, arm: Group, place: Place) -> float:
-        return math.atan2(place[1] - arm.mount[1], place[0] - arm.mount[0])
+        x, y = self._shoulders[arm.name]
+        return math.atan2(place[1] - y, place[0] - x)
 
 
 def jaws(arm: Group) -> Gripper:
     """The gripper of an arm."""
-    assert arm.gripper is not None  # an arm is a group with a gripper
+    assert arm.gripper is not None  # an arm without one picks nothing up
     return arm.gripper
+
+
+def opened(arm: Group, q: Float64) -> Float64:
+    """Joints [..., D] with an arm's jaws open: nearly as far as they go, because safety slows them at their limits."""
+    return q.copy() if arm.gripper is None else _with_jaws(arm, q, jaws(arm).open, jaws(arm).close)
+
+
+def closed(arm: Group, q: Float64) -> Float64:
+    """Joints [..., D] with an arm's jaws closed, likewise."""
+    return q.copy() if arm.gripper is None else _with_jaws(arm, q, jaws(arm).close, jaws(arm).open)
 
 
 def gripper_dim(arm: Group) -> int:
@@ -155,30 +309,7 @@ def gripper_dim(arm: Group) -> int:
     return arm.gripper_dim
 
 
-def opened(arm: Group, q: Float64) -> Float64:
-    """Joints [..., D] with an arm's jaws open: nearly as far as they go, because safety slows them at their limits."""
-    return _with_jaws(arm, q, jaws(arm).open + _MARGIN * (jaws(arm).close - jaws(arm).open))
-
-
-def closed(arm: Group, q: Float64) -> Float64:
-    """Joints [..., D] with an arm's jaws closed, likewise."""
-    return _with_jaws(arm, q, jaws(arm).close + _MARGIN * (jaws(arm).open - jaws(arm).close))
-
-
-def _with_jaws(arm: Group, q: Float64, opening: float) -> Float64:
+def _with_jaws(arm: Group, q: Float64, here: float, there: float) -> Float64:
     changed = q.copy()
-    changed[..., gripper_dim(arm)] = opening
+    changed[..., gripper_dim(arm)] = here + _MARGIN * (there - here)
     return changed
-
-
-def _tip(place: Place, height: float, yaw: float, bearing: float, tilt: float) -> Float64:
-    """Fingertips [4, 4] over a place: pointing down, `tilt` outwards, the jaws opening along `yaw`."""
-    sine, cosine = math.sin(tilt), math.cos(tilt)
-    ahead = np.array([sine * math.cos(bearing), sine * math.sin(bearing), -cosine])
-    across = np.array([math.cos(yaw), math.sin(yaw), 0.0])
-    across -= ahead * (across @ ahead)
-    across /= np.linalg.norm(across)
-    tip = np.eye(4)
-    tip[:3, :3] = np.column_stack([np.cross(across, ahead), across, ahead])
-    tip[:3, 3] = *place, height
-    return tip

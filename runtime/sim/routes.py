@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from runtime.sim import bench
 from runtime.sim.bench import Bench
-from runtime.sim.postures import CLEAR, TILTS, Place, Postures, closed, gripper_dim, opened
+from runtime.sim.hands import Opening
+from runtime.sim.postures import CLEAR, TILTS, Place, Postures, closed, gripper_dim, jaws, opened
 from runtime.types import Float64
 
 if TYPE_CHECKING:
@@ -83,14 +83,14 @@ class Planner:
         self._rate = rate
         self._postures = Postures(robot, table)
         self._speed = np.minimum(0.5 * robot.velocity, _SPEED)
-        for arm in robot.arms:
-            self._speed[gripper_dim(arm)] = _JAW_SPEED
+        for arm in self._postures.arms:
+            self._speed[gripper_dim(arm)] = min(0.5 * robot.velocity[gripper_dim(arm)], _jaw_speed(arm))
 
     def pick_and_place(
         self, q: Float64, block: tuple[float, float, float], plate: Place, slip: Slip
     ) -> Route | None:
         """The route from joints q [D], by the arm nearest the block that reaches all of it; None if none does."""
-        for arm in sorted(self._robot.arms, key=lambda arm: math.dist(arm.mount[:2], block[:2])):
+        for arm in sorted(self._postures.arms, key=lambda arm: self._postures.distance(arm, block)):
             for tilts in TILTS:
                 down, over = self._postures.stations(arm, q, block, plate, slip.short, tilts)
                 if down is not None and over is not None:
@@ -108,7 +108,7 @@ class Planner:
         """From the stations above to below the block, `down`, and the plate, `over`, [stations, D], jaws open."""
         held, lowered = (closed(arm, way) for way in (down, over))
         legs = []
-        if bench.tip_in_world(arm, q)[2, 3] < 0.75 * CLEAR:
+        if self._postures.tip(arm, q)[2, 3] < 0.75 * CLEAR:
             legs.append(self._leg("rise", q, self._postures.risen(arm, q)))
             q = legs[-1].end
         legs += [self._leg("reach", q, down[0]), self._vertical_leg("descend", down)]
@@ -152,3 +152,9 @@ class Planner:
         s = u**3 * (10 - 15 * u + 6 * u * u)
         rows = np.vander(s, len(stations), increasing=True) @ powers
         return np.asarray(np.clip(rows, self._robot.lower, self._robot.upper))
+
+
+def _jaw_speed(arm: Group) -> float:
+    """In the gripper's own unit per second."""
+    opening = Opening(jaws(arm))
+    return abs(opening.number(_JAW_SPEED) - opening.number(0.0))

@@ -54,7 +54,7 @@ class Tabletop:
     def __init__(self, robot: Robot, seed: int, blocks: int = 1, bench: Bench | None = None) -> None:
         self.bench = bench or Bench()
         self._count = blocks
-        self._jaws = [Jaws(arm) for arm in robot.arms]
+        self._jaws = [Jaws(robot, arm) for arm in robot.arms if arm.gripper is not None]
         self._hands: dict[str, Hand] = {}
         self._blocks: list[Block] = []
         self._plate = np.zeros(2)

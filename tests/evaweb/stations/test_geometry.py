@@ -40,7 +40,7 @@ def test_the_tips_are_where_the_bench_has_them():
     assert len(tips) == len(looks.robot.arms)
     for tip, arm in zip(tips, looks.robot.arms, strict=True):
         pose = parts[tip["part"]] @ np.reshape(tip["pose"], (4, 4)).T
-        assert np.allclose(pose, tip_in_world(arm, q), atol=1e-6)
+        assert np.allclose(pose, tip_in_world(looks.robot, arm, q), atol=1e-6)
 
 
 def test_the_bench_that_is_drawn_is_the_one_that_is_simulated():

@@ -10,14 +10,15 @@ import numpy as np
 import robots
 from robots import Group
 from robots.rotations import quaternion_of_matrix
-from runtime.kinematics.numeric import NumericKinematics
-from runtime.sim.bench import mount_of, tip_in_world
+from runtime.kinematics.compiled import CompiledKinematics
+from runtime.sim.bench import tip_in_world
+from runtime.sim.limbs import limbs
 from runtime.sim.plant import Plant
 from runtime.sim.tabletop import Reset, Tabletop
 from runtime.types import Float64
 
 ROBOT = robots.load("agilex_piper")
-KINEMATICS = NumericKinematics(ROBOT)
+KINEMATICS = CompiledKinematics(ROBOT)
 LEFT, RIGHT = ROBOT.arms
 READY = ROBOT.poses["ready"]
 RATE = 30
@@ -75,14 +76,14 @@ class Operator:
         x, y, _, yaw = self.block
         yaw += turn
         self.goes(x, y, 0.09, yaw, max(tilt, 0.1))
-        x, y = (x, y) + aside * tip_in_world(self.arm, self.plant.q)[:2, 0]
+        x, y = (x, y) + aside * tip_in_world(ROBOT, self.arm, self.plant.q)[:2, 0]
         self.goes(x, y, 0.09, yaw, max(tilt, 0.1))
         self.goes(x, y, height, yaw, tilt)
         self.jaws_go(SHUT)
 
     def lifts(self) -> None:
         """Straight up, as the hand is."""
-        raised = tip_in_world(self.arm, self.plant.q)
+        raised = tip_in_world(ROBOT, self.arm, self.plant.q)
         raised[2, 3] = 0.07
         target = self._solved(raised, self.plant.q)
         target[self.gripper] = self.plant.target[self.gripper]
@@ -104,14 +105,14 @@ class Operator:
         dims = self.arm.joint_dims
         away = goal[:2, 3] - self.arm.mount[:2]
         start[dims] = [math.atan2(-away[0], away[1]), 1.6, -1.0, 0.0, 1.0, 0.0]
-        there = tip_in_world(self.arm, self.plant.q)[:2, 1]
+        there = tip_in_world(ROBOT, self.arm, self.plant.q)[:2, 1]
         best = max(ways, key=lambda way: float(way[:2, 1] @ there))
         return self._solved(best, start)
 
     def _solved(self, goal: Float64, start: Float64) -> Float64:
         assert self.arm.tip is not None
         index = ROBOT.arms.index(self.arm)
-        eef = np.linalg.inv(mount_of(self.arm)) @ goal @ np.linalg.inv(self.arm.tip)
+        eef = np.linalg.inv(limbs(ROBOT)[self.arm.name].frame(start)) @ goal @ np.linalg.inv(self.arm.tip)
         targets = KINEMATICS.forward(start)[None]
         targets[0, index] = [*eef[:3, 3], *quaternion_of_matrix(eef[:3, :3])]
         solved = KINEMATICS.solve(targets, start)

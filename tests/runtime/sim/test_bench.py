@@ -9,8 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import robots
+from runtime.errors import SetupError
 from runtime.sim import bench
 from runtime.sim.bench import Bench, BenchError
+from runtime.sim.limbs import Limb
 
 ROBOT = robots.load("agilex_piper")
 READY = ROBOT.poses["ready"]
@@ -37,7 +39,7 @@ def test_the_overhead_picture_shows_the_area_with_a_margin_and_far_is_up() -> No
 
 
 def test_a_pixel_above_the_horizon_shows_no_place_and_what_is_behind_no_pixel() -> None:
-    camera = bench.wrist_camera(bench.tip_in_world(LEFT, ROBOT.poses["home"]), 640, 480)
+    camera = bench.wrist_camera(bench.tip_in_world(ROBOT, LEFT, ROBOT.poses["home"]), 640, 480)
     with pytest.raises(BenchError, match="shows nothing"):
         camera.pixel_to_table(320, -4000)
     behind = camera.pose[:3, 3] - camera.pose[:3, 2]
@@ -56,7 +58,7 @@ def test_cameras_are_where_their_names_say() -> None:
 
 @pytest.mark.parametrize("arm", ROBOT.arms, ids=["left", "right"])
 def test_a_wrist_camera_sees_its_own_fingertips_in_the_middle_with_the_arm_behind(arm: robots.Group) -> None:
-    tip = bench.tip_in_world(arm, READY)
+    tip = bench.tip_in_world(ROBOT, arm, READY)
     camera = bench.wrist_camera(tip, 640, 480)
     u, v = camera.project(tip[:3, 3])
     assert u == pytest.approx(319.5, abs=1)
@@ -70,7 +72,7 @@ def test_in_pose_ready_fingers_point_down_open_and_leave_the_area_in_view() -> N
     camera = bench.overhead_camera(640, 480)
     left_edge = camera.project(np.array([X_FROM, 0.3, 0.0]))[0]
     for arm in ROBOT.arms:
-        tip = bench.tip_in_world(arm, READY)
+        tip = bench.tip_in_world(ROBOT, arm, READY)
         assert math.degrees(math.acos(-tip[2, 2])) < 16
         assert 0.1 < tip[2, 3] < 0.2
         assert READY[arm.gripper_dim] == arm.gripper.open
@@ -93,5 +95,25 @@ def test_poses_on_the_table_and_their_yaw_agree() -> None:
 
 def test_a_group_that_is_no_arm_has_no_tip() -> None:
     base = dataclasses.replace(LEFT, chain=None)
-    with pytest.raises(BenchError, match="allowed: an arm"):
-        bench.tip_in_world(base, READY)
+    with pytest.raises(SetupError, match="group left_arm has no end effector; allowed: an arm"):
+        Limb(ROBOT, base)
+
+
+@pytest.mark.parametrize(
+    ("names", "arms", "carried"),
+    [
+        (("front", "left_wrist", "right_wrist"), ("left_arm", "right_arm"), (None, "left_arm", "right_arm")),
+        (("head", "right_hand"), ("left_arm", "right_arm"), (None, "right_arm")),
+        (("wrist_image", "exterior_image"), ("left_arm",), ("left_arm", None)),
+        (("wrist_image",), ("left_arm", "right_arm"), (None,)),
+    ],
+)
+def test_cameras_of_any_name_are_on_the_arm_that_they_are_called_after_or_look_from_above(
+    names: tuple[str, ...], arms: tuple[str, ...], carried: tuple[str | None, ...]
+) -> None:
+    groups = tuple(arm for arm in ROBOT.arms if arm.name in arms)
+    robot = dataclasses.replace(
+        ROBOT, groups=groups, cameras=tuple(robots.Camera(name, name) for name in names)
+    )
+    found = [bench.camera_arm(robot, camera) for camera in robot.cameras]
+    assert tuple(None if arm is None else arm.name for arm in found) == carried

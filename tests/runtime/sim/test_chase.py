@@ -44,7 +44,7 @@ def beside(x: float) -> Float64:
 def ridden(rows: Float64) -> Float64:
     """Where along the belt the fingertips nearest to it are in each row [m]."""
     dx, dy, height = BELT.beside
-    tips = np.array([[tip_in_world(arm, row)[:3, 3] for arm in ROBOT.arms] for row in rows])
+    tips = np.array([[tip_in_world(ROBOT, arm, row)[:3, 3] for arm in ROBOT.arms] for row in rows])
     nearest = np.abs(tips[..., 1:] - (BELT.y + dy, height)).sum(axis=-1).argmin(axis=-1)
     return tips[np.arange(len(rows)), nearest, 0] - dx
 
@@ -55,7 +55,9 @@ def test_the_map_puts_fingertips_beside_the_block() -> None:
         chance.uniform(*BELT.x, 40), chance.uniform(BELT.y - 0.03, BELT.y + 0.03, 40), strict=True
     ):
         q = PLACES.joints(np.array([x]), np.array([y]))[0]
-        away = [np.linalg.norm(tip_in_world(arm, q)[:3, 3] - (x, y, 0) - BELT.beside) for arm in ROBOT.arms]
+        away = [
+            np.linalg.norm(tip_in_world(ROBOT, arm, q)[:3, 3] - (x, y, 0) - BELT.beside) for arm in ROBOT.arms
+        ]
         assert min(away) < 1e-3
 
 

@@ -21,7 +21,7 @@ BLOCK, PLATE = (-0.1, 0.26, 0.4), (-0.05, 0.38)
 def test_fingertips_hover_where_they_are_asked_to_with_open_jaws():
     q = POSTURES.hover(LEFT, HOME, PLATE, 0.05)
     assert q is not None
-    tip = tip_in_world(LEFT, q)
+    tip = tip_in_world(ROBOT, LEFT, q)
     np.testing.assert_allclose(tip[:3, 3], [*PLATE, 0.05], atol=1e-3)
     assert -tip[2, 2] == pytest.approx(math.cos(TILTS[0][1]), abs=0.01)
     assert q[gripper_dim(LEFT)] == pytest.approx(0.95 * jaws(LEFT).open + 0.05 * jaws(LEFT).close)
@@ -39,7 +39,7 @@ def test_what_is_out_of_reach_has_no_posture():
 def test_the_stations_go_straight_down_on_block_and_plate():
     down, over = POSTURES.stations(LEFT, READY, BLOCK, PLATE, 0.0, TILTS[0])
     for way, place in ((down, BLOCK[:2]), (over, PLATE)):
-        tips = np.stack([tip_in_world(LEFT, q)[:3, 3] for q in way])
+        tips = np.stack([tip_in_world(ROBOT, LEFT, q)[:3, 3] for q in way])
         np.testing.assert_allclose(tips[:, :2], np.broadcast_to(place, (4, 2)), atol=2e-3)
         assert tips[0, 2] == pytest.approx(CLEAR, abs=2e-3)
         assert np.all(np.diff(tips[:, 2]) < 0)
@@ -48,7 +48,7 @@ def test_the_stations_go_straight_down_on_block_and_plate():
 def test_an_arm_that_is_low_rises_where_it_is_and_one_that_is_high_stays():
     low = POSTURES.hover(LEFT, HOME, PLATE, 0.02)
     risen = POSTURES.risen(LEFT, low)
-    np.testing.assert_allclose(tip_in_world(LEFT, risen)[:3, 3], [*PLATE, CLEAR], atol=2e-3)
+    np.testing.assert_allclose(tip_in_world(ROBOT, LEFT, risen)[:3, 3], [*PLATE, CLEAR], atol=2e-3)
     np.testing.assert_array_equal(POSTURES.risen(LEFT, READY), READY)
 
 
@@ -68,7 +68,16 @@ def test_jaws_open_and_close_nearly_as_far_as_they_go():
     np.testing.assert_array_equal(opened(LEFT, rows)[:, others], rows[:, others])
 
 
-def test_a_gripper_whose_number_is_no_length_cannot_pick():
-    arm = replace(LEFT, gripper=replace(jaws(LEFT), unit="percent"))
-    with pytest.raises(SetupError, match="left_arm cannot pick things up"):
-        Postures(replace(ROBOT, groups=(arm, RIGHT)), Bench())
+def test_an_arm_that_does_not_say_how_far_it_opens_cannot_pick_and_leaves_it_to_the_other():
+    one = replace(ROBOT, groups=(mute(LEFT), RIGHT))
+    assert [arm.name for arm in Postures(one, Bench()).arms] == ["right_arm"]
+    neither = replace(ROBOT, groups=tuple(mute(one) for one in ROBOT.groups))
+    with pytest.raises(
+        SetupError, match=r"agilex_piper cannot pick things up: left_arm needs .*\(apart\); right_arm"
+    ):
+        Postures(neither, Bench())
+
+
+def mute(arm):
+    """The arm, with a gripper that does not say how far it opens."""
+    return replace(arm, gripper=replace(jaws(arm), unit="percent", apart=None))

@@ -34,7 +34,7 @@ def leg(route, name):
 
 
 def tips(route, rows):
-    return np.stack([bench.tip_in_world(route.arm, row) for row in rows])
+    return np.stack([bench.tip_in_world(ROBOT, route.arm, row) for row in rows])
 
 
 def test_the_legs_follow_each_other_without_a_jump_of_the_arm():
@@ -87,7 +87,7 @@ def test_it_comes_straight_down_on_the_block_with_the_jaws_along_its_sides(yaw):
 
 def test_it_lets_go_just_above_the_middle_of_the_plate():
     route = planned()
-    tip = bench.tip_in_world(LEFT, leg(route, "lower").end)
+    tip = bench.tip_in_world(ROBOT, LEFT, leg(route, "lower").end)
     np.testing.assert_allclose(tip[:2, 3], PLATE, atol=0.002)
     assert tip[2, 3] == pytest.approx(0.012 + 0.018 + 0.003, abs=0.002)
 
@@ -119,7 +119,7 @@ def test_the_other_arm_takes_what_the_nearer_one_cannot_bring_home():
 
 
 def test_a_grasp_can_be_short_of_the_block():
-    tip = bench.tip_in_world(LEFT, leg(planned(slip=Slip(short=0.05)), "descend").end)
+    tip = bench.tip_in_world(ROBOT, LEFT, leg(planned(slip=Slip(short=0.05)), "descend").end)
     assert math.dist(tip[:2, 3], BLOCK[:2]) == pytest.approx(0.05, abs=0.002)
     assert math.dist(tip[:2, 3], LEFT.mount[:2]) < math.dist(BLOCK[:2], LEFT.mount[:2])
 
@@ -127,7 +127,7 @@ def test_a_grasp_can_be_short_of_the_block():
 def test_the_block_can_be_let_go_of_on_the_way():
     route = planned(slip=Slip(lets_go=True))
     assert [leg.name for leg in route.legs[-3:]] == ["carry", "open", "retreat"]
-    assert math.dist(bench.tip_in_world(LEFT, leg(route, "carry").end)[:2, 3], PLATE) > 0.03
+    assert math.dist(bench.tip_in_world(ROBOT, LEFT, leg(route, "carry").end)[:2, 3], PLATE) > 0.03
 
 
 def test_a_retreat_from_the_table_rises_first():
@@ -143,4 +143,4 @@ def test_a_route_from_the_table_rises_first():
     low = leg(planned(), "descend").end
     route = planned(q=low)
     assert route.legs[0].name == "rise"
-    assert bench.tip_in_world(LEFT, route.legs[0].end)[2, 3] == pytest.approx(CLEAR, abs=0.003)
+    assert bench.tip_in_world(ROBOT, LEFT, route.legs[0].end)[2, 3] == pytest.approx(CLEAR, abs=0.003)

@@ -7,6 +7,7 @@ import pytest
 import robots
 from runtime.sim import bench as benches
 from runtime.sim.bench import Bench, BenchState, BlockState
+from runtime.sim.limbs import limbs
 from runtime.sim.render import Renderer
 
 ROBOT = robots.load("agilex_piper")
@@ -23,7 +24,7 @@ def state(*blocks: tuple[float, float, float], plate: tuple[float, float] = (0.1
 
 
 def in_hand() -> BenchState:
-    return BenchState((BlockState(benches.tip_in_world(LEFT, DOWN), LEFT.name),), (0.1, 0.36))
+    return BenchState((BlockState(benches.tip_in_world(ROBOT, LEFT, DOWN), LEFT.name),), (0.1, 0.36))
 
 
 def orange(picture: np.ndarray) -> np.ndarray:
@@ -92,7 +93,7 @@ def test_no_picture_is_black_or_plain_wherever_the_arms_are() -> None:
 
 def test_a_held_block_is_between_the_fingers_in_the_picture_of_its_wrist_only() -> None:
     pictures = RENDERER.draw(DOWN, in_hand())
-    tip = benches.tip_in_world(LEFT, DOWN)
+    tip = benches.tip_in_world(ROBOT, LEFT, DOWN)
     camera = benches.cameras(ROBOT, DOWN, 640, 480)["cam_left_wrist"]
     seen = orange(pictures["cam_left_wrist"])
     assert np.linalg.norm(middle(seen) - camera.project(tip[:3, 3])) < 25
@@ -107,7 +108,7 @@ def test_a_held_block_is_between_the_fingers_in_the_picture_of_its_wrist_only() 
 
 def test_an_arm_hides_the_block_under_it_from_above() -> None:
     camera = benches.overhead_camera(640, 480)
-    column, row = camera.project(benches.eef_in_world(LEFT, DOWN)[:3, 3])
+    column, row = camera.project(limbs(ROBOT)[LEFT.name].eef(DOWN)[:3, 3])
     there = state((*camera.pixel_to_table(column, row, BENCH.block_edge), 0.0), plate=(0.2, 0.36))
     hidden = orange(RENDERER.draw(DOWN, there)["cam_high"]).sum()
     free = orange(RENDERER.draw(HOME, there)["cam_high"]).sum()

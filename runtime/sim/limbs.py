@@ -1,0 +1,98 @@
+"""Where a robot's arms are on the simulated bench: their frames, end effectors and fingertips in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robots import Body, Chain, urdf
+from robots.copies import copy_of
+from robots.rotations import transform_of
+from runtime.errors import SetupError
+from runtime.types import Float64
+
+if TYPE_CHECKING:
+    from robots import Group, Robot
+    from robots.urdf import Joint, Urdf
+
+
+_UPRIGHT = 0.999  # of a unit vector, along the vertical
+
+
+class Limb:
+    """One arm; everything is a transform [4, 4] in the world, the robot's scene, for the robot's joints q [D].
+
+    What no joint moves is computed once, so that an arm on a base that stands still costs its own chain alone.
+    `upright` is 1 where the arm's first joint turns it about the vertical, -1 where it does so the other way round,
+    else 0.
+    """
+
+    def __init__(self, robot: Robot, arm: Group) -> None:
+        if arm.chain is None or arm.frame is None:
+            raise SetupError(f"group {arm.name} has no end effector; allowed: an arm")
+        self.arm = arm
+        self._body = _body_of(robot)
+        first = urdf.read(robot.urdf).joint(arm.urdf_joints[0])
+        self._first = self._body.link_of(arm.name, first.child)
+        self._below, self._dims = _way_to_frame(robot, arm)
+        root = transform_of(robot.stand) @ transform_of(copy_of(arm, robot.groups)[0].mount)
+        still = self._body.poses(robot.poses["home"])[self._body.link_of(arm.name, arm.frame)]
+        self._base: Float64 = still if self._below is None else root
+        axis = self.shoulder(robot.poses["home"])[:3, :3] @ first.axis
+        self.upright = round(float(axis[2])) if abs(axis[2]) > _UPRIGHT else 0
+
+    def frame(self, q: Float64) -> Float64:
+        """The arm's declared frame."""
+        return self._base if self._below is None else self._base @ self._below.forward(q[self._dims])
+
+    def eef(self, q: Float64) -> Float64:
+        """The end-effector link."""
+        return np.asarray(self.frame(q) @ self.arm.transform(q))
+
+    def tip(self, q: Float64) -> Float64:
+        """The fingertips: z ahead, y the way they open; the end-effector link where there are no fingers."""
+        return self.eef(q) if self.arm.tip is None else np.asarray(self.eef(q) @ self.arm.tip)
+
+    def shoulder(self, q: Float64) -> Float64:
+        """The link behind the arm's first joint."""
+        return np.asarray(self._body.poses(q)[self._first])
+
+
+@lru_cache(maxsize=32)
+def limbs(robot: Robot) -> Mapping[str, Limb]:
+    """The robot's arms by name."""
+    return MappingProxyType({arm.name: Limb(robot, arm) for arm in robot.arms})
+
+
+@lru_cache(maxsize=32)
+def _body_of(robot: Robot) -> Body:
+    return Body(robot)
+
+
+def _way_to_frame(robot: Robot, arm: Group) -> tuple[Chain | None, list[int]]:
+    """The chain from the root to an arm's frame and the places of the joints that drive it; None where none does."""
+    tree, members = urdf.read(robot.urdf), copy_of(arm, robot.groups)
+    movers = {
+        name: int(dim)
+        for group in members
+        for name, dim in zip(group.urdf_joints, group.joint_dims, strict=True)
+    }
+    assert arm.frame is not None
+    leaders = [_leader(tree, joint) for joint in tree.between(tree.root, arm.frame) if joint.kind != "fixed"]
+    driven = [name for name in dict.fromkeys(leaders) if name in movers]
+    if not driven:
+        return None, []
+    known = {name: value for group in members if group.chain for name, value in group.chain.pinned.items()}
+    pinned = {name: known.get(name, 0.0) for name in leaders if name not in movers}
+    return Chain(tree, tree.root, arm.frame, driven, pinned), [movers[name] for name in driven]
+
+
+def _leader(tree: Urdf, joint: Joint) -> str:
+    """The joint that this one follows; itself, unless it is a mimic."""
+    while joint.mimic is not None:
+        joint = tree.joint(joint.mimic.joint)
+    return joint.name

@@ -1,0 +1,174 @@
+"""A station of any robot at its simulated tabletop in lockstep: node, bench and policy wire are the product's own.
+
+Only time is virtual. Of the cameras the overhead one alone is drawn, six times a second; the others show nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+import robots
+from robots import Robot
+from runtime import deployment, family
+from runtime.clock import Clock
+from runtime.family import Plan
+from runtime.lockstep import Lockstep
+from runtime.session import State
+from runtime.sim.bench import Bench, camera_arm
+from runtime.sim.link import Link
+from runtime.sim.node import Node, parser
+from runtime.sim.openpi_server import Behaviour, OpenpiServer
+from runtime.sim.pick_place import PickPlace, Skill
+from runtime.sim.plant import Plant
+from runtime.sim.render import Renderer
+from runtime.sim.surroundings import Surroundings
+from runtime.sim.tabletop import Reset, Tabletop
+from runtime.transports import zmq
+from runtime.transports.base import Capabilities
+from runtime.types import Float64, UInt8
+
+DEPLOYMENTS = Path(__file__).parents[3] / "deployments"
+HORIZON = 50
+_WIDTH, _HEIGHT = 640, 480
+_EVERY = 5  # ticks between two drawn pictures
+_SECONDS = 40.0
+_NOISE = 0.001  # m
+
+
+@cache
+def renderer(robot: str) -> Renderer:
+    """Draws the overhead camera's pictures."""
+    made = robots.load(robot)
+    above = tuple(camera for camera in made.cameras if camera_arm(made, camera) is None)
+    return Renderer(replace(made, cameras=above), Bench(), _WIDTH, _HEIGHT)
+
+
+class SlowEye(Surroundings):
+    """A tabletop whose overhead camera is slow."""
+
+    def __init__(self, robot: Robot, table: Tabletop) -> None:
+        self.table = table
+        self._robot = robot
+        self._dark = {camera.key: np.zeros((8, 8, 3), np.uint8) for camera in robot.cameras}
+        self._shown: dict[str, UInt8] = {}
+
+    def move(self, plant: Plant, seconds: float) -> None:
+        self.table.advance(plant, seconds)
+
+    def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
+        if not self._shown or frame % _EVERY == 0:
+            self._shown = renderer(self._robot.name).draw(q, self.table.state())
+        return {key: picture.copy() for key, picture in (self._dark | self._shown).items()}
+
+    def truth(self) -> dict[str, object]:
+        return self.table.truth()
+
+    def reset(self, wish: Reset) -> None:
+        self.table.reset(wish)
+
+
+@dataclass(frozen=True, slots=True)
+class TabletopPlan(Plan):
+    """A plan whose transport is the simulated node in this process."""
+
+    bench: SlowEye
+    links: dict[int, Link]  # by the clock of their station
+
+    @property
+    def transport(self) -> Any:
+        return SimpleNamespace(source=self._link, sink=self._link)
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return zmq.capabilities(zmq.Config(simulated=True))
+
+    def _link(self, config: object, robot: Robot, clock: Clock) -> Link:
+        if id(clock) not in self.links:
+            line = ["--robot", robot.name, "--bench", "tabletop"]
+            node = Node(robot, parser().parse_args(line), clock, self.bench)
+            self.links[id(clock)] = Link(node, robot, clock)
+        return self.links[id(clock)]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """How a trial ended: what the bench says of it, the station's state and reason, its events, virtual seconds."""
+
+    success: bool
+    milestones: dict[str, bool]
+    state: State
+    reason: str
+    events: list[dict[str, Any]]
+    seconds: float
+
+
+def planned(name: str, seed: int, data: Path, url: str, assignments: Sequence[str] = ()) -> TabletopPlan:
+    """The station of the deployment `name` with the bench laid out by `seed`; nothing is recorded."""
+    given = [
+        f'policy.url="{url}"', f'data_dir="{data}"', "recording.enabled=false", "lockstep.delay_ticks=3", *assignments
+    ]  # fmt: skip
+    made = family.plan(deployment.load(DEPLOYMENTS / f"{name}.toml", given))
+    bench = SlowEye(made.robot, Tabletop(made.robot, seed))
+    return TabletopPlan(made.resolved, made.robot, bench, {})
+
+
+@contextmanager
+def served(
+    name: str, seed: int, data: Path, assignments: Sequence[str] = ()
+) -> Iterator[tuple[TabletopPlan, Lockstep]]:
+    """A station that is not yet connected, and its policy served on loopback on the station's clock."""
+    made = planned(name, seed, data, "ws://127.0.0.1:1", assignments)
+    script = PickPlace(made.robot, HORIZON, made.rate, Skill(_NOISE, seed=seed), clock=_Later())
+    server = OpenpiServer(made.robot, Behaviour(HORIZON, made.rate), 0, script)
+    url = str(server.start()["url"])
+    with closing(server):
+        made = planned(name, seed, data, url, assignments)
+        with closing(Lockstep(made)) as station:
+            script.clock = station.clock
+            yield made, station
+
+
+class _Later(Clock):
+    """Stands in for the station's clock until there is a station."""
+
+    def now(self) -> float:
+        return 0.0
+
+    def sleep_until(self, deadline: float) -> None:
+        raise AssertionError(f"nobody waits until {deadline}")
+
+
+def pick_and_place(name: str, seed: int, data: Path, assignments: Sequence[str] = ()) -> Trial:
+    """Set up, run until the block lies on the plate or for so long."""
+    with served(name, seed, data, assignments) as (made, station):
+        session, table = station.main.session, made.bench.table
+        station.connect()
+        station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
+        station.command("setup")
+        station.until(lambda: session.state is not State.SETTING_UP, 60.0, "set-up")
+        assert session.state is State.READY, session.reason
+        station.command("run")
+        began = station.clock.now()
+
+        def over() -> bool:
+            late = station.clock.now() > began + _SECONDS
+            return late or bool(table.truth()["success"]) or session.state is not State.RUNNING
+
+        station.until(over, 2 * _SECONDS, "the trial")
+        truth = table.truth()
+        return Trial(
+            bool(truth["success"]),
+            dict(truth["milestones"]),
+            session.state,
+            session.reason,
+            station.main.events.since(0),
+            station.clock.now() - began,
+        )
