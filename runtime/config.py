@@ -208,7 +208,7 @@ class Deployment(Section):
     transport: TransportConfig
     policy: PolicyConfig
     kinematics: KinematicsConfig = Field(
-        default_factory=lambda: variants("runtime.kinematics")["numeric"].Config()
+        default_factory=lambda: variants("runtime.kinematics")["compiled"].Config()
     )
     strategy: StrategyConfig = Field(default_factory=lambda: variants("runtime.strategies")["async"].Config())
     control: ControlSettings = ControlSettings()

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from robots import load
 from runtime.errors import PolicyError, SetupError
-from runtime.kinematics.numeric import NumericKinematics
+from runtime.kinematics.compiled import CompiledKinematics
 from runtime.spaces import CommandRows, Spaces
 from runtime.types import ActionChunk, Observation
 
 ROBOT = load("agilex_piper")
-SPACES = Spaces(ROBOT, NumericKinematics(ROBOT), 30.0)
+SPACES = Spaces(ROBOT, CompiledKinematics(ROBOT), 30.0)
 START = np.array(
     [0.1, 1.2, -1.0, 0.3, 0.4, 0.2, 0.03, -0.2, 0.9, -0.8, 0.1, -0.4, 0.5, 0.08], dtype=np.float32
 )
@@ -129,12 +129,12 @@ def test_a_number_that_is_not_finite_is_named(space: str, column: int, name: str
 
 def test_a_rate_that_is_no_rate_is_refused() -> None:
     with pytest.raises(SetupError, match=r"control_rate = 0\.0 Hz; allowed: above zero"):
-        Spaces(ROBOT, NumericKinematics(ROBOT), 0.0)
+        Spaces(ROBOT, CompiledKinematics(ROBOT), 0.0)
 
 
 def test_eef_of_one_vector_is_pose_and_gripper_of_each_arm() -> None:
     vector = SPACES.eef_of(START)
-    poses = NumericKinematics(ROBOT).forward(START.astype(np.float64))
+    poses = CompiledKinematics(ROBOT).forward(START.astype(np.float64))
     assert vector.dtype == np.float32
     assert vector.shape == (16,)
     np.testing.assert_array_equal(vector.reshape(2, 8)[:, :7], poses.astype(np.float32))
@@ -287,7 +287,7 @@ ENDLESS = replace(ROBOT, lower=LOWER, upper=UPPER)
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.sampled_from([0.0, 0.1]), min_size=1, max_size=5), st.sampled_from(["joint", "eef"]))
 def test_binary_grippers_stay_binary_at_every_rate(values: list[float], space: str) -> None:
-    spaces = Spaces(SWITCHED, NumericKinematics(SWITCHED), 30.0)
+    spaces = Spaces(SWITCHED, CompiledKinematics(SWITCHED), 30.0)
     rows = path(len(values), 0.0)
     rows[:, 6] = values
     given_ = rows if space == "joint" else spaces.eef_of(rows)
@@ -297,7 +297,7 @@ def test_binary_grippers_stay_binary_at_every_rate(values: list[float], space: s
 
 @given(st.floats(-20, 20), st.integers(-3, 3), st.integers(1, 8))
 def test_a_joint_without_end_goes_on_from_where_it_was_seen(at: float, turns: int, count: int) -> None:
-    spaces = Spaces(ENDLESS, NumericKinematics(ENDLESS), 30.0)
+    spaces = Spaces(ENDLESS, CompiledKinematics(ENDLESS), 30.0)
     start = START.copy()
     start[ENDLESS_DIM] = at
     way = start[ENDLESS_DIM] + 0.3 * np.arange(count, dtype=np.float32)

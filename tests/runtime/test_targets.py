@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import robots
 from runtime.errors import RuntimeFault
-from runtime.kinematics import numeric
+from runtime.kinematics import compiled
 from runtime.requests import AimRequest, Jog, MoveRequest
 from runtime.safety import Limits, SafetySettings, WorkspaceBox
 from runtime.spaces import Spaces
@@ -23,7 +23,7 @@ from runtime.targets import Targets
 @cache
 def parts() -> tuple[Any, Any, Any]:
     robot = robots.load("agilex_piper")
-    kinematics = numeric.build(numeric.Config(), robot)
+    kinematics = compiled.build(compiled.Config(), robot)
     return robot, kinematics, Spaces(robot, kinematics, 30.0)
 
 

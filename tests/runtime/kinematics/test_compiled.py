@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from robots import Robot, load
 from runtime.kinematics.base import KinematicsError
-from runtime.kinematics.numeric import Config, NumericKinematics, build
+from runtime.kinematics.compiled import CompiledKinematics, Config, build
 
 ROBOT = load("agilex_piper")
-KINEMATICS = NumericKinematics(ROBOT)
+KINEMATICS = CompiledKinematics(ROBOT)
 HOME = ROBOT.poses["home"]
 ARM_DIMS = np.concatenate([arm.joint_dims for arm in ROBOT.arms])
 
@@ -132,7 +132,7 @@ def test_a_seed_outside_the_limits_is_brought_inside() -> None:
 
 def test_grippers_and_groups_without_an_end_effector_pass_through(tmp_path: Path) -> None:
     robot = one_armed(tmp_path)
-    kinematics = NumericKinematics(robot)
+    kinematics = CompiledKinematics(robot)
     seed = np.array([0.1, 0.2, -0.3, 0.4, 0.5, 0.6, 0.07, 0.2, 0.9, -0.8, 0.1, 0.2, 0.3, 0.05])
     moved = seed + 0.05 * np.array([1] * 13 + [0])
     result = kinematics.solve(np.repeat(kinematics.forward(moved)[None], 3, axis=0), seed)
