@@ -1,4 +1,4 @@
-"""End-effector vectors: made canonical, and placed where what they are relative to was.
+"""Poses that are relative to others, placed where those are.
 
 An arm's vector is x, y, z [m], unit quaternion w, x, y, z, gripper; arrays are float64 [T, arms, 8].
 """
@@ -8,71 +8,51 @@ from __future__ import annotations
 import numpy as np
 
 from robots.rotations import matrix_of_quaternion, quaternion_product
-from runtime.errors import PolicyError
+from runtime.orientations import continuous_signs
 from runtime.types import ActionMode, Float64, RelativeFrame
 
-_POSE = slice(0, 7)
 _POSITION, _QUATERNION = slice(0, 3), slice(3, 7)
-_SHORTEST_QUATERNION = (
-    1e-3  # a unit quaternion that a network predicts is off by per cents, never by this much
-)
-
-
-def canonical(vectors: Float64, whose: str = "the policy answered with") -> Float64:
-    """The vectors with unit quaternions, first w >= 0, signs continuous along T.
-
-    Raises PolicyError for a quaternion that is too short to have a direction; `whose` begins its sentence.
-    """
-    quaternions = vectors[..., _QUATERNION]
-    norms = np.linalg.norm(quaternions, axis=-1, keepdims=True)
-    if (norms < _SHORTEST_QUATERNION).any():
-        row, arm = np.argwhere(norms[..., 0] < _SHORTEST_QUATERNION)[0]
-        raise PolicyError(
-            f"{whose} quaternion {quaternions[row, arm].tolist()}, arm {arm}, row {row}; "
-            f"allowed: w, x, y, z of length 1 (it is normalised from {_SHORTEST_QUATERNION:g} on)"
-        )
-    result = vectors.copy()
-    result[..., _QUATERNION] = quaternions / norms
-    result[0, :, _QUATERNION] *= np.where(result[0, :, 3:4] < 0, -1.0, 1.0)
-    result[..., _QUATERNION] *= continuous_signs(result[..., _QUATERNION])
-    return result
-
-
-def continuous_signs(quaternions: Float64) -> Float64:
-    """The factors +-1 [T, arms, 1] that turn each quaternion [T, arms, 4] to its predecessor's side."""
-    dots = np.sum(quaternions[1:] * quaternions[:-1], axis=-1, keepdims=True)
-    flips = np.where(dots < 0, -1.0, 1.0)
-    signs = np.ones((*quaternions.shape[:-1], 1))
-    signs[1:] = np.cumprod(flips, axis=0)
-    return signs
 
 
 def absolute(vectors: Float64, start: Float64, mode: ActionMode, frame: RelativeFrame) -> Float64:
-    """Canonical `vectors` as absolute poses, from the pose `start` [arms, 8] that they are relative to.
+    """`vectors` with unit quaternions as absolute poses, from the pose `start` [arms, 8] that they are relative to.
 
     "relative": each from `start`; "delta": each from the one before. "base": p0 + dp, dq q0; "tool":
-    p0 + R0 dp, q0 dq. Grippers are absolute in every mode and stay.
+    p0 + R0 dp, q0 dq. Grippers are absolute in every mode and stay. Quaternions come out unit and sign-continuous,
+    w >= 0 in the first row.
     """
     if mode == "absolute":
         return vectors
+    before = np.broadcast_to(start, vectors.shape)
+    turns, shifts = vectors[..., _QUATERNION], vectors[..., _POSITION]
     result = vectors.copy()
     if mode == "relative":
-        result[..., _POSE] = _moved(np.broadcast_to(start, vectors.shape), vectors, frame)
+        turned = _after(before[..., _QUATERNION], turns, frame)
     else:
-        pose = start
-        for row, step in zip(result, vectors, strict=True):
-            row[:, _POSE] = _moved(pose, step, frame)
-            pose = row
-    return canonical(result)
-
-
-def _moved(pose: Float64, by: Float64, frame: RelativeFrame) -> Float64:
-    """Poses [..., 7] that `pose` comes to by the offsets `by`."""
-    quaternion, turn, offset = pose[..., _QUATERNION], by[..., _QUATERNION], by[..., _POSITION]
+        every = np.concatenate([start[None, :, _QUATERNION], turns])
+        turned = _running(every, frame)[1:]
+        before = np.concatenate([start[None], vectors[:-1]])
+        before[1:, :, _QUATERNION] = turned[:-1]
     if frame == "tool":
-        offset = (matrix_of_quaternion(quaternion) @ offset[..., None])[..., 0]
-        turned = quaternion_product(quaternion, turn)
-    else:
-        turned = quaternion_product(turn, quaternion)
-    turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
-    return np.concatenate([pose[..., _POSITION] + offset, turned], axis=-1)
+        shifts = (matrix_of_quaternion(before[..., _QUATERNION]) @ shifts[..., None])[..., 0]
+    moved = shifts if mode == "relative" else shifts.cumsum(axis=0)
+    result[..., _POSITION] = start[:, _POSITION] + moved
+    turned *= np.where(turned[:1, :, :1] < 0, -1.0, 1.0)
+    result[..., _QUATERNION] = turned * continuous_signs(turned)
+    return result
+
+
+def _after(before: Float64, turns: Float64, frame: RelativeFrame) -> Float64:
+    """Unit quaternions that `before` comes to by `turns`, about its own axes ("tool") or those that it is given in."""
+    made = quaternion_product(before, turns) if frame == "tool" else quaternion_product(turns, before)
+    unit: Float64 = made / np.linalg.norm(made, axis=-1, keepdims=True)
+    return unit
+
+
+def _running(turns: Float64, frame: RelativeFrame) -> Float64:
+    """What the turns [T, arms, 4] up to each row amount to, by doubling (Hillis and Steele, 1986): log2 T products."""
+    made, span = turns, 1
+    while span < len(made):
+        made = np.concatenate([made[:span], _after(made[:-span], made[span:], frame)])
+        span *= 2
+    return made

@@ -8,9 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robots import Robot
+from robots.rotations import quaternion_of_matrix, transform_of
 from runtime.errors import PolicyError, SetupError
+from runtime.formats import CANONICAL, PoseFormat, PoseRows, continuous
 from runtime.kinematics.base import IkResult, Kinematics
-from runtime.poses import absolute, canonical, continuous_signs
+from runtime.orientations import continuous_signs
+from runtime.poses import absolute
 from runtime.resampling import resample
 from runtime.types import EEF_WIDTH, ActionChunk, Float32, Float64, Observation
 
@@ -19,23 +22,44 @@ _LONGEST = 2000  # rows of a chunk, given and at control rate: they are solved o
 
 
 @dataclass(frozen=True, slots=True)
+class Onset:
+    """Where a chunk takes over from what the robot is told now; vectors float64 [D].
+
+    `held` is what is commanded: grippers and joints of which a row says nothing stay there. `anchor` is the command
+    of the step before row `row`, the first that will be executed: from it on no joint that is solved for is faster
+    than its limit. A robot that stands is anchored where it is measured.
+    """
+
+    held: Float64
+    anchor: Float64
+    row: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class CommandRows:
     """A chunk in command space at control rate.
 
     `rows` float64 [H', D] are absolute joint targets; `source` int64 [H'] is the policy's row that each was made
-    from; `solved` says how well poses were met, None for a joint chunk.
+    from; `solved` says how well poses were met, None for a joint chunk. `first` [D] is where the first pose would
+    have the robot however far that is, None where rows[0] says so.
     """
 
     rows: Float64
     source: NDArray[np.int64]
     solved: IkResult | None
+    first: Float64 | None = None
+
+    @property
+    def meant(self) -> Float64:
+        """Where the policy means to begin [D], also where the robot cannot be within one step."""
+        return self.rows[0] if self.first is None else self.first
 
 
 class Spaces:
-    """One robot's action spaces: joint rows [H, D], and eef rows [H, 8 * arms] that become joints by kinematics.
+    """One robot's action spaces: joint rows [H, D], and rows of poses that become joints by kinematics.
 
-    An arm's vector is x, y, z [m], unit quaternion w, x, y, z, gripper, in the arm's declared frame.
-    `control_rate` [Hz] is the rate of commands, and of chunks that name none.
+    An arm's vector is x, y, z [m], unit quaternion w, x, y, z, gripper, in the arm's declared frame, whatever the
+    format of the rows that it comes from. `control_rate` [Hz] is that of commands, and of chunks that name none.
     """
 
     def __init__(self, robot: Robot, kinematics: Kinematics, control_rate: float) -> None:
@@ -44,36 +68,50 @@ class Spaces:
         self._robot = robot
         self._kinematics = kinematics
         self._control_rate = control_rate
-        self._grippers = np.array([arm.gripper_dim for arm in robot.arms], dtype=np.intp)
+        arms = robot.arms
+        self._count = len(arms)
+        self._gripped = [index for index, arm in enumerate(arms) if arm.gripper is not None]
+        self._grippers = [arm.gripper_dim for arm in arms if arm.gripper_dim is not None]
         self._moving = np.setdiff1d(np.arange(robot.dim), robot.gripper_dims)
-        endless = np.isinf(robot.lower) & np.isinf(robot.upper)
-        self._wrapping = np.flatnonzero(endless)
-        arms = range(len(robot.arms))
-        self._quaternions = [EEF_WIDTH * arm + 3 for arm in arms]
-        self._held = [EEF_WIDTH * a + _GRIPPER for a in arms if self._grippers[a] in robot.binary_dims]
+        solved = np.concatenate([np.zeros(0, np.intp), *(arm.joint_dims for arm in arms)])
+        self._still = np.setdiff1d(np.arange(robot.dim), solved)
+        self._wrapping = np.flatnonzero(np.isinf(robot.lower) & np.isinf(robot.upper))
+        self._quaternions = [EEF_WIDTH * arm + 3 for arm in range(self._count)]
+        pairs = zip(self._gripped, self._grippers, strict=True)
+        self._held = [EEF_WIDTH * arm + _GRIPPER for arm, dim in pairs if dim in robot.binary_dims]
+        self._layout: PoseRows | None = None
 
-    def to_command(self, chunk: ActionChunk, observation: Observation) -> CommandRows:
+    def to_command(
+        self, chunk: ActionChunk, observation: Observation, onset: Onset | None = None
+    ) -> CommandRows:
         """The chunk, which answers `observation`, as absolute joint rows at control rate.
 
-        In this order: checked; made absolute against the observation (poses against the measured ones, else
-        those of its joints); resampled in the policy's own space; poses solved, the first row from the
-        observed joints, each further one from the row before within velocity limits; joints without limits
-        unwrapped from the observed ones on. Grippers are taken as they are; joints that no arm moves (a head)
-        stay where an eef chunk found them. Raises PolicyError for a wrong width, a number that is not finite,
-        or a quaternion without direction.
+        In this order: checked; poses decoded from their format; made absolute against the observation (poses
+        against those that it holds, else those of its joints, in the frame in which they are declared); resampled;
+        poses solved, the first row from the observed joints, each further one from the row before within velocity
+        limits, from `onset` on (without one the robot stands where it was observed); joints without limits
+        unwrapped from the observed ones on. Grippers are taken as they are; what the rows say nothing of stays as
+        in `onset`. Raises PolicyError for a wrong width, a number that is not finite, or numbers that determine no
+        orientation.
         """
-        rows = self._checked(chunk)
-        rate = chunk.rate or self._control_rate
-        _check_length(len(rows), max(1.0, self._control_rate / rate))
         qpos = np.asarray(observation.qpos, dtype=np.float64)
+        rate = chunk.rate or self._control_rate
         if chunk.space == "joint":
-            rows = self._unwrapped(self._absolute_joints(rows, chunk, qpos), qpos)
+            rows = self._checked(chunk, rate, self._robot.dim, self._robot.joint_names)
+            rows = self._absolute_joints(rows, chunk, qpos, np.arange(self._robot.dim))
             rows, source = resample(rows, rate, self._control_rate, self._robot.binary_dims)
-            return CommandRows(rows, source, None)
-        vectors = self._absolute_poses(rows, chunk, observation).reshape(len(rows), -1)
-        vectors, source = resample(vectors, rate, self._control_rate, self._held, self._quaternions)
-        solved = self._solved(vectors, qpos)
-        return CommandRows(self._unwrapped(self._with_grippers(solved, vectors), qpos), source, solved)
+            return CommandRows(self._unwrapped(rows, qpos), source, None)
+        layout = self._layout_of(chunk.pose)
+        rows = self._checked(chunk, rate, layout.width, layout.names)
+        rows = self._absolute_poses(rows, layout, chunk, observation)
+        binary = [
+            self._count * EEF_WIDTH + place
+            for place, dim in enumerate(layout.dims)
+            if dim in self._robot.binary_dims
+        ]
+        rows, source = resample(rows, rate, self._control_rate, [*self._held, *binary], self._quaternions)
+        onset = self._near(onset or Onset(qpos, qpos), qpos)
+        return self._solved(rows, source, layout, qpos, onset)
 
     def eef_of(self, q: ArrayLike, previous: ArrayLike | None = None) -> Float32:
         """End-effector vectors float32 [..., 8 * arms] that joints [..., D] and their grippers amount to.
@@ -82,11 +120,9 @@ class Spaces:
         `previous` [8 * arms] where that is given, so that a stream of single calls is continuous too.
         """
         joints = np.asarray(q, dtype=np.float64)
-        vectors = np.empty((*joints.shape[:-1], len(self._grippers), EEF_WIDTH))
-        vectors[..., :_GRIPPER] = self._kinematics.forward(joints)
-        vectors[..., _GRIPPER] = joints[..., self._grippers]
+        vectors = self.vectors(joints)
         if previous is not None:
-            before = np.asarray(previous, dtype=np.float64).reshape(len(self._grippers), EEF_WIDTH)
+            before = np.asarray(previous, dtype=np.float64).reshape(self._count, EEF_WIDTH)
             first = vectors if joints.ndim == 1 else vectors[0]
             turned = np.sum(first[:, 3:7] * before[:, 3:7], axis=-1) < 0
             first[turned, 3:7] *= -1.0
@@ -94,32 +130,115 @@ class Spaces:
             vectors[..., 3:7] *= continuous_signs(vectors[..., 3:7])
         return vectors.reshape(*joints.shape[:-1], -1).astype(np.float32)
 
-    def _absolute_joints(self, rows: Float64, chunk: ActionChunk, qpos: Float64) -> Float64:
+    def vectors(self, joints: Float64) -> Float64:
+        """The same as float64 [..., arms, 8], each quaternion with w >= 0; 0 for a gripper that an arm has not."""
+        vectors = np.zeros((*joints.shape[:-1], self._count, EEF_WIDTH))
+        vectors[..., :_GRIPPER] = self._kinematics.forward(joints)
+        vectors[..., self._gripped, _GRIPPER] = joints[..., self._grippers]
+        return vectors
+
+    def _layout_of(self, pose: PoseFormat | None) -> PoseRows:
+        """The rows of that format; the last one is kept, because a policy speaks one format."""
+        wanted = CANONICAL if pose is None else pose
+        if self._layout is None or self._layout.pose != wanted:
+            self._layout = PoseRows(wanted, self._robot, "the policy's pose format")
+        return self._layout
+
+    def _absolute_joints(
+        self, rows: Float64, chunk: ActionChunk, qpos: Float64, dims: NDArray[np.intp]
+    ) -> Float64:
+        """Rows [H, n] of the joints `dims` as absolute ones; grippers are that in every mode."""
         if chunk.mode == "absolute":
             return rows
-        moves = rows[:, self._moving]
-        rows[:, self._moving] = qpos[self._moving] + (
-            moves if chunk.mode == "relative" else moves.cumsum(axis=0)
-        )
+        rows = rows.copy()
+        moving = np.isin(dims, self._moving)
+        moves = rows[:, moving]
+        rows[:, moving] = qpos[dims[moving]] + (moves if chunk.mode == "relative" else moves.cumsum(axis=0))
         return rows
 
-    def _absolute_poses(self, rows: Float64, chunk: ActionChunk, observation: Observation) -> Float64:
-        vectors = canonical(rows.reshape(len(rows), len(self._grippers), EEF_WIDTH))
-        if chunk.mode == "absolute":
-            return vectors
+    def _absolute_poses(
+        self, rows: Float64, layout: PoseRows, chunk: ActionChunk, observation: Observation
+    ) -> Float64:
+        """Absolute vectors in each arm's own frame, flat, and the joints that follow: [H, 8 * arms + n]."""
+        qpos = np.asarray(observation.qpos, dtype=np.float64)
+        vectors, joints = layout.decode(rows)
+        joints = self._absolute_joints(joints, chunk, qpos, layout.dims)
+        at = qpos[None]
+        if chunk.mode != "absolute":
+            start = layout.frame.express(self._seen(layout, chunk, observation), at)[0]
+            vectors = absolute(vectors, start, chunk.mode, chunk.frame)
+        elif len(layout.dims):
+            at = self._with(qpos, layout, joints)
+        if not layout.frame.own:
+            vectors = layout.frame.resolve(vectors, at)
+            vectors[..., 3:7] = continuous(vectors[..., 3:7])
+        return np.concatenate([vectors.reshape(len(rows), -1), joints], axis=1)
+
+    def _seen(self, layout: PoseRows, chunk: ActionChunk, observation: Observation) -> Float64:
+        """The vectors [1, arms, 8] that a chunk is relative to."""
         seen = self.eef_of(observation.qpos) if observation.eef is None else observation.eef
-        poses = np.asarray(seen, dtype=np.float64).reshape(1, len(self._grippers), EEF_WIDTH)
-        start = canonical(poses, f"the chunk is {chunk.mode} to an observation with")[0]
-        return absolute(vectors, start, chunk.mode, chunk.frame)
+        vectors = np.asarray(seen, dtype=np.float64).reshape(1, self._count, EEF_WIDTH)
+        return layout.upright(vectors, f"the chunk is {chunk.mode} to an observation with")
 
-    def _solved(self, vectors: Float64, qpos: Float64) -> IkResult:
-        poses = vectors.reshape(len(vectors), len(self._grippers), EEF_WIDTH)[..., :_GRIPPER]
-        return self._kinematics.solve(poses, qpos, 1.0 / self._control_rate)
+    def _with(self, qpos: Float64, layout: PoseRows, joints: Float64) -> Float64:
+        """`qpos` [D], row by row with the joints that follow the poses: [H, D]."""
+        made = np.tile(qpos, (len(joints), 1))
+        made[:, layout.dims] = joints
+        return made
 
-    def _with_grippers(self, solved: IkResult, vectors: Float64) -> Float64:
-        commands = solved.q.copy()
-        commands[:, self._grippers] = vectors[:, _GRIPPER::EEF_WIDTH]
+    def _solved(
+        self, rows: Float64, source: NDArray[np.int64], layout: PoseRows, qpos: Float64, onset: Onset
+    ) -> CommandRows:
+        poses = rows[:, : self._count * EEF_WIDTH].reshape(len(rows), self._count, EEF_WIDTH)
+        joints = rows[:, self._count * EEF_WIDTH :]
+        targets = self._carried(poses[..., :_GRIPPER], layout, joints, qpos)
+        row = min(onset.row, max(0, len(rows) - 1))
+        solved = self._kinematics.solve(targets, qpos, 1.0 / self._control_rate, onset.anchor, row)
+        commands = self._assembled(solved.q, poses, layout, joints, onset)
+        first = None
+        if row == 0 and len(rows):  # the velocity box would hide from everybody that it begins far away
+            free = self._kinematics.solve(targets[:1], qpos)
+            alone = self._assembled(free.q, poses[:1], layout, joints[:1], onset)
+            first = self._unwrapped(alone, qpos)[0]
+        return CommandRows(self._unwrapped(commands, qpos), source, solved, first)
+
+    def _assembled(
+        self, solved: Float64, poses: Float64, layout: PoseRows, joints: Float64, onset: Onset
+    ) -> Float64:
+        """Solved arms, grippers and joints of the rows, and everything else held."""
+        commands = solved.copy()
+        commands[:, self._still] = onset.held[self._still]
+        if layout.pose.gripper:
+            commands[:, self._grippers] = poses[:, self._gripped, _GRIPPER]
+        commands[:, layout.dims] = joints
         return commands
+
+    def _carried(self, poses: Float64, layout: PoseRows, joints: Float64, qpos: Float64) -> Float64:
+        """Poses [H, arms, 7] as they are to be solved for, while what carries the arms stands as observed.
+
+        Where the rows move a torso, each pose is taken along: the arm's joints are those that it will need there.
+        """
+        made = poses
+        for index, arm in enumerate(self._robot.arms):
+            if arm.carrier is None or not np.isin(arm.carrier_dims, layout.dims).any():
+                continue
+            there = arm.carried(self._with(qpos, layout, joints))
+            wanted = arm.carried(qpos) @ np.linalg.inv(there) @ transform_of(poses[:, index])
+            made = made.copy() if made is poses else made
+            made[:, index, :3] = wanted[..., :3, 3]
+            made[:, index, 3:] = quaternion_of_matrix(wanted[..., :3, :3])
+        return made
+
+    def _near(self, onset: Onset, qpos: Float64) -> Onset:
+        """The onset with endless joints on the branch that they were observed on."""
+
+        def on_branch(joints: Float64) -> Float64:
+            made = np.array(joints, dtype=np.float64)
+            apart = made[self._wrapping] - qpos[self._wrapping]
+            made[self._wrapping] -= 2 * np.pi * np.round(apart / (2 * np.pi))
+            return made
+
+        return Onset(on_branch(onset.held), on_branch(onset.anchor), onset.row)
 
     def _unwrapped(self, rows: Float64, qpos: Float64) -> Float64:
         """The rows with endless joints on the branch that is nearest to `qpos`, and without jumps from there."""
@@ -127,18 +246,17 @@ class Spaces:
         rows[:, self._wrapping] = np.unwrap(turning, axis=0)[1:]
         return rows
 
-    def _checked(self, chunk: ActionChunk) -> Float64:
-        width = self._robot.dim if chunk.space == "joint" else self._robot.eef_dim
+    def _checked(self, chunk: ActionChunk, rate: float, width: int, names: tuple[str, ...]) -> Float64:
         rows = np.array(chunk.actions, dtype=np.float64)
         if rows.ndim != 2 or rows.shape[1] != width or not len(rows):
             raise PolicyError(
                 f"the policy answered with {chunk.space} actions of shape {rows.shape}; "
                 f"{self._robot.name} takes [H, {width}] with at least one row"
             )
+        _check_length(len(rows), max(1.0, self._control_rate / rate))
         wrong = np.argwhere(~np.isfinite(rows))
         if len(wrong):
             row, column = wrong[0]
-            names = self._robot.joint_names if chunk.space == "joint" else self._robot.eef_names
             raise PolicyError(
                 f"the policy answered with {rows[row, column]} for {names[column]} in row {row} "
                 f"({len(wrong)} such numbers); allowed: finite numbers"

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from runtime.formats import PoseFormat
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -55,13 +58,15 @@ class Observation:
 class ActionChunk:
     """A policy's answer: rows of actions from the step of the observation on.
 
-    `actions` is float32 [H, W] in `space`: "joint" rows are [D] in group order, "eef" rows 8 per arm. `rate` is
-    the rows' own rate [Hz], None where it is the control rate. `model_actions` are the rows in the model's own
-    normalised space where the server returned them. `timing` holds the server's own figures [ms].
+    `actions` is float32 [H, W] in `space`: "joint" rows are [D] in group order, "eef" rows are poses as `pose`
+    says, None: 8 per arm. They are kept as the server gave them. `rate` is the rows' own rate [Hz], None where it is
+    the control rate. `model_actions` are the rows in the model's own normalised space where the server returned
+    them. `timing` holds the server's own figures [ms].
 
     `mode` says what the numbers are: "absolute" targets; "relative" to the observation the chunk answers; "delta",
     each row relative to the one before, the first to the observation. Grippers are absolute in every mode. `frame`
-    is that of relative poses: offsets along the arm's "base" frame, or along the observed "tool".
+    is that of relative poses: offsets along the frame that poses are declared in ("base"), or along the observed
+    "tool".
     """
 
     actions: Float32
@@ -71,6 +76,7 @@ class ActionChunk:
     timing: Mapping[str, float] = field(default_factory=dict)
     mode: ActionMode = "absolute"
     frame: RelativeFrame = "base"
+    pose: PoseFormat | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +99,12 @@ class Conditioning:
 
 @dataclass(frozen=True, slots=True)
 class RobotCommand:
-    """One absolute target for the whole robot: float32 [D] in group order, for control tick `step`."""
+    """One absolute target for the whole robot: float32 [D] in group order, for control tick `step`.
+
+    `eef` are the poses of these joints as the deployment's `publication` wants them, None where it wants joints.
+    """
 
     action: Float32
     step: int
     time: float  # our monotonic clock [s]
+    eef: Float32 | None = None
