@@ -20,7 +20,8 @@ class Body:
     """The `parts` ("left_arm/link2", ...: links behind the group that moves them) of a robot, and their `poses`.
 
     A robot whose URDF describes one of several equal arms is one copy of the tree per arm; a URDF with the whole
-    body stands once. `jaws` names, for each group with a gripper, the indices of the parts that its fingers are.
+    body stands once. `jaws` names, for each group with a gripper, the indices of the parts that its fingers are;
+    `above` [P] has for each part the index of the one it hangs on, -1 for a root.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -47,8 +48,8 @@ class Body:
         self._offsets = np.concatenate([copy.offsets for copy in made])  # [P]
         self._low, self._high = np.concatenate([copy.bounds for copy in made], axis=1)
         self._tables = np.concatenate([copy.tables for copy in made])  # [P, 4, 16]
-        self._above = np.concatenate([copy.above_from(start) for start, copy in placed])
-        self._layers = _layers(self._above)
+        self.above = np.concatenate([copy.above_from(start) for start, copy in placed])
+        self._layers = _layers(self.above)
 
     def part(self, name: str) -> int:
         """The index of a part; RobotError lists the names where there is none."""
@@ -66,6 +67,13 @@ class Body:
         if link not in links:
             raise RobotError(f"{self._name}: {group} has no link {link!r}; it has {', '.join(sorted(links))}")
         return int(links[link])
+
+    def moved(self) -> NDArray[np.bool_]:
+        """Which numbers of the robot's vector move which part, bool [P, D]: those that any joint above it follows."""
+        moved: NDArray[np.bool_] = self._coupling != 0
+        for parts, above in self._layers:
+            moved[parts] |= moved[above]
+        return moved
 
     def poses(self, q: Float64) -> Float64:
         """Where the parts are, scene <- part [..., P, 4, 4], for the robot's vector q [..., D]."""

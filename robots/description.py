@@ -19,6 +19,7 @@ Positive = Annotated[float, Field(gt=0)]
 Reason = Annotated[str, Field(min_length=1)]
 Kind = Literal["arm", "hand", "head", "torso", "base", "other"]
 Measured = Literal["velocity", "effort", "eef"]
+TABLE = "table"  # in pairs of [collision]: the plane z = 0 of the scene
 
 
 class Table(BaseModel):
@@ -96,7 +97,9 @@ class CollisionTable(Table):
     without: list[str] = []
     """Links that are left out: fingers that touch each other, covers, cameras."""
     ignore: list[Annotated[list[str], Field(min_length=2, max_length=2)]] = []
-    """Pairs of links that may come close: neighbours beyond a joint are left out anyway."""
+    """Pairs that may come close: links of one copy of the URDF, "table", or GROUP/LINK for links of two arms.
+
+    Neighbours beyond one joint, and pairs that touch at every posture, are left out anyway."""
 
 
 class RosGroupTable(Table):

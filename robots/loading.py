@@ -12,7 +12,7 @@ import numpy as np
 from robots import description, urdf
 from robots.chain import Chain
 from robots.copies import copy_of
-from robots.description import GripperTable, GroupTable, OverrideTable, PlaceTable, RobotTable
+from robots.description import TABLE, GripperTable, GroupTable, OverrideTable, PlaceTable, RobotTable
 from robots.errors import RobotError
 from robots.robot import Camera, Gripper, Group, Robot
 from robots.rotations import Float64, matrix_of_quaternion
@@ -64,6 +64,7 @@ def load(
     _refuse_twice(file, "groups", [group.name for group in table.groups])
     _refuse_twice(file, "cameras", list(table.cameras.values()))
     _check_ros(file, table)
+    _check_collision(file, table, tree)
     chosen = _with_grippers(file, _chosen(file, table, groups), grippers or {})
     starts = np.cumsum([0, *(len(entry.joints) for entry in chosen)]).tolist()
     made = tuple(_group(file, tree, entry, start) for entry, start in zip(chosen, starts, strict=False))
@@ -139,6 +140,23 @@ def _check_ros(file: Path, table: RobotTable) -> None:
         unknown = [name for name in given if name not in known]
         if unknown:
             raise RobotError(f"{file}: ros.{key} names {', '.join(unknown)}; allowed: {', '.join(known)}")
+
+
+def _check_collision(file: Path, table: RobotTable, tree: Urdf) -> None:
+    """Collision may name only links of the URDF; in pairs also those of one group's copy, and the table."""
+    collision = table.collision
+    groups = [group.name for group in table.groups]
+    for key, named in (("capsules", list(collision.capsules)), ("without", collision.without)):
+        if unknown := [link for link in named if link not in tree.links]:
+            allowed = ", ".join(sorted(tree.links))
+            raise RobotError(f"{file}: collision.{key} names {', '.join(unknown)}; allowed: {allowed}")
+    known = {*tree.links, TABLE, *(f"{group}/{link}" for group in groups for link in tree.links)}
+    for pair in collision.ignore:
+        if unknown := [link for link in pair if link not in known]:
+            raise RobotError(
+                f"{file}: collision.ignore names {', '.join(unknown)}; allowed: {TABLE}, a link, or GROUP/LINK, of "
+                f"{', '.join(sorted(tree.links))}"
+            )
 
 
 @dataclass(frozen=True, slots=True)

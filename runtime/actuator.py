@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from runtime.behaviour import Target
+from runtime.collision import Collision
 from runtime.config import Answer
 from runtime.errors import RuntimeFault
 from runtime.motion import Brake
@@ -49,6 +50,7 @@ class Sent(NamedTuple):
     refused: bool = False
     limited: str = ""  # the joint that safety changed most, "" where it changed nothing
     change: float = 0.0  # by how much [rad, or what a gripper's travel is worth]
+    near: Collision | None = None  # links that it brought near each other, where that is only warned of
 
 
 class Actuator(ABC):

@@ -10,6 +10,7 @@ import numpy as np
 
 from runtime import realtime
 from runtime.clock import Clock, MonotonicClock
+from runtime.collision import Collisions
 from runtime.errors import RuntimeFault
 from runtime.execution import Strategy
 from runtime.family import Lifeline, Plan, join
@@ -18,7 +19,7 @@ from runtime.report import StatusRecord
 from runtime.safety import SafetyFilter
 from runtime.tick import Tick, TickSettings
 from runtime.transports.base import Sink
-from runtime.types import Float64
+from runtime.workspace import Workspace
 
 log = logging.getLogger(__name__)
 _LATENESS_KEPT = 2000
@@ -27,10 +28,12 @@ _LATENESS_KEPT = 2000
 def make_tick(plan: Plan, page: Page, sink: Sink, now: Callable[[], float]) -> Tick:
     """The tick of a deployment; the same object in real time and in lockstep."""
     deployment, limits = plan.deployment, plan.limits
+    workspace = Workspace(plan.robot, deployment.safety.workspace)
+    collisions = Collisions(plan.robot, deployment.safety.collision_margin)
     return Tick(
         page,
         sink,
-        SafetyFilter(deployment.safety, limits, _outside(plan)),
+        SafetyFilter(deployment.safety, limits, workspace if workspace.arms else None, collisions),
         Strategy(deployment.strategy.kind, plan.strategy.merge(deployment.strategy, plan.dims)),
         TickSettings(
             period=1.0 / plan.rate,
@@ -43,29 +46,6 @@ def make_tick(plan: Plan, page: Page, sink: Sink, now: Callable[[], float]) -> T
         ),
         now,
     )
-
-
-def _outside(plan: Plan) -> Callable[[Float64], tuple[str, ...]] | None:
-    """Names the arms whose end effector would leave its box; None where no box is declared."""
-    boxes = plan.deployment.safety.workspace
-    if not boxes:
-        return None
-    spaces = plan.spaces()
-    arms = [
-        (index, arm.name, np.array(boxes[arm.name].lower), np.array(boxes[arm.name].upper))
-        for index, arm in enumerate(plan.robot.arms)
-        if arm.name in boxes
-    ]
-
-    def outside(action: Float64) -> tuple[str, ...]:
-        poses = spaces.eef_of(action).reshape(len(plan.robot.arms), -1)
-        return tuple(
-            name
-            for index, name, lower, upper in arms
-            if (poses[index, :3] < lower).any() or (poses[index, :3] > upper).any()
-        )
-
-    return outside
 
 
 class Lateness:

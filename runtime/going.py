@@ -12,6 +12,7 @@ from runtime.motion import Trajectory
 from runtime.orders import Orders
 from runtime.page import Page
 from runtime.types import Float64
+from runtime.ways import Ways
 
 _SETTLE_S = 2.0  # for the arm to follow the last target of a motion
 _ARRIVED_RAD = 0.1
@@ -25,9 +26,11 @@ class Going:
         self._orders = orders
         self._page = page
         self._clock = clock
+        self._ways = Ways(plan)
 
     def start(self, goal: Float64, where: str) -> None:
-        """Have control go to `goal` [D]."""
+        """Have control go to `goal` [D]; RuntimeFault, and nothing moves, where the way there is not free."""
+        self._ways.check(f"going to {where}", self._start(), goal)
         self._goal, self._where = goal, where
         self._allowed = self._motion_time() + _SETTLE_S
         self._since = self._clock.now()
@@ -62,9 +65,13 @@ class Going:
 
     def _motion_time(self) -> float:
         """How long the motion takes from where control will start it [s]."""
-        status = self._page.control.read()
-        start = status["commanded"] if status["engaged"] else self._page.observation.read()["qpos"]
         safety, limits = self._plan.deployment.safety, self._plan.limits
         velocity = limits.velocity * safety.motion_velocity_scale
         acceleration = safety.motion_acceleration * limits.reach
-        return Trajectory(np.array(start, np.float64), self._goal, velocity, acceleration).duration
+        return Trajectory(self._start(), self._goal, velocity, acceleration).duration
+
+    def _start(self) -> Float64:
+        """Where control will start [D]."""
+        status = self._page.control.read()
+        start = status["commanded"] if status["engaged"] else self._page.observation.read()["qpos"]
+        return np.array(start, np.float64)

@@ -148,7 +148,7 @@ class Lane:
         if self.run is not None and (gap := self.run.fed(planned)) is not None:
             self._report.say("recovered", f"actions again after {gap:.2f} s")
         sent = self.actuator.send(step, planned, target, verdict.action, (*notes, *verdict.notes))
-        return sent._replace(limited=verdict.most, change=verdict.change)
+        return sent._replace(limited=verdict.most, change=verdict.change, near=verdict.near)
 
     def _hold_to(self, step: int, planned: float, target: Target, seen: Seen) -> Sent:
         """Send a braking or held target as it is; a gripper that is locked elsewhere goes there within its limits."""

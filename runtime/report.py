@@ -10,6 +10,7 @@ import numpy as np
 
 from runtime.actuator import Actuator, Sent
 from runtime.behaviour import Behaviour, EStopped
+from runtime.collision import Collision
 from runtime.messages import ChunkMerged, Event, Message, TickDone, encode
 from runtime.page import Page
 from runtime.recording.base import ControlSource
@@ -63,6 +64,34 @@ class Limiting:
         self._count, self._worst, self._most = 0, 0.0, ""
 
 
+class Nearing:
+    """Tells when actions begin to bring links near each other, and how near once that is over; never once per tick."""
+
+    def __init__(self, say: Callable[[str, str], None]) -> None:
+        self._say = say
+        self._last = float("-inf")
+        self._count = 0
+        self._nearest: Collision | None = None
+
+    def note(self, sent: Sent, now: float) -> None:
+        """One tick."""
+        near = sent.near
+        if near is not None:
+            if self._nearest is None:
+                self._say("near", str(near))
+            if self._nearest is None or near.distance < self._nearest.distance:
+                self._nearest = near
+            self._count, self._last = self._count + 1, now
+        elif self._count and now - self._last >= _QUIET_S:
+            self.close()
+
+    def close(self) -> None:
+        """Whatever was near is apart."""
+        if self._count:
+            self._say("near_sum", f"{self._count} actions came too near, nearest: {self._nearest}")
+        self._count, self._nearest = 0, None
+
+
 class Report:
     """Gathers what a tick has to say, hands it over at its end; a full ring is counted, never waited for."""
 
@@ -76,6 +105,7 @@ class Report:
         self.status: StatusRecord = np.zeros((), page.layout.control_dtype())  # written whole by every tick
         self.status[()] = page.control.read()  # counters go on from a predecessor's
         self.limiting = Limiting(self.say)
+        self.nearing = Nearing(self.say)
         self.order = 0  # number of the newest order obeyed
         self.run = 0
 
@@ -94,6 +124,7 @@ class Report:
     def record(self, seen: Seen, sent: Sent, simulated: bool) -> None:
         """The tick, for the episode; `simulated`: it was the simulated robot that was told."""
         self.limiting.note(sent, self._planned)
+        self.nearing.note(sent, self._planned)
         target, executed = sent.target, sent.executed
         wanted = target is not None and target.path is not None
         self._smoothed = target.action.astype(np.float32) if target and wanted else None

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
+from robots.clearance import MARGIN
+from runtime.collision import Collision, Collisions
 from runtime.section import Section
 from runtime.types import Float64
 
@@ -55,7 +57,14 @@ class SafetySettings(Section):
     first_action_far: float = Field(default=0.3, gt=0)
     """Distance of the policy's first action from the present pose that a person is warned of [rad]."""
     workspace: dict[str, WorkspaceBox] = Field(default_factory=dict)
-    """Boxes by arm name; an action that leaves one is refused, never clamped."""
+    """Boxes by arm name; an action that leaves one is refused, never clamped. Motions of ours do not leave one that
+    they are in."""
+    collision: Literal["off", "warn", "refuse"] = "warn"
+    """What becomes of a policy's action that brings links of the robot near each other or the table: an event, or a
+    refusal unless it parts what is near already. Motions of ours are always refused then."""
+    collision_margin: float = Field(default=MARGIN, ge=0, le=0.5)
+    """Distance within which links count as colliding [m]; the capsules that stand for them cover them whole, so
+    that little is needed on top."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,13 +86,15 @@ class RobotState:
 class Verdict:
     """What may be sent: `action` float64 [D], None where refused; `notes` say what was changed or why.
 
-    `most` is the note on what was changed most, and `change` by how much [rad, or a gripper's worth of them].
+    `most` is the note on what was changed most, and `change` by how much [rad, or a gripper's worth of them]. `near`
+    are links that it brings near each other, where that is only warned of.
     """
 
     action: Float64 | None
     notes: tuple[str, ...] = ()
     most: str = ""
     change: float = 0.0
+    near: Collision | None = None
 
     @property
     def refused(self) -> bool:
@@ -115,7 +126,7 @@ Path = Literal["policy", "motion"]
 
 
 class SafetyFilter:
-    """Judges actions in a fixed order: finite, ages, workspace, following error, jump, reachability, limits.
+    """Judges actions in a fixed order: finite, ages, workspace, collision, following error, jump, reachability, limits.
 
     Reachability makes the command satisfy velocity, acceleration and joint limits in one step: the velocity
     is bounded so that the joint can still stop before its limit with the same acceleration, also at changing
@@ -127,10 +138,12 @@ class SafetyFilter:
         settings: SafetySettings,
         limits: Limits,
         outside: Callable[[Float64], tuple[str, ...]] | None = None,
+        collisions: Collisions | None = None,
     ) -> None:
         self._settings = settings
         self._limits = limits
-        self._outside = outside  # names the arms whose end effector leaves its box
+        self._outside = outside  # names the arms whose end effector is outside its box
+        self._collisions = collisions
         self._angles = ~limits.grippers
         self._switching = bool(limits.binary.any())
         self._reach = limits.reach
@@ -157,19 +170,22 @@ class SafetyFilter:
         reachable = self.reachable(action, state, path)
         notes = self._changes(action, reachable)
         if self._settings.report_only:
-            return Verdict(action, (*filter(None, [refusal]), *notes, *self._excess(action)))
-        violation = self._violation(reachable, state) or self._box_violation(action, reachable, state, path)
+            return self._warned(
+                Verdict(action, (*filter(None, [refusal]), *notes, *self._excess(action))), path
+            )
+        violation = self._violation(reachable, state) or self._arrival(action, reachable, state, path)
         if violation:
             return Verdict(None, (*notes, violation))
-        return self._changed(action, reachable, notes) if notes else Verdict(reachable)
+        return self._warned(self._changed(action, reachable, notes) if notes else Verdict(reachable), path)
 
     def _refusal(self, action: Float64, state: RobotState, path: Path) -> str:
-        if path == "motion":  # of ours: needs no pictures, and may come from outside the box
-            return self._blind(state) or self._runs_away(action, state)
+        blind = self._blind(state)
+        if path == "motion":  # of ours: needs no pictures
+            return blind or self._place(action, state, path) or self._runs_away(action, state)
         return (
-            self._blind(state)
+            blind
             or self._stale(state)
-            or self._leaves_box(action)
+            or self._place(action, state, path)
             or self._runs_away(action, state)
             or self._jumps(action, state)
         )
@@ -187,9 +203,31 @@ class SafetyFilter:
                 return f"picture {camera} is {age:.2f} s old, allowed {allowed:g}"
         return ""
 
-    def _leaves_box(self, action: Float64) -> str:
+    def _place(self, action: Float64, state: RobotState, path: Path) -> str:
+        """Why the robot must not be there, "" where it may: a workspace box, a collision."""
+        return self._leaves_box(action, state, path) or self._collides(action, state, path)
+
+    def _leaves_box(self, action: Float64, state: RobotState, path: Path) -> str:
+        """A policy has no business outside; a motion of ours may come from there, and only not go there."""
         arms = self._outside(action) if self._outside else ()
+        if arms and self._outside and path == "motion":
+            before = self._outside(state.previous)
+            arms = tuple(arm for arm in arms if arm not in before)
         return f"{', '.join(arms)} would leave the workspace box" if arms else ""
+
+    def _collides(self, action: Float64, state: RobotState, path: Path) -> str:
+        if self._collisions is None or (path == "policy" and self._settings.collision != "refuse"):
+            return ""
+        found = self._collisions.approached(action, state.previous)
+        return "" if found is None else str(found)
+
+    def _warned(self, verdict: Verdict, path: Path) -> Verdict:
+        """The verdict, with what the action brings near each other where that is no reason to refuse it."""
+        if self._collisions is None or path == "motion" or self._settings.collision != "warn":
+            return verdict
+        assert verdict.action is not None
+        near = self._collisions.nearest(verdict.action)
+        return verdict if near is None else replace(verdict, notes=(*verdict.notes, str(near)), near=near)
 
     def _runs_away(self, action: Float64, state: RobotState) -> str:
         allowed = self._settings.following_error
@@ -215,14 +253,14 @@ class SafetyFilter:
             return ""
         return f"{self._limits.names[worst]} jumps {jump[worst]:.2f} rad, allowed {self._settings.jump:g}"
 
-    def _box_violation(self, action: Float64, reachable: Float64, state: RobotState, path: Path) -> str:
-        """The box also holds for what is really sent, and for where the arm would come to a stand after it."""
-        if self._outside is None or path == "motion":
+    def _arrival(self, action: Float64, reachable: Float64, state: RobotState, path: Path) -> str:
+        """The same of what is really sent, and of where the robot would come to a stand after it."""
+        if self._outside is None and self._collisions is None:
             return ""
         velocity = (reachable - state.previous) / state.elapsed
         stop = reachable + velocity * np.abs(velocity) / (2.0 * self._braking)
         changed = reachable is not action  # an action that was not changed has been looked at already
-        return (self._leaves_box(reachable) if changed else "") or self._leaves_box(stop)
+        return (self._place(reachable, state, path) if changed else "") or self._place(stop, state, path)
 
     def reachable(self, action: Float64, state: RobotState, path: Path = "policy") -> Float64:
         """The action next to `action` [D] that velocity, acceleration and joint limits allow; itself where they do."""

@@ -87,18 +87,22 @@ class SetUp:
         self._enter(Stage.CONNECT)
 
     def begin_homing(self) -> None:
-        """Only go to the pose."""
-        self._motion_only = f"at the pose {self._plan.deployment.setup.pose!r}"
-        self._start()
-        self._go_home()
+        """Only go to the pose; RuntimeFault, and nothing has changed, where the way there is not free."""
+        pose = self._plan.deployment.setup.pose
+        where = f"the pose {pose!r}"
+        self._only_go(self._plan.robot.poses[pose], where, Stage.HOME)
 
     def begin_approach(self) -> None:
         """Only go to where the policy's first action would have the robot; RuntimeFault where that is not known."""
         if self.first_action is None:
             raise SetupError("approach: the policy's first action is not known: set up again")
-        self._motion_only = "at the policy's first action"
+        self._only_go(self.first_action, "the policy's first action", Stage.APPROACH)
+
+    def _only_go(self, goal: Float64, where: str, stage: Stage) -> None:
+        self._going.start(goal, where)
+        self._motion_only = f"at {where}"
         self._start()
-        self._go(self.first_action, "the policy's first action", Stage.APPROACH)
+        self._enter(stage)
 
     def _start(self) -> None:
         self.stages, self.failed = {}, None
@@ -190,11 +194,8 @@ class SetUp:
 
     def _go_home(self) -> None:
         pose = self._plan.deployment.setup.pose
-        self._go(self._plan.robot.poses[pose], f"the pose {pose!r}", Stage.HOME)
-
-    def _go(self, goal: Float64, where: str, stage: Stage) -> None:
-        self._going.start(goal, where)
-        self._enter(stage)
+        self._going.start(self._plan.robot.poses[pose], f"the pose {pose!r}")
+        self._enter(Stage.HOME)
 
     def _settle(self) -> bool:
         if not self._going.arrived():

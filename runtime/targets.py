@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robots.rotations import matrix_of_quaternion, matrix_of_rpy, quaternion_of_matrix
 from runtime.errors import RuntimeFault
@@ -16,9 +15,9 @@ from runtime.kinematics.base import Kinematics
 from runtime.motion import Trajectory
 from runtime.requests import AimRequest, Jog, MoveRequest
 from runtime.spaces import Spaces
-from runtime.types import EEF_WIDTH, Float32, Float64
+from runtime.types import Float32, Float64
+from runtime.ways import Ways
 
-_SAMPLES = 64  # of a path, for the workspace box
 _TOLERANCE = 1e-6
 
 
@@ -44,6 +43,7 @@ class Targets:
         self._plan = plan
         self._spaces = spaces
         self._kinematics = kinematics
+        self._ways = Ways(plan)
 
     def aim(self, asked: AimRequest, commanded: Float64) -> Aim:
         """Where it would go; RuntimeFault for a pose, an arm or a number of joints that the robot has not."""
@@ -61,7 +61,7 @@ class Targets:
         return self.checked("move", self._wanted("move", asked.joints, asked.pose, commanded), commanded)
 
     def checked(self, what: str, goal: Float64, commanded: Float64) -> Float64:
-        """`goal` [D], where limits and workspace boxes allow the way there; RuntimeFault for `what` else."""
+        """`goal` [D], where limits, workspace boxes and links allow the way there; RuntimeFault for `what` else."""
         limits = self._plan.limits
         beyond = np.flatnonzero((goal < limits.lower - _TOLERANCE) | (goal > limits.upper + _TOLERANCE))
         if len(beyond):
@@ -70,7 +70,7 @@ class Targets:
                 f"{what}: {limits.names[worst]} = {goal[worst]:.4f}; allowed: {limits.lower[worst]:g} to "
                 f"{limits.upper[worst]:g}"
             )
-        self._check_path(what, commanded, goal)
+        self._ways.check(what, commanded, goal)
         return goal
 
     def duration(self, start: Float64, goal: Float64, speed: float = 1.0) -> float:
@@ -78,21 +78,6 @@ class Targets:
         safety, limits = self._plan.deployment.safety, self._plan.limits
         velocity = limits.velocity * safety.motion_velocity_scale * speed
         return Trajectory(start, goal, velocity, safety.motion_acceleration * limits.reach).duration
-
-    def _check_path(self, what: str, start: Float64, goal: Float64) -> None:
-        """RuntimeFault where the straight way in joints leaves a workspace box that it begins in."""
-        boxes = self._plan.deployment.safety.workspace
-        if not boxes:
-            return
-        way = start + np.linspace(0.0, 1.0, _SAMPLES)[:, None] * (goal - start)
-        poses = self._spaces.eef_of(way).reshape(_SAMPLES, -1, EEF_WIDTH)
-        for index, arm in enumerate(self._plan.robot.arms):
-            if arm.name not in boxes:
-                continue
-            box, points = boxes[arm.name], poses[:, index, :3]
-            inside: NDArray[np.bool_] = np.all((points >= box.lower) & (points <= box.upper), axis=1)
-            if inside[0] and not inside.all():
-                raise RuntimeFault(f"{what}: {arm.name} would leave the workspace box on its way")
 
     def _wanted(
         self, what: str, joints: Sequence[float] | None, pose: str | None, commanded: Float64

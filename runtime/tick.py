@@ -180,6 +180,7 @@ class Tick:
 
     def _follow_order(self, order: Order, now: float) -> None:
         self._report.limiting.close()
+        self._report.nearing.close()
         rehearses = order.kind == "hold" or (order.kind == "follow" and order.mode == "sim")
         if order.run != self._simulated_run or not rehearses:
             self._simulated = None

@@ -1,0 +1,137 @@
+"""Capsules that stand for the links of a robot where it must not run into itself or the table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from robots import shapes
+from robots.description import CapsuleTable
+from robots.robot import Robot
+from robots.rotations import Float64
+from robots.shapes import Shape
+
+PIECES = 2  # capsules that a link has at most: each one more makes a good deal more pairs
+_ROUND = 24  # corners of the polygon about a circle
+_STEPS = 100  # towards the middle of what is to be covered
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capsule:
+    """All points within `radius` of the segment from `start` to `end`, float64 [3] in the link's frame [m]."""
+
+    start: Float64
+    end: Float64
+    radius: float
+
+
+def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
+    """Capsules by link of the URDF: the one that robot.toml declares, else those about the link's shapes.
+
+    Links without shapes, and those that robot.toml leaves out, have none.
+    """
+    by_link: dict[str, list[Shape]] = {}
+    for shape in shapes.read(robot.urdf):
+        by_link.setdefault(shape.link, []).append(shape)
+    found = {link: about(shown) for link, shown in by_link.items()}
+    found |= {link: (_declared(table),) for link, table in robot.collision.capsules.items()}
+    return {link: made for link, made in found.items() if link not in robot.collision.without}
+
+
+def about(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
+    """At most `PIECES` capsules that cover the shapes of one link: one bent round a corner is two, not a fat one.
+
+    Each shape begins with a capsule of its own; the two whose common one takes least more room are joined, again
+    and again.
+    """
+    pieces = [[shape] for shape in shown]
+    rooms = [_room(piece) for piece in pieces]
+    grown = {pair: _room(pieces[pair[0]] + pieces[pair[1]]) for pair in combinations(range(len(pieces)), 2)}
+    left = set(range(len(pieces)))
+    while len(left) > 1:
+        one, other = min(
+            combinations(sorted(left), 2), key=lambda pair: grown[pair] - rooms[pair[0]] - rooms[pair[1]]
+        )
+        if len(left) <= PIECES and grown[one, other] > rooms[one] + rooms[other]:
+            break
+        left -= {one, other}
+        joined = len(pieces)
+        pieces.append(pieces[one] + pieces[other])
+        rooms.append(grown[one, other])
+        grown |= {(piece, joined): _room(pieces[piece] + pieces[joined]) for piece in left}
+        left.add(joined)
+    return tuple(around(pieces[piece]) for piece in sorted(left))
+
+
+def _room(shown: Sequence[Shape]) -> float:
+    """The volume [m3] of a capsule about the shapes."""
+    capsule = around(shown, steps=1)
+    length = float(np.linalg.norm(capsule.end - capsule.start))
+    return float(np.pi * capsule.radius**2 * (length + 4 / 3 * capsule.radius))
+
+
+def around(shown: Sequence[Shape], steps: int = _STEPS) -> Capsule:
+    """A capsule that covers the shapes: along the longest axis of their common box, as thin as covers them all.
+
+    Its line goes through the middle of the smallest circle about the shapes as seen along that axis (the better,
+    the more `steps`); its ends are as near to each other as still covers them. What is round is hugged; a box
+    sticks out nowhere, and the capsule sticks out of its faces.
+    """
+    centres, sizes = _balls(shown)  # [n, 3], [n]
+    lower, upper = (centres - sizes[:, None]).min(axis=0), (centres + sizes[:, None]).max(axis=0)
+    axis = int((upper - lower).argmax())
+    across = np.delete(np.arange(3), axis)
+    middle = _middle(centres[:, across], sizes, (lower + upper)[across] / 2, steps)
+    off = np.linalg.norm(centres[:, across] - middle, axis=1)
+    radius = float((off + sizes).max())
+    # A ball that is `off` the line is covered by an end that is no farther from it along the line than this.
+    reach = np.sqrt(np.maximum((radius - sizes) ** 2 - off**2, 0.0))
+    along = centres[:, axis]
+    first, last = float((along + reach).min()), float((along - reach).max())
+    start, end = np.zeros(3), np.zeros(3)
+    start[across] = end[across] = middle
+    start[axis], end[axis] = (first, last) if first <= last else ((first + last) / 2,) * 2
+    return Capsule(start, end, radius)
+
+
+def _declared(table: CapsuleTable) -> Capsule:
+    return Capsule(np.array(table.start), np.array(table.end), table.radius)
+
+
+def _balls(shown: Sequence[Shape]) -> tuple[Float64, Float64]:
+    """Balls whose hull covers the shapes, in the link's frame: centres [n, 3] and radii [n]; corners have none."""
+    centres, sizes = [], []
+    for shape in shown:
+        corners, size = _corners(shape)
+        centres.append(corners @ shape.origin[:3, :3].T + shape.origin[:3, 3])
+        sizes.append(np.full(len(corners), size))
+    return np.concatenate(centres), np.concatenate(sizes)
+
+
+def _corners(shape: Shape) -> tuple[Float64, float]:
+    if shape.kind == "sphere":
+        return np.zeros((1, 3)), shape.size[0]
+    if shape.kind == "cylinder":
+        radius, length = shape.size
+        turn = np.linspace(0.0, 2 * np.pi, _ROUND, endpoint=False)
+        ring = np.column_stack([np.cos(turn), np.sin(turn)]) * radius / np.cos(np.pi / _ROUND)
+        ends = np.repeat([-length / 2, length / 2], _ROUND)
+        return np.column_stack([np.tile(ring, (2, 1)), ends]), 0.0
+    ends = np.array(shape.bounds())  # [2, 3]
+    return np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i, j, k in np.ndindex(2, 2, 2)]), 0.0
+
+
+def _middle(points: Float64, sizes: Float64, start: Float64, steps: int) -> Float64:
+    """The middle of the smallest circle about discs [n, 2] (Badoiu and Clarkson 2003: ever smaller steps outwards)."""
+    middle, best, least = start, start, np.inf
+    for step in range(1, steps + 1):
+        off = points - middle
+        far = np.linalg.norm(off, axis=1) + sizes
+        worst = int(far.argmax())
+        if far[worst] < least:
+            best, least = middle, far[worst]
+        middle = middle + off[worst] / (step + 1)
+    return best

@@ -1,0 +1,167 @@
+"""How far the links of a robot are from each other and from the table: a coarse check, capsules for links."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robots import segments
+from robots.body import Body
+from robots.capsules import capsules
+from robots.description import TABLE
+from robots.robot import Robot
+from robots.rotations import Float64
+
+MARGIN = 0.005  # [m] within which links count as touching, unless somebody says otherwise
+_POSTURES = 256  # at which is looked whether two links ever part
+_NEARLY_ALWAYS = 0.95  # of them
+_LEVEL = 1e-3  # [m] by which the height of what only turns about the vertical changes
+_BLOCK = 64  # postures at once: what lies in between then fits the caches
+
+_Indices = NDArray[np.intp]
+
+
+class Clearance:
+    """Distances of the `pairs` that are looked at, by the names of parts ("left_arm/link5") or "table".
+
+    A pair of links is there once for each pair of their capsules.
+
+    Looked at are links of different arms, links of one body, and links over the table (the plane z = 0 of the
+    scene). Left out, for they say nothing:
+
+    * links with at most one of the robot's joints between them (grippers do not count, nor joints that no group
+      moves); of two arms that each stand for themselves, links that nothing moves;
+    * pairs that touch at nearly every posture (95 %), as in a wrist, in this arm and in others like it;
+    * the table under what nothing moves or what only turns about the vertical, and under fingers: they reach down
+      to it on purpose;
+    * what robot.toml says under collision.ignore and collision.without.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        body = Body(robot)
+        found = [
+            (part, capsule)
+            for link, made in capsules(robot).items()
+            for part in body.parts_of(link)
+            for capsule in made
+        ]
+        found.sort(key=lambda one: one[0])
+        self._body = body
+        self._parts = np.array([part for part, _ in found], dtype=np.intp)
+        self._names = [body.parts[part] for part in self._parts]
+        self._radii = np.array([capsule.radius for _, capsule in found])
+        self._ends = np.ones((len(found), 4, 2))  # in the link, homogeneous
+        for ends, (_, capsule) in zip(self._ends, found, strict=True):
+            ends[:3, 0], ends[:3, 1] = capsule.start, capsule.end
+        self._look_at(*_candidates(robot, body, self._parts))
+        self._look_at(*self._telling(robot))
+
+    def distances(self, q: Float64) -> Float64:
+        """How far the pairs are apart [m], [..., K], below zero where they overlap, for the robot's vector [..., D]."""
+        if q.ndim == 1:
+            return self._distances(q)
+        flat = q.reshape(-1, q.shape[-1])
+        apart = np.empty((len(flat), len(self.pairs)))
+        for start in range(0, len(flat), _BLOCK):
+            apart[start : start + _BLOCK] = self._distances(flat[start : start + _BLOCK])
+        return apart.reshape(*q.shape[:-1], len(self.pairs))
+
+    def _distances(self, q: Float64) -> Float64:
+        poses = self._body.poses(q)
+        ends = poses[..., self._parts, :3, :] @ self._ends  # [..., N, 3, 2]
+        starts = ends[..., 0]
+        ways = ends[..., 1] - starts
+        one, other = self._first, self._second
+        apart = segments.distances(
+            starts[..., one, :], ways[..., one, :], starts[..., other, :], ways[..., other, :]
+        )
+        lowest = ends[..., self._over, 2, :].min(axis=-1)
+        return np.asarray(np.concatenate([apart, lowest], axis=-1) - self._thick)
+
+    def _look_at(self, first: _Indices, second: _Indices, over: _Indices) -> None:
+        """The pairs from now on: capsules `first` and `second`, and those `over` the table."""
+        self._first, self._second, self._over = first, second, over
+        self._thick = np.concatenate([self._radii[first] + self._radii[second], self._radii[over]])
+        names = self._names
+        self.pairs = (
+            *((names[one], names[other]) for one, other in zip(first, second, strict=True)),
+            *((names[one], TABLE) for one in over),
+        )
+
+    def _telling(self, robot: Robot) -> tuple[_Indices, _Indices, _Indices]:
+        """The pairs whose distance says something: they part somewhere, and what is over the table has a height."""
+        lower = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
+        upper = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
+        apart = self.distances(np.random.default_rng(0).uniform(lower, upper, (_POSTURES, robot.dim)))
+        touching = dict.fromkeys(map(_alike, self.pairs), 0.0)
+        for pair, share in zip(self.pairs, (apart < MARGIN).mean(axis=0), strict=True):
+            touching[_alike(pair)] = max(touching[_alike(pair)], float(share))
+        parting = np.array([touching[_alike(pair)] < _NEARLY_ALWAYS for pair in self.pairs], dtype=bool)
+        count = len(self._first)
+        tilting = np.ptp(apart[:, count:], axis=0) > _LEVEL
+        return (
+            self._first[parting[:count]],
+            self._second[parting[:count]],
+            self._over[parting[count:] & tilting],
+        )
+
+
+def _alike(pair: tuple[str, str]) -> tuple[str, ...]:
+    """What a pair has in common with the same links of another arm like it; itself, where it is of two arms."""
+    (group, _, link), (other_group, _, other) = (name.partition("/") for name in pair)
+    return (link, other or other_group) if group == other_group or not other else pair
+
+
+def _candidates(robot: Robot, body: Body, parts: _Indices) -> tuple[_Indices, _Indices, _Indices]:
+    """Pairs of capsules that could touch without being neighbours, and capsules that could reach the table."""
+    moved = body.moved()[parts]
+    grippers = np.isin(np.arange(robot.dim), robot.gripper_dims)
+    fingers = moved[:, grippers].any(axis=1)
+    moved = moved[:, ~grippers]
+    roots = np.array([_root(body, part) for part in parts])
+    between = (moved[:, None] ^ moved[None]).sum(axis=-1)
+    together = roots[:, None] == roots[None]
+    wanted = between >= np.where(together, 2, 1)
+    first, second = (side.astype(np.intp) for side in np.nonzero(np.triu(wanted, 1)))
+    ignored = {frozenset(pair) for pair in robot.collision.ignore}
+    names = [body.parts[part] for part in parts]
+    links = [name.partition("/")[2] for name in names]
+
+    def ignoring(one: int, other: int) -> bool:
+        alike = bool(together[one, other]) and frozenset((links[one], links[other])) in ignored
+        return alike or frozenset((names[one], names[other])) in ignored
+
+    pairs = [pair for pair in zip(first.tolist(), second.tolist(), strict=True) if not ignoring(*pair)]
+    first, second = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+    over = np.array(
+        [
+            index
+            for index in np.flatnonzero(moved.any(axis=1) & ~fingers)
+            if not ignored & {frozenset((links[index], TABLE)), frozenset((names[index], TABLE))}
+        ],
+        dtype=np.intp,
+    )
+    return first, second, over
+
+
+def _root(body: Body, part: np.intp) -> int:
+    while body.above[part] >= 0:
+        part = body.above[part]
+    return int(part)
+
+
+def problems(robot: Robot, margin: float = MARGIN) -> list[str]:
+    """What is wrong with [collision] of the robot, in sentences: pairs that touch at a named pose, or no pairs."""
+    clearance = Clearance(robot)
+    if not clearance.pairs:
+        return ["collision: no two links are looked at; links need shapes, or capsules in robot.toml"]
+    found: dict[tuple[str, str, str], float] = {}
+    for name, pose in robot.poses.items():
+        for (one, other), apart in zip(clearance.pairs, clearance.distances(pose).tolist(), strict=True):
+            found[name, one, other] = min(apart, found.get((name, one, other), apart))
+    return [
+        f"poses.{name}: {one} and {other} are {1000 * apart:.0f} mm apart, needed: {1000 * margin:g}; correct the "
+        "pose or the capsules, or name the pair in collision.ignore"
+        for (name, one, other), apart in found.items()
+        if apart < margin
+    ]

@@ -1,0 +1,98 @@
+"""Whether a robot would run into itself or the table: its own rule about what a step, or a way, may do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robots import Robot
+from robots.clearance import Clearance
+from runtime.types import Float64
+
+_NEARER = 1e-6  # [m] that is rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Collision:
+    """Two links ("left_arm/link5"), or a link and "table", that touch or nearly do.
+
+    `distance` is that of the capsules that stand for them [m], below zero where they overlap.
+    """
+
+    one: str
+    other: str
+    distance: float
+
+    def __str__(self) -> str:
+        if self.distance < 0:
+            return f"{self.one} and {self.other} would collide ({-1000 * self.distance:.0f} mm deep)"
+        return f"{self.one} and {self.other} would be {1000 * self.distance:.0f} mm apart"
+
+
+class Collisions:
+    """Judges postures float64 [D] of a robot: pairs of links within `margin` [m] of each other count as touching.
+
+    Who touches already may stay, and may part; only coming nearer is forbidden. Grippers open and close freely: it
+    is arms that are kept apart, and an object must be let go of wherever it is.
+    """
+
+    def __init__(self, robot: Robot, margin: float) -> None:
+        self._clearance = Clearance(robot)
+        self._margin = margin
+        self._grippers = np.array(robot.gripper_dims, dtype=np.intp)
+
+    def nearest(self, q: Float64) -> Collision | None:
+        """The nearest pair within the margin; None where there is none."""
+        apart = self._clearance.distances(q)
+        return self._worst(apart, apart < self._margin)
+
+    def approached(self, q: Float64, before: Float64) -> Collision | None:
+        """The nearest pair that touches at `q` and came nearer since `before`; None where nothing does."""
+        apart = self._clearance.distances(q)
+        touching = apart < self._margin
+        if not touching.any():
+            return None
+        return self._worst(
+            apart, touching & (apart < self._clearance.distances(self._gripping(before, q)) - _NEARER)
+        )
+
+    def on_way(self, way: Float64) -> tuple[Collision, int] | None:
+        """The first pair that comes nearer while it touches, and at which posture of `way` [T, D]; None where none.
+
+        Judged with the grippers of the beginning and with those of the end all along: they may move at any time.
+        """
+        found = [hit for end in self._ends(way) if (hit := self._hit(self._gripping(way, end))) is not None]
+        return min(found, key=lambda hit: hit[1], default=None)
+
+    def _ends(self, way: Float64) -> Sequence[Float64]:
+        same = np.array_equal(way[0, self._grippers], way[-1, self._grippers])
+        return (way[0],) if same else (way[0], way[-1])
+
+    def _hit(self, way: Float64) -> tuple[Collision, int] | None:
+        apart = self._clearance.distances(way)  # [T, K]
+        farthest = np.maximum.accumulate(apart, axis=0)
+        wrong = (apart < self._margin) & (apart < farthest - _NEARER)
+        if not wrong.any():
+            return None
+        at = int(wrong.any(axis=1).argmax())
+        worst = self._worst(apart[at], wrong[at])
+        assert worst is not None
+        return worst, at
+
+    def _gripping(self, q: Float64, like: Float64) -> Float64:
+        """Postures `q` with the grippers of `like`."""
+        if not len(self._grippers):
+            return q
+        gripping = q.copy()
+        gripping[..., self._grippers] = like[self._grippers]
+        return gripping
+
+    def _worst(self, apart: Float64, among: NDArray[np.bool_]) -> Collision | None:
+        if not among.any():
+            return None
+        index = int(np.where(among, apart, np.inf).argmin())
+        one, other = self._clearance.pairs[index]
+        return Collision(one, other, float(apart[index]))

@@ -1,0 +1,46 @@
+"""Whether the straight way in joints from one posture to another may be gone by a motion of ours."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from runtime.collision import Collisions
+from runtime.errors import RuntimeFault
+from runtime.family import Plan
+from runtime.types import Float64
+from runtime.workspace import Workspace
+
+_STEP = 0.01  # [rad or m] of the joint that goes farthest, between postures that are looked at
+# What is begun must not be stopped half-way by control, which judges what is really sent, at other postures.
+_SPARE = 0.001  # [m]
+
+
+class Ways:
+    """The ways of one robot, within its workspace boxes and without collisions."""
+
+    def __init__(self, plan: Plan) -> None:
+        safety = plan.deployment.safety
+        self._grippers = plan.limits.grippers
+        self._workspace = Workspace(plan.robot, safety.workspace)
+        self._collisions = Collisions(plan.robot, safety.collision_margin + _SPARE)
+
+    def check(self, what: str, start: Float64, goal: Float64) -> None:
+        """RuntimeFault for `what` where the way from `start` to `goal` [D] leaves a box it is in, or links collide."""
+        way = self._way(start, goal)
+        if arm := self._workspace.left_on(way):
+            raise RuntimeFault(f"{what}: {arm} would leave the workspace box on its way")
+        found = self._collisions.on_way(way)
+        if found is not None:
+            collision, at = found
+            raise RuntimeFault(
+                f"{what}: {collision} after {100 * at / (len(way) - 1):.0f} % of the way: go by another pose, or move "
+                "the robot by hand first"
+            )
+
+    def _way(self, start: Float64, goal: Float64) -> Float64:
+        """Postures [T, D] from `start` to `goal`, near enough to each other."""
+        farthest = np.abs(goal - start).max(where=~self._grippers, initial=0.0)
+        count = max(2, math.ceil(farthest / _STEP) + 1)
+        return np.asarray(start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start))

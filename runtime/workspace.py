@@ -1,0 +1,45 @@
+"""The boxes that end effectors must stay in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robots import Robot
+from runtime.safety import WorkspaceBox
+from runtime.types import Float64
+
+
+class Workspace:
+    """Which arms' end effectors are outside their boxes, by the robot's own forward kinematics.
+
+    `arms` are those that have a box, in the robot's order.
+    """
+
+    def __init__(self, robot: Robot, boxes: Mapping[str, WorkspaceBox]) -> None:
+        self._groups = [arm for arm in robot.arms if arm.name in boxes]
+        self.arms = tuple(arm.name for arm in self._groups)
+        self._lower = np.array([boxes[name].lower for name in self.arms]).reshape(-1, 3)
+        self._upper = np.array([boxes[name].upper for name in self.arms]).reshape(-1, 3)
+
+    def __call__(self, q: Float64) -> tuple[str, ...]:
+        """The names of the arms that are outside with the joints q [D]."""
+        return tuple(name for name, out in zip(self.arms, self.outside(q), strict=True) if out)
+
+    def outside(self, q: Float64) -> NDArray[np.bool_]:
+        """Whether each of `arms` is outside, bool [..., arms], with the joints q [..., D]."""
+        if not self._groups:
+            return np.zeros((*q.shape[:-1], 0), dtype=bool)
+        points = np.stack([arm.transform(q)[..., :3, 3] for arm in self._groups], axis=-2)
+        return np.asarray(((points < self._lower) | (points > self._upper)).any(axis=-1))
+
+    def left_on(self, way: Float64) -> str:
+        """The arm that leaves its box somewhere on a `way` [T, D] in joints; "" where none does.
+
+        Who begins outside may go anywhere until it is inside.
+        """
+        outside = self.outside(way)
+        left = (~outside[:-1] & outside[1:]).any(axis=0)
+        return self.arms[int(left.argmax())] if left.any() else ""
