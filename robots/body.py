@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,21 @@ from robots.errors import RobotError
 from robots.robot import Group, Robot
 from robots.rotations import Float64, transform_of
 from robots.urdf import Joint, Urdf
+
+
+class BodyTables(NamedTuple):
+    """How parts [P] hang on each other: a part's joint has the value coupling . q + offset, within bounds.
+
+    Its transform behind the part `above` it (-1: in the scene; parents come first) is the sum of its four `motions`
+    [P, 4, 16], weighted by 1, the cosine and sine of that value, and the value.
+    """
+
+    motions: Float64
+    coupling: Float64  # [P, D], at most one number per row is not zero
+    offsets: Float64
+    low: Float64
+    high: Float64
+    above: NDArray[np.intp]
 
 
 class Body:
@@ -74,6 +90,11 @@ class Body:
         for parts, above in self._layers:
             moved[parts] |= moved[above]
         return moved
+
+    @property
+    def tables(self) -> BodyTables:
+        """What `poses` is computed from, for those who compute it otherwise."""
+        return BodyTables(self._tables, self._coupling, self._offsets, self._low, self._high, self.above)
 
     def poses(self, q: Float64) -> Float64:
         """Where the parts are, scene <- part [..., P, 4, 4], for the robot's vector q [..., D]."""

@@ -1,0 +1,59 @@
+"""Where all parts of a robot are, in the form that the 3D scene reads, in microseconds."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from robots import Body
+from runtime.kinematics.base import KinematicsError
+from runtime.types import Float32
+
+if TYPE_CHECKING:
+    from runtime.kinematics.kernels.bodies import Parts
+
+
+class Links:
+    """The parts of a body, in its order; compiled or loaded from disk when it is made.
+
+    Raises KinematicsError where numba is not installed.
+    """
+
+    def __init__(self, body: Body) -> None:
+        try:
+            from runtime.kinematics.kernels.bodies import place_parts
+        except ImportError as error:
+            raise KinematicsError(str(error)) from error
+        self._place = place_parts
+        self._parts = _parts_of(body)
+        self._dim = body.tables.coupling.shape[1]
+        self.poses(np.zeros(self._dim))
+
+    def poses(self, q: ArrayLike) -> Float32:
+        """Scene <- part for joints [..., D] as float32 [..., P, 16], each matrix column by column."""
+        joints = np.array(q, dtype=np.float64, order="C")
+        if joints.shape[-1:] != (self._dim,):
+            raise KinematicsError(f"joints of shape {joints.shape} were given; allowed: [..., {self._dim}]")
+        placed = np.empty((*joints.shape[:-1], len(self._parts.drive), 16), dtype=np.float32)
+        rows = joints.reshape(-1, self._dim)
+        self._place(self._parts, rows, placed.reshape(len(rows), len(self._parts.drive), 16))
+        return placed
+
+
+def _parts_of(body: Body) -> Parts:
+    from runtime.kinematics.kernels.bodies import Parts
+
+    tables = body.tables
+    motions = tables.motions.reshape(-1, 4, 4, 4)
+    drive = np.where(tables.coupling.any(axis=1), np.argmax(tables.coupling != 0, axis=1), -1)
+    return Parts(
+        motions=np.concatenate([motions[:, :, :3, :3].reshape(-1, 4, 9), motions[:, :, :3, 3]], axis=2),
+        drive=drive.astype(np.int64),
+        factor=tables.coupling[np.arange(len(drive)), np.maximum(drive, 0)],
+        offset=tables.offsets.copy(),
+        low=tables.low.copy(),
+        high=tables.high.copy(),
+        above=tables.above.astype(np.int64),
+    )

@@ -1,0 +1,51 @@
+"""How well solved joints meet their targets, whichever backend solved them: errors and flags of every frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robots import Group, Robot
+from robots.rotations import rotation_vector, transform_of
+from runtime.kinematics.base import IkFlag, IkResult, KinematicsSettings
+from runtime.types import Float64
+
+_RESTS = 1e-6  # rad (m) within which a joint rests on a bound
+
+
+def measured(
+    robot: Robot, settings: KinematicsSettings, q: Float64, targets: Float64, bounds: tuple[Float64, Float64]
+) -> IkResult:
+    """The result for joints q [T, D] that were solved for poses [T, arms, 7].
+
+    `bounds` are the lowest and the highest joints [T, D] that each frame could have: the joint limits, and what
+    the velocities allowed.
+    """
+    shape = (len(q), len(robot.arms))
+    position, rotation, flags = np.empty(shape), np.empty(shape), np.zeros(shape, dtype=np.uint8)
+    for index, arm in enumerate(robot.arms):
+        found, wanted = arm.transform(q), transform_of(targets[:, index])
+        position[:, index] = np.linalg.norm(found[:, :3, 3] - wanted[:, :3, 3], axis=-1)
+        apart = rotation_vector(wanted[:, :3, :3] @ np.swapaxes(found[:, :3, :3], -1, -2))
+        rotation[:, index] = np.linalg.norm(apart, axis=-1)
+        flags[:, index] = _bound(robot, arm, q, bounds) | _singular(arm, q, settings.singular_below)
+    over = (position > settings.position_tolerance) | (rotation > settings.rotation_tolerance)
+    flags[over] |= int(IkFlag.OVER_TOLERANCE)
+    return IkResult(q, position, rotation, flags)
+
+
+def _bound(robot: Robot, arm: Group, q: Float64, bounds: tuple[Float64, Float64]) -> NDArray[np.uint8]:
+    dims = arm.joint_dims
+    own, low, high = q[:, dims], bounds[0][:, dims], bounds[1][:, dims]
+    at_limit = (own <= robot.lower[dims] + _RESTS) | (own >= robot.upper[dims] - _RESTS)
+    at_velocity = ~at_limit & ((own <= low + _RESTS) | (own >= high - _RESTS))
+    flags = at_limit.any(axis=1) * int(IkFlag.AT_LIMIT) + at_velocity.any(axis=1) * int(IkFlag.AT_VELOCITY)
+    return flags.astype(np.uint8)
+
+
+def _singular(arm: Group, q: Float64, below: float) -> NDArray[np.uint8]:
+    assert arm.chain is not None  # it is an arm
+    smallest = [
+        np.linalg.svd(arm.chain.jacobian(row)[1], compute_uv=False)[-1] for row in q[:, arm.joint_dims]
+    ]
+    return np.where(np.array(smallest) < below, int(IkFlag.NEAR_SINGULAR), 0).astype(np.uint8)
