@@ -151,12 +151,13 @@ class Node:
             "t": self._clock.now() + self._options.clock_offset,
             "images": self._pictures(),
             "state": {name: part.astype(np.float32) for name, part in robot.split(q).items()},
-            "eef": poses(robot, q),
         }
+        if not self._options.no_eef:
+            message["eef"] = poses(robot, q)
         if self._leader_phase is not None:
             applied = self._plant.target
             message["action"] = applied.astype(np.float32)
-            message["action_eef"] = np.concatenate(list(poses(robot, applied).values()))
+            message["action_eef"] = np.concatenate([np.empty(0, np.float32), *poses(robot, applied).values()])
         message |= {"hil_supported": False, "hil_active": False}
         if self._hil_error:
             message["hil_error"] = self._hil_error
@@ -198,6 +199,9 @@ def parser() -> argparse.ArgumentParser:
         prog="python -m runtime.sim.node", description="A simulated execution node."
     )
     line.add_argument("--robot", required=True, help="name of a folder in robots/, or a path")
+    line.add_argument(
+        "--groups", type=standin.names, metavar="NAME,...", help="of the robot, as the deployment has them"
+    )
     line.add_argument("--obs-endpoint", default="tcp://127.0.0.1:5555", help="port 0 takes a free one")
     line.add_argument("--action-endpoint", default="tcp://127.0.0.1:5556", help="port 0 takes a free one")
     line.add_argument("--insecure-link", action="store_true", help="allow addresses beyond this machine")
@@ -230,6 +234,7 @@ def parser() -> argparse.ArgumentParser:
         help="fault: said of the drives, which are off",
     )
     line.add_argument("--drives-disabled", action="store_true", help="fault: the drives are off")
+    line.add_argument("--no-eef", action="store_true", help="it measures no poses of its end effectors")
     line.add_argument(
         "--clock-offset", type=float, default=0.0, metavar="S", help="added to the node's clock"
     )
@@ -245,7 +250,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     told = standin.ending(options.lifeline)
     clock = MonotonicClock()
     try:
-        node = Node(robots.load(options.robot), options, clock)
+        node = Node(robots.load(options.robot, options.groups), options, clock)
         with contextlib.closing(node):
             standin.announce(node.open(), options.ready_file)
             run(node, clock, options.rate, told)

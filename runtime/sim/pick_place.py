@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -27,7 +27,7 @@ from runtime.sim.sight import Overhead, Sight
 from runtime.types import Float32, Float64, UInt8
 
 if TYPE_CHECKING:
-    from robots import Robot
+    from robots import Group, Robot
 
 _LEAD = 0.12  # s by which rows lead the measured joints where time does not tell: what robots lag behind
 _BEHIND, _AHEAD = 0.8, 0.6  # s between the row of the clock and that of the joints, beyond which they win
@@ -41,7 +41,12 @@ _EMPTY = 0.75  # of the block's edge: jaws narrower than that hold nothing
 _SHORT = 0.05  # m by which a grasp is short where it slips
 _CARRYING = ("lift", "carry", "lower")
 _LEAVING = ("back off", "retreat")
+_ARM = 0.25  # m
 _PAUSED = 3.0  # s without a request, after which a robot that was leaving begins another episode
+
+
+Apart = Callable[["Group", Float64, Float64], Float64]
+"""From the arm at work, rows float64 [n, D] and joints [D] to how far apart they are [n], in rad."""
 
 
 class ScriptError(RuntimeFault):
@@ -72,8 +77,10 @@ class PickPlace(Script):
         skill: Skill,
         name: str | None = None,
         clock: Clock | None = None,
+        apart: Apart | None = None,
     ) -> None:
         self.robot, self.clock = robot, clock or MonotonicClock()
+        self.apart = apart or joints_apart(robot)
         self.horizon, self.rate, self.skill = horizon, rate, skill
         self.table = Bench()
         self.overhead = Overhead(robot, self.table)
@@ -205,10 +212,7 @@ class Pursuit:
         return self._apart(self._on().legs[self._leg].rows, q)
 
     def _apart(self, rows: Float64, q: Float64) -> Float64:
-        """Of the joints [D] from each of the rows [n, D], grippers aside [rad]."""
-        apart = np.abs(rows - q)
-        apart[:, list(self._policy.robot.gripper_dims)] = 0.0
-        return np.asarray(apart.max(axis=1))
+        return self._policy.apart(self._on().arm, rows, q)
 
     def _advance(self, q: Float64, elapsed: float) -> None:
         """Find the leg and the row that the robot is at; a route that is done is dropped."""
@@ -262,6 +266,27 @@ class Pursuit:
 
     def _still(self, q: Float64) -> Float32:
         return np.repeat(q[None], self._policy.horizon, axis=0).astype(np.float32)
+
+
+def joints_apart(robot: Robot) -> Apart:
+    """How far the joints are from each of the rows, at most: grippers and numbers that move no link aside [rad]."""
+    moving = np.concatenate([group.joint_dims[np.array(group.urdf_joints) != ""] for group in robot.groups])
+
+    def apart(arm: Group, rows: Float64, q: Float64) -> Float64:
+        return np.asarray(np.abs(rows - q)[:, moving].max(axis=1))
+
+    return apart
+
+
+def poses_apart(arm: Group, rows: Float64, q: Float64) -> Float64:
+    """How far the arm's end effector is from where it is in each of the rows, whatever its joints are [rad].
+
+    A way of _ARM metres counts as one radian.
+    """
+    wanted, found = arm.pose(rows), arm.pose(q)
+    shift = np.linalg.norm(wanted[:, :3] - found[:3], axis=1) / _ARM
+    turn = 2 * np.arccos(np.minimum(1.0, np.abs(wanted[:, 3:] @ found[3:])))
+    return np.asarray(np.maximum(shift, turn))
 
 
 def _differs(sight: Sight, before: Sight) -> bool:

@@ -14,6 +14,7 @@ from runtime.sim.script import Script, Waving
 
 if TYPE_CHECKING:
     from robots import Robot
+    from runtime.sim.rtc_wires import Name
 
 
 def parser() -> argparse.ArgumentParser:
@@ -25,6 +26,9 @@ def parser() -> argparse.ArgumentParser:
     )
     line.add_argument("protocol", choices=["openpi"])
     line.add_argument("--robot", required=True, help="name of a folder in robots/, or a path")
+    line.add_argument(
+        "--groups", type=standin.names, metavar="NAME,...", help="of the robot, as the deployment has them"
+    )
     line.add_argument("--port", type=int, default=8000, help="0 takes a free one")
     line.add_argument("--horizon", type=int, default=50, help="rows per chunk")
     line.add_argument("--rate", type=float, help="rows per second; the robot's control rate if not given")
@@ -41,12 +45,22 @@ def parser() -> argparse.ArgumentParser:
     skill.add_argument(
         "--failure-rate", type=_share, default=0.0, metavar="P", help="share of episodes that it spoils"
     )
+    poses = line.add_argument_group("what its rows are")
+    poses.add_argument(
+        "--space", choices=["joint", "eef"], default="joint", help="it is asked with joints in any case"
+    )
+    poses.add_argument(
+        "--pose",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="with --space eef: how poses are written, the keys of policy.action_pose",
+    )
     line.add_argument(
         "--rtc",
         choices=["none", "prev_action", "async_rtc"],
-        default="prev_action",
         help="how it is told what the robot is committed to, which it then copies: flat keys (plain requests are "
-        "understood too), envelopes alone, or not at all",
+        "understood too; the default), envelopes alone, or not at all, as always with --space eef",
     )
     line.add_argument("--fault", type=faults.parse, default=faults.NONE, metavar="NAME[:ARG]")
     standin.add_arguments(line)
@@ -61,12 +75,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     told = standin.ending(options.lifeline)
     try:
-        robot = robots.load(options.robot)
+        robot = robots.load(options.robot, options.groups)
         rate = options.rate or robot.control_rate
         behaviour = Behaviour(
-            options.horizon, rate, options.latency_ms / 1e3, options.fault, options.seed, options.rtc
+            options.horizon, rate, options.latency_ms / 1e3, options.fault, options.seed, _rtc(options)
         )
-        played = _script(robot, rate, options)
+        played = _spoken(_script(robot, rate, options), robot, rate, options)
         with contextlib.closing(OpenpiServer(robot, behaviour, options.port, played)) as server:
             standin.announce(server.start(), options.ready_file)
             told.wait()
@@ -76,9 +90,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _rtc(options: argparse.Namespace) -> Name:
+    """How it is told what to continue; SetupError where it could not."""
+    if options.space == "eef" and options.rtc not in (None, "none"):
+        raise SetupError(
+            f"--rtc {options.rtc} with --space eef: it continues joint rows alone; allowed: none"
+        )
+    chosen: Name = options.rtc or ("none" if options.space == "eef" else "prev_action")
+    return chosen
+
+
+def _spoken(script: Script, robot: Robot, rate: float, options: argparse.Namespace) -> Script:
+    """The script, in the space that was asked for."""
+    from runtime.sim.in_poses import InPoses, pose_format
+
+    if options.space == "joint":
+        if options.pose:
+            raise SetupError(f"--pose {' '.join(options.pose)}: allowed with --space eef")
+        return script
+    return InPoses(script, robot, rate, pose_format(options.pose))
+
+
 def _script(robot: Robot, rate: float, options: argparse.Namespace) -> Script:
     from runtime.sim.chase import Chase
-    from runtime.sim.pick_place import PickPlace, Skill
+    from runtime.sim.pick_place import PickPlace, Skill, poses_apart
 
     if options.behaviour != "pick_place" and (options.noise or options.failure_rate):
         raise SetupError(
@@ -89,7 +124,8 @@ def _script(robot: Robot, rate: float, options: argparse.Namespace) -> Script:
     if options.behaviour == "gesture":
         return Waving(robot, options.horizon, rate, options.seed, options.name)
     skill = Skill(options.noise / 1e3, options.failure_rate, options.seed)
-    return PickPlace(robot, options.horizon, rate, skill, options.name)
+    apart = poses_apart if options.space == "eef" else None
+    return PickPlace(robot, options.horizon, rate, skill, options.name, apart=apart)
 
 
 def _length(text: str) -> float:

@@ -30,6 +30,7 @@ _DARKEST = 40  # of 255; in shadow a colour is still a colour
 _BLOCK_SIZE = (0.7, 1.4)  # area seen over area expected
 _PLATE_SIZE = (0.85, 1.2)
 _ROUND = 1.15  # longest over shortest width of a disc
+_RING = 0.6  # of what a ring surrounds, the most that has its colour
 _CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
 
 Matrix = NDArray[Any]  # what OpenCV's own annotations call a picture or a mask
@@ -104,8 +105,9 @@ class Overhead:
         return _area(self._camera, self._bench.block_edge * _CORNERS @ turn + (x, y, 0.0))
 
     def _plate(self, hsv: Matrix) -> tuple[float, float] | None:
-        """The middle of the rim's outer edge."""
-        rim = _largest(_mask(hsv, self._bench.plate_rim_colour))
+        """The middle of the rim's outer edge; a solid disc of its colour is part of a robot."""
+        mask = _mask(hsv, self._bench.plate_rim_colour)
+        rim = _largest(mask)
         if rim is None or len(rim) < 5:
             return None
         pixels = self._native(rim[:, 0].astype(np.float64), hsv)
@@ -116,7 +118,7 @@ class Overhead:
         radius = self._bench.plate_radius
         circle = np.column_stack([x + radius * np.cos(turns), y + radius * np.sin(turns)])
         expected = _area(self._camera, np.insert(circle, 2, self._bench.plate_height, axis=1))
-        is_round = max(width, height) <= _ROUND * min(width, height)
+        is_round = max(width, height) <= _ROUND * min(width, height) and _is_ring(mask, rim)
         return (x, y) if is_round and _within(cv2.contourArea(hull), expected, _PLATE_SIZE) else None
 
     def _native(self, pixels: Float64, shown: Matrix) -> Float64:
@@ -158,6 +160,15 @@ def _largest(mask: Matrix) -> Matrix | None:
     """The outline [n, 1, 2] of the largest patch."""
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return max(outlines, key=cv2.contourArea, default=None)
+
+
+def _is_ring(mask: Matrix, outline: Matrix) -> bool:
+    """Whether most of what the outline [n, 1, 2] surrounds, or would if it were closed, is not in the mask."""
+    left, top, width, height = cv2.boundingRect(outline)
+    inside = np.zeros((height, width), np.uint8)
+    cv2.fillConvexPoly(inside, cv2.convexHull(outline - (left, top)), 1)
+    coloured = mask[top : top + height, left : left + width] * inside
+    return bool(np.count_nonzero(coloured) <= _RING * np.count_nonzero(inside))
 
 
 def _area(camera: PinholeCamera, points: Float64) -> float:

@@ -19,6 +19,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lifeline", action="store_true", help="end when standard input ends")
 
 
+def names(text: str) -> list[str]:
+    """Names, separated by commas."""
+    return [name.strip() for name in text.split(",")]
+
+
 def announce(ready: Mapping[str, object], path: Path | None) -> None:
     """Write the addresses to `path`, whole or not at all, then print them as one JSON line."""
     line = json.dumps(dict(ready))

@@ -23,10 +23,11 @@ from runtime.family import Plan
 from runtime.lockstep import Lockstep
 from runtime.session import State
 from runtime.sim.bench import Bench, camera_arm
+from runtime.sim.in_poses import InPoses
 from runtime.sim.link import Link
 from runtime.sim.node import Node, parser
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
-from runtime.sim.pick_place import PickPlace, Skill
+from runtime.sim.pick_place import PickPlace, Skill, poses_apart
 from runtime.sim.plant import Plant
 from runtime.sim.render import Renderer
 from runtime.sim.surroundings import Surroundings
@@ -126,8 +127,12 @@ def served(
 ) -> Iterator[tuple[TabletopPlan, Lockstep]]:
     """A station that is not yet connected, and its policy served on loopback on the station's clock."""
     made = planned(name, seed, data, "ws://127.0.0.1:1", assignments)
-    script = PickPlace(made.robot, HORIZON, made.rate, Skill(_NOISE, seed=seed), clock=_Later())
-    server = OpenpiServer(made.robot, Behaviour(HORIZON, made.rate), 0, script)
+    policy = made.deployment.policy
+    in_poses = policy.action_space == "eef"
+    skill, apart = Skill(_NOISE, seed=seed), poses_apart if in_poses else None
+    script = PickPlace(made.robot, HORIZON, made.rate, skill, clock=_Later(), apart=apart)
+    spoken = InPoses(script, made.robot, made.rate, policy.action_pose) if in_poses else script
+    server = OpenpiServer(made.robot, Behaviour(HORIZON, made.rate, rtc="none"), 0, spoken)
     url = str(server.start()["url"])
     with closing(server):
         made = planned(name, seed, data, url, assignments)

@@ -99,3 +99,16 @@ def test_what_is_covered_in_part_is_not_seen(thing):
 def test_a_picture_of_another_shape_is_refused():
     with pytest.raises(BenchError, match=r"\(224, 224, 4\) was given; allowed: \[H, W, 3\] or \[3, H, W\]"):
         EYE.look(np.zeros((224, 224, 4), np.uint8))
+
+
+def test_a_solid_disc_of_the_rims_colour_is_no_plate():
+    picture = np.tile(np.uint8(BENCH.table_colour), (480, 640, 1))
+    u, v = CAMERA.project(np.array([*LAYOUT.plate, BENCH.plate_height]))
+    edge, _ = CAMERA.project(
+        np.array([LAYOUT.plate[0] + BENCH.plate_radius, LAYOUT.plate[1], BENCH.plate_height])
+    )
+    colour = tuple(int(part) for part in BENCH.plate_rim_colour)
+    cv2.circle(picture, (round(u), round(v)), round(edge - u), colour, 12)
+    assert EYE.look(letterboxed(picture)).plate == pytest.approx(LAYOUT.plate, abs=0.01)
+    cv2.circle(picture, (round(u), round(v)), round(edge - u), colour, cv2.FILLED)
+    assert EYE.look(letterboxed(picture)).plate is None
