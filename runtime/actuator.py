@@ -19,7 +19,7 @@ from runtime.safety import Limits, RobotState, SafetySettings
 from runtime.seen import Seen
 from runtime.timeline import Dims, difference
 from runtime.transports.base import Sink
-from runtime.types import Float64, RobotCommand
+from runtime.types import Float32, Float64, RobotCommand
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +33,9 @@ class TickSettings:
     heartbeat_timeout: float
     starvation: Answer
     starvation_hold: float  # until "slow" holds
+    publication: Callable[[Float64], Float32] | None = (
+        None  # poses of a joint command, where they are published too
+    )
 
     @property
     def starvation_patience(self) -> float:
@@ -171,7 +174,8 @@ class RobotActuator(Actuator):
         if self._page.estop is EStop.LATCHED and target.source != "estop":
             # Pressed since this tick looked: the next one takes over, this one repeats the last command.
             action, notes = self.commanded, ("e-stop pressed within the tick",)
-        self._sink.send(RobotCommand(action.astype(np.float32), step, now))
+        eef = None if self._settings.publication is None else self._settings.publication(action)
+        self._sink.send(RobotCommand(action.astype(np.float32), step, now, eef))
         return now, action, notes
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from runtime.formats import PoseFormat
 from runtime.kinematics.base import KinematicsSettings
 from runtime.messages import Mode
 from runtime.plugins import variants
@@ -17,6 +18,7 @@ from runtime.recording.settings import RecordingSettings
 from runtime.safety import SafetySettings
 from runtime.section import Section
 from runtime.strategies.base import StrategyParameters
+from runtime.types import Space
 
 
 def _variants_of(package: str) -> Any:
@@ -140,6 +142,15 @@ class PublishSettings(Section):
     """Folder of the dataset, relative to the data folder; nothing is published where it is not given."""
 
 
+class PublicationSettings(Section):
+    """What the robot is told: joints, or poses beside them where the transport takes such a command."""
+
+    space: Space = "joint"
+    """"eef" publishes the poses that the safe joint command amounts to along with the joints."""
+    pose: PoseFormat = PoseFormat()
+    """How these poses are written."""
+
+
 class LeaseSettings(Section):
     """Who may command, and for how long."""
 
@@ -218,6 +229,7 @@ class Deployment(Section):
     safety: SafetySettings = SafetySettings()
     recording: RecordingChoice = RecordingChoice()
     publish: PublishSettings = PublishSettings()
+    publication: PublicationSettings = PublicationSettings()
     lease: LeaseSettings = LeaseSettings()
     bus: BusSettings = BusSettings()
     lockstep: LockstepSettings = LockstepSettings()

@@ -17,6 +17,10 @@ class PolicyError(RuntimeFault):
     """The policy server is absent, mute, gone, or answered with something unusable."""
 
 
+class ContradictionError(SetupError, PolicyError):
+    """The policy server says of itself what the deployment says otherwise; names both sides."""
+
+
 class PolicyLostError(PolicyError):
     """The policy server is not there any more, or did not answer in time; it may come back."""
 

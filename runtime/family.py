@@ -20,10 +20,12 @@ from runtime.clock import Clock
 from runtime.config import Deployment
 from runtime.deployment import Resolved
 from runtime.errors import ConfigurationError, RuntimeFault, SetupError
+from runtime.formats import PoseRows
 from runtime.kinematics.base import Kinematics
 from runtime.page import Page, PageLayout
 from runtime.plugins import variants
 from runtime.policies.base import Policy
+from runtime.publication import Publication
 from runtime.safety import Limits
 from runtime.spaces import Spaces
 from runtime.timeline import Dims
@@ -123,6 +125,13 @@ class Plan:
         """The robot's action spaces, with its kinematics."""
         return Spaces(self.robot, self.kinematics(), self.rate)
 
+    def publication(self) -> Publication | None:
+        """What makes the poses that are published of a joint command; None where joints alone are."""
+        wanted = self.deployment.publication
+        if wanted.space == "joint":
+            return None
+        return Publication(PoseRows(wanted.pose, self.robot, "publication.pose"), self.spaces())
+
 
 def plan(resolved: Resolved) -> Plan:
     """Check that the parts of a deployment fit each other; raises ConfigurationError or SetupError."""
@@ -148,12 +157,32 @@ def plan(resolved: Resolved) -> Plan:
             f"recording.fps = {made.fps:g}: there would be more rows than ticks; "
             f"allowed: at most {made.rate:g}, the control rate"
         )
+    _check_publication(made)
     if settings.safety.report_only and made.capabilities.moves_robot:
         raise SetupError(
             f"safety.report_only = true with transport {settings.transport.kind!r}: it can move a robot; "
             "report-only is for transports that cannot (dataset)"
         )
     return made
+
+
+def _check_publication(made: Plan) -> None:
+    """Poses are published only where the transport has such a command."""
+    wanted, capabilities = made.deployment.publication, made.capabilities
+    kind = made.deployment.transport.kind
+    if wanted.space not in capabilities.spaces:
+        raise SetupError(
+            f"publication.space = {wanted.space!r} with transport {kind!r}, which has no such command; "
+            f"allowed: {', '.join(sorted(capabilities.spaces))}"
+        )
+    if wanted.space == "joint":
+        return
+    PoseRows(wanted.pose, made.robot, "publication.pose")
+    if capabilities.poses and wanted.pose not in capabilities.poses:
+        raise SetupError(
+            f"publication.pose = {wanted.pose} with transport {kind!r}; "
+            f"allowed: {'; '.join(map(str, capabilities.poses))}"
+        )
 
 
 @dataclass(frozen=True, slots=True)

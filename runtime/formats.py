@@ -84,7 +84,7 @@ class PoseFormat(Section):
         return QuaternionNumbers(self.orientation == "wxyz")
 
     def __str__(self) -> str:
-        words = [self.orientation]
+        words: list[str] = [self.orientation]
         words += [self.euler_order] if self.orientation == "euler" else []
         words += [f"of {self.sixd}"] if self.orientation == "6d" else []
         words += ["in degrees"] if self.degrees else []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 from runtime.types import ActionChunk, Conditioning, Observation, Space
 
@@ -21,7 +22,14 @@ class PolicyInfo:
 
 
 class Policy(ABC):
-    """One connection to one policy; one request in flight, every wait has a deadline."""
+    """One connection to one policy; one request in flight, every wait has a deadline.
+
+    `observation_eef` says which poses it is shown where the robot measures its own, and what relative chunks are
+    relative to; where the robot measures none, those of its joints in any case.
+    """
+
+    observation_eef: Literal["measured", "fk"] = "measured"
+    sees_poses: bool = False  # its answers depend on the poses of an observation
 
     @abstractmethod
     def connect(self) -> PolicyInfo:

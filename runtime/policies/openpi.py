@@ -18,9 +18,11 @@ from pydantic import Field
 from runtime import codecs
 from runtime.clock import Clock
 from runtime.errors import CodecError, ConfigurationError, PolicyError
+from runtime.formats import PoseFormat
+from runtime.policies.agreement import Declared, agreed
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.link import WebsocketLink
-from runtime.policies.request import RequestLayout, RequestSettings, width_of
+from runtime.policies.request import RequestLayout, RequestSettings, poses_of
 from runtime.policies.rows import action_rows
 from runtime.policies.rtc.async_rtc import AsyncRtc, Schedule
 from runtime.policies.rtc.base import Dialect, Plain
@@ -34,7 +36,6 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Rate = Annotated[float, Field(ge=1, le=1000)]
 
 ANSWER_LIMIT = 64 * 1024 * 1024  # bytes; a chunk of 50 rows is some kilobytes
-_SPACES: dict[object, Space] = {"joint": "joint", "qpos": "joint", "eef": "eef"}
 
 
 class Config(RequestSettings):
@@ -52,13 +53,15 @@ class Config(RequestSettings):
     inference_deadline: Positive = 2.0
     """For every later answer [s], also of a server that came back; after it the connection is dropped."""
     action_space: Space = "joint"
-    """What the rows of the answer are: joint targets, or 8 numbers of pose and gripper per arm."""
+    """What the rows of the answer are: joint targets, or poses."""
+    action_pose: PoseFormat = PoseFormat()
+    """How poses are written in the answer, where action_space is "eef"."""
     action_mode: ActionMode = "absolute"
     """What their numbers are: targets; "relative" to the observation; or "delta", each to the row before.
 
     Grippers are absolute in every mode. A server's own metadata key action_mode names the space, not this."""
     relative_frame: RelativeFrame = "base"
-    """Axes of relative poses: the arm's base, or the tool as observed."""
+    """Axes of relative poses: those of the frame that poses are declared in, or the tool as observed."""
     action_rate: Rate | None = None
     """Rows per second of the answer [Hz]; the control rate where it is not given."""
     rtc: Literal["none", "prev_action", "async_rtc"] = "none"
@@ -71,7 +74,7 @@ class Config(RequestSettings):
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> OpenpiPolicy:
     """The policy, not yet connected; ConfigurationError where the request's layout does not fit the robot."""
-    return OpenpiPolicy(config, robot)
+    return OpenpiPolicy(config, robot, control_rate)
 
 
 class OpenpiPolicy(Policy):
@@ -82,10 +85,24 @@ class OpenpiPolicy(Policy):
     inference together, so that a server that came back mute, or compiles again, is found out quickly.
     """
 
-    def __init__(self, config: Config, robot: Robot) -> None:
+    def __init__(self, config: Config, robot: Robot, control_rate: float) -> None:
         self._config = config
         self._layout = RequestLayout(config, robot)
-        self._width = width_of(config.action_space, robot)
+        poses = poses_of(config.action_space, config.action_pose, robot, "action_pose")
+        self._width = robot.dim if poses is None else poses.width
+        self._declared = Declared(
+            config,
+            config.action_space,
+            config.action_mode,
+            config.relative_frame,
+            config.action_pose,
+            self._width,
+            config.action_rate or control_rate,
+        )
+        self.observation_eef = config.observation_eef
+        self.sees_poses = config.observation_space == "eef" or (
+            config.action_space == "eef" and config.action_mode != "absolute"
+        )
         self._headers = _headers(config)
         self._dialect = _dialect(config)
         self._link = self._new_link()
@@ -145,7 +162,7 @@ class OpenpiPolicy(Policy):
     def _open(self) -> PolicyInfo:
         metadata = self._unpacked(self._link.open(), "metadata")
         try:
-            space = self._checked_space(metadata, "metadata")
+            space = agreed(metadata, self._declared, "metadata")
             supports_rtc = self._dialect.supported(metadata)
         except PolicyError:
             self._link.drop()
@@ -192,7 +209,7 @@ class OpenpiPolicy(Policy):
             raise PolicyError(
                 f"the answer has no 'actions'; it has {', '.join(map(str, reply)) or 'nothing'}"
             )
-        self._checked_space(reply, "answer")
+        agreed(reply, self._declared, "answer")
         origin = reply.get("origin_actions")
         return ActionChunk(
             actions=action_rows("actions", reply["actions"], self._width),
@@ -200,26 +217,10 @@ class OpenpiPolicy(Policy):
             rate=self._config.action_rate,
             mode=self._config.action_mode,
             frame=self._config.relative_frame,
+            pose=self._config.action_pose,
             model_actions=None if origin is None else action_rows("origin_actions", origin),
             timing=_timing(reply) | {"round_trip_ms": round_trip},
         )
-
-    def _checked_space(self, message: Mapping[str, Any], where: str) -> Space | None:
-        """The action space the server names; it may not contradict the configured one."""
-        if message.get("action_mode") is None:
-            return None
-        mode = message["action_mode"]
-        space = _SPACES.get(mode) if isinstance(mode, str) else None
-        if space is None:
-            raise PolicyError(
-                f"the server's {where} has action_mode {mode!r}; allowed: {', '.join(map(str, _SPACES))}"
-            )
-        if space != self._config.action_space:
-            raise PolicyError(
-                f"the server's {where} says that actions are {space!r}, policy.action_space is "
-                f"{self._config.action_space!r}; correct the one that is wrong"
-            )
-        return space
 
 
 def _dialect(config: Config) -> Dialect:

@@ -8,9 +8,10 @@ import numpy as np
 from pydantic import Field
 
 from runtime.errors import ConfigurationError, PolicyError
+from runtime.formats import PoseFormat, PoseRows
 from runtime.policies.pictures import Layout, Resize, fitted, laid_out
 from runtime.section import Section
-from runtime.types import Float32, Observation, Space
+from runtime.types import EEF_WIDTH, Float32, Observation, Space
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -25,6 +26,11 @@ class RequestSettings(Section):
 
     observation_space: Space = "joint"
     """What is sent as state: joints, or poses."""
+    observation_pose: PoseFormat = PoseFormat()
+    """How poses are written in the state, where observation_space is "eef"."""
+    observation_eef: Literal["measured", "fk"] = "measured"
+    """Poses that the policy is shown and that its relative poses are relative to: as the robot measures them, where
+    it does; or as its joints have them in any case."""
     cameras: dict[str, str] | None = None
     """Observation key = request key; without it all pictures that there are, under their own keys."""
     images_key: str = "images"
@@ -49,7 +55,11 @@ class RequestLayout:
     def __init__(self, settings: RequestSettings, robot: Robot) -> None:
         self._settings = settings
         self._cameras = _cameras(settings, robot)
-        self._state_width = width_of(settings.observation_space, robot)
+        self._poses = poses_of(
+            settings.observation_space, settings.observation_pose, robot, "observation_pose"
+        )
+        self._poses_given = robot.eef_dim
+        self._state_width = robot.dim if self._poses is None else self._poses.width
         for key, dims in settings.state_parts.items():
             if max(dims) >= self._state_width:
                 raise ConfigurationError(
@@ -70,12 +80,22 @@ class RequestLayout:
         return request
 
     def _state(self, observation: Observation) -> Float32:
-        state = observation.qpos if self._settings.observation_space == "joint" else observation.eef
-        if state is None:
-            raise PolicyError('policy.observation_space is "eef" but the observation has no poses')
+        state = observation.qpos if self._poses is None else self._written(self._poses, observation)
         if state.shape != (self._state_width,):
             raise PolicyError(f"the state has shape {list(state.shape)}; expected [{self._state_width}]")
         return np.ascontiguousarray(state, dtype=np.float32)
+
+    def _written(self, poses: PoseRows, observation: Observation) -> Float32:
+        """The observation's poses as the policy was trained with them; a single row is in the usual range."""
+        if observation.eef is None:
+            raise PolicyError('policy.observation_space is "eef" but the observation has no poses')
+        if observation.eef.size != self._poses_given:
+            raise PolicyError(
+                f"the observation has {observation.eef.size} numbers of poses; expected {self._poses_given}"
+            )
+        vectors = observation.eef.astype(np.float64).reshape(1, -1, EEF_WIDTH)
+        row = poses.encode(vectors, observation.qpos.astype(np.float64)[None])
+        return np.asarray(row[0], dtype=np.float32)
 
     def _picture(self, observation: Observation, camera: str) -> np.ndarray[Any, Any]:
         picture = observation.pictures.get(camera)
@@ -88,9 +108,9 @@ class RequestLayout:
         return laid_out(picture, settings.image_layout)
 
 
-def width_of(space: Space, robot: Robot) -> int:
-    """Numbers per row in a space."""
-    return robot.dim if space == "joint" else robot.eef_dim
+def poses_of(space: Space, pose: PoseFormat, robot: Robot, key: str) -> PoseRows | None:
+    """The rows of a space that is poses, None for joints; ConfigurationError where the format does not fit."""
+    return None if space == "joint" else PoseRows(pose, robot, f"policy.{key}")
 
 
 def _cameras(settings: RequestSettings, robot: Robot) -> dict[str, str] | None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from runtime.errors import TransportError
+from runtime.formats import PoseFormat
 from runtime.types import Observation, RobotCommand
 
 
@@ -18,7 +19,12 @@ class Capabilities:
     moves_robot: bool  # commands reach something that can break: report-only safety is refused
     ends: bool = False  # the source runs out (a recording)
     measures_eef: bool = False
-    spaces: frozenset[str] = frozenset({"joint"})  # command spaces it can publish
+    spaces: frozenset[str] = frozenset(
+        {"joint"}
+    )  # command spaces it can publish; "eef" comes along with joints
+    poses: tuple[
+        PoseFormat, ...
+    ] = ()  # formats of poses that it takes where it publishes "eef"; any where empty
     resets_bench: bool = (
         False  # declared simulated: it lays out its bench when told, and says the truth of it
     )

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from websockets.http11 import Request
 from websockets.server import ServerProtocol
 from websockets.sync.server import ServerConnection, serve
@@ -17,7 +18,8 @@ from websockets.sync.server import ServerConnection, serve
 import robots
 from runtime import codecs
 from runtime.clock import MonotonicClock
-from runtime.errors import ConfigurationError, PolicyError, PolicyLostError
+from runtime.errors import ConfigurationError, ContradictionError, PolicyError, PolicyLostError
+from runtime.formats import PoseFormat
 from runtime.policies import openpi
 from runtime.policies.link import PolicyGone, PolicyTimeout, WebsocketLink
 from runtime.policies.openpi import Config, OpenpiPolicy
@@ -28,6 +30,7 @@ from runtime.types import Conditioning, Observation
 ROBOT = robots.load("agilex_piper")
 CAMERAS = tuple(camera.key for camera in ROBOT.cameras)
 Handler = Callable[[ServerConnection], None]
+POSES = np.array([0.1, 0.2, 0.3, 0.1, 0.7, -0.5, 0.5, 0.02, 0.4, 0.5, 0.6, 0, 1, 0, 0, 0.03], np.float32)
 
 
 def observation(value: float = 0.1, **changes: Any) -> Observation:
@@ -257,10 +260,35 @@ def test_a_flat_layout_with_a_divided_state_can_be_declared() -> None:
 
 
 def test_poses_are_the_state_if_the_policy_was_trained_so() -> None:
-    poses = np.arange(ROBOT.eef_dim, dtype=np.float32)
-    np.testing.assert_array_equal(request_of(observation(eef=poses), observation_space="eef")["state"], poses)
+    np.testing.assert_array_equal(request_of(observation(eef=POSES), observation_space="eef")["state"], POSES)
     with pytest.raises(PolicyError, match="no poses"):
         request_of(observation_space="eef")
+    with pytest.raises(PolicyError, match="12 numbers of poses; expected 16"):
+        request_of(observation(eef=POSES[:12]), observation_space="eef")
+
+
+def test_poses_are_written_as_the_policy_was_trained_with_them() -> None:
+    pose = PoseFormat(orientation="euler", euler_order="ZYX", degrees=True, gripper=False)
+    settings = {"observation_space": "eef", "observation_pose": pose}
+    state = request_of(observation(eef=POSES), **settings, state_parts={"turn": [3, 4, 5]})
+    assert state["state"].shape == (12,)
+    np.testing.assert_allclose(state["state"][6:12], [0.4, 0.5, 0.6, 0, 0, 180], atol=1e-4)
+    expected = Rotation.from_quat(POSES[3:7], scalar_first=True).as_euler("ZYX", degrees=True)
+    np.testing.assert_allclose(state["turn"], expected, atol=1e-4)
+    with pytest.raises(ConfigurationError, match="allowed: 0 to 11"):
+        request_of(observation(eef=POSES), **settings, state_parts={"gripper": [12]})
+
+
+def test_measured_poses_without_direction_are_not_shown_to_a_policy() -> None:
+    with pytest.raises(PolicyError, match="the robot measured no orientation for left_arm in row 0"):
+        request_of(observation(eef=np.zeros(16, np.float32)), observation_space="eef")
+
+
+@pytest.mark.parametrize("side", ["observation", "action"])
+def test_a_frame_that_is_none_is_refused_before_anything_is_connected(side: str) -> None:
+    settings: dict[str, Any] = {f"{side}_space": "eef", f"{side}_pose": PoseFormat(frame="moon")}
+    with pytest.raises(ConfigurationError, match=rf"policy\.{side}_pose\.frame = 'moon'"):
+        openpi.build(Config(**settings), ROBOT, MonotonicClock(), 30.0)
 
 
 def test_a_missing_picture_is_named() -> None:
@@ -443,6 +471,7 @@ def test_a_first_frame_that_is_no_map_is_the_wrong_protocol(first: bytes, says: 
     [
         ("eef", "actions are 'eef', policy.action_space is 'joint'"),
         ("torque", "'torque'; allowed: joint, qpos, eef"),
+        ("delta", "has action_mode = 'delta', policy.action_mode = 'absolute'"),
     ],
 )
 def test_metadata_may_not_contradict_the_configured_space(mode: str, says: str) -> None:
@@ -457,6 +486,62 @@ def test_metadata_may_not_contradict_the_configured_space(mode: str, says: str) 
 def test_metadata_that_agree_are_reported() -> None:
     with served(Fault("action_mode", "qpos")) as url, policy_at(url) as policy:
         assert policy.connect().action_space == "joint"
+
+
+SIX = {"action_space": "eef", "action_pose": PoseFormat(orientation="6d", gripper=False)}
+
+
+@pytest.mark.parametrize(
+    ("settings", "metadata", "says"),
+    [
+        ({}, {"action_space": "eef"}, "actions are 'eef', policy.action_space is 'joint'"),
+        ({}, {"action_space": "wheels"}, "action_space 'wheels'; allowed: joint, qpos, eef"),
+        ({}, {"action_dim": 16}, "action_dim = 16, policy.action_space: joints of this robot, numbers = 14"),
+        (SIX, {"action_dim": 16}, r"poses \(6d of columns without gripper\) of this robot, numbers = 18"),
+        ({}, {"action_rate": 15}, "action_rate = 15, policy.action_rate = 30.0"),
+        ({"action_rate": 15.0}, {"action_rate": 30}, "action_rate = 30, policy.action_rate = 15.0"),
+        (SIX, {"orientation": "xyzw"}, "orientation = 'xyzw', policy.action_pose.orientation = '6d'"),
+        (SIX, {"action_orientation": "rpy"}, "= 'euler', policy.action_pose.orientation = '6d'"),
+        (SIX, {"action_pose": {"sixd": "rows"}}, "sixd = 'rows', policy.action_pose.sixd = 'columns'"),
+        (
+            {"observation_space": "eef"},
+            {"observation_orientation": "rot6d"},
+            "= '6d', policy.observation_pose.orientation = 'wxyz'",
+        ),
+        ({}, {"image_size": [480, 640]}, r"image_size = \[480, 640\], policy.image_size = \[24, 32\]"),
+        ({}, {"image_resolution": 224}, r"image_resolution = \[224, 224\], policy.image_size = \[24, 32\]"),
+        (
+            SIX | {"action_mode": "delta"},
+            {"relative_frame": "tool"},
+            "'tool', policy.relative_frame = 'base'",
+        ),
+    ],
+)
+def test_metadata_that_contradict_the_configuration_are_an_error_with_both_sides(
+    settings: dict[str, Any], metadata: dict[str, Any], says: str
+) -> None:
+    with (
+        stub(replying({}, metadata)) as url,
+        policy_at(url, **settings) as policy,
+        pytest.raises(ContradictionError, match=says),
+    ):
+        policy.connect()
+
+
+@pytest.mark.parametrize(
+    ("settings", "metadata"),
+    [
+        ({}, {"action_dim": 14, "action_rate": 30, "image_size": [24, 32, 3], "orientation": "rpy"}),
+        ({}, {"training_obs_image_size": np.array([3, 24, 32]), "action_mode": "absolute"}),
+        (SIX, {"action_dim": 18, "orientation": "ROT6D", "action_pose": {"frame": "", "gripper": False}}),
+        ({"resize": "none"}, {"image_size": [480, 640]}),
+    ],
+)
+def test_metadata_that_say_the_same_are_no_contradiction(
+    settings: dict[str, Any], metadata: dict[str, Any]
+) -> None:
+    with stub(replying({}, metadata)) as url, policy_at(url, **settings) as policy:
+        assert policy.connect().action_space is None
 
 
 # What goes wrong with an answer
@@ -524,6 +609,21 @@ def test_poses_have_eight_numbers_per_arm() -> None:
         chunk = policy.infer(observation())
     assert chunk.space == "eef"
     assert chunk.actions.shape == (3, 16)
+    assert chunk.pose == PoseFormat()
+
+
+def test_the_width_of_an_answer_is_that_of_the_declared_format() -> None:
+    pose = PoseFormat(orientation="6d")
+    with stub(replying({"actions": np.ones((3, 20))})) as url:
+        with policy_at(url, action_space="eef", action_pose=pose) as policy:
+            chunk = policy.infer(observation())
+        with (
+            policy_at(url, action_space="eef") as policy,
+            pytest.raises(PolicyError, match="rows of 20 numbers; this robot needs 16"),
+        ):
+            policy.infer(observation())
+    assert chunk.pose == pose
+    assert chunk.actions.shape == (3, 20)
 
 
 def test_a_text_frame_at_any_time_is_the_servers_error() -> None:
