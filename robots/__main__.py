@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from robots import Robot, RobotError, load, names
+from robots.clearance import problems
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -19,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.command == "list":
             print("\n".join(f"{name}  {load(name).title}" for name in names()))
         elif options.command == "check":
-            print("\n".join(_summary(load(options.name))))
+            return _check(load(options.name))
         else:
             print(json.dumps(_forward(load(options.name), options.group, options.q)))
     except RobotError as error:
@@ -41,6 +42,14 @@ def _parser() -> argparse.ArgumentParser:
         "q", metavar="Q", type=float, nargs=argparse.REMAINDER, help="joints [rad], without the gripper"
     )
     return parser
+
+
+def _check(robot: Robot) -> int:
+    print("\n".join(_summary(robot)))
+    found = problems(robot)
+    for sentence in found:
+        print(f"{robot.folder}: {sentence}", file=sys.stderr)
+    return 1 if found else 0
 
 
 def _summary(robot: Robot) -> list[str]:

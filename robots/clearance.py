@@ -16,7 +16,8 @@ MARGIN = 0.005  # [m] within which links count as touching, unless somebody says
 _POSTURES = 256  # at which is looked whether two links ever part
 _NEARLY_ALWAYS = 0.95  # of them
 _LEVEL = 1e-3  # [m] by which the height of what only turns about the vertical changes
-_BLOCK = 64  # postures at once: what lies in between then fits the caches
+_REACHING = ("arm", "hand")  # kinds of groups that come down to the table
+_BLOCK = 16  # postures at once: what lies in between then fits the caches
 
 _Indices = NDArray[np.intp]
 
@@ -32,8 +33,8 @@ class Clearance:
     * links with at most one of the robot's joints between them (grippers do not count, nor joints that no group
       moves); of two arms that each stand for themselves, links that nothing moves;
     * pairs that touch at nearly every posture (95 %), as in a wrist, in this arm and in others like it;
-    * the table under what nothing moves or what only turns about the vertical, and under fingers: they reach down
-      to it on purpose;
+    * the table under what no arm or hand moves (a torso stands beside it) or what only turns about the vertical, and
+      under fingers: they reach down to it on purpose;
     * what robot.toml says under collision.ignore and collision.without.
     """
 
@@ -116,6 +117,10 @@ def _candidates(robot: Robot, body: Body, parts: _Indices) -> tuple[_Indices, _I
     """Pairs of capsules that could touch without being neighbours, and capsules that could reach the table."""
     moved = body.moved()[parts]
     grippers = np.isin(np.arange(robot.dim), robot.gripper_dims)
+    reaching = np.zeros(robot.dim, dtype=bool)
+    for group in robot.groups:
+        reaching[group.slice] = group.kind in _REACHING
+    carried = moved[:, reaching & ~grippers].any(axis=1)
     fingers = moved[:, grippers].any(axis=1)
     moved = moved[:, ~grippers]
     roots = np.array([_root(body, part) for part in parts])
@@ -136,7 +141,7 @@ def _candidates(robot: Robot, body: Body, parts: _Indices) -> tuple[_Indices, _I
     over = np.array(
         [
             index
-            for index in np.flatnonzero(moved.any(axis=1) & ~fingers)
+            for index in np.flatnonzero(carried & ~fingers)
             if not ignored & {frozenset((links[index], TABLE)), frozenset((names[index], TABLE))}
         ],
         dtype=np.intp,

@@ -36,6 +36,15 @@ def test_check_of_a_wrong_description_says_what_is_wrong_and_fails(
     assert "unknown key rate" in capsys.readouterr().err
 
 
+def test_check_names_the_links_that_touch_at_a_named_pose_and_fails(
+    edited: Edit, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = edited(('["link2", "link4"], ', ""))
+    assert main(["check", str(folder)]) == 1
+    said = capsys.readouterr().err
+    assert f"{folder}: poses.home: left_arm/link2 and left_arm/link4 are -18 mm apart" in said
+
+
 def test_fk_answers_json(capsys: pytest.CaptureFixture[str]) -> None:
     q = ["-1e-3", "0.5", "-0.25", "-.1", "0", "1"]
     assert main(["fk", "agilex_piper", "right_arm", *q]) == 0
