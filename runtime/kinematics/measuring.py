@@ -28,7 +28,8 @@ def measured(
         position[:, index] = np.linalg.norm(found[:, :3, 3] - wanted[:, :3, 3], axis=-1)
         apart = rotation_vector(wanted[:, :3, :3] @ np.swapaxes(found[:, :3, :3], -1, -2))
         rotation[:, index] = np.linalg.norm(apart, axis=-1)
-        flags[:, index] = _bound(robot, arm, q, bounds) | _singular(arm, q, settings.singular_below)
+        flags[:, index] = _bound(robot, arm, q, bounds)
+        flags[:, index] |= _singular(arm, q, settings.singular_below)
     over = (position > settings.position_tolerance) | (rotation > settings.rotation_tolerance)
     flags[over] |= int(IkFlag.OVER_TOLERANCE)
     return IkResult(q, position, rotation, flags)
@@ -39,8 +40,10 @@ def _bound(robot: Robot, arm: Group, q: Float64, bounds: tuple[Float64, Float64]
     own, low, high = q[:, dims], bounds[0][:, dims], bounds[1][:, dims]
     at_limit = (own <= robot.lower[dims] + _RESTS) | (own >= robot.upper[dims] - _RESTS)
     at_velocity = ~at_limit & ((own <= low + _RESTS) | (own >= high - _RESTS))
-    flags = at_limit.any(axis=1) * int(IkFlag.AT_LIMIT) + at_velocity.any(axis=1) * int(IkFlag.AT_VELOCITY)
-    return flags.astype(np.uint8)
+    flags = np.zeros(len(q), dtype=np.uint8)
+    flags[at_limit.any(axis=1)] |= int(IkFlag.AT_LIMIT)
+    flags[at_velocity.any(axis=1)] |= int(IkFlag.AT_VELOCITY)
+    return flags
 
 
 def _singular(arm: Group, q: Float64, below: float) -> NDArray[np.uint8]:
@@ -48,4 +51,6 @@ def _singular(arm: Group, q: Float64, below: float) -> NDArray[np.uint8]:
     smallest = [
         np.linalg.svd(arm.chain.jacobian(row)[1], compute_uv=False)[-1] for row in q[:, arm.joint_dims]
     ]
-    return np.where(np.array(smallest) < below, int(IkFlag.NEAR_SINGULAR), 0).astype(np.uint8)
+    flags = np.zeros(len(q), dtype=np.uint8)
+    flags[np.array(smallest) < below] = int(IkFlag.NEAR_SINGULAR)
+    return flags

@@ -1,21 +1,281 @@
 """Kinematics by PyRoki (Kim et al. 2025, arXiv:2505.03728), for users who have it: the same problem, solved in JAX.
 
-PyRoki is on no package index: it and jaxls are installed from their repositories. Nothing of it is imported before
+PyRoki is on no package index; it and jaxls are installed from their repositories. Nothing of it is imported before
 a deployment asks for it.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Any, Literal
+import importlib
+from types import ModuleType
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from robots import Group, Robot, urdf
-from robots.chain import motions, motion_table
+from robots.chain import motion_table, motions
+from robots.rotations import quaternion_of_matrix, transform_of
 from robots.urdf import Joint
 from runtime.errors import SetupError
 from runtime.kinematics import compiled
-from runtime.kinematics.base import IkResult, Kinematics, KinematicsError, KinematicsSettings
+from runtime.kinematics.base import IkResult, Kinematics, KinematicsSettings
 from runtime.kinematics.measuring import measured
 from runtime.types import Float64
+
+_BUCKET = 64  # rows: chunks are filled up to a multiple, so that few lengths are compiled
+_BOX_WEIGHT = 100.0  # per rad beyond the box; what is left beyond it is cut off
+
+
+class Config(KinematicsSettings):
+    """PyRoki's least squares in JAX: for those who have it, and to compare with."""
+
+    kind: Literal["pyroki"] = "pyroki"
+
+
+def build(config: Config, robot: Robot) -> PyrokiKinematics:
+    """The kinematics of the robot's arms, compiled for chunks of up to 64 rows."""
+    made = PyrokiKinematics(robot, config)
+    home = robot.poses["home"]
+    made.solve(made.forward(home)[None], home)
+    return made
+
+
+class PyrokiKinematics(Kinematics):
+    """Inverse kinematics in float32 by Levenberg-Marquardt, frame after frame in one compiled scan per arm.
+
+    Joint limits and velocities are a cost of their own and a cut: PyRoki's variables know no hard box. Forward
+    kinematics and the errors of a result are those of the default backend, in float64.
+    """
+
+    def __init__(self, robot: Robot, config: Config | None = None) -> None:
+        self._config = config or Config()
+        self._robot = robot
+        self._default = compiled.build(
+            compiled.Config.model_validate(self._config.model_dump(exclude={"kind"})), robot
+        )
+        libraries = _libraries()
+        self._arms = [_Arm(libraries, robot, arm, self._config) for arm in robot.arms]
+
+    def forward(self, q: Float64) -> Float64:
+        """Poses [..., arms, 7] for joint vectors [..., D]; KinematicsError for another width."""
+        return self._default.forward(q)
+
+    def solve(
+        self,
+        targets: Float64,
+        seed: Float64,
+        dt: float | None = None,
+        anchor: Float64 | None = None,
+        anchor_row: int = 0,
+    ) -> IkResult:
+        """Joints for poses [T, arms, 7]; the errors are measured on the joints that are returned.
+
+        Raises KinematicsError as the default backend does.
+        """
+        # The default backend checks every argument, in one row; what it solves is not used.
+        self._default.solve(targets[:1], seed, dt, anchor, anchor_row)
+        targets, seed = np.asarray(targets, np.float64), np.asarray(seed, np.float64)
+        q = np.repeat(seed[None], len(targets), axis=0)
+        low = np.repeat(self._robot.lower[None], len(targets), axis=0)
+        high = np.repeat(self._robot.upper[None], len(targets), axis=0)
+        for index, arm in enumerate(self._arms):
+            asked = _Asked(targets[:, index], seed, dt, anchor, anchor_row)
+            q[:, arm.dims], low[:, arm.dims], high[:, arm.dims] = arm.follow(asked)
+        return measured(self._robot, self._config, q, targets, (low, high))
+
+
+class _Asked(NamedTuple):
+    """One arm's part of a chunk: poses [T, 7] in its frame, and what bounds its rows."""
+
+    targets: Float64
+    seed: Float64
+    dt: float | None
+    anchor: Float64 | None
+    anchor_row: int
+
+
+class _Arm:
+    """One arm as PyRoki sees it: the serial chain of its own joints, and the scan over a chunk."""
+
+    def __init__(self, libraries: _Libraries, robot: Robot, group: Group, config: Config) -> None:
+        self._group = group
+        described = _robot_of(libraries, robot, group)
+        order = [group.urdf_joints.index(name) for name in described.joints.actuated_names]
+        self.dims = group.joint_dims[order]
+        self._lower, self._upper = robot.lower[self.dims], robot.upper[self.dims]
+        self._speed = robot.velocity[self.dims] * config.velocity_scale
+        self._scan = _scan_of(libraries, described, config)
+
+    def follow(self, asked: _Asked) -> tuple[Float64, Float64, Float64]:
+        """Joints [T, n], and the lowest and highest that each row could have."""
+        rows = len(asked.targets)
+        goals = np.linalg.inv(self._group.carried(asked.seed)) @ transform_of(_unit(asked.targets))
+        poses = np.concatenate([quaternion_of_matrix(goals[:, :3, :3]), goals[:, :3, 3]], axis=-1)
+        filled = np.concatenate([poses, np.repeat(poses[-1:], -rows % _BUCKET, axis=0)])
+        held, steps = self._bounds(asked, len(filled))
+        seed = np.clip(asked.seed[self.dims], self._lower, self._upper)
+        held = np.clip(held, self._lower, self._upper)
+        given = (
+            filled,
+            steps,
+            np.arange(len(filled)) == asked.anchor_row,
+            seed,
+            held,
+            self._lower,
+            self._upper,
+        )
+        q, low, high = (np.asarray(part, np.float64)[:rows] for part in self._scan(*map(_float32, given)))
+        # float32 may round beyond the box by its last digit
+        low, high = np.maximum(low, self._lower), np.minimum(high, self._upper)
+        return self._cut(q, asked, steps[:rows], held), low, high
+
+    def _bounds(self, asked: _Asked, rows: int) -> tuple[Float64, Float64]:
+        """What is held before the anchor's row [n], and how far each row may be from the one before [rows, n]."""
+        steps = np.full((rows, len(self.dims)), np.inf)
+        held = (asked.seed if asked.anchor is None else np.asarray(asked.anchor, np.float64))[self.dims]
+        if asked.dt is not None:
+            first = 1 if asked.anchor is None else asked.anchor_row
+            steps[first:] = self._speed * asked.dt
+        return held, steps
+
+    def _cut(self, q: Float64, asked: _Asked, steps: Float64, held: Float64) -> Float64:
+        """The rows [T, n] within limits and velocities to the last digit of float64."""
+        cut = np.clip(q, self._lower, self._upper)
+        for row in range(len(cut)):
+            anchored = asked.anchor is not None and row == asked.anchor_row
+            if row == 0 and not anchored:
+                continue
+            before = held if anchored else cut[row - 1]
+            cut[row] = np.clip(cut[row], before - steps[row], before + steps[row])
+        return cut
+
+
+class _Libraries(NamedTuple):
+    """What PyRoki consists of, imported."""
+
+    jax: ModuleType
+    jaxlie: ModuleType
+    jaxls: ModuleType
+    pyroki: ModuleType
+    yourdfpy: ModuleType
+
+
+def _libraries() -> _Libraries:
+    try:
+        made = _Libraries(*(importlib.import_module(name) for name in _Libraries._fields))
+    except ImportError as error:
+        raise SetupError(
+            f'kinematics.kind = "pyroki": {error}; install PyRoki (chungmin99/pyroki) and jaxls (brentyi/jaxls) from '
+            'their repositories, the jaxls of the package index is another project; or use kind = "compiled"'
+        ) from error
+    importlib.import_module("loguru").logger.disable("jaxls")  # it tells of every problem that it builds
+    return made
+
+
+def _robot_of(libraries: _Libraries, robot: Robot, group: Group) -> Any:
+    """PyRoki's robot for the chain of the group's own joints; SetupError where a mimic lies on it."""
+    assert group.chain is not None  # it is an arm
+    describe = libraries.yourdfpy.urdf
+    tree = urdf.read(robot.urdf)
+    joints, links = [], [group.chain.frame]
+    for joint in tree.between(group.chain.frame, group.chain.tip):
+        links.append(joint.child)
+        own = joint.name in group.urdf_joints
+        if joint.mimic is not None and not own:
+            raise SetupError(
+                f'kinematics.kind = "pyroki": {joint.name} of {group.name} is a mimic; allowed: arms without, or '
+                'kind = "compiled"'
+            )
+        dim = int(group.joint_dims[group.urdf_joints.index(joint.name)]) if own else -1
+        joints.append(
+            describe.Joint(
+                name=joint.name,
+                type=("prismatic" if joint.kind == "prismatic" else "revolute") if own else "fixed",
+                parent=joint.parent,
+                child=joint.child,
+                origin=joint.origin if own else _standing(joint, group.chain.pinned.get(joint.name, 0.0)),
+                axis=joint.axis,
+                limit=describe.Limit(
+                    effort=1.0,
+                    velocity=float(robot.velocity[dim]),
+                    lower=float(robot.lower[dim]),
+                    upper=float(robot.upper[dim]),
+                )
+                if own
+                else None,
+            )
+        )
+    described = describe.Robot(
+        name=group.name, links=[describe.Link(name=link) for link in links], joints=joints
+    )
+    return libraries.pyroki.Robot.from_urdf(describe.URDF(robot=described, load_meshes=False))
+
+
+def _standing(joint: Joint, value: float) -> Float64:
+    """The transform [4, 4] of a joint that stands still at `value`."""
+    if joint.kind == "fixed":
+        return joint.origin
+    return np.asarray(motions(np.array([value]), motion_table(joint.origin, joint)[None])[0])
+
+
+def _scan_of(libraries: _Libraries, robot: Any, config: Config) -> Any:
+    """The compiled function from poses and bounds of a chunk to joints and the boxes they were solved in."""
+    jax, jaxlie, jaxls = libraries.jax, libraries.jaxlie, libraries.jaxls
+    jnp = jax.numpy
+    variable = robot.joint_var_cls(0)
+    link = jnp.array(len(robot.links.names) - 1)
+    termination = jaxls.TerminationConfig(max_iterations=config.max_iterations)
+
+    def beyond(values: Any, of: Any, low: Any, high: Any) -> Any:
+        q = values[of]
+        return (jnp.maximum(0.0, q - high) + jnp.maximum(0.0, low - q)) * _BOX_WEIGHT
+
+    box_cost = jaxls.Cost.factory(beyond)
+
+    def frame(carry: Any, row: Any) -> Any:
+        before, start, held, lower, upper = carry
+        pose, step, anchored = row
+        base = jnp.where(anchored > 0, held, before)
+        low, high = jnp.maximum(lower, base - step), jnp.minimum(upper, base + step)
+        start = jnp.clip(start, low, high)
+        costs = [
+            libraries.pyroki.costs.pose_cost_analytic_jac(
+                robot,
+                variable,
+                jaxlie.SE3(pose),
+                link,
+                pos_weight=config.position_weight,
+                ori_weight=config.rotation_weight,
+            ),
+            libraries.pyroki.costs.rest_cost(variable, start, config.rest_weight),
+            box_cost(variable, low, high),
+        ]
+        solution = (
+            jaxls.LeastSquaresProblem(costs, [variable])
+            .analyze()
+            .solve(
+                jaxls.VarValues.make([variable.with_value(start)]),
+                verbose=False,
+                linear_solver="dense_cholesky",
+                termination=termination,
+            )
+        )
+        q = jnp.clip(solution[variable], low, high)
+        return (q, q, held, lower, upper), (q, low, high)
+
+    def chunk(poses: Any, steps: Any, anchored: Any, seed: Any, held: Any, lower: Any, upper: Any) -> Any:
+        first = (seed, seed, held, lower, upper)
+        return jax.lax.scan(frame, first, (poses, steps, anchored))[1]
+
+    return jax.jit(chunk)
+
+
+def _unit(poses: Float64) -> Float64:
+    """The poses [T, 7] with quaternions of length 1."""
+    unit = poses.copy()
+    unit[:, 3:] /= np.linalg.norm(unit[:, 3:], axis=-1, keepdims=True)
+    return unit
+
+
+def _float32(array: Float64) -> Any:
+    return np.asarray(array, np.float32)
