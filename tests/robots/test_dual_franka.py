@@ -58,9 +58,9 @@ def test_the_right_home_is_the_shipped_one_and_points_down_in_the_workcell() -> 
 def test_the_postures_of_the_arms_are_mirror_images(pose: str) -> None:
     left, right = (tip_in_scene(ROBOT, arm, ROBOT.poses[pose]) for arm in ROBOT.arms)
     flip = np.diag([-1.0, 1.0, 1.0])  # the middle between the arms is the scene's yz-plane
-    np.testing.assert_allclose(left[:3, 3], flip @ right[:3, 3], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(left[:3, 3], flip @ right[:3, 3], rtol=0, atol=1e-8)
     # A hand opens to both sides alike: mirrored, its x and y point the other way about.
-    np.testing.assert_allclose(left[:3, :3], flip @ right[:3, :3] @ np.diag([1.0, -1.0, 1.0]), atol=1e-6)
+    np.testing.assert_allclose(left[:3, :3], flip @ right[:3, :3] @ np.diag([1.0, -1.0, 1.0]), atol=1e-8)
 
 
 @pytest.mark.parametrize("opening", [0.0, 0.5, 1.0])
