@@ -3,7 +3,7 @@
 import { verb, words } from "./words.js";
 
 const BAD = new Set(["estopped", "family_died", "policy_failed", "policy_lost", "recording_failed", "source_failed", "displaced", "moved_away", "too_far"]);
-const WARN = new Set(["refused", "word_refused", "tune_refused", "lock_refused", "refusals", "starved", "starvation", "limited", "far_start", "chunk_dropped", "ik_unreached", "not_journalled", "unmeasured", "unreadable", "rtc_warning", "late_ticks", "scheduling"]);
+const WARN = new Set(["refused", "word_refused", "tune_refused", "lock_refused", "refusals", "starved", "starvation", "limited", "near", "far_start", "chunk_dropped", "ik_unreached", "not_journalled", "unmeasured", "unreadable", "rtc_warning", "late_ticks", "scheduling"]);
 const GOOD = new Set(["policy_back", "recovered", "punctual", "released"]); // a trouble is over
 const NAMES = {
   chunk_dropped: "chunk not used",
@@ -21,6 +21,8 @@ const NAMES = {
   locked: "gripper lock",
   motion_done: "motion",
   moved_away: "arm was moved",
+  near: "too near",
+  near_sum: "too near",
   not_journalled: "not in journal",
   policy_back: "policy is back",
   policy_failed: "policy failed",

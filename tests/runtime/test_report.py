@@ -3,7 +3,8 @@ import pytest
 
 from runtime.actuator import Sent
 from runtime.behaviour import Target
-from runtime.report import Limiting, Report
+from runtime.collision import Collision
+from runtime.report import Limiting, Nearing, Report
 from tests.runtime.tick_bench import Bench, following, wave
 
 
@@ -44,6 +45,26 @@ def test_closing_what_was_never_limited_says_nothing():
     limiting.close()
     limiting.close()
     assert [kind for kind, _ in said] == ["limited", "limited_sum"]
+
+
+def near(distance, other="right_arm/hand"):
+    return Sent(0.0, None, np.zeros(2), near=Collision("left_arm/hand", other, distance))
+
+
+def test_what_comes_near_is_told_once_and_how_near_it_came_when_it_is_over():
+    nearing = Nearing(said := Said())
+    nearing.note(near(0.004), 10.0)
+    nearing.note(near(-0.01, "table"), 10.1)
+    nearing.note(near(-0.002), 10.2)
+    nearing.note(Sent(0.0), 10.9)
+    assert said == [("near", "left_arm/hand and right_arm/hand would be 4 mm apart")]
+    nearing.note(Sent(0.0), 11.2)
+    text = "3 actions came too near, nearest: left_arm/hand and table would collide (10 mm deep)"
+    assert said[1:] == [("near_sum", text)]
+    nearing.note(near(0.004), 12.0)
+    nearing.close()
+    nearing.close()
+    assert [kind for kind, _ in said] == ["near", "near_sum", "near", "near_sum"]
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+import robots
+from runtime.collision import Collisions
 from runtime.safety import Limits, RobotState, SafetyFilter, SafetySettings
+from tests.runtime.collision_samples import collisions, robot, turned
 
 NAMES = ("arm.joint0", "arm.joint1", "arm.gripper")
 LIMITS = Limits(
@@ -235,3 +238,115 @@ def test_the_box_is_not_asked_twice_about_an_action_that_was_not_changed():
     asked.clear()
     judge([0.3, 1.0, 0.05], outside=lambda action: asked.append(action.copy()) or ())
     assert len(asked) == 3
+
+
+# --- collisions -----------------------------------------------------------------------------------------------
+
+
+def arms(action, previous, path="policy", measured=None, **options):
+    """The verdict on a step of the two Pipers that stand beside each other."""
+    own = robot()
+    grippers = np.isin(np.arange(own.dim), own.gripper_dims)
+    limits = Limits(own.joint_names, own.lower, own.upper, own.velocity, grippers, np.zeros(own.dim, bool))
+    where = RobotState(previous, np.zeros(own.dim), previous if measured is None else measured, DT)
+    return SafetyFilter(SafetySettings(**options), limits, None, collisions()).judge(action, where, path)
+
+
+def inwards(by):
+    """A step further inwards that velocity and acceleration allow."""
+    return by + 0.02
+
+
+def test_by_default_a_step_into_the_other_arm_is_sent_and_warned_of():
+    action = turned(inwards(1.2))
+    verdict = arms(action, turned(1.2))
+    assert np.array_equal(verdict.action, action)
+    assert verdict.near is not None
+    assert verdict.notes == (str(verdict.near),)
+    assert arms(turned(inwards(0.5)), turned(0.5)).near is None
+
+
+def test_where_collisions_are_refused_such_a_step_is_and_one_that_parts_is_not():
+    refused = arms(turned(inwards(1.2)), turned(1.2), collision="refuse")
+    assert refused.refused
+    assert "left_arm/" in refused.notes[0]
+    assert "deep)" in refused.notes[0]
+    assert not arms(turned(1.18), turned(1.2), collision="refuse").refused
+    assert not arms(turned(1.2), turned(1.2), collision="refuse").refused
+    assert arms(turned(1.18), turned(1.2), collision="refuse").near is None
+
+
+def test_an_arm_that_could_not_stop_before_the_other_is_refused_while_there_is_room():
+    own = robot()
+    fast = np.zeros(own.dim)
+    fast[[0, 7]] = -3.0, 3.0
+    grippers = np.isin(np.arange(own.dim), own.gripper_dims)
+    limits = Limits(own.joint_names, own.lower, own.upper, own.velocity, grippers, np.zeros(own.dim, bool))
+    judging = SafetyFilter(SafetySettings(collision="refuse"), limits, None, collisions())
+    before, action = turned(0.75), turned(0.85)
+    assert collisions().approached(action, before) is None
+    quick = judging.judge(action, RobotState(before, fast, before, DT))
+    assert quick.refused
+    assert "right_arm/" in quick.notes[-1]
+    assert not judging.judge(turned(0.76), RobotState(before, fast / 10, before, DT)).refused
+
+
+def test_motions_of_ours_are_refused_even_where_policies_are_not_judged():
+    for mode in ("off", "warn", "refuse"):
+        assert arms(turned(inwards(1.2)), turned(1.2), path="motion", collision=mode).refused
+        assert not arms(turned(1.19), turned(1.2), path="motion", collision=mode).refused
+    off = arms(turned(inwards(1.2)), turned(1.2), collision="off")
+    assert (off.refused, off.near, off.notes) == (False, None, ())
+
+
+def test_report_only_tells_of_a_collision_and_sends_the_action():
+    action = turned(inwards(1.2))
+    told = arms(action, turned(1.2), report_only=True, collision="refuse")
+    assert np.array_equal(told.action, action)
+    assert "deep)" in told.notes[0]
+    assert arms(action, turned(1.2), report_only=True).near is not None
+
+
+def test_a_collision_is_judged_after_the_box_and_before_the_following_error():
+    far = turned(1.2)
+    far[1] -= 0.9
+    action = turned(inwards(1.2))
+    verdict = arms(action, turned(1.2), measured=far, collision="refuse")
+    assert "deep)" in verdict.notes[0]
+    assert "from where it is measured" in arms(action, turned(1.2), measured=far, collision="off").notes[0]
+
+
+def test_a_motion_of_ours_may_come_from_outside_its_box_and_not_go_there():
+    """Where the first joint is beyond 0.05 the arm is outside."""
+
+    def outside(action):
+        return ("left_arm",) if action[0] > 0.05 else ()
+
+    left = judge([0.06, 1, 0.05], state(previous=(0.04, 1, 0.05)), path="motion", outside=outside)
+    assert left.notes == ("left_arm would leave the workspace box",)
+    for there in (0.05, 0.1, 0.11):
+        back = judge([there, 1, 0.05], state(previous=(0.1, 1, 0.05)), path="motion", outside=outside)
+        assert not back.refused
+
+
+# --- robots of every kind -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("path", ["policy", "motion"])
+def test_every_robot_may_stand_at_its_poses_and_move_from_them_within_its_limits(name, path):
+    own = robots.load(name)
+    grippers = np.isin(np.arange(own.dim), own.gripper_dims)
+    binary = np.isin(np.arange(own.dim), own.binary_dims)
+    limits = Limits(own.joint_names, own.lower, own.upper, own.velocity, grippers, binary)
+    judging = SafetyFilter(SafetySettings(collision="refuse"), limits, None, Collisions(own, 0.005))
+    for pose in own.poses.values():
+        where = RobotState(pose, np.zeros(own.dim), pose, DT)
+        assert np.array_equal(judging.judge(pose.copy(), where, path).action, pose)
+        jump = np.where(grippers, np.where(pose == own.upper, own.lower, own.upper), pose)
+        verdict = judging.judge(jump, where, path)
+        assert not verdict.refused  # a gripper's whole travel is no jump, whatever its unit
+        assert np.array_equal(verdict.action[binary], jump[binary])
+        travel = np.abs(verdict.action - pose)[grippers & ~binary]
+        assert (travel <= (own.velocity * DT)[grippers & ~binary] + 1e-9).all()
+        assert (travel > 0).all()

@@ -1,0 +1,40 @@
+"""Postures of the two Pipers that are about to meet."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+import robots
+from robots import Robot
+from runtime.collision import Collisions
+from runtime.types import Float64
+
+MARGIN = 0.005
+GRIPPERS = [6, 13]
+
+
+def robot() -> Robot:
+    return robots.load("agilex_piper")
+
+
+@cache
+def collisions(margin: float = MARGIN) -> Collisions:
+    return Collisions(robot(), margin)
+
+
+def turned(inwards: float, opening: float = 0.1) -> Float64:
+    """Both arms as in `ready`, turned towards each other: they touch from about 1 rad on, most at 1.6."""
+    q = robot().poses["ready"].copy()
+    q[0], q[7] = -inwards, inwards
+    q[GRIPPERS] = opening
+    return q
+
+
+def way(*postures: Float64, count: int = 200) -> Float64:
+    """Straight lines [T, D] from posture to posture."""
+    legs = [
+        a + np.linspace(0, 1, count)[:, None] * (b - a) for a, b in zip(postures, postures[1:], strict=False)
+    ]
+    return np.concatenate(legs)

@@ -1,0 +1,95 @@
+"""What a step, or a way, may do where links are near each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from runtime.collision import Collision
+from tests.runtime.collision_samples import MARGIN, collisions, robot, turned, way
+
+FREE, NEAR, DEEP = turned(0.5), turned(1.2), turned(1.4)
+
+
+def test_links_that_touch_are_named_with_how_far_they_are_apart() -> None:
+    assert collisions().nearest(FREE) is None
+    found = collisions().nearest(DEEP)
+    assert found is not None
+    assert {found.one, found.other} == {"left_arm/gripper_base", "right_arm/gripper_base"}
+    assert -0.03 < found.distance < -0.02
+    assert str(found) == "left_arm/gripper_base and right_arm/gripper_base would collide (24 mm deep)"
+    assert str(Collision("a/b", "table", 0.0031)) == "a/b and table would be 3 mm apart"
+
+
+def test_the_table_is_one_of_them() -> None:
+    low = robot().poses["ready"].copy()
+    low[1] = 2.15
+    found = collisions().nearest(low)
+    assert found is not None
+    assert (found.one, found.other) == ("left_arm/gripper_base", "table")
+
+
+def test_a_margin_is_how_near_counts_as_touching() -> None:
+    q = turned(0.95)
+    assert collisions(0.0).nearest(q) is None
+    assert collisions(0.03).nearest(q) is not None
+
+
+def test_a_step_into_a_collision_is_found_and_one_out_of_it_or_on_the_spot_is_not() -> None:
+    assert collisions().approached(NEAR, FREE) is not None
+    assert collisions().approached(DEEP, NEAR) is not None
+    assert collisions().approached(NEAR, NEAR) is None
+    assert collisions().approached(FREE, NEAR) is None
+    parting = turned(1.18)
+    assert collisions().nearest(parting) is not None
+    assert collisions().approached(parting, NEAR) is None
+
+
+def test_of_two_pairs_one_may_part_only_while_the_other_does_not_come_nearer() -> None:
+    low = turned(1.2)
+    low[1] = 2.1
+    lower = low.copy()
+    lower[0], lower[1] = -1.1, 2.2
+    found = collisions().approached(lower, low)
+    assert found is not None
+    assert found.other == "table"
+
+
+def test_grippers_open_and_close_freely() -> None:
+    closed, opened = turned(1.15, 0.0), turned(1.15, 0.1)
+    apart = collisions().nearest(opened)
+    assert apart is not None
+    shut = collisions().nearest(closed)
+    assert shut is None or shut.distance > apart.distance
+    assert collisions().approached(opened, closed) is None
+
+
+def test_a_way_is_free_or_says_where_it_first_is_not() -> None:
+    assert collisions().on_way(way(turned(0.0), FREE)) is None
+    found = collisions().on_way(way(FREE, DEEP, FREE))
+    assert found is not None
+    collision, at = found
+    assert collision.distance == pytest.approx(MARGIN, abs=2e-3)
+    assert 60 < at < 200
+
+
+def test_a_way_that_begins_in_a_collision_may_only_part() -> None:
+    assert collisions().on_way(way(NEAR, FREE)) is None
+    assert collisions().on_way(way(NEAR, DEEP)) is not None
+    found = collisions().on_way(way(NEAR, FREE, NEAR))
+    assert found is not None
+    assert found[1] > 200
+
+
+def test_a_way_is_judged_with_the_grippers_of_both_its_ends() -> None:
+    """They may open at once, or stay closed until the end."""
+    closing = way(turned(0.5, 0.1), turned(1.02, 0.0))
+    opening = way(turned(0.5, 0.0), turned(1.02, 0.1))
+    assert collisions().on_way(way(turned(0.5, 0.0), turned(1.02, 0.0))) is None
+    assert collisions().on_way(closing) is not None
+    assert collisions().on_way(opening) is not None
+
+
+def test_standing_still_is_free_wherever_it_is() -> None:
+    assert collisions().on_way(np.stack([FREE, FREE])) is None
+    assert collisions().on_way(np.stack([DEEP, DEEP])) is None
