@@ -7,7 +7,7 @@ import importlib
 import sys
 from pathlib import Path
 
-_BENCHMARKS = ("latency", "live", "loop", "measures", "moving_target", "strategies")
+_BENCHMARKS = ("ik", "latency", "live", "loop", "measures", "moving_target", "strategies")
 _SETTABLE = ("latency", "loop")
 _SECONDS = 20.0
 

@@ -1,0 +1,36 @@
+"""A process that imports everything, builds one robot's kinematics, solves one chunk, and tells what that took.
+
+`python -m benchmarks.first_chunk KIND ROBOT` prints JSON: `rss_mb` when the chunk is solved, `forward_mb` before
+anything is solved. The chunk is of home's own poses.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+
+import robots
+from runtime.plugins import variants
+
+
+def main(kind: str, name: str) -> None:
+    """Solves, then prints."""
+    robot = robots.load(name)
+    module = variants("runtime.kinematics")[kind]
+    kinematics = module.build(module.Config(), robot)
+    home = robot.poses["home"]
+    targets = np.repeat(kinematics.forward(home)[None], 50, axis=0)
+    result = kinematics.solve(targets, home, 1 / robot.control_rate, home, 0)
+    assert result.reached.all()
+    print(json.dumps({"rss_mb": _resident_mb()}), flush=True)
+
+
+def _resident_mb() -> float:
+    with open("/proc/self/statm", encoding="ascii") as file:
+        return int(file.read().split()[1]) * 4096 / 1e6
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,203 @@
+"""Chunks of poses into joints: how long, how exact, how fast the joints, for all robots and installed backends.
+
+On one core, because a station has others for the rest. All backends are asked for the same chunks in turns.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import robots
+from benchmarks.ik_paths import Chunk, arm_dims, invented, recorded
+from benchmarks.labs import ROOT
+from benchmarks.report import Figure, Report
+from robots import Robot
+from runtime.errors import SetupError
+from runtime.kinematics.base import IkResult, Kinematics
+from runtime.plugins import variants
+
+SECONDS = 0.5
+_DEFAULT = "compiled"
+_FEWEST = 3  # calls of a backend for each chunk, however slow it is
+_STARTS = 3
+_RECORDED = "agilex_piper"  # the robot of $EVA_SAMPLE_EPISODE
+_EPISODE = "EVA_SAMPLE_EPISODE"
+
+
+def measure(seconds: float) -> Report:
+    """`chunk_ms.ROBOT.TRAJECTORY` and what the solutions are worth; of other backends behind their kind's name."""
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        rows = [row for name in robots.names() for row in _robot(name, seconds)]
+        figures = [figure for row in rows for figure in _figures(row)]
+        figures += _compared(rows)
+        figures.append(
+            Figure("limit_violations", sum(row["violations"] for row in rows if _ours(row)), "", "== 0")
+        )
+        figures += _fk() + _starts()
+    finally:
+        os.sched_setaffinity(0, allowed)
+    return Report("ik", figures, rows)
+
+
+def _robot(name: str, seconds: float) -> list[dict[str, Any]]:
+    """A row per trajectory and backend."""
+    robot = robots.load(name)
+    cases = invented(robot)
+    folder = os.environ.get(_EPISODE)
+    if name == _RECORDED and folder:
+        cases["recorded"] = recorded(Path(folder)).chunks(1 / robot.control_rate)
+    backends = _backends(robot)
+    return [
+        {"robot": name, "trajectory": trajectory, "arms": len(robot.arms), **row}
+        for trajectory, chunks in cases.items()
+        for row in _case(robot, backends, chunks, seconds)
+    ]
+
+
+def _backends(robot: Robot) -> dict[str, Kinematics]:
+    """Those that can be built here, ready to solve."""
+    built = {}
+    for kind, module in variants("runtime.kinematics").items():
+        try:
+            built[kind] = module.build(module.Config(), robot)
+        except SetupError as error:
+            print(f"{kind} is not measured: {error}", file=sys.stderr)
+    return built
+
+
+def _case(
+    robot: Robot, backends: Mapping[str, Kinematics], chunks: Sequence[Chunk], seconds: float
+) -> list[dict[str, Any]]:
+    """Every backend solves the chunks in turns, until each had its time."""
+    times: dict[str, list[float]] = {kind: [] for kind in backends}
+    solved = {kind: [_solved(backend, chunk) for chunk in chunks] for kind, backend in backends.items()}
+    ends = dict.fromkeys(backends, seconds)
+    while any(sum(times[k]) < ends[k] or len(times[k]) < _FEWEST * len(chunks) for k in backends):
+        for chunk in chunks:
+            for kind, backend in backends.items():
+                begun = time.perf_counter()
+                _solved(backend, chunk)
+                times[kind].append(time.perf_counter() - begun)
+    return [
+        {"kind": kind, **_timed(times[kind]), **_judged(robot, chunks, solved[kind])} for kind in backends
+    ]
+
+
+def _solved(backend: Kinematics, chunk: Chunk) -> IkResult:
+    return backend.solve(chunk.targets, chunk.seed, chunk.dt, chunk.seed, 0)
+
+
+def _timed(seconds: Sequence[float]) -> dict[str, float]:
+    quantiles = {"chunk_ms": 50, "chunk_ms_p99": 99}
+    return {name: float(np.percentile(seconds, q)) * 1e3 for name, q in quantiles.items()}
+
+
+def _judged(robot: Robot, chunks: Sequence[Chunk], solved: Sequence[IkResult]) -> dict[str, float]:
+    """What the solutions are worth, over all chunks; the first row's speed counts from the seed."""
+    dims = arm_dims(robot)
+    q = np.stack([result.q for result in solved])[..., dims]
+    seeds = np.stack([np.clip(chunk.seed, robot.lower, robot.upper) for chunk in chunks])[:, dims]
+    steps = np.abs(np.diff(np.concatenate([seeds[:, None], q], axis=1), axis=1))
+    away = np.stack([result.position_error for result in solved]) * 1e3
+    turned = np.degrees(np.stack([result.rotation_error for result in solved]))
+    return {
+        "position_error_mm": float(away.max()),
+        "position_error_mean_mm": float(away.mean()),
+        "rotation_error_deg": float(turned.max()),
+        "rotation_error_mean_deg": float(turned.mean()),
+        "largest_step": float(steps.max()),
+        "velocity_ratio": float((steps / chunks[0].dt / robot.velocity[dims]).max()),
+        "violations": int(((q < robot.lower[dims]) | (q > robot.upper[dims])).sum()),
+    }
+
+
+def _ours(row: Mapping[str, Any]) -> bool:
+    return bool(row["kind"] == _DEFAULT)
+
+
+def _figures(row: Mapping[str, Any]) -> list[Figure]:
+    """Wanted of the default backend alone."""
+    case = f"{row['robot']}.{row['trajectory']}" + ("" if _ours(row) else f".{row['kind']}")
+    reachable = row["trajectory"] != "out_of_reach"
+    wanted = {"chunk_ms": "<= 0.5" if reachable else "<= 1", "velocity_ratio": "<= 1"}
+    if reachable:
+        wanted |= {"position_error_mm": "<= 0.05", "rotation_error_deg": "<= 0.02"}
+    units = {
+        "chunk_ms": "ms",
+        "chunk_ms_p99": "ms",
+        "position_error_mm": "mm",
+        "position_error_mean_mm": "mm",
+        "rotation_error_deg": "deg",
+        "rotation_error_mean_deg": "deg",
+        "largest_step": "rad",
+        "velocity_ratio": "",
+    }
+    return [
+        Figure(f"{name}.{case}", row[name], unit, wanted.get(name, "") if _ours(row) else "")
+        for name, unit in units.items()
+    ]
+
+
+def _compared(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
+    """How many times as long the other backends take."""
+    ours = {(row["robot"], row["trajectory"]): row["chunk_ms"] for row in rows if _ours(row)}
+    return [
+        Figure(f"ratio.{row['robot']}.{row['trajectory']}.{row['kind']}", row["chunk_ms"] / ours[key], "x")
+        for row in rows
+        if not _ours(row) and (key := (row["robot"], row["trajectory"])) in ours
+    ]
+
+
+def _fk() -> list[Figure]:
+    """How far the recorded joints' poses are from the recorded poses."""
+    folder = os.environ.get(_EPISODE)
+    if not folder:
+        print(f"the recorded episode is not measured: {_EPISODE} is not set", file=sys.stderr)
+        return []
+    robot, recording = robots.load(_RECORDED), recorded(Path(folder))
+    module = variants("runtime.kinematics")[_DEFAULT]
+    found = module.build(module.Config(), robot).forward(recording.joints)
+    away = np.linalg.norm(found[..., :3] - recording.poses[..., :3], axis=-1) * 1e3
+    cosine = np.abs(np.sum(found[..., 3:] * recording.poses[..., 3:], axis=-1))
+    turned = np.degrees(2 * np.arccos(np.minimum(1.0, cosine)))
+    return [
+        Figure("real_episode_fk_mm", float(away.max()), "mm", "<= 0.15"),
+        Figure("real_episode_fk_deg", float(turned.max()), "deg"),
+    ]
+
+
+def _starts() -> list[Figure]:
+    """From the start of a process to its first chunk, with an empty cache and with what that has left there."""
+    name = _RECORDED if _RECORDED in robots.names() else robots.names()[0]
+    with tempfile.TemporaryDirectory() as folder:
+        cold = _first_chunk(name, folder)
+        warm = [_first_chunk(name, folder) for _ in range(_STARTS)]
+    return [
+        Figure("cold_start_s.cold", cold["seconds"], "s"),
+        Figure("cold_start_s.warm", float(np.median([start["seconds"] for start in warm])), "s", "< 1.5"),
+        Figure("rss_mb.cold", cold["rss_mb"], "MB"),
+        Figure("rss_mb.warm", float(np.median([start["rss_mb"] for start in warm])), "MB"),
+    ]
+
+
+def _first_chunk(name: str, cache: str) -> dict[str, float]:
+    command = [sys.executable, "-m", "benchmarks.first_chunk", _DEFAULT, name]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": cache}
+    begun = time.perf_counter()
+    with subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        told: dict[str, float] = json.loads(process.stdout.readline())
+        told["seconds"] = time.perf_counter() - begun
+    return told
