@@ -3,7 +3,8 @@
 from robots.body import Body
 from robots.chain import Chain
 from robots.errors import RobotError
-from robots.loading import GripperChoice, load, names
+from robots.gripping import GripperChoice
+from robots.loading import load, names
 from robots.robot import EEF_FIELDS, Camera, Gripper, Group, Robot
 from robots.visuals import RobotScene, Visual, scene_of
 

@@ -17,6 +17,8 @@ Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
 Quadruple = Annotated[list[float], Field(min_length=4, max_length=4)]
 Positive = Annotated[float, Field(gt=0)]
 Reason = Annotated[str, Field(min_length=1)]
+Label = Annotated[str, Field(min_length=1)]  # of a joint: what the wire or the URDF calls it
+Topic = Annotated[str, Field(pattern=r"^[~/A-Za-z][A-Za-z0-9_/~]*$")]
 Kind = Literal["arm", "hand", "head", "torso", "base", "other"]
 Measured = Literal["velocity", "effort", "eef"]
 TABLE = "table"  # in pairs of [collision]: the plane z = 0 of the scene
@@ -105,21 +107,21 @@ class CollisionTable(Table):
 class RosGroupTable(Table):
     """The topics of one group; what is absent the robot's stack does not have."""
 
-    state: str | None = None
-    command: str | None = None
-    eef: str | None = None
-    eef_command: str | None = None
-    gripper_state: str | None = None
-    gripper_command: str | None = None
-    simulation: str | None = None
-    leader: str | None = None
+    state: Topic | None = None
+    command: Topic | None = None
+    eef: Topic | None = None
+    eef_command: Topic | None = None
+    gripper_state: Topic | None = None
+    gripper_command: Topic | None = None
+    simulation: Topic | None = None
+    leader: Topic | None = None
 
 
 class RosTable(Table):
     """The topics of the robot's own ROS stack."""
 
     version: Literal[1, 2]
-    cameras: dict[Name, str] = {}
+    cameras: dict[Name, Topic] = {}
     """Logical camera name = topic."""
     groups: dict[Name, RosGroupTable] = {}
 
@@ -127,7 +129,7 @@ class RosTable(Table):
 class OverrideTable(Table):
     """Limits that replace the URDF's for one joint, and why."""
 
-    joint: str
+    joint: Label
     lower: float | None = None
     upper: float | None = None
     velocity: Positive | None = None
@@ -138,7 +140,7 @@ class GroupTable(Table):
     """Joints that travel together on the wire, in this order."""
 
     name: Name
-    joints: Annotated[list[str], Field(min_length=1)]
+    joints: Annotated[list[Label], Field(min_length=1)]
     """Names on the wire, the gripper's included."""
     urdf_joints: list[str]
     """Their names in the URDF, in the same order, without the gripper; "" for a number that moves no link of it

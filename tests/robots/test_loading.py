@@ -86,7 +86,80 @@ def test_a_robot_travels_between_processes() -> None:
         ('"joint5", "joint6"]\nframe', '"joint5"]\nframe', "urdf_joints names 5 joints; allowed: 6"),
         ('"joint5", "joint6"]\nframe', '"joint5", "joint9"]\nframe', "no joint 'joint9'; it has joint1"),
         ('"joint5", "joint6"]\nframe', '"joint5", "joint8"]\nframe', "joint8 is fixed or a mimic"),
-        ('"joint5", "joint6"]\nframe', '"joint5", "joint7"]\nframe', "'joint6' lies between base_link and"),
+        (
+            '"joint5", "joint6"]\nframe',
+            '"joint5", "joint7"]\nframe',
+            "left_arm.gripper.fingers: joint7 is also among urdf_joints",
+        ),
+        (FIRST, 'eef_link = "link7"\n', "left_arm: "),
+        (FIRST, 'eef_link = "link7"\n', "'joint7' lies between base_link and link7, not driven"),
+        ('"joint5", "joint6"]\nframe', '"joint5", "joint5"]\nframe', "urdf_joints: joint5 more than once"),
+        (
+            '"joint5", "joint6"]\nframe',
+            '"joint5", ""]\nframe',
+            'urdf_joints has ""; allowed for an arm: joints',
+        ),
+        (
+            'urdf = "agilex_piper.urdf"',
+            'urdf = "piper.urdf"',
+            "urdf = 'piper.urdf' is no file; URDFs in the folder: agilex_piper.urdf",
+        ),
+        (FIRST, FIRST + "pinned = { joint9 = 0.0 }\n", "left_arm.pinned: "),
+        (FIRST, FIRST + "pinned = { joint9 = 0.0 }\n", "no joint 'joint9'; it has joint1"),
+        (
+            FIRST,
+            FIRST + "pinned = { joint1 = 0.0 }\n",
+            "joint1 is fixed or among urdf_joints; allowed: other",
+        ),
+        ('frame = "base_link"', 'frame = "floor"', "left_arm: from frame to eef_link: "),
+        (
+            'frame = "base_link"\n' + FIRST,
+            'kind = "arm"\n',
+            'left_arm.kind = "arm"; allowed without eef_link',
+        ),
+        (
+            'frame = "base_link"\n' + FIRST,
+            "pinned = { joint1 = 0.0 }\n",
+            "left_arm.pinned: joint1; allowed only with eef_link and frame",
+        ),
+        ("fingers = { joint7", "fingers = { joint9", "left_arm.gripper.fingers: "),
+        ("fingers = { joint7", "fingers = { joint8", "joint8 is fixed or a mimic"),
+        (
+            "binary = false",
+            "apart = [0.1, 0.05]",
+            "gripper.apart = [0.1, 0.05]; allowed: 0 <= at close < at open",
+        ),
+        ("close = 0.0", "close = -0.1", "left_arm.gripper.close = -0.1; allowed: 0.0 to 0.1"),
+        (
+            "[cameras]",
+            "[stand]\nxyz = [0.0, 0.0, 0.0]\nwxyz = [1.0, 1.0, 0.0, 0.0]\n[cameras]",
+            "stand.wxyz has",
+        ),
+        (
+            "[cameras]",
+            '[ros]\nversion = 2\n[ros.groups.head]\nstate = "/head"\n[cameras]',
+            "ros.groups names head; allowed: left_arm, right_arm",
+        ),
+        (
+            "[cameras]",
+            '[ros]\nversion = 2\n[ros.cameras]\nhead = "/head"\n[cameras]',
+            "ros.cameras names head; allowed: front, left_wrist, right_wrist",
+        ),
+        (
+            "[collision]",
+            '[collision]\nwithout = ["cover"]',
+            "collision.without names cover; allowed: base_link,",
+        ),
+        (
+            "[collision]",
+            "[collision]\ncapsules = { cover = { start = [0.0, 0.0, 0.0], end = [0.0, 0.0, 0.1], radius = 0.1 } }",
+            "collision.capsules names cover; allowed: base_link,",
+        ),
+        (
+            '["link2", "link5"]',
+            '["link2", "left_arm/cover"]',
+            "collision.ignore names left_arm/cover; allowed: table",
+        ),
         (FIRST, 'eef_link = "hand"\n', "no link 'hand'"),
         (FIRST, "", "eef_link and frame make an arm together"),
         ("index = 6", "index = 7", "left_arm.gripper.index = 7; allowed: 0 to 6"),
@@ -116,6 +189,7 @@ def test_what_does_not_fit_together_is_named(edited: Edit, old: str, new: str, s
         ("joint6", "upper", 1.0, "overrides names joint 'joint6'; allowed: joint0,"),
         ("joint1", "upper", -1.0, "joint 'joint1' has range 0.0 to -1.0"),
         ("joint1", "velocity", 0.0, "Input should be greater than 0"),
+        ("", "upper", 1.0, "overrides.0.joint = '': String should have at least 1 character"),
     ],
 )
 def test_an_override_that_makes_no_sense_is_refused(
@@ -184,3 +258,65 @@ def test_a_declared_fingertip_needs_a_unit_quaternion(edited: Edit) -> None:
     declared = "[groups.gripper.tip]\nxyz = [0.0, 0.0, 0.2]\nwxyz = [1.0, 1.0, 0.0, 0.0]\n\n[groups.mount]"
     with pytest.raises(RobotError, match=r"left_arm\.gripper\.tip\.wxyz has length 1\.41.*allowed: 1"):
         load(edited(("[groups.mount]", declared)))
+
+
+def test_an_override_that_changes_nothing_is_refused(edited: Edit) -> None:
+    override = '[[groups.overrides]]\njoint = "joint1"\nreason = "none"\n\n[groups.mount]'
+    with pytest.raises(
+        RobotError, match=r"left_arm\.overrides: joint1 changes nothing; needed: lower, upper or"
+    ):
+        load(edited(("[groups.mount]", override)))
+
+
+def test_a_robot_whose_groups_are_all_optional_is_refused(edited: Edit) -> None:
+    folder = edited(('name = "left_arm"', 'name = "left_arm"\noptional = true'))
+    assert [group.name for group in load(folder).groups] == ["right_arm"]
+    file = folder / "robot.toml"
+    file.write_text(file.read_text().replace('name = "right_arm"', 'name = "right_arm"\noptional = true'))
+    with pytest.raises(RobotError, match="groups: all are optional; needed: one that is always part"):
+        load(folder)
+    assert [group.name for group in load(folder, ["left_arm"]).groups] == ["left_arm"]
+
+
+def test_groups_of_one_copy_of_the_urdf_stand_in_one_place(edited: Edit) -> None:
+    """The second group moves nothing of the URDF that the first does: both are one body."""
+    joints = 'urdf_joints = ["joint1", "joint2", "joint3", "joint4", "joint5", "joint6"]\n'
+    arm = 'joints = ["joint0", "joint1", "joint2", "joint3", "joint4", "joint5", "joint6"]\n' + joints
+    head = 'joints = ["yaw", "joint6"]\nurdf_joints = [""]\noverrides = [{ joint = "yaw", lower = -1.0, upper = 1.0, '
+    head += 'velocity = 1.0, reason = "measured" }]\n'
+    folder = edited()
+    file = folder / "robot.toml"
+    before, right = file.read_text().split('name = "right_arm"\n')
+    right = right.replace(arm + 'frame = "base_link"\n' + FIRST, head).replace("index = 6", "index = 1")
+    right = right.replace("fingers = { joint7 = [0.0, 0.05] }", "")
+    for zeros in (
+        "right_arm = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]",
+        "right_arm = [-0.35, 1.15, -0.85, 0.0, 1.1, 0.0, 0.1]",
+    ):
+        assert zeros in right
+        right = right.replace(zeros, "right_arm = [0.0, 0.0]")
+    file.write_text(before + 'name = "right_arm"\n' + right)
+    with pytest.raises(RobotError, match=r"groups\.right_arm\.mount differs from that of left_arm"):
+        load(folder)
+
+
+def test_what_is_chosen_has_to_be_there(edited: Edit) -> None:
+    with pytest.raises(RobotError, match=r"groups \['head'\] were chosen; allowed: left_arm, right_arm"):
+        load(edited(), ["head"])
+    with pytest.raises(RobotError, match=r"groups \[\] were chosen"):
+        load("agilex_piper", [])
+    with pytest.raises(
+        RobotError, match=r"grippers of head were chosen; groups with a gripper: left_arm, right"
+    ):
+        load("agilex_piper", grippers={"head": robots.GripperChoice(binary=True)})
+
+
+def test_robots_of_ones_own_lie_in_the_folders_of_an_environment_variable(
+    edited: Edit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = edited()
+    monkeypatch.setenv("EVA_ROBOTS", str(folder.parent))
+    assert "copy" in robots.names()
+    assert load("copy").folder == folder
+    folder.rename(folder.parent / "agilex_piper")
+    assert load("agilex_piper").folder != folder.parent / "agilex_piper"

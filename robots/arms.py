@@ -1,0 +1,91 @@
+"""The chains of a robot's arms, what carries them, and where their copies of the URDF stand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from robots.chain import Chain
+from robots.copies import copies, copy_of
+from robots.description import GroupTable
+from robots.errors import RobotError
+from robots.refusals import naming
+from robots.robot import Group
+from robots.urdf import Urdf
+
+
+def check_arm(key: str, table: GroupTable) -> None:
+    """End effector, frame and what only an arm has come together."""
+    if (table.eef_link is None) != (table.frame is None):
+        raise RobotError(f"{key}: eef_link and frame make an arm together; allowed: both or neither")
+    if table.eef_link is not None:
+        if "" in table.urdf_joints:
+            raise RobotError(f'{key}.urdf_joints has ""; allowed for an arm: joints of the URDF')
+        return
+    if table.kind == "arm":
+        raise RobotError(f'{key}.kind = "arm"; allowed without eef_link and frame: the other kinds')
+    if table.pinned:
+        raise RobotError(f"{key}.pinned: {', '.join(table.pinned)}; allowed only with eef_link and frame")
+    if table.gripper is not None and table.gripper.tip is not None:
+        raise RobotError(f"{key}.gripper.tip is a frame in eef_link; allowed only with eef_link and frame")
+
+
+def with_chain(file: Path, tree: Urdf, table: GroupTable, group: Group, groups: Sequence[Group]) -> Group:
+    """The group with the chain of its own joints, and with the chain that carries it where others move it."""
+    if table.eef_link is None or table.frame is None:
+        return group
+    key = f"{file}: groups.{table.name}"
+    _check_pinned(f"{key}.pinned", tree, table)
+    with naming(f"{key}: from frame to eef_link"):
+        way = tree.between(table.frame, table.eef_link)
+    movers = {
+        name: int(dim)
+        for other in copy_of(group, groups)
+        if other is not group
+        for name, dim in zip(other.urdf_joints, other.joint_dims, strict=True)
+    }
+    carried = [joint.name for joint in way if joint.name in movers]
+    if not carried:
+        with naming(key):
+            chain = Chain(tree, table.frame, table.eef_link, table.urdf_joints, table.pinned)
+        return replace(group, chain=chain)
+    root = next((joint.parent for joint in way if joint.name in table.urdf_joints), None)
+    if root is None:
+        raise RobotError(f"{key}.urdf_joints: none lies between {table.frame} and {table.eef_link}")
+    pinned = {name: value for name, value in table.pinned.items() if name not in carried}
+    if beyond := [joint.name for joint in tree.between(root, table.eef_link) if joint.name in movers]:
+        raise RobotError(f"{key}: {', '.join(beyond)} of other groups lie among its own joints")
+    with naming(key):
+        own = Chain(tree, root, table.eef_link, table.urdf_joints, pinned)
+        carrier = Chain(tree, table.frame, root, carried, pinned)
+    return replace(
+        group,
+        chain=own,
+        carrier=carrier,
+        carrier_dims=np.array([movers[name] for name in carried], dtype=np.intp),
+    )
+
+
+def _check_pinned(key: str, tree: Urdf, table: GroupTable) -> None:
+    """Pinned are joints that can move and that the group does not move itself."""
+    for name in table.pinned:
+        with naming(key):
+            joint = tree.joint(name)
+        if joint.kind == "fixed" or name in table.urdf_joints:
+            raise RobotError(f"{key}: {name} is fixed or among urdf_joints; allowed: other joints that move")
+
+
+def check_mounts(file: Path, tables: Sequence[GroupTable], groups: Sequence[Group]) -> None:
+    """A copy of the URDF stands in one place: that of its first group."""
+    mounts = {table.name: table.mount for table in tables}
+    for members in copies(groups):
+        first = members[0].name
+        for group in members[1:]:
+            if mounts[group.name] is not None and mounts[group.name] != mounts[first]:
+                raise RobotError(
+                    f"{file}: groups.{group.name}.mount differs from that of {first}, with which it shares one copy "
+                    "of the URDF; allowed: the same, or none"
+                )

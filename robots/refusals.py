@@ -1,0 +1,33 @@
+"""What is wrong with a description, said with file and key."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from robots.errors import RobotError
+from robots.urdf import Urdf
+
+
+@contextmanager
+def naming(key: str) -> Iterator[None]:
+    """What is said of the URDF in here is said with the key that asked for it."""
+    try:
+        yield
+    except RobotError as error:
+        raise RobotError(f"{key}: {error}") from error
+
+
+def refuse_twice(file: Path, key: str, given: list[str]) -> None:
+    twice = sorted({name for name in given if given.count(name) > 1})
+    if twice:
+        raise RobotError(f"{file}: {key}: {', '.join(twice)} more than once; each is allowed once")
+
+
+def check_movers(key: str, tree: Urdf, names: Iterable[str]) -> None:
+    for name in names:
+        with naming(key):
+            joint = tree.joint(name)
+        if joint.kind == "fixed" or joint.mimic is not None:
+            raise RobotError(f"{key}: {name} is fixed or a mimic; allowed: joints that move by themselves")
