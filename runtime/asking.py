@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
 
 from runtime.clock import Clock
+from runtime.kinematics.base import IkFlag, IkResult
 from runtime.messages import Event
 from runtime.policies.base import Policy
 from runtime.runner import Runner
 from runtime.sight import Sight
-from runtime.spaces import CommandRows, Spaces
+from runtime.spaces import CommandRows, Onset, Spaces
 from runtime.types import ActionChunk, Conditioning, Observation
 
 Committed = Callable[[int], Conditioning | None]  # by the step of the observation
@@ -21,7 +25,8 @@ Committed = Callable[[int], Conditioning | None]  # by the step of the observati
 class Answered:
     """An inference that came back: the chunk, how long it took [s], what it was asked about, what it means.
 
-    `made` are its rows in command space. `waited`: the robot stood meanwhile.
+    `made` are its rows in command space. `waited`: the robot stood meanwhile. `eef` says where the poses of the
+    observation come from: the robot's own measurement, or its joints.
     """
 
     chunk: ActionChunk
@@ -30,6 +35,10 @@ class Answered:
     made: CommandRows
     waited: bool = False
     age: float | None = None  # of the oldest stream of the observation when the policy was asked [s]
+    eef: Literal["measured", "fk"] = "fk"
+    ik: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # how its poses were met, as by `figures`; {} for joints
 
 
 class Asking:
@@ -69,8 +78,13 @@ class Asking:
         """What the policy would be shown now; PolicyError where there is nothing, or it is old."""
         return self.sight.now(self.task)
 
-    def ask(self, waited: bool = False, committed: Committed | None = None) -> Future[Answered]:
-        """Send one request about the newest observation; raises PolicyError where that is too old."""
+    def ask(
+        self, waited: bool = False, committed: Committed | None = None, k_max: int | None = None
+    ) -> Future[Answered]:
+        """Send one request about the newest observation; raises PolicyError where that is too old.
+
+        `k_max` is how many rows of the answer may be dropped as stale at most, None: as many as are.
+        """
         observation = self.observe()
         conditioning = committed(observation.step) if committed else None
         policy, fresh, self._fresh = self.policy, self._fresh, False
@@ -79,21 +93,61 @@ class Asking:
             if fresh:
                 policy.reset()
             begun = self._clock.now()
+            measured = observation.eef is not None and policy.observation_eef == "measured"
             shown = observation
-            if shown.eef is None:
+            if not measured:
                 shown = replace(shown, eef=self._spaces.eef_of(shown.qpos))
             age = self._clock.now() - min(shown.captured.values())
             chunk = policy.infer(shown, conditioning)
             seconds = self._clock.now() - begun
-            return Answered(chunk, seconds, shown, self._spaces.to_command(chunk, shown), waited, age)
+            onset = self._onset(shown, waited, waited or fresh, k_max)
+            made = self._spaces.to_command(chunk, shown, onset)
+            source: Literal["measured", "fk"] = "measured" if measured else "fk"
+            ik = {} if made.solved is None else figures(made.solved)
+            return Answered(chunk, seconds, shown, made, waited, age, source, ik)
 
         return self.runner.submit(infer)
 
+    def _onset(self, shown: Observation, waited: bool, rests: bool, k_max: int | None) -> Onset:
+        """Where the answer will take over, as far as that is known now: from what control was told to do last.
+
+        Its first row that can still be executed follows the newest control step. A robot that rests starts from
+        where it is measured.
+        """
+        qpos = np.asarray(shown.qpos, dtype=np.float64)
+        told = self.sight.commanded()
+        if told is None:
+            return Onset(qpos, qpos)
+        step, commanded = told
+        passed = 0 if waited else max(0, step + 1 - shown.step)
+        row = passed if k_max is None else min(passed, k_max)
+        return Onset(commanded, qpos if rests else commanded, row)
+
     def note(self, answered: Answered) -> None:
         """Say what could not be done of an answer."""
-        made = answered.made
-        if made.solved is not None and not made.solved.reached.all():
-            missed = int((~made.solved.reached).any(axis=1).sum())
-            worst = float(made.solved.position_error.max()) * 1000
-            text = f"{missed} of {len(made.rows)} poses are out of reach, the worst by {worst:.1f} mm: nearest taken"
-            self.notes.append(Event("ik_unreached", text, self._clock.now(), answered.observation.step))
+        ik = answered.ik
+        if ik.get("over"):
+            text = (
+                f"{ik['over']} of {ik['rows']} poses are not reached, the worst by {ik['worst_mm']:.1f} mm and "
+                f"{ik['worst_deg']:.2f} degrees: nearest taken ({ik['limit']} at a joint limit, {ik['velocity']} as "
+                f"fast as joints may, {ik['singular']} near singular)"
+            )
+            step = answered.observation.step
+            self.notes.append(Event("ik_unreached", text, self._clock.now(), step, ik))
+
+
+def figures(solved: IkResult) -> dict[str, Any]:
+    """Rows of which any arm is flagged, by flag, and the worst errors [mm, degrees]."""
+
+    def flagged(flag: IkFlag) -> int:
+        return int(((solved.flags & flag) != 0).any(axis=1).sum())
+
+    return {
+        "rows": len(solved.flags),
+        "over": flagged(IkFlag.OVER_TOLERANCE),
+        "limit": flagged(IkFlag.AT_LIMIT),
+        "velocity": flagged(IkFlag.AT_VELOCITY),
+        "singular": flagged(IkFlag.NEAR_SINGULAR),
+        "worst_mm": 1000.0 * float(solved.position_error.max(initial=0.0)),
+        "worst_deg": float(np.degrees(solved.rotation_error.max(initial=0.0))),
+    }

@@ -98,7 +98,12 @@ class Follow(Behaviour):
         arrival = Arrival(chunk.chunk_id, chunk.observation_step, rows.astype(np.float64), chunk.waited)
         safety = self._settings.safety
         # A policy that means to begin elsewhere is told by its first row; a late one has gone on by the first used.
-        meant, where = self._away(arrival.rows[0], commanded)
+        begin = arrival.rows[0] if chunk.meant is None else chunk.meant.astype(np.float64)
+        if begin.shape != (dim,):
+            return Joined(
+                dropped(chunk, step, f"it means to begin at {list(begin.shape)} numbers; expected {dim}")
+            )
+        meant, where = self._away(begin, commanded)
         if meant > safety.jump:
             far = f"{where}, allowed {safety.jump:g} (safety.jump): approach it, or start elsewhere"
             return Joined(dropped(chunk, step, far), far, too_far=True)

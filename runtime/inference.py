@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,7 @@ class ShownChunk:
     targets: NDArray[np.int64]
     rows: Float64
     overlap: int = 0
+    ik: Mapping[str, Any] = field(default_factory=dict)  # as in asking.Answered
 
 
 class Inference:
@@ -211,7 +213,14 @@ class Inference:
             state = "dropped" if merged.dropped else "merged"
             step = made.answered.observation.step
             self.shown = ShownChunk(
-                merged.chunk_id, merged.run, state, step, merged.targets, made.rows, merged.overlap
+                merged.chunk_id,
+                merged.run,
+                state,
+                step,
+                merged.targets,
+                made.rows,
+                merged.overlap,
+                made.answered.ik,
             )
             if not merged.dropped:
                 self._planned = self.shown
@@ -270,7 +279,8 @@ class Inference:
         now = self._clock.now()
         waited = self._mode in ON_DEMAND or self._strategy.query.waits
         try:
-            flight = self.asking.ask(waited, self._committed if self.continues else None)
+            committed = self._committed if self.continues else None
+            flight = self.asking.ask(waited, committed, self._strategy.parameters.k_max)
         except StaleObservationError:
             if self._stale_since is None:
                 self._stale_since = now
@@ -298,18 +308,19 @@ class Inference:
         self.asking.note(answered)
         made = Made(self._orders.next_chunk(), answered.made.rows, answered)
         self._wanted = False
-        self.tally.answered(answered.seconds, answered.age)
+        self.tally.answered(answered.seconds, answered.age, answered.ik)
         self._commitment.answered(made.number, chunk, step, answered.waited, self._generation)
         if self._mode == "preview":
             self.proposal = made
             nowhere = np.full(len(made.rows), -1, np.int64)
-            self.shown = ShownChunk(made.number, self._run, "proposed", step, nowhere, made.rows)
+            ik = answered.ik
+            self.shown = ShownChunk(made.number, self._run, "proposed", step, nowhere, made.rows, ik=ik)
         else:
             self._post(made)
         return self._record(made)
 
     def _record(self, made: Made) -> PolicyAnswer:
-        answered = made.answered
+        answered, solved = made.answered, made.answered.made.solved
         return PolicyAnswer(
             made.number,
             self._run,
@@ -318,13 +329,16 @@ class Inference:
             answered.chunk.space,
             answered.made.source,
             answered.seconds * 1000.0,
+            position_error=None if solved is None else solved.position_error,
+            rotation_error=None if solved is None else solved.rotation_error,
+            ik_flags=None if solved is None else solved.flags,
+            eef=answered.eef if self.policy.sees_poses else "",
         )
 
     def _post(self, made: Made) -> None:
-        answered = made.answered
-        self._orders.post(
-            PostedChunk(made.number, self._run, answered.observation.step, made.rows, answered.waited)
-        )
+        answered, step = made.answered, made.answered.observation.step
+        first = answered.made.first
+        self._orders.post(PostedChunk(made.number, self._run, step, made.rows, answered.waited, first))
         self._unmerged[made.number] = made
 
     def _recovered(self) -> None:

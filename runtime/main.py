@@ -96,6 +96,7 @@ class Service:
             "rows": shown.rows.astype(np.float32),
             "poses": self._main.spaces.eef_of(shown.rows),
             "overlap": shown.overlap,
+            "ik": dict(shown.ik),
         }
 
     def _joints(self) -> dict[str, Any]:

@@ -211,6 +211,7 @@ def make_recorder(plan: Plan, now: Callable[[], float], patient: bool = False) -
         "name": robot.name,
         "joint_names": list(robot.joint_names),
         "eef_names": list(robot.eef_names),
+        "eef_frames": {arm.name: arm.frame for arm in robot.arms},
         "dim": robot.dim,
         "eef_dim": robot.eef_dim,
     }

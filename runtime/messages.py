@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from runtime.codecs import pack, unpack
 from runtime.errors import CodecError
-from runtime.types import Float32, Float64
+from runtime.types import Float32, Float64, UInt8
 
 # --- main -> control ---------------------------------------------------------------------------------------
 
@@ -42,7 +42,8 @@ class PostedChunk:
     """A chunk in command space at control rate, not yet merged: float64 [H, D].
 
     Row 0 is for `observation_step`; where it `waited`, the robot stood while the policy was asked (or while a
-    person looked), and row 0 is for the first tick that is still free.
+    person looked), and row 0 is for the first tick that is still free. `meant` [D] is where the policy means to
+    begin, however far that is; None where row 0 says so.
     """
 
     chunk_id: int
@@ -50,6 +51,7 @@ class PostedChunk:
     observation_step: int
     rows: Float64
     waited: bool = False
+    meant: Float64 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +138,12 @@ class BeginEpisode:
 
 @dataclass(frozen=True, slots=True)
 class PolicyAnswer:
-    """A chunk as the policy gave it; `source_rows` [H'] says which row each posted row was made from."""
+    """A chunk as the policy gave it; `source_rows` [H'] says which row each posted row was made from.
+
+    Where its rows are poses, the errors float64 [H', arms] in m and rad and the flags uint8 [H', arms] (bits of
+    kinematics.base.IkFlag) say how the posted rows meet them. `eef` is where the poses come from that the policy was
+    shown, or that its rows are relative to: "measured" or "fk".
+    """
 
     chunk_id: int
     run: int
@@ -145,6 +152,10 @@ class PolicyAnswer:
     space: str
     source_rows: NDArray[np.int64]
     inference_ms: float
+    position_error: Float64 | None = None
+    rotation_error: Float64 | None = None
+    ik_flags: UInt8 | None = None
+    eef: str = ""
 
 
 @dataclass(frozen=True, slots=True)

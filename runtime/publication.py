@@ -19,6 +19,6 @@ class Publication:
 
     def __call__(self, action: Float64) -> Float32:
         joints = action[None]
-        row = self._rows.encode(self._spaces.vectors(joints), joints, self._previous)[0]
+        row: Float64 = self._rows.encode(self._spaces.vectors(joints), joints, self._previous)[0]
         self._previous = row
         return row.astype(np.float32)

@@ -175,6 +175,7 @@ class Recorder:
             # A row of the policy counts for the first step that was made from it.
             for step, row in zip(merged.targets[::-1], answer.source_rows[::-1], strict=True):
                 targets[row] = step
+        metres, radians, flags = _met(answer)
         self._journal.append(
             RawChunk(
                 chunk_id=answer.chunk_id,
@@ -188,6 +189,10 @@ class Recorder:
                 inference_ms=answer.inference_ms,
                 strategy=merged.strategy if merged else "",
                 overlap=merged.overlap if merged else 0,
+                ik_position_error=metres,
+                ik_rotation_error=radians,
+                ik_flags=flags,
+                eef=answer.eef,
             )
         )
 
@@ -266,6 +271,26 @@ def _reported_eef(seen: Observation, action: Float32) -> Float32 | None:
     if seen.reported_action is None or not np.array_equal(seen.reported_action, action):
         return None
     return seen.reported_action_eef
+
+
+def _met(answer: PolicyAnswer) -> tuple[Float32 | None, Float32 | None, UInt8 | None]:
+    """How each row [H, arms] of the policy was met: the worst error [m, rad] and all flags of the steps made of it.
+
+    NaN and no flag for a row that no step was made of, None for a chunk of joints.
+    """
+    errors, flags = (answer.position_error, answer.rotation_error), answer.ik_flags
+    if errors[0] is None or errors[1] is None or flags is None:
+        return None, None, None
+    shape = (len(answer.actions), flags.shape[1])
+    made: list[Float32] = []
+    for error in errors:
+        assert error is not None
+        worst = np.full(shape, np.nan, np.float32)
+        np.fmax.at(worst, answer.source_rows, error.astype(np.float32))
+        made.append(worst)
+    gathered = np.zeros(shape, np.uint8)
+    np.bitwise_or.at(gathered, answer.source_rows, flags)
+    return made[0], made[1], gathered
 
 
 def _executed(tick: TickDone) -> ExecutedTick:

@@ -235,7 +235,7 @@ class SetUp:
 
     def _validate(self, answered: Answered) -> None:
         self._inference.asking.note(answered)
-        self.first_action = answered.made.rows[0]
+        self.first_action = answered.made.meant
         first = first_action(self.first_action, np.asarray(answered.observation.qpos, np.float64), self._plan)
         far = ": far, approach it or start elsewhere" if first["far"] else ""
         self.validated = (

@@ -10,7 +10,7 @@ import numpy as np
 from runtime.clock import Clock
 from runtime.errors import PolicyError
 from runtime.page import Page
-from runtime.types import Observation
+from runtime.types import Float64, Observation
 
 
 class StaleObservationError(PolicyError):
@@ -50,6 +50,16 @@ class Sight:
             raise PolicyError(f"no picture has arrived from {', '.join(missing)}")
         shown = replace(seen, step=self._step_of(seen), prompt=prompt)
         return self._of_the_simulated_robot(shown) if self.simulated else shown
+
+    def commanded(self) -> tuple[int, Float64] | None:
+        """The newest control step and what the robot that chunks are for was told then [D]; None before that."""
+        status = self._page.control.read()
+        simulated = np.array(status["simulated"], np.float64)
+        if int(status["step"]) >= 0 and np.isfinite(simulated).all() and bytes(status["behaviour"]):
+            return int(status["step"]), simulated
+        if not status["engaged"]:
+            return None
+        return int(status["step"]), np.array(status["commanded"], np.float64)
 
     def _step_of(self, seen: Observation) -> int:
         """The control step that an observation is assembled for: the tick that saw it, or the next one.

@@ -209,7 +209,7 @@ def _proposal(view: View) -> dict[str, Any]:
     made = view.inference.proposal
     if made is None:
         return {}
-    first = first_action(made.rows[0], _joints(view), view.plan)
+    first = first_action(made.answered.made.meant, _joints(view), view.plan)
     age = view.now - made.answered.observation.captured.get("joints", view.now)
     return {"chunk": made.number, "rows": len(made.rows), "age_s": age, **first}
 

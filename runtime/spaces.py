@@ -72,9 +72,10 @@ class Spaces:
         self._count = len(arms)
         self._gripped = [index for index, arm in enumerate(arms) if arm.gripper is not None]
         self._grippers = [arm.gripper_dim for arm in arms if arm.gripper_dim is not None]
-        self._moving = np.setdiff1d(np.arange(robot.dim), robot.gripper_dims)
+        self._all = np.arange(robot.dim)
+        self._moving = np.setdiff1d(self._all, robot.gripper_dims)
         solved = np.concatenate([np.zeros(0, np.intp), *(arm.joint_dims for arm in arms)])
-        self._still = np.setdiff1d(np.arange(robot.dim), solved)
+        self._still = np.setdiff1d(self._all, solved)
         self._wrapping = np.flatnonzero(np.isinf(robot.lower) & np.isinf(robot.upper))
         self._quaternions = [EEF_WIDTH * arm + 3 for arm in range(self._count)]
         pairs = zip(self._gripped, self._grippers, strict=True)
@@ -98,9 +99,9 @@ class Spaces:
         rate = chunk.rate or self._control_rate
         if chunk.space == "joint":
             rows = self._checked(chunk, rate, self._robot.dim, self._robot.joint_names)
-            rows = self._absolute_joints(rows, chunk, qpos, np.arange(self._robot.dim))
+            rows = self._absolute_joints(rows, chunk, qpos, self._all)
             rows, source = resample(rows, rate, self._control_rate, self._robot.binary_dims)
-            return CommandRows(self._unwrapped(rows, qpos), source, None)
+            return CommandRows(rows, source, None)
         layout = self._layout_of(chunk.pose)
         rows = self._checked(chunk, rate, layout.width, layout.names)
         rows = self._absolute_poses(rows, layout, chunk, observation)
@@ -147,14 +148,14 @@ class Spaces:
     def _absolute_joints(
         self, rows: Float64, chunk: ActionChunk, qpos: Float64, dims: NDArray[np.intp]
     ) -> Float64:
-        """Rows [H, n] of the joints `dims` as absolute ones; grippers are that in every mode."""
-        if chunk.mode == "absolute":
-            return rows
+        """Rows [H, n] of the joints `dims` as absolute ones, turns counted on; grippers are that in every mode."""
         rows = rows.copy()
-        moving = np.isin(dims, self._moving)
-        moves = rows[:, moving]
-        rows[:, moving] = qpos[dims[moving]] + (moves if chunk.mode == "relative" else moves.cumsum(axis=0))
-        return rows
+        if chunk.mode != "absolute":
+            moving = np.isin(dims, self._moving)
+            moves = rows[:, moving]
+            moved = moves if chunk.mode == "relative" else moves.cumsum(axis=0)
+            rows[:, moving] = qpos[dims[moving]] + moved
+        return self._unwrapped(rows, qpos, dims)
 
     def _absolute_poses(
         self, rows: Float64, layout: PoseRows, chunk: ActionChunk, observation: Observation
@@ -199,8 +200,8 @@ class Spaces:
         if row == 0 and len(rows):  # the velocity box would hide from everybody that it begins far away
             free = self._kinematics.solve(targets[:1], qpos)
             alone = self._assembled(free.q, poses[:1], layout, joints[:1], onset)
-            first = self._unwrapped(alone, qpos)[0]
-        return CommandRows(self._unwrapped(commands, qpos), source, solved, first)
+            first = self._unwrapped(alone, qpos, self._all)[0]
+        return CommandRows(self._unwrapped(commands, qpos, self._all), source, solved, first)
 
     def _assembled(
         self, solved: Float64, poses: Float64, layout: PoseRows, joints: Float64, onset: Onset
@@ -240,10 +241,11 @@ class Spaces:
 
         return Onset(on_branch(onset.held), on_branch(onset.anchor), onset.row)
 
-    def _unwrapped(self, rows: Float64, qpos: Float64) -> Float64:
-        """The rows with endless joints on the branch that is nearest to `qpos`, and without jumps from there."""
-        turning = np.concatenate([qpos[None], rows])[:, self._wrapping]
-        rows[:, self._wrapping] = np.unwrap(turning, axis=0)[1:]
+    def _unwrapped(self, rows: Float64, qpos: Float64, dims: NDArray[np.intp]) -> Float64:
+        """Rows of the joints `dims`, endless ones on the branch that is nearest to `qpos`, without jumps from there."""
+        endless = np.flatnonzero(np.isin(dims, self._wrapping))
+        turning = np.concatenate([qpos[dims[endless]][None], rows[:, endless]])
+        rows[:, endless] = np.unwrap(turning, axis=0)[1:]
         return rows
 
     def _checked(self, chunk: ActionChunk, rate: float, width: int, names: tuple[str, ...]) -> Float64:

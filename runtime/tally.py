@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -41,13 +41,24 @@ class Tally:
 
     def forget(self) -> None:
         """Begin anew."""
+        self.ik: dict[str, Any] = {}  # of the newest answer
+        self.poses: dict[
+            str, Any
+        ] = {}  # of all answers: rows that were solved for, flagged ones, worst errors
         self.answers = self.dropped = self.mistimed = self.starved = self.lost = 0
         self.latencies: deque[float] = deque(maxlen=_KEPT)  # [s]
         self.ages: deque[float] = deque(maxlen=_KEPT)  # of what the policy was shown when it was asked [s]
         self.delays: deque[int] = deque(maxlen=_KEPT)  # control steps, measured
 
-    def answered(self, seconds: float, age: float | None = None) -> None:
-        """An answer came after so long [s]; what was shown was so old when the policy was asked [s]."""
+    def answered(self, seconds: float, age: float | None = None, ik: Mapping[str, Any] | None = None) -> None:
+        """An answer came after so long [s]; what was shown was so old when the policy was asked [s].
+
+        `ik` says how its poses were met (asking.figures), {} for joints.
+        """
+        for name, figure in (ik or {}).items():
+            before = self.poses.get(name, 0)
+            self.poses[name] = max(before, figure) if name.startswith("worst") else before + figure
+        self.ik = dict(ik or {})
         self.answers += 1
         self.latencies.append(seconds)
         if age is not None:
@@ -69,6 +80,7 @@ class Tally:
             "latency_p90_ms": quantile(latencies, 90) * 1000,
             "delay_p50": quantile(delays, 50),
             "delay_max": max(delays, default=math.nan),
+            "ik": dict(self.ik),
         }
 
     def figures(self) -> dict[str, Any]:
@@ -82,6 +94,7 @@ class Tally:
             "lost": self.lost,
             "latency_ms": _spread([seconds * 1000 for seconds in latencies]),
             "delay_steps": _spread(delays),
+            "ik": dict(self.poses) or None,
             "observation_age_ms": _spread([seconds * 1000 for seconds in ages]),
         }
 

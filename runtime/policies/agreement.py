@@ -85,9 +85,10 @@ def _pose_pairs(said: Mapping[str, Any], side: str, pose: PoseFormat) -> Iterato
             here = f"{side}_pose.orientation"
             yield key, _ORIENTATIONS.get(str(said[key]).lower(), said[key]), here, pose.orientation
     given = said.get(f"{side}_pose")
-    for key, value in pose.model_dump().items() if isinstance(given, Mapping) else ():
-        if key in given:
-            yield f"{side}_pose.{key}", given[key], f"{side}_pose.{key}", value
+    if isinstance(given, Mapping):
+        for key, value in pose.model_dump().items():
+            if key in given:
+                yield f"{side}_pose.{key}", given[key], f"{side}_pose.{key}", value
 
 
 def _space(said: Mapping[str, Any], declared: Declared, where: str) -> Space | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 from types import MappingProxyType
 
 import numpy as np
@@ -65,7 +66,16 @@ def admit_chunk(chunk: RawChunk) -> RawChunk:
             f"chunk {chunk.chunk_id}: actions {actions.shape} and target_steps {targets.shape}, "
             "must be [H, W] and [H]"
         )
-    return replace(chunk, actions=actions, target_steps=targets)
+    met: dict[str, Any] = {
+        name: None if (given := getattr(chunk, name)) is None else np.array(given)
+        for name in ("ik_position_error", "ik_rotation_error", "ik_flags")
+    }
+    for name, given in met.items():
+        if given is not None and (given.ndim != 2 or len(given) != len(actions)):
+            raise RecordingError(
+                f"chunk {chunk.chunk_id}: {name} {given.shape}, must be [{len(actions)}, arms]"
+            )
+    return replace(chunk, actions=actions, target_steps=targets, **met)
 
 
 def _check_pictures(layout: Layout, row: Row) -> None:

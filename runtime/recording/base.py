@@ -76,6 +76,12 @@ class RawChunk:
     inference_ms: float = float("nan")
     strategy: str = ""  # the kind that merged it
     overlap: int = 0  # steps from the arrival on that were blended with what was planned before
+    ik_position_error: Float32 | None = (
+        None  # [H, arms] m, of the worst step made of each row; NaN where none was
+    )
+    ik_rotation_error: Float32 | None = None  # [H, arms] rad, likewise
+    ik_flags: UInt8 | None = None  # [H, arms] bits of kinematics.base.IkFlag, of all these steps
+    eef: str = ""  # "measured" or "fk": what the policy saw of poses, or its rows are relative to
 
 
 Record = Row | ExecutedTick | RawChunk

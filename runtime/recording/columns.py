@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from runtime.recording.base import ExecutedTick, RawChunk, Row
 from runtime.recording.layout import Layout
@@ -98,6 +99,10 @@ def raw_columns(layout: Layout, chunks: Sequence[RawChunk]) -> dict[str, Any]:
         "inference_ms": each([chunk.inference_ms for chunk in chunks]),
         "strategy": each([chunk.strategy for chunk in chunks]),
         "overlap": each([chunk.overlap for chunk in chunks]),
+        "ik_position_error": _by_arm([chunk.ik_position_error for chunk in chunks], lengths),
+        "ik_rotation_error": _by_arm([chunk.ik_rotation_error for chunk in chunks], lengths),
+        "ik_flags": _by_arm([chunk.ik_flags for chunk in chunks], lengths),
+        "eef_source": each([chunk.eef or None for chunk in chunks]),
     }
 
 
@@ -117,6 +122,14 @@ def _vectors(values: Sequence[Float32 | None], width: int) -> Any:
             numbers[position] = value
     mask = pa.array(missing) if missing.any() else None
     return pa.FixedSizeListArray.from_arrays(pa.array(numbers.ravel()), width, mask=mask)
+
+
+def _by_arm(figures: Sequence[NDArray[Any] | None], lengths: Sequence[int]) -> list[list[Any] | None]:
+    """A list per row of every chunk, null for chunks that have none."""
+    rows: list[list[Any] | None] = []
+    for each, length in zip(figures, lengths, strict=True):
+        rows += [None] * length if each is None else each.tolist()
+    return rows
 
 
 def _leading(tick: ExecutedTick) -> int:

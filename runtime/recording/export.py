@@ -47,6 +47,14 @@ SCHEMA = pa.schema(
         pa.field("strategy", pa.string()),  # raw: the kind that merged it
         pa.field("inference_ms", pa.float64()),  # raw
         pa.field("space", pa.string()),  # raw: joint or eef; the other streams are joints
+        pa.field("ik_position_error", _VECTOR),  # raw: by arm [m], null for joints
+        pa.field("ik_rotation_error", _VECTOR),  # raw: by arm [rad], null for joints
+        pa.field(
+            "ik_flags", pa.list_(pa.uint8())
+        ),  # raw: by arm, bits: missed 1, limit 2, velocity 4, singular 8
+        pa.field(
+            "eef_source", pa.string()
+        ),  # raw: poses that the policy saw were measured or fk; null: it saw none
         pa.field("chunk_ids", pa.list_(pa.int64())),  # smoothed: what made the step; 0 is the held target
         pa.field("weights", pa.list_(pa.float64())),  # smoothed
         pa.field("action", _VECTOR),  # null where nothing was sent
@@ -184,7 +192,10 @@ def _cast(values: Any, kind: Any) -> Any:
 
 def _raw(run: _Run) -> dict[str, Any]:
     raw = run.raw
-    same = ("chunk_id", "observation_step", "index", "mistimed", "overlap", "inference_ms", "space", "action")
+    same = (
+        *("chunk_id", "observation_step", "index", "mistimed", "overlap", "inference_ms", "space", "action"),
+        *("ik_position_error", "ik_rotation_error", "ik_flags", "eef_source"),
+    )
     target = _known(raw["target_step"])
     strategy = raw["strategy"]
     return {name: raw[name] for name in same} | {

@@ -91,6 +91,10 @@ def raw_schema(layout: Layout) -> Any:
             pa.field("inference_ms", pa.float64()),
             pa.field("strategy", pa.string()),
             pa.field("overlap", pa.int64()),
+            pa.field("ik_position_error", pa.list_(pa.float32())),
+            pa.field("ik_rotation_error", pa.list_(pa.float32())),
+            pa.field("ik_flags", pa.list_(pa.uint8())),
+            pa.field("eef_source", pa.string()),
         ]
     )
 
@@ -103,17 +107,21 @@ SCHEMAS: Mapping[str, Callable[[Layout], Any]] = {
 }
 
 
-# Columns that tables did not have from the beginning: null in those of older episodes.
-ADDED = frozenset({"strategy", "overlap", "woke"})
+# Columns that tables did not have from the beginning, oldest first: null in those of older episodes.
+ADDED = (
+    frozenset({"strategy", "overlap", "woke"}),
+    frozenset({"ik_position_error", "ik_rotation_error", "ik_flags", "eef_source"}),
+)
 
 
 def _vector(width: int) -> Any:
     return pa.list_(pa.float32(), width)
 
 
-def _before(schema: Any) -> Any:
-    """The schema without what was added since."""
-    return pa.schema([field for field in schema if field.name not in ADDED])
+def _generations(schema: Any) -> list[Any]:
+    """The schema as it is, and as it was before each of the times when columns were added."""
+    absent = [frozenset[str]().union(*ADDED[first:]) for first in range(len(ADDED) + 1)]
+    return [pa.schema([field for field in schema if field.name not in names]) for names in absent]
 
 
 class TableWriter:
@@ -197,7 +205,7 @@ def read_table(path: Path, schema: Any) -> TableRead:
         stream = pa.ipc.open_stream(source)
     except (pa.ArrowInvalid, OSError):
         return TableRead(schema.empty_table(), len(data), False)
-    if not (stream.schema.equals(schema) or stream.schema.equals(_before(schema))):
+    if not any(stream.schema.equals(known) for known in _generations(schema)):
         raise RecordingError(
             f"{path} has other columns than its manifest says: {_difference(stream.schema, schema)}"
         )

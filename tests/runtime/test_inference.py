@@ -13,13 +13,14 @@ from runtime.clock import VirtualClock
 from runtime.commitment import Commitment
 from runtime.errors import PolicyError, PolicyLostError
 from runtime.inference import Inference, Patience, Strategy
+from runtime.kinematics.base import IkResult
 from runtime.messages import ChunkMerged, Mode, PolicyAnswer, PostedChunk, decode
 from runtime.orders import Orders
 from runtime.page import Page, PageLayout
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.runner import LockstepRunner, Runner, ThreadRunner
 from runtime.sight import Sight, SightSettings
-from runtime.spaces import CommandRows, Spaces
+from runtime.spaces import CommandRows, Onset, Spaces
 from runtime.strategies import overlap, rtc, sync
 from runtime.types import ActionChunk, Conditioning, Float32, Observation
 
@@ -66,9 +67,12 @@ class FakeSpaces(Spaces):
     """Joint rows pass; a row of NaN is refused as the real ones refuse it."""
 
     def __init__(self) -> None:
-        pass
+        self.onsets: list[Onset | None] = []
 
-    def to_command(self, chunk: ActionChunk, observation: Observation) -> CommandRows:
+    def to_command(
+        self, chunk: ActionChunk, observation: Observation, onset: Onset | None = None
+    ) -> CommandRows:
+        self.onsets.append(onset)
         if not np.isfinite(chunk.actions).all():
             raise PolicyError("the policy answered with nan")
         rows = chunk.actions.astype(np.float64)
@@ -93,7 +97,8 @@ class Desk:
         self.policy = FakePolicy()
         self.runner = runner or LockstepRunner(0)
         sight = Sight(self.page, self.clock, SightSettings(RATE, 0.2, 0.5))
-        self.asking = Asking(self.policy, "pick", FakeSpaces(), sight, self.runner, self.clock)
+        self.spaces = FakeSpaces()
+        self.asking = Asking(self.policy, "pick", self.spaces, sight, self.runner, self.clock)
         self.inference = Inference(
             self.asking,
             strategy or ASYNC,
@@ -118,9 +123,11 @@ class Desk:
         }
         self.page.publish_observation(Observation(**(fields | changes)), {"cam": self.sequence})
 
-    def ticked(self, step: int, remaining: int = 0) -> None:
+    def ticked(self, step: int, remaining: int = 0, **said: Any) -> None:
         """Control has done `step` with the newest observation."""
         status = self.page.control.read().copy()
+        for name, value in said.items():
+            status[name] = value
         status["step"], status["planned"], status["sequence"] = step, self.clock.now(), self.sequence
         status["remaining"] = remaining
         self.page.control.write(status)
@@ -594,3 +601,139 @@ def test_figures_are_those_of_the_run(desk: Desk) -> None:
     assert desk.inference.tally.newest()["delays"] == [3, 5]
     desk.inference.begin(2, fresh=True)
     assert desk.inference.tally.figures()["delay_steps"] is None
+
+
+# Where a chunk takes over
+
+
+TOLD = np.array([0.25, -0.5], np.float32)
+SEEN = np.array([0.2, -0.4], np.float32)
+
+
+def onset_after(strategy: Strategy | None = None, behaviour: bytes = b"follow", **said: Any) -> Onset:
+    """Of the second request of a run, whose observation was of step 7, when control has done step 9."""
+    desk = Desk(strategy=strategy).going()
+    desk.inference.pump()
+    desk.merged(1)
+    desk.observe(qpos=SEEN)
+    said = {"engaged": 1, "simulated": np.nan} | said
+    desk.ticked(7, behaviour=behaviour, commanded=TOLD, **said)
+
+    def slowly(observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        desk.ticked(9)
+        return ActionChunk(np.zeros((4, 2), np.float32))
+
+    desk.policy.infer = slowly  # type: ignore[method-assign]
+    desk.inference.pump()
+    found = desk.spaces.onsets[-1]
+    assert found is not None
+    return found
+
+
+def test_a_chunk_is_anchored_where_control_is_when_its_answer_is_there() -> None:
+    onset = onset_after()
+    np.testing.assert_array_equal(onset.anchor, TOLD)
+    np.testing.assert_array_equal(onset.held, TOLD)
+    assert onset.row == 3  # rows 0, 1, 2 are for steps 7, 8, 9, which have been sent
+
+
+def test_no_more_rows_are_taken_for_stale_than_will_be_dropped() -> None:
+    assert onset_after(_async(k_max=1)).row == 1
+
+
+def test_a_chunk_that_the_robot_waited_for_starts_from_where_it_is_measured() -> None:
+    onset = onset_after(SYNC)
+    np.testing.assert_array_equal(onset.anchor, SEEN)
+    np.testing.assert_array_equal(onset.held, TOLD)
+    assert onset.row == 0
+
+
+def test_a_robot_that_was_never_told_anything_is_anchored_where_it_is_measured() -> None:
+    onset = onset_after(engaged=0)
+    np.testing.assert_array_equal(onset.anchor, SEEN)
+    np.testing.assert_array_equal(onset.held, SEEN)
+    assert onset.row == 0
+
+
+def test_in_simulation_a_chunk_goes_on_from_the_simulated_robot() -> None:
+    onset = onset_after(behaviour=b"simulate", simulated=np.array([0.7, 0.8], np.float32))
+    np.testing.assert_allclose(onset.anchor, [0.7, 0.8], atol=1e-6)
+
+
+def test_the_first_chunk_of_a_run_starts_from_where_the_robot_is_measured() -> None:
+    desk = Desk().going()
+    desk.observe(qpos=SEEN)
+    desk.ticked(9, behaviour=b"hold", commanded=TOLD, simulated=np.nan, engaged=1)
+    desk.inference.pump()
+    onset = desk.spaces.onsets[-1]
+    assert onset is not None
+    np.testing.assert_array_equal(onset.anchor, SEEN)
+    assert onset.row == 1
+
+
+# Poses that were measured, and how poses were met
+
+
+@pytest.mark.parametrize(("wanted", "shown"), [("measured", 0.5), ("fk", 0.0)])
+def test_a_policy_is_shown_measured_poses_or_those_of_the_joints(
+    wanted: Any, shown: float, desk: Desk
+) -> None:
+    desk.policy.observation_eef, desk.policy.sees_poses = wanted, True
+    desk.observe(eef=np.full(8, 0.5, np.float32), captured={"joints": 100.0, "cam": 100.0, "eef": 100.0})
+    answer = desk.inference.pump()
+    assert desk.policy.seen[-1].eef is not None
+    assert desk.policy.seen[-1].eef.tolist() == [shown] * 8
+    assert answer is not None
+    assert answer.eef == wanted
+
+
+def test_where_nothing_is_measured_the_poses_are_those_of_the_joints(desk: Desk) -> None:
+    desk.policy.sees_poses = True
+    answer = desk.inference.pump()
+    assert answer is not None
+    assert answer.eef == "fk"
+
+
+def solved_with(flags: Any, metres: Any) -> IkResult:
+    flags = np.array(flags, np.uint8)
+    return IkResult(np.zeros((4, 2)), np.array(metres), np.zeros(flags.shape), flags)
+
+
+def test_how_poses_were_met_is_recorded_told_and_counted(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    solved = solved_with([[0, 0], [1, 4], [3, 0], [8, 8]], [[0, 0], [0.012, 0], [0.002, 0], [0, 0]])
+    rows = CommandRows(np.zeros((4, 2)), np.arange(4), solved, np.array([0.1, 0.2]))
+    monkeypatch.setattr(desk.spaces, "to_command", lambda chunk, observation, onset: rows)
+    answer = desk.inference.pump()
+    assert answer is not None
+    np.testing.assert_array_equal(answer.ik_flags, solved.flags)
+    np.testing.assert_array_equal(answer.position_error, solved.position_error)
+    (note,) = desk.inference.notes
+    assert note.kind == "ik_unreached"
+    assert "2 of 4 poses are not reached, the worst by 12.0 mm" in note.text
+    figures = {
+        "rows": 4,
+        "over": 2,
+        "limit": 1,
+        "velocity": 1,
+        "singular": 1,
+        "worst_mm": 12.0,
+        "worst_deg": 0.0,
+    }
+    assert note.data == pytest.approx(figures)
+    assert desk.inference.tally.newest()["ik"] == note.data
+    (posted,) = desk.posted()
+    assert posted.meant is not None
+    np.testing.assert_array_equal(posted.meant, [0.1, 0.2])
+    desk.merged(1)
+    assert desk.inference.shown is not None
+    assert desk.inference.shown.ik == note.data
+    desk.inference.pump()
+    assert desk.inference.tally.figures()["ik"]["over"] == 4
+
+
+def test_poses_that_are_all_reached_are_no_event(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = CommandRows(np.zeros((4, 2)), np.arange(4), solved_with([[4, 2]] * 4, [[0.0, 0.0]] * 4))
+    monkeypatch.setattr(desk.spaces, "to_command", lambda chunk, observation, onset: rows)
+    desk.inference.pump()
+    assert desk.inference.notes == []
+    assert desk.inference.tally.newest()["ik"]["velocity"] == 4

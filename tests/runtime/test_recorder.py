@@ -251,6 +251,39 @@ def test_a_resampled_row_counts_for_the_first_step_that_was_made_from_it(desk: D
     assert chunk.target_steps.tolist() == [-1, 12, 14]
 
 
+@pytest.mark.parametrize("source", [[0, 0, 1, 1], [0, 2]])
+def test_what_was_missed_of_a_row_is_the_worst_of_the_steps_made_from_it(
+    desk: Desk, source: list[int]
+) -> None:
+    metres = np.array([[0.1, 0.0], [0.3, 0.2], [0.0, 0.4], [0.05, 0.0]])[: len(source)]
+    flags = np.array([[1, 0], [2, 8], [0, 4], [1, 0]], np.uint8)[: len(source)]
+    actions, mapping = np.zeros((3, 2), np.float32), np.array(source)
+    answer = PolicyAnswer(4, 1, 10, actions, "eef", mapping, 12.0, metres, 2 * metres, flags, "fk")
+    desk.recorder.answered(answer)
+    desk.merge(4, list(range(len(source))))
+    (chunk,) = desk.journal.of(RawChunk)
+    expected = {
+        4: ([[0.3, 0.2], [0.05, 0.4], [np.nan, np.nan]], [[3, 8], [1, 4], [0, 0]]),
+        2: ([[0.1, 0.0], [np.nan, np.nan], [0.3, 0.2]], [[1, 0], [0, 0], [2, 8]]),
+    }[len(source)]
+    np.testing.assert_allclose(chunk.ik_position_error, expected[0], atol=1e-7)
+    np.testing.assert_allclose(chunk.ik_rotation_error, 2 * np.array(expected[0]), atol=1e-7)
+    np.testing.assert_array_equal(chunk.ik_flags, expected[1])
+    assert chunk.eef == "fk"
+
+
+def test_joint_rows_say_nothing_of_poses(desk: Desk) -> None:
+    desk.answer(4)
+    desk.merge(4, [10, 11, 12])
+    (chunk,) = desk.journal.of(RawChunk)
+    assert (chunk.ik_position_error, chunk.ik_rotation_error, chunk.ik_flags, chunk.eef) == (
+        None,
+        None,
+        None,
+        "",
+    )
+
+
 def test_answers_that_were_never_merged_are_written_at_the_end(desk: Desk) -> None:
     desk.answer(4)
     desk.recorder.end("finished", "over", {})()

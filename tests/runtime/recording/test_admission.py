@@ -1,3 +1,4 @@
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -80,3 +81,13 @@ def test_a_chunk_needs_one_target_per_row() -> None:
     bad = RawChunk(7, 10, 11, good.actions, good.target_steps[:3], "joint", 1)
     with pytest.raises(RecordingError, match=r"chunk 7: actions \(4, 2\) and target_steps \(3,\)"):
         admit_chunk(bad)
+
+
+def test_how_poses_were_met_is_said_of_every_row_or_of_none() -> None:
+    flags = np.zeros((4, 2), np.uint8)
+    admitted = admit_chunk(replace(chunk(7), ik_flags=flags))
+    flags[0] = 3
+    assert admitted.ik_flags is not None
+    assert not admitted.ik_flags.any()
+    with pytest.raises(RecordingError, match=r"chunk 7: ik_flags \(3, 2\), must be \[4, arms\]"):
+        admit_chunk(replace(chunk(7), ik_flags=flags[:3]))

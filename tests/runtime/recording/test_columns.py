@@ -6,6 +6,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from runtime.errors import RecordingError
+from runtime.recording.base import RawChunk
 from runtime.recording.columns import RecordedRow
 from runtime.recording.layout import Layout
 from runtime.recording.tables import SCHEMAS, TableWriter, read_table, write_table
@@ -110,3 +112,42 @@ def test_a_chunk_says_which_strategy_merged_it_and_over_how_many_steps(tmp_path:
     merged = replace(chunk(1, horizon=2), strategy="rtc", overlap=6)
     found = written(tmp_path, "raw", merged, chunk(2, horizon=1)).to_pylist()
     assert [(row["strategy"], row["overlap"]) for row in found] == [("rtc", 6), ("rtc", 6), ("", 0)]
+
+
+METRES = np.array([[0.5, np.nan], [0.25, 0.0]], np.float32)
+FLAGS = np.array([[1, 0], [3, 8]], np.uint8)
+
+
+def met() -> RawChunk:
+    figures = {"ik_position_error": METRES, "ik_rotation_error": 2 * METRES, "ik_flags": FLAGS}
+    return replace(chunk(1, horizon=2), space="eef", eef="measured", **figures)
+
+
+def test_how_poses_were_met_is_in_their_rows_arm_by_arm_and_null_for_joints(tmp_path: Path) -> None:
+    found = written(tmp_path, "raw", met(), chunk(2, horizon=1)).to_pylist()
+    assert [row["ik_flags"] for row in found] == [[1, 0], [3, 8], None]
+    assert found[1]["ik_position_error"] == [0.25, 0.0]
+    assert found[1]["ik_rotation_error"] == [0.5, 0.0]
+    assert math.isnan(found[0]["ik_position_error"][1])
+    assert found[2]["ik_position_error"] is None
+    assert [row["eef_source"] for row in found] == ["measured", "measured", None]
+
+
+IK = ["ik_position_error", "ik_rotation_error", "ik_flags", "eef_source"]
+
+
+@pytest.mark.parametrize("absent", [IK, [*IK, "strategy", "overlap"]])
+def test_episodes_of_every_generation_still_open(tmp_path: Path, absent: list[str]) -> None:
+    table = written(tmp_path, "raw", met())
+    write_table(tmp_path / "raw.arrow", table.drop_columns(absent))
+    older = read_table(tmp_path / "raw.arrow", SCHEMAS["raw"](LAYOUT)).table
+    assert older.column_names == table.column_names
+    assert [older[name].to_pylist() for name in absent] == [[None, None]] * len(absent)
+    assert older["action"].to_pylist() == table["action"].to_pylist()
+
+
+def test_a_table_of_no_generation_is_refused(tmp_path: Path) -> None:
+    table = written(tmp_path, "raw", met())
+    write_table(tmp_path / "raw.arrow", table.drop_columns(["strategy", "ik_flags"]))
+    with pytest.raises(RecordingError, match="other columns"):
+        read_table(tmp_path / "raw.arrow", SCHEMAS["raw"](LAYOUT))
