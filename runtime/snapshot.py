@@ -9,6 +9,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from robots.units import units_of
 from runtime.by_hand import ByHand
 from runtime.family import Plan
 from runtime.inference import Inference
@@ -96,7 +97,9 @@ def facts(plan: Plan) -> dict[str, Any]:
     robot, bus = plan.robot, plan.deployment.bus
     return {
         "robot": robot.name,
+        "groups": [group.name for group in robot.groups],
         "joint_names": list(robot.joint_names),
+        "units": list(units_of(robot)),
         "arms": [arm.name for arm in robot.arms],
         "eef_names": list(robot.eef_names),
         "gripper_dims": list(robot.gripper_dims),

@@ -9,21 +9,20 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 from typing import Any
 from uuid import uuid4
 
 import numpy as np
 
 from evaweb.console.requests import Aim
-from evaweb.errors import EvaError, NotFound
+from evaweb.errors import EvaError
 from evaweb.frames import plain
 from evaweb.roles import Role
-from evaweb.stations.geometry import looks_of
 from evaweb.stations.holders import readable
+from evaweb.stations.looks import Looks
 from evaweb.stations.models import Station
 from evaweb.stations.wire import StationWire
-from robots import RobotError
 from runtime import messages
 from runtime.bus import CodecError
 
@@ -31,13 +30,15 @@ _TIMEOUT_S = 1.0
 _DIGITS = 5  # of a matrix in the answer: a hundredth of a millimetre
 _threads = ThreadPoolExecutor(8, "aim")
 Say = Callable[[dict[str, Any]], None]
+See = Callable[[], Looks | None]  # the robot as it is drawn now
 
 
 class Aims:
     """The questions of one page; belongs to the event loop."""
 
-    def __init__(self, station: Station, username: str, role: Role, say: Say) -> None:
+    def __init__(self, station: Station, username: str, role: Role, say: Say, looks: See) -> None:
         self._station, self._username, self._role, self._say = station, username, role, say
+        self._looks = looks
         self._waiting: Aim | None = None
         self._under_way = False
 
@@ -57,36 +58,34 @@ class Aims:
         try:
             while (request := self._waiting) is not None:
                 self._waiting = None
-                found = await loop.run_in_executor(
-                    _threads, aimed, self._station, self._username, request.args
-                )
+                work = partial(aimed, self._station.name, self._username, request.args, self._looks())
+                found = await loop.run_in_executor(_threads, work)
                 self._say({"type": "aimed", "id": request.id, **found})
         finally:
             self._under_way = False
 
 
-def aimed(station: Station, username: str, args: Mapping[str, Any]) -> dict[str, Any]:
+def aimed(station: str, username: str, args: Mapping[str, Any], looks: Looks | None) -> dict[str, Any]:
     """What the station says of a target, and `links`, where its parts would be, one after the other [P * 16]."""
     command = messages.Command(str(uuid4()), "aim", args, user=username, holder=username)
     try:
         messages.encode(command)  # what cannot be sent is no fault of the station
-        ack = _wire_to(station.name).request(command, timeout=_TIMEOUT_S)
+        ack = _wire_to(station).request(command, timeout=_TIMEOUT_S)
     except CodecError as error:
         return {"ok": False, "reason": f"the target cannot be sent: {error}"}
     except EvaError as gone:
         return {"ok": False, "reason": str(gone)}
     data = plain(dict(ack.data))
-    links = _links(station.robot, data.get("joints")) if ack.status == "done" else []
+    links = _links(looks, data.get("joints")) if ack.status == "done" else []
     return {**data, "ok": ack.status == "done", "reason": readable(ack.reason), "links": links}
 
 
-def _links(robot: str, joints: Any) -> list[float]:
+def _links(looks: Looks | None, joints: Any) -> list[float]:
     """World <- part of every part, each matrix column by column; none where the robot is not drawn."""
-    try:
-        poses = looks_of(robot).poses(np.asarray(joints, np.float64))
-    except (NotFound, RobotError):
+    target = np.asarray(joints, np.float64)
+    if looks is None or target.shape != (looks.robot.dim,):
         return []
-    found: list[float] = poses.astype(np.float64).round(_DIGITS).ravel().tolist()
+    found: list[float] = looks.poses(target).astype(np.float64).round(_DIGITS).ravel().tolist()
     return found if np.isfinite(found).all() else []
 
 

@@ -30,7 +30,7 @@ from evaweb.console.requests import Aim, BadRequest, Credit, EStop, Events, Rene
 from evaweb.errors import NotFound, StationGone
 from evaweb.roles import Role, role_of
 from evaweb.stations import commands, leases, stops
-from evaweb.stations.geometry import facts_of
+from evaweb.stations.looks import facts_of
 from evaweb.stations.models import Station
 from evaweb.stations.selectors import station_get
 
@@ -100,9 +100,9 @@ class StationConsumer(AsyncWebsocketConsumer):
         self._username = self._user.get_username()
         hello = {"station": station.name, "user": self._username, "role": role, "page": self._page}
         self._say({"type": "hello", **hello, "facts": facts})
-        self._aims = Aims(station, self._username, role, self._say)
-        self._room = hub().room(station.name, station.robot)
-        self._mailbox = self._room.join(self._outbox.put_nowait)
+        room = self._room = hub().room(station.name, station.robot)
+        self._aims = Aims(station, self._username, role, self._say, lambda: room.looks)
+        self._mailbox = room.join(self._outbox.put_nowait)
         self._tasks = [asyncio.create_task(work) for work in (self._write(), self._follow_login(role))]
         for task in self._tasks:
             task.add_done_callback(_finished)

@@ -15,40 +15,49 @@ from evaweb.console.chunks import chunk_part
 from evaweb.console.parts import Part
 from evaweb.console.recent import Recent
 from evaweb.errors import NotFound
-from evaweb.stations.geometry import Looks, looks_of
-from robots import RobotError
+from evaweb.stations.looks import Looks, looks_of
 
 log = logging.getLogger(__name__)
 _VECTORS = ("measured", "raw", "planned", "commanded", "simulated")  # of the joints, as the runtime has them
 
 
 class Encoder:
-    """Makes parts of what a feed tells."""
+    """Makes parts of what a feed tells; `looks` is the robot as the station has it, None where it is not drawn."""
 
     def __init__(self, robot: str) -> None:
-        self._looks = _looks(robot)
+        self._robot = robot
+        self._groups: tuple[str, ...] | None = None  # None: nobody has said yet
+        self.looks = _looks(robot, None)
         self._recent = Recent()
 
     def encode(self, stream: str, content: Any) -> list[Part]:
         """The parts that `content` of a stream is shown as."""
         now = time.monotonic()
         if stream == "state":
+            self._follow(content.get("facts"))
             return [parts.facts(stream, content, now)]
         if stream == "joints":
             return self._joints(content, now)
         if stream == "chunk":
-            return [chunk_part(content, self._looks, now)]
+            return [chunk_part(content, self.looks, now)]
         if stream.startswith("camera/"):
             return [parts.picture(stream, content, now)]
         return []
+
+    def _follow(self, facts: Any) -> None:
+        """The robot is drawn with the groups that the station says it has."""
+        groups = facts.get("groups") if isinstance(facts, Mapping) else None
+        if groups and tuple(groups) != self._groups:
+            self._groups = tuple(groups)
+            self.looks = _looks(self._robot, self._groups)
 
     def _joints(self, content: Mapping[str, Any], now: float) -> list[Part]:
         vectors = {name: np.asarray(content[name], np.float32) for name in _VECTORS if name in content}
         words = {key: content[key] for key in content if key not in vectors}
         made = [parts.numbers("joints", words, vectors, now), self._recent.with_one_more(vectors, words, now)]
-        if self._looks and _drawable(vectors["measured"], self._looks):
+        if self.looks and _drawable(vectors["measured"], self.looks):
             rows = shown_rows(vectors, engaged=bool(content.get("engaged")))
-            poses = self._looks.poses(rows)
+            poses = self.looks.poses(rows)
             made.append(parts.array("poses", poses if len(rows) > 1 else poses[0], now))
         return made
 
@@ -70,10 +79,10 @@ def _drawable(joints: NDArray[Any], looks: Looks) -> bool:
     return joints.shape == (looks.robot.dim,) and bool(np.isfinite(joints).all())
 
 
-def _looks(robot: str) -> Looks | None:
+def _looks(robot: str, groups: tuple[str, ...] | None) -> Looks | None:
     """None: the robot is not drawn, and the log says why."""
     try:
-        return looks_of(robot)
-    except (NotFound, RobotError) as error:
+        return looks_of(robot, groups)
+    except NotFound as error:
         log.error("no 3D scene: %s", error)
         return None

@@ -13,6 +13,7 @@ from evaweb.console.encoder import Encoder
 from evaweb.console.feed import Feeds, History, Link, feeds
 from evaweb.console.mailbox import Deliver, Mailbox
 from evaweb.console.parts import Part
+from evaweb.stations.looks import Looks
 
 _FLUSH_S = 1 / 40  # frames leave at most so often
 _CHANGES_S = 1.0
@@ -34,6 +35,11 @@ class Room:
         self._flushed = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._changes: asyncio.Task[None] | None = None
+
+    @property
+    def looks(self) -> Looks | None:
+        """The robot in the groups that the station says it has; None where it is not drawn."""
+        return self._encoder.looks
 
     @property
     def empty(self) -> bool:

@@ -7,13 +7,11 @@ from typing import Any
 
 from django.contrib.sessions.backends.base import SessionBase
 
-from evaweb.errors import NotFound
-from evaweb.stations.geometry import looks_of
+from evaweb.stations.looks import facts_of
 from evaweb.stations.models import Lease, Station
 from evaweb.stations.selectors import last_set_up, leases_open, station_list
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene, Score, Trial, TrialStatus
 from evaweb.trials.selectors import UNFINISHED, checkpoint_list, scene_list, trial_list, trial_open
-from robots import RobotError
 
 SESSION_KEY = "station"
 FAILURES_OFFERED = 12
@@ -91,20 +89,13 @@ def robot_facts(*, robot: str) -> dict[str, Any]:
 
     "error" says why; the page goes on without them.
     """
-    try:
-        described = looks_of(robot).robot
-    except (NotFound, RobotError) as error:
-        return {"names": [], "units": [], "cameras": [], "title": robot, "error": str(error)}
-    units = ["rad"] * described.dim
-    for group in described.groups:
-        if group.gripper is not None and group.gripper_dim is not None:
-            units[group.gripper_dim] = group.gripper.unit
+    found = facts_of(robot)
     return {
-        "names": list(described.joint_names),
-        "units": units,
-        "cameras": [camera.key for camera in described.cameras],
-        "title": described.title,
-        "error": "",
+        "names": found["joint_names"],
+        "units": found["units"],
+        "cameras": found["cameras"],
+        "title": found["title"],
+        "error": found.get("error", ""),
     }
 
 

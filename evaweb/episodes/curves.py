@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaweb.episodes.chunks import chunks
+from evaweb.episodes.robot import looks_in, robot_in
 from evaweb.errors import NotFound
 from evaweb.frames import Stream, encode
-from evaweb.stations.geometry import looks_of
 from runtime.recording.reader import Episode, open_episode
 from runtime.recording.summary import HELD
 
@@ -38,7 +38,7 @@ def curves(folder: Path) -> bytes:
         "raw": _raw(episode, start),
         "chunks": chunks(episode, lambda steps: _times_of(episode, steps) - start),
     }
-    names = _robot(episode).get("joint_names")
+    names = robot_in(episode.manifest).get("joint_names")
     return encode(
         streams,
         joints=names if isinstance(names, list) else [f"joint {k}" for k in range(episode.layout.dim)],
@@ -51,22 +51,12 @@ def curves(folder: Path) -> bytes:
     )
 
 
-def _robot(episode: Episode) -> Mapping[str, Any]:
-    robot = episode.manifest.get("robot")
-    return robot if isinstance(robot, Mapping) else {}
-
-
 def _units(episode: Episode) -> list[str]:
     """The unit of every joint, "" where the robot is not known any more, or is another one today."""
-    dim = episode.layout.dim
     try:
-        robot = looks_of(str(_robot(episode).get("name", ""))).robot
+        return list(looks_in(episode.manifest).units)
     except NotFound:
-        return [""] * dim
-    if robot.dim != dim:
-        return [""] * dim
-    grippers = {group.gripper_dim: group.gripper.unit for group in robot.groups if group.gripper}
-    return [grippers.get(index, "rad") for index in range(dim)]
+        return [""] * episode.layout.dim
 
 
 def _start(episode: Episode) -> float:

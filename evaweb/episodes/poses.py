@@ -7,26 +7,24 @@ from pathlib import Path
 import numpy as np
 
 from evaweb.episodes.curves import vectors
+from evaweb.episodes.robot import looks_in
 from evaweb.errors import NotFound
 from evaweb.frames import Stream, encode
-from evaweb.stations.geometry import looks_of
 from runtime.recording.reader import open_episode
 
 MOST_ROWS = 900  # of one answer: half a minute at 30 Hz
 
 
-def poses(folder: Path, robot: str, first: int) -> bytes:
+def poses(folder: Path, first: int) -> bytes:
     """One message of evaweb.frames with stream `poses`: f4 [rows, P, 16], column-major world <- part.
 
     Rows `first` to at most `first` + MOST_ROWS - 1, from the measured joints. NotFound where there is no such
     robot or row; RecordingError names the file that is absent or damaged.
     """
-    looks = looks_of(robot)
     episode = open_episode(folder)
+    looks = looks_in(episode.manifest)
     if not 0 <= first < max(1, episode.frames):
         raise NotFound(f"row {first}: the episode has rows 0 to {episode.frames - 1}")
     joints = vectors(episode.rows.slice(first, MOST_ROWS), "qpos", episode.layout.dim).T
-    if joints.shape[1] != looks.robot.dim:
-        raise NotFound(f"the episode has {joints.shape[1]} joints, {robot} has {looks.robot.dim} today")
     found = looks.poses(np.nan_to_num(joints))
     return encode({"poses": Stream(body=found)}, first=first, rows=episode.frames, fps=episode.layout.fps)

@@ -16,5 +16,6 @@ urlpatterns = [
     path("episodes/<uuid:uuid>/export", views.export, name="episode-export"),
     path("episodes/<uuid:uuid>/table", views.table, name="episode-table"),
     path("episodes/<uuid:uuid>/curves", views.episode_curves, name="episode-curves"),
+    path("episodes/<uuid:uuid>/geometry", views.episode_geometry, name="episode-geometry"),
     path("episodes/<uuid:uuid>/poses", views.episode_poses, name="episode-poses"),
 ]

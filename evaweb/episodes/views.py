@@ -8,7 +8,7 @@ from uuid import UUID
 
 from asgiref.sync import sync_to_async
 from django.core.paginator import Paginator
-from django.http import HttpRequest, HttpResponse
+from django.http import HttpRequest, HttpResponse, JsonResponse
 from django.http.response import HttpResponseBase
 from django.shortcuts import redirect, render
 from django.templatetags.static import static
@@ -21,12 +21,14 @@ from evaweb.episodes.exporting import CONTENT_TYPE, table_file, table_of
 from evaweb.episodes.folders import THUMBNAIL, journal_folder, preview_folder, preview_video
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.poses import poses
+from evaweb.episodes.robot import looks_in
 from evaweb.episodes.selectors import episode_get, stage_of
 from evaweb.episodes.streaming import file_answer
 from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.roles import Role, require
+from evaweb.stations.geometry import geometry
 from evaweb.stations.models import Station
-from runtime.recording.files import RecordingError
+from runtime.recording.files import RecordingError, read_document
 
 PER_PAGE = 50
 
@@ -111,11 +113,12 @@ def preview(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 def _config(episode: Episode) -> dict[str, Any]:
     """What the page's modules have to know."""
-    address = {name: reverse(f"episode-{name}", args=[episode.uuid]) for name in ("curves", "poses")}
+    address = {
+        name: reverse(f"episode-{name}", args=[episode.uuid]) for name in ("curves", "geometry", "poses")
+    }
     return {
         **address,
         "videos": [reverse("episode-video", args=[episode.uuid, camera]) for camera in episode.cameras],
-        "geometry": reverse("robot-geometry", args=[episode.robot]) if episode.robot else "",
         "viewer": static("meshcat/main.min.js"),
         "uplot": static("uplot/uPlot.esm.js"),
         "fps": episode.fps,
@@ -155,13 +158,26 @@ def episode_curves(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 
 @require_GET
+def episode_geometry(request: HttpRequest, uuid: UUID) -> HttpResponse:
+    """What the 3D scene needs of the robot as it was then, as JSON."""
+    episode_get(uuid=uuid)
+    try:
+        manifest = read_document(journal_folder(uuid) / "manifest.json")
+    except RecordingError as error:
+        raise Conflict(str(error)) from None
+    robot = looks_in(manifest).robot
+    groups = [group.name for group in robot.groups]
+    return JsonResponse(geometry(robot.name, groups, simulated=False))
+
+
+@require_GET
 def episode_poses(request: HttpRequest, uuid: UUID) -> HttpResponse:
     """Where the robot's parts were from row ?first= on, as one message of evaweb.frames."""
-    episode = episode_get(uuid=uuid)
+    episode_get(uuid=uuid)
     first = request.GET.get("first", "0")
     if not (first.isascii() and first.isdecimal()) or len(first) > 9:
         raise EvaError(f"first = {first!r:.40}; allowed: a whole number from 0")
-    return _message(lambda: poses(journal_folder(uuid), episode.robot, int(first)))
+    return _message(lambda: poses(journal_folder(uuid), int(first)))
 
 
 def _message(make: Callable[[], bytes]) -> HttpResponse:

@@ -2,25 +2,53 @@
 
 from __future__ import annotations
 
-from django.http import Http404, HttpRequest, JsonResponse
+from django.http import Http404, HttpRequest, HttpResponse, JsonResponse
+from django.views.decorators.http import condition, require_safe
 
 from evaweb.errors import NotFound
-from evaweb.stations import geometry
+from evaweb.stations import geometry, meshes
 from evaweb.stations.selectors import station_get
 
+_A_YEAR = 365 * 24 * 3600
 
+
+@require_safe
 def station_geometry(request: HttpRequest, name: str) -> JsonResponse:
-    """The scene of a station."""
+    """The scene of a station, whose robot has the groups ?groups=a,b where its runtime says so."""
     try:
         station = station_get(name=name)
-        return JsonResponse(geometry.geometry(station.robot, simulated=station.simulated))
+        found = geometry.geometry(station.robot, _groups(request), simulated=station.simulated)
     except NotFound as error:
         raise Http404(str(error)) from None
+    return JsonResponse(found)
 
 
+@require_safe
 def robot_geometry(request: HttpRequest, robot: str) -> JsonResponse:
-    """The scene of a robot by itself."""
+    """The scene of a robot by itself, with ?groups=a,b or all that are not optional."""
     try:
-        return JsonResponse(geometry.geometry(robot, simulated=False))
+        return JsonResponse(geometry.geometry(robot, _groups(request), simulated=False))
     except NotFound as error:
         raise Http404(str(error)) from None
+
+
+def _groups(request: HttpRequest) -> list[str] | None:
+    given = request.GET.get("groups", "")
+    return given.split(",") if given else None
+
+
+def _etag(request: HttpRequest, robot: str, digest: str) -> str:
+    return f'"{digest}"'
+
+
+@require_safe
+@condition(etag_func=_etag)
+def robot_mesh(request: HttpRequest, robot: str, digest: str) -> HttpResponse:
+    """A mesh of a robot; another content has another address, so a browser may keep it."""
+    try:
+        content = meshes.mesh_content(robot=robot, digest=digest)
+    except NotFound as error:
+        raise Http404(str(error)) from None
+    answer = HttpResponse(content, content_type="application/octet-stream")
+    answer["Cache-Control"] = f"private, max-age={_A_YEAR}, immutable"
+    return answer

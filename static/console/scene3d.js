@@ -1,50 +1,73 @@
 // The robot in 3D by the viewer script of meshcat: shapes once, then one matrix per part and frame.
 
+import { block, ground, mount, plate, table } from "./scene_bench.js";
+import { Capsules } from "./scene_capsules.js";
 import { ChunkDots } from "./scene_chunk.js";
+import { Frames } from "./scene_frames.js";
 import { Ghosts } from "./scene_ghosts.js";
+import { Meshes } from "./scene_meshes.js";
 import { Preview } from "./scene_preview.js";
 import { lightenWork, rendererIn } from "./scene_renderer.js";
-import { block, css, place, plate, robotParts, SIZE, table, three } from "./scene_shapes.js";
+import { place, robotParts, SIZE } from "./scene_robot.js";
+import { three } from "./scene_shapes.js";
 import { Tips } from "./scene_tips.js";
 import { Views } from "./scene_views.js";
 
 const STILL = 2e-5; // m, and about as much of a turn: less than a pixel
+const OURS = ["bench", "robot", "ghost", "capsules", "frame", "path", "chunk"];
 
 /** `element` is filled by it; throws where the browser has no WebGL. */
 export class Scene3D {
   #viewer;
   #views;
-  #parts;
+  #meshes;
+  #parts = [];
   #ghosts;
   #tips;
+  #frames;
+  #capsules;
   #dots = new ChunkDots();
   #preview = new Preview();
   #blocks = [];
   #plate = null;
-  #geometry;
-  #shown = { ghost: false, frames: false, path: true, chunk: true };
+  #geometry = null;
+  #shown = { ghost: false, frames: false, path: true, chunk: true, capsules: false };
   #simulated = false;
   #drawn = new Float32Array(0); // the numbers of all parts as they were drawn last
   #framed = false;
 
-  constructor(element, geometry) {
+  constructor(element) {
     if (!window.MeshCat) throw new Error("the viewer script did not load");
     const { renderer, software } = rendererIn(element);
     this.software = software;
     this.#viewer = new window.MeshCat.Viewer(element, undefined, renderer);
     this.#viewer.gui.domElement.remove();
+    this.#viewer.hide_background();
+    this.#viewer.delete_path(["Axes"]);
     this.#fitTo(element);
     this.#views = new Views(this.#viewer);
+    this.#meshes = new Meshes(this.#viewer);
+    document.addEventListener("eva:theme", () => this.#ground());
+  }
+
+  /** Draw the robot and the bench of `geometry`; what was drawn before is gone. */
+  show(geometry) {
+    for (const path of OURS) this.#viewer.delete_path([path]);
     this.#geometry = geometry;
+    this.#blocks = [];
+    this.#plate = null;
+    this.#drawn = new Float32Array(0);
+    this.#framed = false;
+    this.#preview.end();
     this.#bench(geometry);
     this.#robot(geometry);
-    document.addEventListener("eva:theme", () => this.#ground());
     if (geometry.home) this.setPoses(Float32Array.from(geometry.home.flat()), 1);
   }
 
   /** Where every part is: [count * P * 16]; the second is where it was told to be, the third a simulated robot. */
   setPoses(numbers, count) {
     const size = this.#parts.length * SIZE;
+    if (numbers.length !== count * size) return; // of the robot in other groups: its shapes are on their way
     const film = this.#preview.at(performance.now());
     if (!film && this.#framed && !this.#moved(numbers)) return; // drawn already, as it is
     place(this.#parts, numbers, 0);
@@ -58,7 +81,7 @@ export class Scene3D {
 
   /** Where the things on a simulated bench are: {blocks: [[x, y, z, yaw]], plate: [x, y]}. */
   setBench({ blocks = [], plate: at }) {
-    const { bench } = this.#geometry;
+    const bench = this.#geometry?.bench;
     if (!bench || !Array.isArray(at)) return;
     this.#plate ??= this.#add("bench/plate", plate(bench));
     this.#plate.position.set(at[0], at[1], 0);
@@ -101,16 +124,23 @@ export class Scene3D {
     this.#follow();
   }
 
-  /** Show or hide "ghost" (the commanded pose), "frames", "path" or "chunk"; returns whether it is shown now. */
+  /** Show or hide "ghost" (the commanded pose), "frames", "path", "chunk" or "capsules"; returns whether it is shown now. */
   toggle(what) {
     this.#shown[what] = !this.#shown[what];
-    this.#tips.show(this.#shown.frames, this.#shown.path);
-    this.#ghosts.allow("commanded", this.#shown.ghost);
-    this.#ghosts.allow("chunk", this.#shown.chunk);
+    this.#apply();
     if (!this.#shown.chunk) this.#dots.show(null);
     this.#drawn = new Float32Array(0); // what is shown now may never have been placed
     this.#viewer.set_dirty();
     return this.#shown[what];
+  }
+
+  #apply() {
+    const { ghost, frames, path, chunk, capsules } = this.#shown;
+    this.#tips.show(path);
+    this.#frames.show(frames);
+    this.#capsules.show(capsules);
+    this.#ghosts.allow("commanded", ghost);
+    this.#ghosts.allow("chunk", chunk);
   }
 
   #add(path, object) {
@@ -119,40 +149,44 @@ export class Scene3D {
     return object;
   }
 
-  /** The viewer measures the window; ours is a pane. */
+  /** The viewer measures the window; ours is a pane, and what had to be in view stays so. */
   #fitTo(element) {
     const fit = this.#viewer.set_3d_pane_size.bind(this.#viewer);
     this.#viewer.set_3d_pane_size = () => {
-      if (element.clientWidth && element.clientHeight) fit(element.clientWidth, element.clientHeight);
+      if (!element.clientWidth || !element.clientHeight) return;
+      fit(element.clientWidth, element.clientHeight);
+      this.#views?.again();
     };
     new ResizeObserver(() => this.#viewer.set_3d_pane_size()).observe(element);
     this.#viewer.set_3d_pane_size();
   }
 
   #bench(geometry) {
-    this.#viewer.hide_background();
-    this.#viewer.delete_path(["Axes"]);
     this.#ground();
     if (geometry.table) this.#add("bench/table", table(geometry.table));
+    geometry.mounts?.forEach((one, index) => this.#add(`bench/mount${index}`, mount(one)));
   }
 
   #ground() {
-    const THREE = three();
-    const grid = new THREE.GridHelper(4, 40, css("--scene-grid"), css("--scene-grid"));
-    grid.rotateX(Math.PI / 2);
-    grid.position.z = -0.04;
-    this.#add("Grid", grid);
+    this.#add("Grid", ground(this.#geometry?.floor));
     this.#viewer.set_dirty();
   }
 
   #robot(geometry) {
     const add = (path, object) => this.#add(path, object);
-    this.#parts = robotParts(geometry);
+    const changed = (mesh) => {
+      if (this.software) lightenWork(mesh);
+      this.#viewer.set_dirty();
+    };
+    const drawing = { meshes: this.#meshes, changed };
+    this.#parts = robotParts(geometry, drawing);
     this.#parts.forEach((part, index) => add(`robot/${index}`, part));
-    this.#ghosts = new Ghosts(geometry, add);
-    this.#ghosts.allow("commanded", false);
+    this.#ghosts = new Ghosts(geometry, add, drawing);
     this.#tips = new Tips(geometry.tips ?? [], add);
+    this.#frames = new Frames(geometry.frames ?? [], add);
+    this.#capsules = new Capsules(geometry.capsules ?? [], add);
     this.#dots.objects.forEach((points, index) => add(`chunk/${index}`, points));
+    this.#apply();
   }
 
   /** Whether anything is elsewhere than it was drawn last. */
@@ -171,26 +205,21 @@ export class Scene3D {
     const simulated = this.#ghosts.visible("simulated");
     if (simulated !== this.#simulated) this.#tips.forget();
     this.#simulated = simulated;
-    this.#tips.move(simulated ? this.#ghosts.parts("simulated") : this.#parts);
+    const acting = simulated ? this.#ghosts.parts("simulated") : this.#parts;
+    for (const hung of [this.#tips, this.#frames, this.#capsules]) hung.move(acting);
     if (this.#views.following >= 0) this.#views.follow(this.#tips.world(this.#views.following));
   }
 
-  /** Look at the whole robot, once it is known where it is. */
+  /** Look at the whole robot, where it is and where its named poses would take it, and at the bench. */
   #frame() {
-    const THREE = three();
-    const box = new THREE.Box3();
-    const corner = new THREE.Vector3();
-    const toZUp = new THREE.Matrix4().copy(this.#viewer.scene.matrixWorld).invert();
+    const { Box3, Matrix4, Vector3 } = three();
+    const { view, ahead } = this.#geometry;
+    const box = new Box3();
     this.#viewer.scene.updateMatrixWorld(true);
     for (const part of this.#parts) box.expandByObject(part);
-    box.applyMatrix4(toZUp);
-    const { table: desk, bench } = this.#geometry;
-    if (bench) box.expandByPoint(corner.set(bench.area[0], bench.area[2], 0)).expandByPoint(corner.set(bench.area[1], bench.area[3], 0));
-    const centre = box.getCenter(new THREE.Vector3());
-    const radius = box.getSize(corner).length() / 2;
-    const ahead = desk ? [desk.centre[0], desk.centre[1]] : [0, 1];
-    const length = Math.hypot(...ahead) || 1;
-    this.#views.frame(centre.toArray(), radius * 1.12, length > 1e-6 ? ahead.map((value) => value / length) : [0, 1]);
+    box.applyMatrix4(new Matrix4().copy(this.#viewer.scene.matrixWorld).invert());
+    for (const corner of [view.low, view.high]) box.expandByPoint(new Vector3(...corner));
+    this.#views.frame(box.min.toArray(), box.max.toArray(), ahead);
     this.#framed = true;
     this.view("all");
   }

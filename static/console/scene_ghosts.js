@@ -1,6 +1,7 @@
 // Robots that are not the real one: the commanded pose, a target, a proposed chunk, the robot of a simulation.
 
-import { ghostPaint, place, robotParts, SIZE } from "./scene_shapes.js";
+import { place, robotParts, SIZE } from "./scene_robot.js";
+import { ghostPaint } from "./scene_shapes.js";
 
 /** Each a translucent blue; what is to be looked at is more solid than what is only compared with. */
 export const GHOSTS = {
@@ -13,12 +14,14 @@ export const GHOSTS = {
 export class Ghosts {
   #geometry;
   #add;
+  #drawing;
   #robots = new Map(); // made when they are first wanted: most pages never show most of them
   #there = new Set();
   #hidden = new Set();
 
-  /** `add(path, object)` puts an object into the scene. */
-  constructor(geometry, add) {
+  /** `add(path, object)` puts an object into the scene; `drawing` is how robots are drawn there. */
+  constructor(geometry, add, drawing) {
+    this.#drawing = drawing;
     this.#geometry = geometry;
     this.#add = add;
   }
@@ -57,7 +60,7 @@ export class Ghosts {
 
   #robot(name) {
     if (!this.#robots.has(name)) {
-      const parts = robotParts(this.#geometry, () => ghostPaint(GHOSTS[name]));
+      const parts = robotParts(this.#geometry, { ...this.#drawing, paint: () => ghostPaint(GHOSTS[name]) });
       parts.forEach((part, index) => this.#add(`ghost/${name}/${index}`, part));
       this.#robots.set(name, parts);
     }

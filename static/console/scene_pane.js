@@ -12,9 +12,10 @@ import { Tags } from "./tags.js";
 export async function scenePane(store) {
   const note = document.getElementById("scene-note");
   try {
-    const geometry = await get(config.geometry);
     const element = document.getElementById("scene");
-    const scene = new Scene3D(element, geometry);
+    const scene = new Scene3D(element);
+    const shapes = new Shapes(store, (geometry) => scene.show(geometry));
+    await shapes.fetch();
     note.hidden = true;
     aimGhost(scene);
     const shown = new ShownChunk(scene, () => store.snapshot?.facts?.rate ?? store.facts.rate);
@@ -38,6 +39,42 @@ export async function scenePane(store) {
     note.textContent = `No 3D scene: ${error.message}. Everything else works without it.`;
     console.error(error);
     return { poses() {}, bench() {}, chunk() {}, software: false };
+  }
+}
+
+/** The robot's shapes, in the groups that the station says it has: fetched again when it says something else. */
+class Shapes {
+  #store;
+  #show;
+  #groups = null; // of the shapes that were asked for last
+
+  constructor(store, show) {
+    this.#store = store;
+    this.#show = show;
+  }
+
+  /** Resolves when something is drawn; from then on the station is followed. */
+  async fetch() {
+    await this.#get(this.#said);
+    this.#store.on("snapshot", () => this.#follow());
+    this.#follow();
+  }
+
+  get #said() {
+    return this.#store.snapshot?.facts?.groups?.join() ?? "";
+  }
+
+  async #get(groups) {
+    this.#groups = groups;
+    const geometry = await get(groups ? `${config.geometry}?groups=${groups}` : config.geometry);
+    if (this.#groups !== groups) return; // it has said something else meanwhile
+    this.#groups = geometry.groups.join();
+    this.#show(geometry);
+  }
+
+  #follow() {
+    const said = this.#said;
+    if (said && said !== this.#groups) this.#get(said).catch((error) => console.error(`no shapes for ${said}: ${error.message}`));
   }
 }
 

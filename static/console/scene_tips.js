@@ -1,4 +1,4 @@
-// What hangs on fingertips: their frames, the ways they went, and the camera that follows one.
+// What hangs on fingertips: the ways they went, and the camera that follows one.
 
 import { Path } from "./scene_path.js";
 import { css, three } from "./scene_shapes.js";
@@ -8,18 +8,15 @@ export const ARM_COLOURS = ["#4fa3ff", "#f7a04b", "#46d17f", "#c79bff"];
 export class Tips {
   #tips; // [{part, pose}] of the server
   #offsets;
-  #frames = [];
+  #places;
   #paths = [];
 
   constructor(tips, add) {
     const THREE = three();
     this.#tips = tips;
     this.#offsets = tips.map(({ pose }) => new THREE.Matrix4().fromArray(pose));
+    this.#places = tips.map(() => new THREE.Matrix4());
     tips.forEach((tip, index) => {
-      const axes = new THREE.AxesHelper(0.08);
-      axes.matrixAutoUpdate = false;
-      axes.visible = false;
-      this.#frames.push(add(`frame/${index}`, axes));
       const path = new Path(ARM_COLOURS[index % ARM_COLOURS.length], css("--scene"));
       this.#paths.push(path);
       add(`path/${index}`, path.object);
@@ -30,25 +27,21 @@ export class Tips {
     return this.#tips.length;
   }
 
-  show(frames, paths) {
-    for (const axes of this.#frames) axes.visible = frames;
+  show(paths) {
     for (const path of this.#paths) path.object.visible = paths;
   }
 
   /** The robot is at `parts` now (its groups). */
   move(parts) {
     this.#tips.forEach((tip, index) => {
-      const axes = this.#frames[index];
-      axes.matrix.multiplyMatrices(parts[tip.part].matrix, this.#offsets[index]);
-      axes.matrixWorldNeedsUpdate = true;
-      const world = axes.matrix.elements;
+      const world = this.#places[index].multiplyMatrices(parts[tip.part].matrix, this.#offsets[index]).elements;
       this.#paths[index].add(world[12], world[13], world[14]);
     });
   }
 
   /** Where fingertip `index` is: 16 numbers, column by column. */
   world(index) {
-    return this.#frames[index].matrix.elements;
+    return this.#places[index].elements;
   }
 
   /** Another robot goes on: its way begins here. */

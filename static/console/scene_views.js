@@ -2,48 +2,96 @@
 
 import { three } from "./scene_shapes.js";
 
-const FIELD = 38; // degrees, of the smaller side
+const FIELD = 38; // degrees, from top to bottom
+const ROOM = 1.09; // around what has to be in view
+const TOOLS = 36; // px over the scene that its buttons take
+const ROUNDS = 6; // until the middle of what is seen is in the middle
 const WRIST = { behind: 0.28, aside: 0.4, ahead: 0 }; // m from a fingertip
 
 function inThree([x, y, z]) {
   return new (three().Vector3)(x, z, -y);
 }
 
+const dot = (one, other) => one.reduce((sum, value, axis) => sum + value * other[axis], 0);
+const along = (from, way, length) => from.map((value, axis) => value + length * way[axis]);
+
+function cross([a, b, c], [x, y, z]) {
+  return [b * z - c * y, c * x - a * z, a * y - b * x];
+}
+
+function unit(vector) {
+  const length = Math.hypot(...vector);
+  return vector.map((value) => value / length);
+}
+
+/**
+ * From where all `corners` are seen, looking against `direction`: {eye, target}. `wide` and `high` are the tangents
+ * of the half angles of view to the sides and up.
+ */
+export function eyeFor(corners, direction, wide, high) {
+  const back = unit(direction);
+  const right = unit(cross([0, 0, 1], back));
+  const up = cross(back, right);
+  let target = corners[0].map((_, axis) => corners.reduce((sum, corner) => sum + corner[axis], 0) / corners.length);
+  let distance = 0;
+  for (let round = 0; round < ROUNDS; round += 1) {
+    const seen = corners.map((corner) => {
+      const off = corner.map((value, axis) => value - target[axis]);
+      return { x: dot(off, right), y: dot(off, up), z: dot(off, back) };
+    });
+    distance = Math.max(...seen.map(({ x, y, z }) => z + Math.max(Math.abs(x) / wide, Math.abs(y) / high)));
+    const middle = (axis) => {
+      const slopes = seen.map((point) => point[axis] / Math.max(1e-3, distance - point.z));
+      return ((Math.min(...slopes) + Math.max(...slopes)) / 2) * distance;
+    };
+    target = along(along(target, right, middle("x")), up, middle("y"));
+  }
+  return { eye: along(target, back, distance), target };
+}
+
 export class Views {
   #viewer;
-  #sphere = { centre: [0, 0.2, 0.15], radius: 0.7 };
+  #corners = [];
   #ahead = [0, 1];
   #following = -1;
+  #shown = ""; // "" where a person has taken the camera
 
   constructor(viewer) {
     this.#viewer = viewer;
     viewer.camera.near = 0.01;
     viewer.camera.far = 50;
-    viewer.dom_element.addEventListener("pointerdown", () => this.free());
-    viewer.dom_element.addEventListener("wheel", () => this.free(), { passive: true });
+    viewer.dom_element.addEventListener("pointerdown", () => this.#taken());
+    viewer.dom_element.addEventListener("wheel", () => this.#taken(), { passive: true });
   }
 
   get following() {
     return this.#following;
   }
 
-  /** What has to be in view: a sphere around it, and the side that the robot works towards. */
-  frame(centre, radius, ahead) {
-    this.#sphere = { centre, radius };
+  /** What has to be in view, its least and greatest corner, and the side that the robot works towards. */
+  frame(low, high, ahead) {
+    this.#corners = [0, 1, 2, 3, 4, 5, 6, 7].map((bits) => low.map((value, axis) => ((bits >> axis) & 1 ? high[axis] : value)));
     this.#ahead = ahead;
   }
 
   /** The person takes the camera: no tip is followed any more. */
-  free() {
+  #taken() {
     this.#following = -1;
+    this.#shown = "";
+  }
+
+  /** The pane has another size: what was in view is so again. */
+  again() {
+    if (this.#shown && this.#shown !== "wrist") this.show(this.#shown);
   }
 
   show(name, tips = 0) {
+    this.#shown = name;
     if (name === "wrist") {
       this.#following = tips ? (this.#following + 1) % tips : -1;
       return;
     }
-    this.free();
+    this.#following = -1;
     const [x, y] = this.#ahead;
     const direction = { all: [0.75 * x + 0.62 * y, 0.75 * y - 0.62 * x, 0.62], front: [x, y, 0.12], top: [-0.002 * x, -0.002 * y, 1] }[name];
     this.#look(direction);
@@ -59,13 +107,11 @@ export class Views {
   }
 
   #look(direction) {
-    const { centre, radius } = this.#sphere;
-    const { camera } = this.#viewer;
-    const half = ((FIELD / 2) * Math.PI) / 180;
-    const narrow = Math.min(1, camera.aspect || 1);
-    const distance = radius / Math.sin(Math.atan(Math.tan(half) * narrow));
-    const length = Math.hypot(...direction);
-    this.#place(centre.map((value, axis) => value + (direction[axis] / length) * distance), centre);
+    const { camera, dom_element: pane } = this.#viewer;
+    const high = Math.tan(((FIELD / 2) * Math.PI) / 180) / ROOM;
+    const kept = 1 - TOOLS / Math.max(4 * TOOLS, pane.clientHeight);
+    const { eye, target } = eyeFor(this.#corners, direction, high * (camera.aspect || 1), high * kept);
+    this.#place(eye, target);
   }
 
   #place(eye, target) {

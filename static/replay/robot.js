@@ -65,7 +65,8 @@ export async function robotPane({ clock, geometry: address, poses }) {
   try {
     if (!address) throw new Error("the episode names no robot");
     const geometry = await get(address);
-    const scene = new Scene3D(document.getElementById("scene"), geometry);
+    const scene = new Scene3D(document.getElementById("scene"));
+    scene.show(geometry);
     scene.toggle("path"); // a path that jumps with the clock would be none
     for (const button of document.querySelectorAll("[data-view]")) {
       button.addEventListener("click", () => scene.view(button.dataset.view));

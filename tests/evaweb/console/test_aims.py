@@ -12,21 +12,22 @@ from evaweb.console import aims
 from evaweb.console.aims import Aims, aimed
 from evaweb.console.requests import Aim
 from evaweb.roles import Role
-from evaweb.stations.geometry import looks_of
+from evaweb.stations.looks import looks_of
 from evaweb.stations.models import Station
 from runtime.messages import Ack
 
 Q = [0.1] * 14
+PIPER = looks_of("agilex_piper")
 
 
 def test_a_target_comes_with_where_every_part_would_be(live, runtime):
     runtime.aim_says = Ack(
         "", "done", data={"joints": np.array(Q, np.float32), "reached": True, "distance": 0.5}
     )
-    found = aimed(live, "ann", {"pose": "home"})
+    found = aimed(live.name, "ann", {"pose": "home"}, PIPER)
     assert (found["ok"], found["reached"], found["distance"]) == (True, True, 0.5)
     assert np.allclose(found["joints"], Q)
-    wanted = looks_of("agilex_piper").poses(np.array(Q)).ravel()
+    wanted = PIPER.poses(np.array(Q)).ravel()
     assert np.allclose(found["links"], wanted, atol=2e-5)
     assert [(asked.kind, asked.args, asked.user) for asked in runtime.aims] == [
         ("aim", {"pose": "home"}, "ann")
@@ -35,7 +36,7 @@ def test_a_target_comes_with_where_every_part_would_be(live, runtime):
 
 def test_a_refusal_has_its_sentence_and_no_parts(live, runtime):
     runtime.aim_says = Ack("", "refused", "pose = 'x' is unknown; web:bob:p1 holds the lease")
-    assert aimed(live, "ann", {"pose": "x"}) == {
+    assert aimed(live.name, "ann", {"pose": "x"}, PIPER) == {
         "ok": False,
         "reason": "pose = 'x' is unknown; bob holds the lease",
         "links": [],
@@ -45,16 +46,21 @@ def test_a_refusal_has_its_sentence_and_no_parts(live, runtime):
 @pytest.mark.parametrize("joints", [None, [0.0] * 3, [None] * 14])
 def test_a_target_that_cannot_be_drawn_has_no_parts(live, runtime, joints):
     runtime.aim_says = Ack("", "done", data={"joints": joints})
-    assert aimed(live, "ann", {})["links"] == []
+    assert aimed(live.name, "ann", {}, PIPER)["links"] == []
+
+
+def test_a_robot_that_is_not_drawn_has_no_parts(live, runtime):
+    runtime.aim_says = Ack("", "done", data={"joints": Q})
+    assert aimed(live.name, "ann", {}, None)["links"] == []
 
 
 def test_a_station_that_is_away_is_a_reason():
-    found = aimed(Station(name="bench-nowhere", robot="agilex_piper"), "ann", {})
+    found = aimed("bench-nowhere", "ann", {}, PIPER)
     assert found == {"ok": False, "reason": "bench-nowhere is not running: its runtime has to be started"}
 
 
 def test_what_cannot_be_sent_never_reaches_the_station(live, runtime):
-    found = aimed(live, "ann", {"joints": [2**70]})
+    found = aimed(live.name, "ann", {"joints": [2**70]}, PIPER)
     assert (found["ok"], runtime.aims) == (False, [])
     assert "cannot be sent" in found["reason"]
 
@@ -65,10 +71,11 @@ class Page:
     def __init__(self, monkeypatch, role=Role.OPERATOR):
         self.told, self.asked = [], []
         self.begun, self.go = threading.Event(), threading.Event()
-        self.aims = Aims(Station(name="bench-1"), "ann", role, self.told.append)
+        self.aims = Aims(Station(name="bench-1"), "ann", role, self.told.append, lambda: PIPER)
         monkeypatch.setattr(aims, "aimed", self._aimed)
 
-    def _aimed(self, station, username, args):
+    def _aimed(self, station, username, args, looks):
+        assert (station, looks) == ("bench-1", PIPER)
         self.asked.append(args["n"])
         self.begun.set()
         assert self.go.wait(10)

@@ -8,7 +8,8 @@ import pytest
 from evaweb.console import parts
 from evaweb.console.chunks import GHOSTS, chunk_part
 from evaweb.frames import decode
-from evaweb.stations.geometry import geometry, looks_of
+from evaweb.stations.geometry import geometry
+from evaweb.stations.looks import looks_of
 
 LOOKS = looks_of("agilex_piper")
 

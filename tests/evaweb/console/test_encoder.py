@@ -8,7 +8,7 @@ import pytest
 from evaweb.console import parts
 from evaweb.console.encoder import Encoder
 from evaweb.frames import decode
-from evaweb.stations.geometry import looks_of
+from evaweb.stations.looks import looks_of
 
 Q = np.full(14, 0.1, np.float32)
 
@@ -76,6 +76,30 @@ def test_a_robot_that_is_not_simulated_is_not_drawn_as_such():
 def test_what_cannot_be_drawn_is_still_told(content, robot):
     frame = encoded(content, robot)
     assert set(frame.header["streams"]) == {"joints", "recent"}
+
+
+def test_a_robot_is_drawn_in_the_groups_that_its_station_says_it_has():
+    encoder = Encoder("agilex_piper")
+    one = joints(measured=Q[:7], commanded=Q[:7])
+    assert [part.stream for part in encoder.encode("joints", one)] == ["joints", "recent"]
+    encoder.encode("state", {"facts": {"groups": ["right_arm"]}})
+    poses = [part for part in encoder.encode("joints", one) if part.stream == "poses"]
+    assert decode(parts.frame(poses, 1, 0.0)).array("poses").shape == (2, 10, 16)
+    assert encoder.looks is looks_of("agilex_piper", ["right_arm"])
+
+
+@pytest.mark.parametrize("facts", [None, {}, {"groups": None}, {"groups": []}])
+def test_a_station_that_does_not_say_has_all_groups(facts):
+    encoder = Encoder("agilex_piper")
+    encoder.encode("state", {"facts": facts})
+    assert encoder.looks is looks_of("agilex_piper")
+
+
+def test_a_station_with_groups_that_nobody_knows_is_not_drawn():
+    encoder = Encoder("agilex_piper")
+    encoder.encode("state", {"facts": {"groups": ["tail"]}})
+    assert encoder.looks is None
+    assert [part.stream for part in encoder.encode("joints", joints())] == ["joints", "recent"]
 
 
 def test_events_and_link_are_no_parts():

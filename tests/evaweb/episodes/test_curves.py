@@ -15,7 +15,7 @@ from evaweb.episodes.curves import curves, held_spans
 from evaweb.episodes.poses import poses
 from evaweb.errors import NotFound
 from evaweb.frames import decode
-from evaweb.stations.geometry import looks_of
+from evaweb.stations.looks import looks_of
 from runtime.recording.files import RecordingError
 from runtime.recording.reader import open_episode
 from runtime.recording.tables import write_table
@@ -106,7 +106,7 @@ def test_poses_are_those_of_the_measured_joints_and_come_in_parts(
     looks = looks_of("agilex_piper")
     wanted = looks.scene.poses(column(episode.rows, "qpos").astype(np.float64))
     for first, count in ((0, 10), (20, episode.frames - 20)):
-        frame = decode(poses(folder, "agilex_piper", first))
+        frame = decode(poses(folder, first))
         found = frame.array("poses")
         assert found.shape == (count, len(looks.scene.parts), 16)
         matrices = found.reshape(count, -1, 4, 4).swapaxes(-1, -2)  # column by column
@@ -114,16 +114,10 @@ def test_poses_are_those_of_the_measured_joints_and_come_in_parts(
         assert frame.header["rows"] == episode.frames
 
 
-@pytest.mark.parametrize("robot", ["", "nobody", "../agilex_piper", "/etc"])
-def test_a_robot_that_is_not_known_is_named(folder: Path, robot: str) -> None:
-    with pytest.raises(NotFound, match="agilex_piper"):
-        poses(folder, robot, 0)
-
-
 @pytest.mark.parametrize("first", [-1, 24, 5000])
 def test_a_row_that_there_is_not_is_refused(folder: Path, first: int) -> None:
     with pytest.raises(NotFound, match="has rows 0 to 23"):
-        poses(folder, "agilex_piper", first)
+        poses(folder, first)
 
 
 def test_a_robot_that_nobody_knows_any_more_leaves_curves_without_units(put: object) -> None:

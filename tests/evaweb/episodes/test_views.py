@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import uuid
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from django.contrib.auth.models import Group, User
 from django.test import AsyncClient, Client
 from django.urls import reverse
 
+import robots
 from evaweb.episodes import streaming
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.frames import decode
@@ -425,3 +427,26 @@ def test_the_page_says_how_late_the_policy_was(previewed: Episode, browser: Clie
     assert "2 mistimed</span>" in page
     Episode.objects.update(policy={})
     assert "Delay" not in page_of(browser, previewed)
+
+
+# --- the robot -----------------------------------------------------------------------------------------------
+
+
+def test_the_robot_is_drawn_in_the_groups_that_were_recorded(
+    previewed: Episode, data: Path, browser: Client
+) -> None:
+    address = reverse("episode-geometry", args=[previewed.uuid])
+    assert f'"geometry": "{address}"' in page_of(browser, previewed)
+    assert browser.get(address).json()["groups"] == ["left_arm", "right_arm"]
+    path = data / "episodes" / str(previewed.uuid) / "manifest.json"
+    whole = json.loads(path.read_text())
+    one = robots.load("agilex_piper", ["right_arm"])
+    whole["robot"] |= {"dim": one.dim, "joint_names": list(one.joint_names)}
+    path.write_text(json.dumps(whole))
+    assert browser.get(address).json()["groups"] == ["right_arm"]
+    path.write_text(json.dumps(whole | {"robot": whole["robot"] | {"name": "retired"}}))
+    refused = browser.get(address)
+    assert (refused.status_code, "'retired' does not exist" in refused.content.decode()) == (404, True)
+    path.write_text("{")
+    assert browser.get(address).status_code == 409
+    assert Client().get(address).status_code == 302

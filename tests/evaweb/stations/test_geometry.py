@@ -9,70 +9,72 @@ import pytest
 
 import robots
 from evaweb.errors import NotFound
-from evaweb.stations.geometry import BENCH, TABLE, facts_of, geometry, looks_of
+from evaweb.stations.geometry import geometry
+from evaweb.stations.looks import looks_of
 from evaweb.stations.models import Station
-from runtime.sim.bench import Bench, tip_in_world
+from evaweb.stations.surroundings import BENCH
 
 
-def test_a_robot_has_parts_shapes_and_a_pose_to_begin_with():
-    found = geometry("agilex_piper", simulated=False)
+@pytest.mark.parametrize("name", robots.names())
+def test_a_robot_has_parts_shapes_and_a_pose_to_begin_with(name):
+    found = geometry(name, simulated=False)
     assert json.loads(json.dumps(found)) == found
     assert len(found["home"]) == len(found["parts"])
-    assert {visual["part"] for visual in found["visuals"]} <= set(range(len(found["parts"])))
+    parts = range(len(found["parts"]))
+    assert {visual["part"] for visual in found["visuals"]} <= set(parts)
     assert all(len(visual["origin"]) == 16 for visual in found["visuals"])
+    assert all(one["part"] in parts and one["radius"] > 0 for one in found["capsules"])
     assert found["bench"] is None
 
 
-def test_matrices_go_column_by_column():
-    looks = looks_of("agilex_piper")
-    q = np.asarray(looks.robot.poses["home"])
-    poses = looks.poses(np.stack([q, q]))
-    assert poses.shape == (2, len(looks.scene.parts), 16)
-    assert poses.dtype == np.float32
-    assert np.allclose(poses[0, 3].reshape(4, 4).T, looks.scene.poses(q)[3], atol=1e-6)
+@pytest.mark.parametrize("name", robots.names())
+def test_end_effectors_and_the_frames_of_their_poses_are_frames(name):
+    looks = looks_of(name)
+    frames = geometry(name, simulated=False)["frames"]
+    ends = [frame for frame in frames if frame["kind"] == "end"]
+    assert [frame["name"] for frame in ends] == [f"{arm.name}/{arm.eef_link}" for arm in looks.robot.arms]
+    references = {frame["part"] for frame in frames if frame["kind"] == "reference"} - {None}
+    assert references == {looks.scene.link_of(arm.name, arm.frame) for arm in looks.robot.arms}
 
 
-def test_the_tips_are_where_the_bench_has_them():
-    looks = looks_of("agilex_piper")
+@pytest.mark.parametrize("name", robots.names())
+def test_a_pose_of_an_arm_leads_from_its_frame_to_its_end_effector(name):
+    looks = looks_of(name)
+    frames = geometry(name, simulated=False)["frames"]
     q = np.asarray(looks.robot.poses["home"])
     parts = looks.scene.poses(q)
-    tips = geometry("agilex_piper", simulated=True)["tips"]
-    assert len(tips) == len(looks.robot.arms)
-    for tip, arm in zip(tips, looks.robot.arms, strict=True):
-        pose = parts[tip["part"]] @ np.reshape(tip["pose"], (4, 4)).T
-        assert np.allclose(pose, tip_in_world(looks.robot, arm, q), atol=1e-6)
+    for frame, arm in zip(frames, looks.robot.arms, strict=False):
+        base = parts[looks.scene.link_of(arm.name, arm.frame)]
+        assert np.allclose(np.linalg.inv(base) @ parts[frame["part"]], arm.transform(q), atol=1e-6)
 
 
-def test_the_bench_that_is_drawn_is_the_one_that_is_simulated():
-    bench = Bench()
-    for size in ("block_edge", "plate_radius", "plate_height"):
-        assert BENCH[size] == getattr(bench, size)
-    assert BENCH["area"] == list(bench.area)
-    colours = {
-        "plate_colour": bench.plate_colour,
-        "plate_rim_colour": bench.plate_rim_colour,
-    }
-    for name, colour in colours.items():
-        assert [round(255 * part) for part in BENCH[name]] == [*colour, 255]
-    drawn = [tuple(round(255 * part) for part in colour[:3]) for colour in BENCH["block_colours"]]
-    assert tuple(drawn) == bench.block_colours
-    assert tuple(round(255 * part) for part in TABLE["colour"][:3]) == bench.table_colour
+def test_the_frame_of_all_mounts_stands_still():
+    robot = looks_of("dual_franka").robot
+    (stand,) = [one for one in geometry("dual_franka", simulated=False)["frames"] if one["part"] is None]
+    assert stand["name"] == robot.mount_frame
+    assert np.allclose(stand["pose"][12:15], robot.stand[:3])
 
 
-@pytest.mark.parametrize("name", ["nobody", "../robots/agilex_piper", "/etc", ""])
-def test_a_robot_that_there_is_not_never_reaches_the_disk(name):
-    with pytest.raises(NotFound, match="there are: agilex_piper"):
-        looks_of(name)
-    assert "does not exist" in facts_of(name)["error"]
+def test_fewer_groups_are_fewer_parts():
+    one = geometry("agilex_piper", ["left_arm"], simulated=False)
+    assert one["groups"] == ["left_arm"]
+    assert len(one["parts"]) == len(geometry("agilex_piper", simulated=False)["parts"]) / 2
+    with pytest.raises(NotFound, match="tail"):
+        geometry("agilex_piper", ["tail"], simulated=False)
 
 
 @pytest.mark.django_db
-def test_the_addresses_answer_who_is_logged_in(client, vera):
+def test_pages_fetch_it_by_station_and_by_robot(client, django_user_model):
     Station.objects.create(name="bench-9", robot="agilex_piper", simulated=True)
     assert client.get("/stations/bench-9/geometry").status_code == 302
-    client.force_login(vera)
+    client.force_login(django_user_model.objects.create_user("ann"))
     assert client.get("/stations/bench-9/geometry").json()["bench"] == BENCH
+    assert client.get("/stations/bench-9/geometry?groups=right_arm").json()["groups"] == ["right_arm"]
     assert client.get("/robots/agilex_piper/geometry").json()["bench"] is None
-    assert client.get("/stations/nowhere/geometry").status_code == 404
-    assert client.get("/robots/nobody/geometry").status_code == 404
-    assert robots.names() == ("agilex_piper",)
+    for address in (
+        "/stations/nowhere/geometry",
+        "/stations/bench-9/geometry?groups=tail",
+        "/robots/nobody/geometry",
+        "/robots/agilex_piper/geometry?groups=left_arm,,",
+    ):
+        assert client.get(address).status_code == 404

@@ -1,0 +1,98 @@
+"""A robot as pages know it: names of its numbers, where its parts are for given joints, and in which groups."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import robots
+from evaweb.errors import NotFound
+from robots.units import units_of
+
+_KEPT = 64  # robots in the groups of some station or episode
+
+
+@dataclass(frozen=True, eq=False)
+class Looks:
+    """A robot as it is drawn: its description and its scene."""
+
+    robot: robots.Robot
+    scene: robots.RobotScene
+
+    def poses(self, q: NDArray[Any]) -> NDArray[np.float32]:
+        """World <- part for joints [..., D] as float32 [..., P, 16], each matrix column by column."""
+        found = np.swapaxes(self.scene.poses(np.asarray(q, np.float64)), -1, -2)
+        return found.reshape(*found.shape[:-2], 16).astype(np.float32)
+
+    def tips(self, links: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Where the fingertips are for parts at `links` [..., P, 16]: float32 [..., arms, 3], in the world [m]."""
+        found = np.empty((*links.shape[:-2], len(self.robot.arms), 3), np.float32)
+        for index, arm in enumerate(self.robot.arms):
+            part = links[..., self.carrier(arm), :].reshape(*links.shape[:-2], 4, 4)  # its columns as rows
+            found[..., index, :] = (tip_of(arm)[:, 3] @ part)[..., :3]
+        return found
+
+    def carrier(self, arm: robots.Group) -> int:
+        """The part that is an arm's end effector, and carries its fingertips."""
+        assert arm.eef_link is not None
+        return self.scene.link_of(arm.name, arm.eef_link)
+
+    @cached_property
+    def units(self) -> tuple[str, ...]:
+        """The unit of every number of the robot's vector."""
+        return units_of(self.robot)
+
+    def facts(self) -> dict[str, Any]:
+        """Groups, names and units of the numbers, names of the cameras, and the robot's title."""
+        return {
+            "robot": self.robot.name,
+            "title": self.robot.title,
+            "groups": [group.name for group in self.robot.groups],
+            "joint_names": list(self.robot.joint_names),
+            "units": list(self.units),
+            "cameras": [camera.key for camera in self.robot.cameras],
+            "rate": self.robot.control_rate,
+        }
+
+
+def tip_of(arm: robots.Group) -> NDArray[np.float64]:
+    """The frame [4, 4] between an arm's fingertips in its end effector; without a gripper the end effector itself."""
+    return np.eye(4) if arm.tip is None else arm.tip
+
+
+def looks_of(robot: str, groups: Sequence[str] | None = None) -> Looks:
+    """The looks of a known robot with these groups, None for all that are not optional.
+
+    NotFound lists what there is, or says what its description lacks.
+    """
+    return _looks(robot, None if groups is None else tuple(groups))
+
+
+@lru_cache(_KEPT)
+def _looks(robot: str, groups: tuple[str, ...] | None) -> Looks:
+    if robot not in robots.names():  # a name, never a path: it may come from an address
+        raise NotFound(f"robot {robot!r:.80} does not exist; there are: {', '.join(robots.names())}")
+    try:
+        described = robots.load(robot, groups)
+        return Looks(described, robots.scene_of(described))
+    except robots.RobotError as error:
+        raise NotFound(str(error)) from error
+
+
+def groups_of(joint_names: Iterable[str]) -> tuple[str, ...]:
+    """The groups that numbers of these names ("group.joint") are in, in their order."""
+    return tuple(dict.fromkeys(name.partition(".")[0] for name in joint_names))
+
+
+def facts_of(robot: str) -> dict[str, Any]:
+    """The facts of a robot; where its description cannot be read, none but why: stopping must work all the same."""
+    try:
+        return looks_of(robot).facts()
+    except NotFound as error:
+        nothing: dict[str, Any] = {"groups": [], "joint_names": [], "units": [], "cameras": []}
+        return {"robot": robot, "title": robot, **nothing, "error": str(error)}

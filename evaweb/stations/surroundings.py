@@ -1,0 +1,185 @@
+"""What stands around a robot in the scene: table, floor, mounts, and from where the robot looks at the table.
+
+The scene is that of the simulated bench: z = 0 is the table's surface, things lie within BENCH's `area`. A robot
+whose body reaches below the table stands on a floor, and the table keeps clear of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaweb.stations.looks import Looks
+from robots import urdf
+from robots.visuals import Visual
+
+Float64 = NDArray[np.float64]
+Rectangle = tuple[float, float, float, float]  # x from, to, y from, y to [m]
+
+AREA: Rectangle = (-0.22, 0.22, 0.18, 0.40)  # where things may lie
+# The simulated bench of runtime.sim.bench, whose sizes a test compares: [m], and colours from 0 to 1.
+BENCH = {
+    "block_edge": 0.04,
+    "plate_radius": 0.075,
+    "plate_height": 0.012,
+    "area": list(AREA),
+    "plate_colour": [226 / 255, 234 / 255, 244 / 255, 1.0],
+    "plate_rim_colour": [58 / 255, 104 / 255, 190 / 255, 1.0],
+    "block_colours": [
+        [226 / 255, 74 / 255, 22 / 255, 1.0],
+        [40 / 255, 150 / 255, 70 / 255, 1.0],
+        [150 / 255, 70 / 255, 170 / 255, 1.0],
+        [235 / 255, 190 / 255, 40 / 255, 1.0],
+    ],
+}
+_WOOD = [176 / 255, 164 / 255, 146 / 255, 1.0]
+_STEEL = [96 / 255, 102 / 255, 110 / 255, 1.0]
+_THICKNESS = 0.03
+_LEAST_TABLE: Rectangle = (-0.6, 0.6, -0.2, 0.6)  # around the area, with room beside it
+_CLEAR = 0.03  # between table and body
+_FOOT = 0.15  # of table around an arm's base
+_BELOW = -0.05  # a body that reaches lower stands on the floor
+_ABOVE = 0.04  # a base that stands higher has a mount under it
+_RADIUS = 0.055  # of a mount
+_ONE_MOUNT = 0.3  # bases nearer to each other share theirs
+_NOWHERE = 0.05  # from base to area: no way that could be looked along
+
+
+class Box(NamedTuple):
+    """Something's bounds in the scene: corners [3], in m."""
+
+    low: Float64
+    high: Float64
+
+
+def surroundings(looks: Looks) -> dict[str, Any]:
+    """For drawing: `table`, `mounts`, `floor` (its height or None), `ahead` [2] and `view`, what has to be seen."""
+    boxes = _at_poses(looks)
+    home = boxes[0]
+    floor = _floor(looks, home)
+    table = _table(looks, home)
+    return {
+        "table": _drawn(table, floor),
+        "mounts": _mounts(looks, table, floor),
+        "floor": floor,
+        "ahead": _ahead(looks),
+        "view": _view([box for pose in boxes for box in pose]),
+    }
+
+
+def bounds(visual: Visual, part: Float64) -> Box:
+    """The least and the greatest corner [3] of what a shape on a part at `part` [4, 4] fills in the scene."""
+    low, high = visual.bounds()
+    placed = part @ visual.origin
+    middle = placed[:3, :3] @ ((low + high) / 2) + placed[:3, 3]
+    reach = np.abs(placed[:3, :3]) @ ((high - low) / 2)
+    return Box(middle - reach, middle + reach)
+
+
+def _at_poses(looks: Looks) -> list[list[Box]]:
+    """What the robot's shapes fill in each of its named poses, home first."""
+    named = looks.robot.poses
+    found = []
+    for name in sorted(named, key=lambda name: name != "home"):
+        parts = looks.scene.poses(named[name])
+        found.append([bounds(visual, parts[visual.part]) for visual in looks.scene.visuals])
+    return found
+
+
+def _roots(looks: Looks) -> list[Float64]:
+    """Where the copies of the robot's tree stand, [3] each."""
+    root = urdf.read(looks.robot.urdf).root
+    poses = looks.scene.poses(looks.robot.poses["home"])
+    return [poses[part, :3, 3] for part in looks.scene.parts_of(root)]
+
+
+def _floor(looks: Looks, home: Sequence[Box]) -> float | None:
+    """How high the floor is that it stands on; None for a robot on a table."""
+    lowest = min([*(box.low[2] for box in home), *(root[2] for root in _roots(looks))], default=0.0)
+    return float(lowest) if lowest < _BELOW else None
+
+
+def _table(looks: Looks, home: Sequence[Box]) -> Rectangle:
+    """x from, to, y from, to: with room for the bases that stand on it, clear of a body that stands beside it."""
+    x_from, x_to, y_from, y_to = _LEAST_TABLE
+    for x, y, z in _roots(looks):
+        if z > _BELOW:
+            x_from, x_to = min(x_from, x - _FOOT), max(x_to, x + _FOOT)
+            y_from, y_to = min(y_from, y - _FOOT), max(y_to, y + _FOOT)
+    table = (float(x_from), float(x_to), float(y_from), float(y_to))
+    for box in home:
+        if box.low[2] < _BELOW:
+            table = _cut(table, box)
+    return table
+
+
+def _cut(table: Rectangle, box: Box) -> Rectangle:
+    """The largest part of the table that is clear of a box and keeps the area; as it is where there is none."""
+    x_from, x_to, y_from, y_to = table
+    (x_low, y_low), (x_high, y_high) = box.low[:2] - _CLEAR, box.high[:2] + _CLEAR
+    if x_high <= x_from or x_low >= x_to or y_high <= y_from or y_low >= y_to:
+        return table
+    cuts = [
+        (float(x_high), x_to, y_from, y_to),
+        (x_from, float(x_low), y_from, y_to),
+        (x_from, x_to, float(y_high), y_to),
+        (x_from, x_to, y_from, float(y_low)),
+    ]
+    kept = [cut for cut in cuts if _holds(cut, AREA)]
+    return max(kept, key=lambda cut: (cut[1] - cut[0]) * (cut[3] - cut[2]), default=table)
+
+
+def _holds(table: Rectangle, area: Rectangle) -> bool:
+    x_from, x_to, y_from, y_to = table
+    return x_from <= area[0] and x_to >= area[1] and y_from <= area[2] and y_to >= area[3]
+
+
+def _drawn(table: Rectangle, floor: float | None) -> dict[str, Any]:
+    x_from, x_to, y_from, y_to = table
+    return {
+        "centre": [(x_from + x_to) / 2, (y_from + y_to) / 2],
+        "size": [x_to - x_from, y_to - y_from],
+        "thickness": _THICKNESS,
+        "colour": _WOOD,
+        "legs": None if floor is None else -floor,
+    }
+
+
+def _mounts(looks: Looks, table: Rectangle, floor: float | None) -> list[dict[str, Any]]:
+    """A column under the bases that stand above the table, one for those close to each other."""
+    near: list[list[Float64]] = []
+    for root in _roots(looks):
+        if root[2] < _ABOVE:
+            continue
+        shared = [many for many in near if np.linalg.norm(many[0][:2] - root[:2]) < _ONE_MOUNT]
+        if shared:
+            shared[0].append(root)
+        else:
+            near.append([root])
+    return [_mount(np.array(many), table, floor) for many in near]
+
+
+def _mount(roots: Float64, table: Rectangle, floor: float | None) -> dict[str, Any]:
+    x, y, top = roots.mean(axis=0).tolist()
+    x_from, x_to, y_from, y_to = table
+    on_table = floor is None or (x_from < x < x_to and y_from < y < y_to)
+    return {"at": [x, y], "from": 0.0 if on_table else floor, "to": top, "radius": _RADIUS, "colour": _STEEL}
+
+
+def _ahead(looks: Looks) -> list[float]:
+    """The way from the bases to where things lie, a unit vector in x and y."""
+    x_from, x_to, y_from, y_to = AREA
+    way = np.array([x_from + x_to, y_from + y_to]) / 2 - np.mean(_roots(looks), axis=0)[:2]
+    length = float(np.linalg.norm(way))
+    return [0.0, 1.0] if length < _NOWHERE else (way / length).tolist()
+
+
+def _view(boxes: Sequence[Box]) -> dict[str, list[float]]:
+    """What has to be seen: the robot in each of its named poses and the area where things lie."""
+    x_from, x_to, y_from, y_to = AREA
+    low = [np.array([x_from, y_from, 0.0]), *(box.low for box in boxes)]
+    high = [np.array([x_to, y_to, 0.0]), *(box.high for box in boxes)]
+    return {"low": np.min(low, axis=0).tolist(), "high": np.max(high, axis=0).tolist()}

@@ -1,0 +1,26 @@
+"""In which unit each number of a robot's vector is."""
+
+from __future__ import annotations
+
+from robots import urdf
+from robots.robot import Group, Robot
+from robots.urdf import Urdf
+
+
+def units_of(robot: Robot) -> tuple[str, ...]:
+    """A unit for every number: "rad", "m" for what slides, a gripper's own, "" for what moves no link."""
+    tree = urdf.read(robot.urdf)
+    return tuple(unit for group in robot.groups for unit in _units(group, tree))
+
+
+def _units(group: Group, tree: Urdf) -> list[str]:
+    units = [_unit(tree, name) for name in group.urdf_joints]
+    if group.gripper is not None:
+        units.insert(group.gripper.index, group.gripper.unit)
+    return units
+
+
+def _unit(tree: Urdf, joint: str) -> str:
+    if not joint:
+        return ""
+    return "m" if tree.joint(joint).kind == "prismatic" else "rad"

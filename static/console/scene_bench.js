@@ -1,0 +1,69 @@
+// What stands around the robot: table, mounts and ground, and on a simulated bench plate and blocks. Metres, z up.
+
+import { css, material, shape, three } from "./scene_shapes.js";
+
+const LEG = 0.045; // m, edge
+const UNDER = 0.04; // m below the table's surface, of a ground that is no floor
+const SIDE = 5; // m, of the ground
+
+function box(size, colour, at) {
+  const THREE = three();
+  const mesh = new THREE.Mesh(shape("box", size), material(colour));
+  mesh.position.set(...at);
+  return mesh;
+}
+
+/** Its surface is z = 0; with `legs`, how far it stands above the floor. */
+export function table({ centre: [x, y], size: [width, depth], thickness, colour, legs }) {
+  const group = new (three().Group)();
+  group.add(box([width, depth, thickness], colour, [x, y, -thickness / 2 - 0.001]));
+  if (!legs) return group;
+  const dark = colour.map((part, index) => (index < 3 ? part * 0.7 : part));
+  const length = legs - thickness;
+  for (const right of [-1, 1]) {
+    for (const far of [-1, 1]) {
+      const at = [x + (right * (width - 2 * LEG)) / 2, y + (far * (depth - 2 * LEG)) / 2, -thickness - length / 2];
+      group.add(box([LEG, LEG, length], dark, at));
+    }
+  }
+  return group;
+}
+
+/** A column with a foot, up to where a base stands on it. */
+export function mount({ at: [x, y], from, to, radius, colour }) {
+  const THREE = three();
+  const group = new THREE.Group();
+  const part = (size, z) => {
+    const mesh = new THREE.Mesh(shape("cylinder", size), material(colour));
+    mesh.position.set(x, y, z);
+    group.add(mesh);
+  };
+  part([radius, to - from], (from + to) / 2);
+  part([1.7 * radius, 0.012], from + 0.006);
+  return group;
+}
+
+/** A grid, on the floor where there is one. */
+export function ground(floor) {
+  const grid = new (three().GridHelper)(SIDE, SIDE * 10, css("--scene-grid"), css("--scene-grid"));
+  grid.rotateX(Math.PI / 2);
+  grid.position.z = floor ?? -UNDER;
+  return grid;
+}
+
+/** A flat plate around its own middle, standing on z = 0. */
+export function plate({ plate_radius: radius, plate_height: height, plate_colour: colour, plate_rim_colour: rim }) {
+  const THREE = three();
+  const group = new THREE.Group();
+  const dish = new THREE.Mesh(shape("cylinder", [radius * 0.86, height]), material(colour));
+  const edge = new THREE.Mesh(shape("cylinder", [radius, height * 0.8]), material(rim));
+  dish.position.z = height / 2 + 0.0005;
+  edge.position.z = (height * 0.8) / 2;
+  group.add(edge, dish);
+  return group;
+}
+
+/** The block number `index`, around its own middle. */
+export function block({ block_edge: edge, block_colours: colours }, index) {
+  return new (three().Mesh)(shape("box", [edge, edge, edge]), material(colours[index % colours.length]));
+}

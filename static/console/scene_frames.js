@@ -1,0 +1,86 @@
+// Frames as small triads, x red, y green, z blue: of the end effectors, and those in which their poses are given.
+
+import { shape, three } from "./scene_shapes.js";
+
+const AXES = [
+  { colour: "#ff5a52", turn: [0, Math.PI / 2, 0] },
+  { colour: "#4fce5d", turn: [-Math.PI / 2, 0, 0] },
+  { colour: "#5b9bff", turn: [0, 0, 0] },
+];
+const LENGTH = { end: 0.075, reference: 0.13 }; // m
+const THICK = 0.0026; // m, radius
+const LABEL = 0.02; // height of a name, where 1 is about the view's
+
+export class Frames {
+  #frames; // [{part, pose}] of the server
+  #offsets;
+  #triads;
+  #moving;
+
+  /** `frames` [{name, kind, part, pose}], part null for one that stands still; `add` puts an object into the scene. */
+  constructor(frames, add) {
+    const THREE = three();
+    this.#frames = frames;
+    this.#offsets = frames.map(({ pose }) => new THREE.Matrix4().fromArray(pose));
+    this.#triads = frames.map((frame, index) => add(`frame/${index}`, triad(frame)));
+    this.#triads.forEach((triad, index) => triad.matrix.copy(this.#offsets[index]));
+    this.show(false);
+  }
+
+  show(shown) {
+    for (const triad of this.#triads) triad.visible = shown;
+  }
+
+  /** The robot is at `parts` now (its groups). */
+  move(parts) {
+    this.#frames.forEach(({ part }, index) => {
+      if (part === null) return;
+      const triad = this.#triads[index];
+      triad.matrix.multiplyMatrices(parts[part].matrix, this.#offsets[index]);
+      triad.matrixWorldNeedsUpdate = true;
+    });
+  }
+}
+
+/** Drawn over the robot: an end effector's frame lies inside of it. */
+function triad({ name, kind }) {
+  const THREE = three();
+  const group = new THREE.Group();
+  group.matrixAutoUpdate = false;
+  const length = LENGTH[kind];
+  for (const { colour, turn } of AXES) {
+    const look = { color: colour, depthTest: false, transparent: true };
+    const axis = new THREE.Mesh(shape("cylinder", [THICK, length]), new THREE.MeshBasicMaterial(look));
+    const arm = new THREE.Group();
+    axis.position.z = length / 2;
+    axis.renderOrder = 3;
+    arm.add(axis);
+    arm.rotation.set(...turn);
+    group.add(arm);
+  }
+  group.add(label(name));
+  return group;
+}
+
+function label(name) {
+  const THREE = three();
+  const canvas = document.createElement("canvas");
+  const ctx = canvas.getContext("2d");
+  const font = "500 40px system-ui, sans-serif";
+  ctx.font = font;
+  canvas.width = Math.ceil(ctx.measureText(name).width) + 24;
+  canvas.height = 56;
+  ctx.font = font;
+  ctx.fillStyle = "rgb(12 18 24 / 72%)";
+  ctx.roundRect(0, 0, canvas.width, canvas.height, 10);
+  ctx.fill();
+  ctx.fillStyle = "#e8eef4";
+  ctx.fillText(name, 12, 41);
+  const look = { map: new THREE.CanvasTexture(canvas), depthTest: false, transparent: true, sizeAttenuation: false };
+  look.map.minFilter = THREE.LinearFilter;
+  const sprite = new THREE.Sprite(new THREE.SpriteMaterial(look));
+  sprite.scale.set((LABEL * canvas.width) / canvas.height, LABEL, 1);
+  sprite.center.set(0.5, 1.6);
+  sprite.renderOrder = 4;
+  return sprite;
+}

@@ -1,0 +1,37 @@
+// The parts of a robot as groups of shapes, put where the server says.
+
+import { exchange } from "./scene_meshes.js";
+import { material, shape, three } from "./scene_shapes.js";
+
+export const SIZE = 16; // numbers of a matrix
+
+/** Put `groups` at matrices that begin at `from` in `numbers`. */
+export function place(groups, numbers, from) {
+  groups.forEach((group, index) => {
+    group.matrix.fromArray(numbers, from + index * SIZE);
+    group.matrixWorldNeedsUpdate = true;
+  });
+}
+
+/**
+ * One group per part, its matrix free to be set; `paint` overrides the colours. Meshes come when they are read, by
+ * `meshes`, and are boxes until then; `changed(object)` hears of each.
+ */
+export function robotParts({ parts, visuals }, { meshes, changed, paint = null }) {
+  const THREE = three();
+  const groups = parts.map(() => {
+    const group = new THREE.Group();
+    group.matrixAutoUpdate = false;
+    return group;
+  });
+  const painted = paint && paint();
+  for (const visual of visuals) {
+    const { kind, size, origin } = visual.box ?? visual;
+    const mesh = new THREE.Mesh(shape(kind, size), painted ?? material(visual.colour));
+    mesh.matrixAutoUpdate = false;
+    mesh.matrix.fromArray(origin);
+    groups[visual.part].add(mesh);
+    if (visual.address) exchange(meshes, visual, mesh, painted, changed);
+  }
+  return groups;
+}

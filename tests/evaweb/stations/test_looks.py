@@ -1,0 +1,68 @@
+"""Robots as pages know them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import robots
+from evaweb.errors import NotFound
+from evaweb.stations.looks import facts_of, groups_of, looks_of
+from runtime.sim.bench import tip_in_world
+
+
+@pytest.mark.parametrize("name", robots.names())
+def test_matrices_go_column_by_column(name):
+    looks = looks_of(name)
+    q = np.asarray(looks.robot.poses["home"])
+    poses = looks.poses(np.stack([q, q]))
+    assert poses.shape == (2, len(looks.scene.parts), 16)
+    assert poses.dtype == np.float32
+    assert np.allclose(poses[0].reshape(-1, 4, 4).swapaxes(-1, -2), looks.scene.poses(q), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", robots.names())
+def test_the_tips_are_where_the_bench_has_them(name):
+    looks = looks_of(name)
+    q = np.stack([looks.robot.poses["home"], (looks.robot.lower + looks.robot.upper) / 2])
+    tips = looks.tips(looks.poses(q))
+    assert tips.shape == (2, len(looks.robot.arms), 3)
+    for row in range(2):
+        for index, arm in enumerate(looks.robot.arms):
+            wanted = tip_in_world(looks.robot, arm, q[row])[:3, 3]
+            assert np.allclose(tips[row, index], wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", robots.names())
+def test_every_number_has_a_name_and_a_unit(name):
+    facts = looks_of(name).facts()
+    assert len(facts["units"]) == len(facts["joint_names"])
+    assert groups_of(facts["joint_names"]) == tuple(facts["groups"])
+
+
+def test_a_robot_is_known_in_the_groups_that_a_station_has():
+    whole, one = looks_of("agilex_piper"), looks_of("agilex_piper", ["right_arm"])
+    assert (whole.robot.dim, one.robot.dim) == (14, 7)
+    assert one.poses(np.zeros(7)).shape == (len(whole.scene.parts) // 2, 16)
+    assert looks_of("agilex_piper", ["right_arm"]) is one
+
+
+@pytest.mark.parametrize("name", ["", "nobody", "..", "../agilex_piper", "/etc"])
+def test_only_robots_that_are_known_are_found(name):
+    with pytest.raises(NotFound, match="agilex_piper"):
+        looks_of(name)
+    assert "does not exist" in facts_of(name)["error"]
+
+
+def test_groups_that_it_has_not_are_said():
+    with pytest.raises(NotFound, match="tail"):
+        looks_of("agilex_piper", ["left_arm", "tail"])
+
+
+def test_a_description_that_cannot_be_read_is_a_sentence(tmp_path, monkeypatch):
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "robot.toml").write_text('title = "x"')
+    monkeypatch.setenv("EVA_ROBOTS", str(tmp_path))
+    found = facts_of("broken")
+    assert (found["joint_names"], found["groups"]) == ([], [])
+    assert "robot.toml" in found["error"]
