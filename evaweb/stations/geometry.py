@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from evaweb.stations.looks import Looks, looks_of, tip_of
 from evaweb.stations.meshes import mesh_in
 from evaweb.stations.surroundings import BENCH, surroundings
+from robots import Group
 from robots.capsules import capsules
 from robots.rotations import transform_of
 from robots.shapes import PLAIN
@@ -69,11 +70,16 @@ def _frames(looks: Looks) -> list[dict[str, Any]]:
     for arm in robot.arms:
         assert arm.frame is not None
         part = looks.scene.link_of(arm.name, arm.frame)
-        found.setdefault(part, _frame(looks.scene.parts[part], "reference", part))
-    if robot.mount_frame != "world":
+        found.setdefault(part, _frame(_link(looks, arm, arm.frame), "reference", part))
+    if robot.mount_frame not in ("world", *(frame["name"] for frame in found.values())):
         found[None] = _frame(robot.mount_frame, "reference", None, transform_of(robot.stand))
-    ends = [_frame(f"{arm.name}/{arm.eef_link}", "end", looks.carrier(arm)) for arm in robot.arms]
+    ends = [_frame(_link(looks, arm, str(arm.eef_link)), "end", looks.carrier(arm)) for arm in robot.arms]
     return [*ends, *found.values()]
+
+
+def _link(looks: Looks, arm: Group, link: str) -> str:
+    """A link's name, behind its arm's where there are several of that name."""
+    return link if len(looks.scene.parts_of(link)) == 1 else f"{arm.name}/{link}"
 
 
 def _capsules(looks: Looks) -> list[dict[str, Any]]:

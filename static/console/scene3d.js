@@ -213,13 +213,13 @@ export class Scene3D {
   /** Look at the whole robot, where it is and where its named poses would take it, and at the bench. */
   #frame() {
     const { Box3, Matrix4, Vector3 } = three();
-    const { view, ahead } = this.#geometry;
+    const { view, ahead, floor } = this.#geometry;
     const box = new Box3();
     this.#viewer.scene.updateMatrixWorld(true);
     for (const part of this.#parts) box.expandByObject(part);
     box.applyMatrix4(new Matrix4().copy(this.#viewer.scene.matrixWorld).invert());
     for (const corner of [view.low, view.high]) box.expandByPoint(new Vector3(...corner));
-    this.#views.frame(box.min.toArray(), box.max.toArray(), ahead);
+    this.#views.frame(box.min.toArray(), box.max.toArray(), ahead, floor !== null);
     this.#framed = true;
     this.view("all");
   }

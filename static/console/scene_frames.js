@@ -9,7 +9,9 @@ const AXES = [
 ];
 const LENGTH = { end: 0.075, reference: 0.13 }; // m
 const THICK = 0.0026; // m, radius
-const LABEL = 0.02; // height of a name, where 1 is about the view's
+const LABEL = 0.023; // height of a name, where 1 is about the view's
+const BELOW = [0.5, 1.6]; // where the frame is in its name's box, from 0 to 1
+const BEHIND = [1.12, 0.9];
 
 export class Frames {
   #frames; // [{part, pose}] of the server
@@ -23,7 +25,10 @@ export class Frames {
     this.#frames = frames;
     this.#offsets = frames.map(({ pose }) => new THREE.Matrix4().fromArray(pose));
     this.#triads = frames.map((frame, index) => add(`frame/${index}`, triad(frame)));
-    this.#triads.forEach((triad, index) => triad.matrix.copy(this.#offsets[index]));
+    this.#triads.forEach((triad, index) => {
+      triad.matrix.copy(this.#offsets[index]);
+      triad.matrixWorldNeedsUpdate = true;
+    });
     this.show(false);
   }
 
@@ -43,7 +48,7 @@ export class Frames {
 }
 
 /** Drawn over the robot: an end effector's frame lies inside of it. */
-function triad({ name, kind }) {
+function triad({ name, kind, part }) {
   const THREE = three();
   const group = new THREE.Group();
   group.matrixAutoUpdate = false;
@@ -58,29 +63,28 @@ function triad({ name, kind }) {
     arm.rotation.set(...turn);
     group.add(arm);
   }
-  group.add(label(name));
+  group.add(label(name, part === null ? BEHIND : BELOW));
   return group;
 }
 
-function label(name) {
+function label(name, beside) {
   const THREE = three();
   const canvas = document.createElement("canvas");
   const ctx = canvas.getContext("2d");
-  const font = "500 40px system-ui, sans-serif";
+  const font = "500 22px system-ui, sans-serif";
   ctx.font = font;
-  canvas.width = Math.ceil(ctx.measureText(name).width) + 24;
-  canvas.height = 56;
+  canvas.width = Math.ceil(ctx.measureText(name).width) + 14;
+  canvas.height = 32;
   ctx.font = font;
   ctx.fillStyle = "rgb(12 18 24 / 72%)";
-  ctx.roundRect(0, 0, canvas.width, canvas.height, 10);
+  ctx.roundRect(0, 0, canvas.width, canvas.height, 6);
   ctx.fill();
   ctx.fillStyle = "#e8eef4";
-  ctx.fillText(name, 12, 41);
+  ctx.fillText(name, 7, 23);
   const look = { map: new THREE.CanvasTexture(canvas), depthTest: false, transparent: true, sizeAttenuation: false };
-  look.map.minFilter = THREE.LinearFilter;
   const sprite = new THREE.Sprite(new THREE.SpriteMaterial(look));
   sprite.scale.set((LABEL * canvas.width) / canvas.height, LABEL, 1);
-  sprite.center.set(0.5, 1.6);
+  sprite.center.set(...beside);
   sprite.renderOrder = 4;
   return sprite;
 }

@@ -53,6 +53,7 @@ export class Views {
   #viewer;
   #corners = [];
   #ahead = [0, 1];
+  #standing = false;
   #following = -1;
   #shown = ""; // "" where a person has taken the camera
 
@@ -68,8 +69,12 @@ export class Views {
     return this.#following;
   }
 
-  /** What has to be in view, its least and greatest corner, and the side that the robot works towards. */
-  frame(low, high, ahead) {
+  /**
+   * What has to be in view, its least and greatest corner; the side that the robot works towards; whether it stands
+   * on the floor, behind its table.
+   */
+  frame(low, high, ahead, standing) {
+    this.#standing = standing;
     this.#corners = [0, 1, 2, 3, 4, 5, 6, 7].map((bits) => low.map((value, axis) => ((bits >> axis) & 1 ? high[axis] : value)));
     this.#ahead = ahead;
   }
@@ -93,7 +98,8 @@ export class Views {
     }
     this.#following = -1;
     const [x, y] = this.#ahead;
-    const direction = { all: [0.75 * x + 0.62 * y, 0.75 * y - 0.62 * x, 0.62], front: [x, y, 0.12], top: [-0.002 * x, -0.002 * y, 1] }[name];
+    const aside = this.#standing ? 1.3 : 0.62; // past the table
+    const direction = { all: [0.75 * x + aside * y, 0.75 * y - aside * x, 0.62], front: [x, y, 0.12], top: [-0.002 * x, -0.002 * y, 1] }[name];
     this.#look(direction);
   }
 
