@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -34,7 +35,5 @@ def turned(inwards: float, opening: float = 0.1) -> Float64:
 
 def way(*postures: Float64, count: int = 200) -> Float64:
     """Straight lines [T, D] from posture to posture."""
-    legs = [
-        a + np.linspace(0, 1, count)[:, None] * (b - a) for a, b in zip(postures, postures[1:], strict=False)
-    ]
+    legs = [a + np.linspace(0, 1, count)[:, None] * (b - a) for a, b in pairwise(postures)]
     return np.concatenate(legs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -69,7 +70,7 @@ def test_what_was_accepted_is_not_refused_by_control_half_way() -> None:
             continue
         accepted += 1
         steps = start + np.linspace(0, 1, 37)[:, None] * (goal - start)
-        for before, after in zip(steps, steps[1:], strict=False):
+        for before, after in pairwise(steps):
             assert collisions(margin).approached(after, before) is None
     assert accepted > 5
 
