@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from runtime.errors import RuntimeFault
+from runtime.sim.eyes import Eye, wrist_eye
 from runtime.sim.limbs import limbs
 from runtime.types import Float64
 
@@ -23,7 +24,6 @@ Colour = tuple[int, int, int]
 
 _OVERHEAD_EYE, _OVERHEAD_AIM = (0.0, 0.36, 0.85), (0.0, 0.27, 0.0)
 _OVERHEAD_FOCAL = 1.0  # per picture width
-_WRIST_EYE, _WRIST_AIM = (-0.095, 0.0, -0.125), (-0.005, 0.0, 0.03)  # in the tip's frame
 _WRIST_FOCAL = 0.75
 
 
@@ -158,7 +158,7 @@ def cameras(robot: Robot, q: Float64, width: int, height: int) -> dict[str, Pinh
     return {
         key: overhead_camera(width, height)
         if arm is None
-        else wrist_camera(tip_in_world(robot, arm, q), width, height)
+        else wrist_camera(tip_in_world(robot, arm, q), width, height, wrist_eye(robot, arm.name))
         for key, arm in carriers.items()
     }
 
@@ -169,9 +169,10 @@ def overhead_camera(width: int, height: int) -> PinholeCamera:
     return _camera(pose, _OVERHEAD_FOCAL, width, height)
 
 
-def wrist_camera(tip: Float64, width: int, height: int) -> PinholeCamera:
-    """The camera behind the fingers of an arm whose fingertips are at `tip` [4, 4]."""
-    return _camera(tip @ _looking(_WRIST_EYE, _WRIST_AIM, up=(-1.0, 0.0, 0.0)), _WRIST_FOCAL, width, height)
+def wrist_camera(tip: Float64, width: int, height: int, eye: Eye | None = None) -> PinholeCamera:
+    """The camera beside the fingers of an arm whose fingertips are at `tip` [4, 4]."""
+    eye = eye or Eye()
+    return _camera(tip @ _looking(eye.place, eye.aim, eye.up), _WRIST_FOCAL, width, height)
 
 
 def _camera(pose: Float64, focal: float, width: int, height: int) -> PinholeCamera:

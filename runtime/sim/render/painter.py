@@ -43,7 +43,7 @@ class Painter:
         solids, placed = self._solids, self._placed
         eye = camera.pose[:3, 3].astype(np.float32)
         inside = (placed.vertices - eye) @ camera.pose[:3, :3].astype(np.float32)
-        chosen = np.flatnonzero(_in_view(camera, inside, solids))
+        chosen = np.flatnonzero(_in_view(camera, inside, solids) & placed.seen)
         near = np.minimum.reduceat(inside[:, 2], solids.starts) < _NEAR
         pixels = _pixels(camera, inside)
         low = np.minimum.reduceat(pixels, solids.starts)

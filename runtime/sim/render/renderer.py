@@ -47,7 +47,8 @@ class Renderer:
         """A BGR uint8 [H, W, 3] per camera key for joints [D]; fresh memory each time."""
         solids = self._solids_of(len(state.blocks))
         frames = np.array([*self._scene.poses(q), *(block.pose for block in state.blocks)])
-        placed = solids.placed(frames)
+        whole = solids.placed(frames)
+        placed = solids.above_table(whole)
         light = self._shadows.cast(solids, placed, state.plate)
         painter = Painter(solids, placed)
         pictures = {}
@@ -56,7 +57,8 @@ class Renderer:
             picture = self._table.draw(camera) if still is None else still.copy()
             self._plate.draw(picture, camera, state.plate)
             darken(picture, camera, light)
-            painter.paint(picture, camera)
+            under = camera.pose[2, 3] < 0  # where no arm should be, but a simulated one can
+            (Painter(solids, whole) if under else painter).paint(picture, camera)
             pictures[key] = picture
         return pictures
 

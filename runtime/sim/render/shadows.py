@@ -38,7 +38,7 @@ class Shadows:
         corners = ((points - (X[0], Y[0])) / _TEXEL * 16).astype(np.int32)
         middle = placed.centres[:, 2]
         soft, sharp = np.full((2, *self._shape), 255, np.uint8)
-        for solid in np.argsort(-middle).tolist():
+        for solid in filter(placed.seen.__getitem__, np.argsort(-middle).tolist()):
             hull = cv2.convexHull(corners[solids.starts[solid] : solids.stops[solid]])
             high = middle[solid] > _SOFT_FROM
             light = 150 + 60 * min(1.0, float(middle[solid]) / 0.4) if high else 118

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,20 +90,30 @@ class Solids:
         vertices = (turns[self._vertex_frames] @ self._vertices)[..., 0] + shifts[self._vertex_frames]
         normals = (turns[self._face_frames] @ self._normals)[..., 0]
         boxes = near[self.frames] @ self._origins
-        return Placed(vertices, normals, boxes[:, :3, 3], boxes[:, :3, :3].transpose(0, 2, 1))
+        seen = np.ones(len(self.solids), bool)
+        return Placed(vertices, normals, boxes[:, :3, 3], boxes[:, :3, :3].transpose(0, 2, 1), seen)
+
+    def above_table(self, placed: Placed) -> Placed:
+        """What of them stands out of the table, z = 0: the rest is cut off, and solids wholly under it are not seen."""
+        above = np.maximum.reduceat(placed.vertices[:, 2], self.starts) > 0
+        cut = placed.vertices.copy()
+        np.maximum(cut[:, 2], 0, out=cut[:, 2])
+        return replace(placed, vertices=cut, seen=above)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
     """Solids in the world: vertices [V, 3], outward normals [F, 3], and the boxes around them.
 
-    A box has its centre [S, 3] and its three unit axes as the rows of [S, 3, 3].
+    A box has its centre [S, 3] and its three unit axes as the rows of [S, 3, 3]. `seen` [S] are the solids that
+    are to be drawn.
     """
 
     vertices: Float32
     normals: Float32
     centres: Float32
     axes: Float32
+    seen: NDArray[np.bool_]
 
 
 def _pairs(

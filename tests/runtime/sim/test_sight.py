@@ -108,7 +108,7 @@ def test_a_solid_disc_of_the_rims_colour_is_no_plate():
         np.array([LAYOUT.plate[0] + BENCH.plate_radius, LAYOUT.plate[1], BENCH.plate_height])
     )
     colour = tuple(int(part) for part in BENCH.plate_rim_colour)
-    cv2.circle(picture, (round(u), round(v)), round(edge - u), colour, 12)
+    cv2.circle(picture, (round(u), round(v)), round(edge - u - 4), colour, 8)
     assert EYE.look(letterboxed(picture)).plate == pytest.approx(LAYOUT.plate, abs=0.01)
-    cv2.circle(picture, (round(u), round(v)), round(edge - u), colour, cv2.FILLED)
+    cv2.circle(picture, (round(u), round(v)), round(edge - u - 4), colour, cv2.FILLED)
     assert EYE.look(letterboxed(picture)).plate is None
