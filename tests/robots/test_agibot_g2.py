@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from robots import Body, load, shapes
+from robots.clearance import MARGIN, Clearance
 from robots.rotations import matrix_of_quaternion, rotation_vector, transform_of
 
 ROBOT = load("agibot_g2")
@@ -147,6 +148,14 @@ def test_it_stands_on_the_floor_with_its_arms_above_the_table() -> None:
     above = [z for link, z in lowest.items() if link.startswith(("arm_", "gripper_"))]
     assert len(above) == 2 * (7 + 10)
     assert min(above) > 0.1
+
+
+def test_nothing_touches_on_the_straight_way_from_home_to_ready() -> None:
+    home, ready = (ROBOT.poses[name] for name in ("home", "ready"))
+    way = home + np.linspace(0, 1, 21)[:, None] * (ready - home)
+    clearance = Clearance(ROBOT)
+    assert ("left_arm/arm_l_link7", "table") in clearance.pairs
+    assert clearance.distances(way).min() > MARGIN
 
 
 def test_ready_holds_the_fingers_down_and_open_beside_the_workspace() -> None:

@@ -40,8 +40,8 @@ Edit = Callable[..., Path]
             "urdf = 'agilex_piper.xacro': String should",
         ),
         (
-            "[cameras]",
-            "measures = ['force']\n[cameras]",
+            'measures = ["velocity", "effort", "eef"]',
+            "measures = ['force']",
             "measures.0 = 'force': Input should be 'velocity', 'effort'",
         ),
         (
@@ -50,16 +50,16 @@ Edit = Callable[..., Path]
             "mount_frame = 'the floor': String should match",
         ),
         ("[cameras]", "[stand]\nxyz = [0.0, 0.0, 0.0]\n[cameras]", "stand.wxyz: required and absent"),
-        ("[cameras]", "[ros]\nversion = 3\n[cameras]", "ros.version = 3: Input should be 1 or 2"),
-        ("[cameras]", '[ros]\nversion = 1\n[ros.cameras]\nfront = ""\n[cameras]', "ros.cameras.front = ''"),
+        ("version = 1", "version = 3", "ros.version = 3: Input should be 1 or 2"),
+        ('front = "/camera_f/color/image_raw"', 'front = ""', "ros.cameras.front = ''"),
         (
-            "[cameras]",
-            '[ros]\nversion = 1\n[ros.groups.left_arm]\nstate = "/a b"\n[cameras]',
+            'state = "/puppet/joint_left"',
+            'state = "/a b"',
             "ros.groups.left_arm.state = '/a b': String should match",
         ),
         (
-            "[cameras]",
-            '[ros]\nversion = 1\n[ros.groups.left_arm]\ntopic = "/a"\n[cameras]',
+            'state = "/puppet/joint_left"',
+            'topic = "/a"',
             "ros.groups.left_arm: unknown key topic; allowed: state, command, eef,",
         ),
         ('name = "left_arm"', 'name = "left arm"', "groups.0.name = 'left arm': String should match"),

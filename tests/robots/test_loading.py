@@ -136,13 +136,13 @@ def test_a_robot_travels_between_processes() -> None:
             "stand.wxyz has",
         ),
         (
-            "[cameras]",
-            '[ros]\nversion = 2\n[ros.groups.head]\nstate = "/head"\n[cameras]',
+            "[ros.groups.left_arm]",
+            "[ros.groups.head]",
             "ros.groups names head; allowed: left_arm, right_arm",
         ),
         (
-            "[cameras]",
-            '[ros]\nversion = 2\n[ros.cameras]\nhead = "/head"\n[cameras]',
+            'front = "/camera_f/color/image_raw"',
+            'head = "/camera_f/color/image_raw"',
             "ros.cameras names head; allowed: front, left_wrist, right_wrist",
         ),
         (
