@@ -18,6 +18,27 @@ def test_list_names_the_robots(capsys: pytest.CaptureFixture[str]) -> None:
     assert "agilex_piper  Two AgileX Piper arms" in capsys.readouterr().out
 
 
+def test_list_goes_on_behind_a_robot_that_cannot_be_loaded_and_fails(
+    edited: Edit, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = edited(("control_rate", "rate"))
+    monkeypatch.setenv("EVA_ROBOTS", str(folder.parent))
+    assert main(["list"]) == 1
+    shown = capsys.readouterr()
+    assert "ur5e  UR5e" in shown.out
+    assert "copy  cannot be loaded: " in shown.err
+    assert "unknown key rate" in shown.err
+
+
+def test_list_says_where_a_robot_of_ones_own_lies(
+    edited: Edit, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = edited()
+    monkeypatch.setenv("EVA_ROBOTS", str(folder.parent))
+    assert main(["list"]) == 0
+    assert f"copy  Two AgileX Piper arms with parallel grippers  ({folder})" in capsys.readouterr().out
+
+
 def test_check_shows_limits_their_source_and_a_home_that_stands_on_one(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -42,7 +63,9 @@ def test_check_names_the_links_that_touch_at_a_named_pose_and_fails(
     folder = edited(('["link2", "link4"], ', ""))
     assert main(["check", str(folder)]) == 1
     said = capsys.readouterr().err
-    assert f"{folder}: poses.home: left_arm/link2 and left_arm/link4 are -18 mm apart" in said
+    assert (
+        f"error: {folder}/robot.toml: poses.home: left_arm/link2 and left_arm/link4 are -18 mm apart" in said
+    )
 
 
 def test_fk_answers_json(capsys: pytest.CaptureFixture[str]) -> None:
@@ -55,6 +78,12 @@ def test_fk_answers_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert answer["position"] == pose[:3].tolist()
     assert answer["wxyz"] == pose[3:].tolist()
     assert (answer["frame"], answer["link"], answer["within_limits"]) == ("base_link", "gripper_base", True)
+
+
+def test_fk_knows_an_optional_arm(edited: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = edited(('name = "left_arm"', 'name = "left_arm"\noptional = true'))
+    assert main(["fk", str(folder), "left_arm", "0", "0", "0", "0", "0", "0"]) == 0
+    assert json.loads(capsys.readouterr().out)["position"] == pytest.approx([0.05614, 0.0, 0.21319], abs=1e-4)
 
 
 def test_fk_says_when_joints_lie_outside_their_limits(capsys: pytest.CaptureFixture[str]) -> None:
