@@ -13,7 +13,7 @@ from evaweb.console.parts import Part
 from evaweb.stations.looks import Looks
 
 GHOSTS = 12  # whole robots at most; the page moves the ghost on between them
-_WORDS = ("chunk", "run", "state", "observation_step", "step", "overlap")
+_WORDS = ("chunk", "run", "state", "observation_step", "step", "overlap", "ik")
 
 
 def chunk_part(content: Mapping[str, Any], looks: Looks | None, now: float) -> Part:

@@ -6,6 +6,7 @@ import { ManualPanel } from "./manual_panel.js";
 import { ModePanel } from "./mode_panel.js";
 import { panels } from "./panels.js";
 import { robotPanel } from "./robot_panel.js";
+import { groups } from "./targets.js";
 import { TuningPanel } from "./tuning_panel.js";
 
 /** Returns {aimed(answer)}, which hears what the station says of targets. */
@@ -15,7 +16,7 @@ export function byHand(store, socket, commands) {
   new ModePanel(store, commands, (mode) => shown.open(mode === "manual" ? "manual" : "policy"));
   new TuningPanel(store, commands);
   new ManualPanel(store, commands, aim);
-  robotPanel(store, commands, gripperUnit);
+  robotPanel(store, commands, aboutGripper);
   commands.provide("setup", bench);
   document.getElementById("hand").addEventListener("keydown", ({ key, target }) => {
     if (key === "Enter" && target.matches("input")) target.blur(); // what was typed counts, and the keys are free again
@@ -23,9 +24,10 @@ export function byHand(store, socket, commands) {
   return { aimed: (answer) => aim.answered(answer) };
 }
 
-/** The unit of a group's gripper; joints and units stand in the same order. */
-function gripperUnit({ joint_names: names = [], gripper_dims: grippers = [] } = {}, group) {
-  return config.units[grippers.find((index) => names[index]?.startsWith(`${group}.`))] ?? "";
+/** Unit and range of a group's gripper. */
+function aboutGripper(facts = {}, group) {
+  const own = groups({ units: config.units, ...facts }).find(({ name }) => name === group);
+  return own?.joints.find(({ gripper }) => gripper);
 }
 
 /** How a simulated bench is to be laid out at set-up; nothing where it is to stay as it lies. */

@@ -73,7 +73,10 @@ export class Cameras {
       const camera = new Camera(figure);
       this.#cameras.set(camera.name, camera);
     }
-    store.on("snapshot", ({ link }) => this.#measured(link));
+    store.on("snapshot", ({ link, facts }) => {
+      if (facts?.cameras) this.#keep(facts.cameras);
+      this.#measured(link);
+    });
     store.on("second", () => store.fresh || this.#measured({ rates: {}, ages: {} }));
     setInterval(() => this.#tell(), 100);
   }
@@ -98,6 +101,13 @@ export class Cameras {
     }
     const draws = await Promise.all(ready);
     return () => draws.forEach((draw) => draw());
+  }
+
+  /** Those that the station does not have are away. */
+  #keep(names) {
+    for (const camera of this.#cameras.values()) camera.figure.hidden = !names.includes(camera.name);
+    const shown = [...this.#cameras.values()].filter(({ figure }) => !figure.hidden).length;
+    document.querySelector(".station").style.setProperty("--cameras", Math.max(1, shown));
   }
 
   #measured({ rates, ages }) {

@@ -3,6 +3,7 @@
 import { config } from "./config.js";
 import { Legend } from "./curve_legend.js";
 import { Curves } from "./curves.js";
+import { jointOptions } from "./joint_options.js";
 import { GHOSTS } from "./scene_ghosts.js";
 import { MarkLegend } from "./mark_legend.js";
 import { Tags } from "./tags.js";
@@ -24,7 +25,7 @@ export async function curvePane(store) {
   const legend = new Legend(document.getElementById("curves-legend"), (name, shown) => curves.reveal(name, shown));
   const markLegend = new MarkLegend(document.getElementById("curves-marks"));
   const curves = new Curves({ element: document.getElementById("curves"), library, legend, markLegend, names: config.joints });
-  const select = joints(curves, config.joints);
+  const select = joints(curves, config.joints, config.units);
   document.getElementById("joint-next").addEventListener("click", () => {
     select.selectedIndex = (select.selectedIndex + 1) % Math.max(1, select.options.length);
     select.dispatchEvent(new Event("change"));
@@ -37,21 +38,21 @@ export async function curvePane(store) {
   });
   return {
     add: (samples) => curves.add(samples),
-    joints: (names) => {
+    joints: (names, units) => {
       curves.joints(names);
-      if (names.join() !== [...select.options].map((option) => option.text).join()) joints(curves, names);
+      if (names.join() !== [...select.options].map((option) => option.text).join()) joints(curves, names, units);
     },
   };
 }
 
-function joints(curves, names) {
+function joints(curves, names, units) {
   const select = document.getElementById("joint");
-  select.replaceChildren(...names.map((name, index) => new Option(name, String(index))));
+  select.replaceChildren(...jointOptions(names));
   const wanted = names.indexOf(localStorage.getItem(KEY));
   select.selectedIndex = names.length ? Math.max(0, wanted) : -1;
   const show = () => {
     curves.show(select.selectedIndex);
-    document.getElementById("curves-unit").textContent = config.units[select.selectedIndex] ?? "";
+    document.getElementById("curves-unit").textContent = units[select.selectedIndex] ?? "";
   };
   select.onchange = () => {
     localStorage.setItem(KEY, names[select.selectedIndex]);

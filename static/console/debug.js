@@ -1,6 +1,7 @@
 // The Debug page: figures of the station as the runtime measures them.
 
 import { Distribution } from "./distribution.js";
+import { reachWords } from "./reach.js";
 import { age, figure } from "./words.js";
 
 const TELL_MS = 500; // figures that flicker cannot be read
@@ -14,6 +15,8 @@ const TEXTS = [
   ["Connection", ({ policy: p }) => (p.lost ? `lost; next try ${soon(p.retry_in_s)}` : ""), "warn"],
   ["Predicted", ({ policy: p, strategy }) => (strategy === "rtc" ? predicted(p.rtc ?? {}) : "")],
   ["RTC", ({ policy: p, strategy }) => (strategy === "rtc" ? p.rtc?.warning : ""), "warn"],
+  ["Poses", ({ policy: p }) => (p.ik?.over ? "" : reachWords(p.ik))],
+  ["Out of reach", ({ policy: p }) => (p.ik?.over ? reachWords(p.ik) : ""), "warn"],
   ["Joints", ({ link: l }) => `${age(l.ages.joints ?? Infinity)} old`],
   ["Faults seen", ({ link: l }) => Object.entries(l.faults).filter(([, count]) => count).map(([name, count]) => `${name} ${count}`).join(", ") || "none"],
   ["Task", (snapshot) => snapshot.task || "–"],

@@ -15,7 +15,7 @@ function groupButton(name, index, chosen, next) {
   text.textContent = name.replaceAll("_", " ");
   button.append(text);
   if (index !== next || next === chosen) return button;
-  Object.assign(button.dataset, { key: "shift+a", keyText: "Next arm" });
+  Object.assign(button.dataset, { key: "shift+a", keyText: "Next group of joints" });
   const cap = document.createElement("kbd");
   cap.textContent = "⇧A";
   button.append(" ", cap);

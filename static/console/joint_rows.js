@@ -1,7 +1,7 @@
 // A slider and a number for each joint of a group, within its limits.
 
-import { config } from "./config.js";
-import { stepOf, within } from "./targets.js";
+import { within } from "./targets.js";
+import { digitsOf, shortUnit, stepOf } from "./units.js";
 
 export class JointRows {
   #list = document.getElementById("joints");
@@ -24,7 +24,7 @@ export class JointRows {
     for (const { joint, slider, number } of this.#rows) {
       const value = target[joint.index];
       if (document.activeElement !== slider || slider.valueAsNumber !== value) slider.value = value;
-      if (document.activeElement !== number) number.value = value.toFixed(3);
+      if (document.activeElement !== number) number.value = value.toFixed(digitsOf(joint));
     }
   }
 
@@ -51,11 +51,11 @@ export class JointRows {
     Object.assign(number, { step, min: joint.lower, max: joint.upper });
     label.htmlFor = slider.id;
     label.textContent = joint.gripper ? "gripper" : joint.name;
-    const unit = config.units[joint.index] ?? "";
-    row.title = `${joint.full}: ${joint.lower} to ${joint.upper} ${unit}`;
-    row.querySelector(".joint-unit").textContent = unit;
+    const { unit } = joint;
+    row.title = `${joint.full}: ${joint.lower} to ${joint.upper} ${unit}`.trim();
+    row.querySelector(".joint-unit").textContent = shortUnit(unit);
     slider.setAttribute("aria-label", joint.full);
-    number.setAttribute("aria-label", `${joint.full} in ${unit}, as a number`);
+    number.setAttribute("aria-label", unit ? `${joint.full} in ${unit}, as a number` : `${joint.full} as a number`);
     slider.addEventListener("input", () => this.#set(joint, slider.valueAsNumber, number));
     slider.addEventListener("keydown", (event) => this.#arrow(event, joint, slider, number));
     number.addEventListener("input", () => this.#type(joint, number.valueAsNumber, slider));
@@ -66,7 +66,7 @@ export class JointRows {
   #set(joint, given, number, slider = null) {
     if (!Number.isFinite(given)) return;
     const { value, said } = within(joint, given);
-    number.value = value.toFixed(3);
+    number.value = value.toFixed(digitsOf(joint));
     if (slider) slider.value = value;
     this.#typed(joint.index, value, said);
   }

@@ -1,5 +1,6 @@
 // Moving by hand: a target made with sliders, numbers, named poses and steps of the hand, shown as a ghost, and sent.
 
+import { config } from "./config.js";
 import { groupButtons } from "./group_buttons.js";
 import { JointRows } from "./joint_rows.js";
 import { arrived, groups, handAt, jog, start, verdict } from "./targets.js";
@@ -8,6 +9,7 @@ export class ManualPanel {
   #store;
   #commands;
   #aim;
+  #names = ""; // of the joints that there are fields for
   #groups = [];
   #group = 0;
   #target = null; // [D] where the robot would be sent
@@ -71,7 +73,7 @@ export class ManualPanel {
   }
 
   #follow({ facts, state, mode, run }) {
-    if (facts?.joint_names && !this.#groups.length) this.#build(facts);
+    if (facts?.joint_names && facts.joint_names.join() !== this.#names) this.#build(facts);
     const elsewhere = state === "setting_up" || state === "faulted" || (run?.number && mode !== "manual");
     if (elsewhere && this.#edited) this.reset(); // what was meant for another moment is not sent by accident
     const send = document.querySelector('[data-command="move"]');
@@ -79,7 +81,10 @@ export class ManualPanel {
   }
 
   #build(facts) {
-    this.#groups = groups(facts);
+    this.#names = facts.joint_names.join();
+    this.#groups = groups({ units: config.units, ...facts });
+    this.#target = null;
+    this.#edited = false;
     const poses = (facts.poses ?? []).map((name) => new Option(name));
     const none = new Option(poses.length ? "pose" : "no pose", "");
     none.disabled = true;
@@ -93,7 +98,9 @@ export class ManualPanel {
 
   #choose(group) {
     this.#group = group;
-    document.getElementById("groups").replaceChildren(...groupButtons(this.#groups, group));
+    const buttons = groupButtons(this.#groups, group);
+    document.getElementById("groups").replaceChildren(...buttons);
+    document.querySelector(".target-head").toggleAttribute("data-many", buttons.length > 2);
     this.#rows.build(this.#groups[group].joints);
     const hand = this.#arm !== undefined;
     document.querySelector('[data-target="no-hand"]').hidden = hand;
@@ -110,12 +117,16 @@ export class ManualPanel {
 
   #fromRobot() {
     const { joints } = this.#store;
-    if (!joints || !this.#groups.length) return;
+    if (!joints || !this.#groups.length || joints.measured.length !== this.#dim) return;
     this.#rows.now(joints.measured);
     const now = start(joints);
     if (!this.#edited) this.#target = now;
     else for (const index of this.#grippers) if (!this.#held.has(index)) this.#target[index] = now[index];
     this.#show();
+  }
+
+  get #dim() {
+    return this.#store.snapshot.facts.joint_names.length;
   }
 
   get #grippers() {

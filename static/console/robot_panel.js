@@ -1,13 +1,15 @@
 // Grippers with their state, and what the drives say of themselves.
 
+import { digitsOf, unitWords } from "./units.js";
+
 const KEYS = [
   { open: ",", close: ".", lock: "-" },
   { open: "shift+o", close: "shift+c", lock: "shift+l" },
 ];
 
-/** Where a gripper is, in words. */
-export function gripperWords({ locked, at }, unit = "") {
-  const place = Number.isFinite(at) ? `at ${at.toFixed(3)} ${unit}`.trim() : "";
+/** Where a gripper is, in words; `about` has its unit and its range. */
+export function gripperWords({ locked, at }, about = {}) {
+  const place = Number.isFinite(at) ? `at ${at.toFixed(digitsOf(about))} ${unitWords(about.unit)}`.trim() : "";
   return locked ? `locked ${place}`.trim() : place || "not known";
 }
 
@@ -18,14 +20,14 @@ export function driveWords(drives) {
   return drives.enabled ? { text: "enabled, no fault", weight: "good" } : { text: "disabled: the robot does not follow", weight: "warn" };
 }
 
-/** Keeps the panel true; `unit(facts, name)` is that of the gripper of the group `name`. */
-export function robotPanel(store, commands, unit) {
+/** Keeps the panel true; `about(facts, name)` is what is known of the gripper of the group `name`. */
+export function robotPanel(store, commands, about) {
   const list = document.getElementById("grippers");
   const rows = new Map();
   store.on("snapshot", ({ grippers = {}, drives, facts }) => {
     const names = Object.keys(grippers);
     if (names.join() !== [...rows.keys()].join()) build(list, rows, names, commands);
-    for (const [name, row] of rows) draw(row, grippers[name], unit(facts, name));
+    for (const [name, row] of rows) draw(row, grippers[name], about(facts, name));
     drawDrives(driveWords(drives));
   });
 }
@@ -55,9 +57,9 @@ function named(button, arm, keys) {
   button.append(" ", cap);
 }
 
-function draw(row, gripper, unit) {
+function draw(row, gripper, about) {
   const state = row.querySelector(".gripper-state");
-  const said = gripperWords(gripper, unit);
+  const said = gripperWords(gripper, about);
   if (state.textContent !== said) state.textContent = said;
   state.dataset.locked = String(Boolean(gripper.locked));
   const lock = row.querySelector('[data-grip="lock"]');

@@ -1,5 +1,7 @@
 // The chunk that the scene shows: drawn when it changes, a film while it is proposed, gone when nothing is heard of it.
 
+import { reachWords } from "./reach.js";
+
 const HEARD_MS = 2500; // the station speaks of a chunk each second while there is one
 
 export class ShownChunk {
@@ -36,6 +38,12 @@ export class ShownChunk {
     if (this.#chunk?.state !== "proposed") return "";
     const rows = this.#chunk.targets?.length ?? 0;
     return `chunk ${this.#chunk.chunk}, proposed: ${rows} steps, ${(rows / this.#rate()).toFixed(1)} s`;
+  }
+
+  /** What of it could not be reached, in words; "" where all of it was. */
+  get reach() {
+    const { chunk, ik } = this.#chunk ?? {};
+    return ik?.over ? `chunk ${chunk}: ${reachWords(ik)}` : "";
   }
 
   #set(chunk) {

@@ -29,7 +29,6 @@ function listen(store, { events, estop, commands, lease, trial, hand }) {
       store.closed = null;
       store.facts = facts;
       store.role = role ?? store.role;
-      if (facts.joint_names?.length) panes.curves.joints(facts.joint_names);
       store.tell("hello");
     },
     link: (link) => {
@@ -85,6 +84,8 @@ async function start() {
   document.body.addEventListener("htmx:afterSettle", () => steps(store));
   steps(store);
   setInterval(() => store.tell("second"), 500);
+  const joints = ({ joint_names: names, units }) => names?.length && panes.curves.joints(names, units ?? config.units);
+  store.on("snapshot", ({ facts }) => facts && joints(facts));
   store.on("snapshot", (snapshot) => snapshot.truth && panes.scene.bench(snapshot.truth));
   scenePane(store).then((pane) => Object.assign(panes, { scene: pane }));
   curvePane(store).then((pane) => Object.assign(panes, { curves: pane }));

@@ -1,30 +1,27 @@
 // Where a person wants the robot to go: joints by group, within their limits, and what the station said of it.
 
+import { digitsOf } from "./units.js";
+
 const ENDLESS = 2 * Math.PI; // a joint without a limit is offered one turn each way
 
-/** Joints of `facts` in groups, in order: [{name, joints: [{index, name, lower, upper, gripper}]}]. */
-export function groups({ joint_names: names = [], lower = [], upper = [], gripper_dims: grippers = [] }) {
+/** Joints of `facts` in groups, in order: [{name, joints: [{index, name, full, lower, upper, unit, gripper}]}]. */
+export function groups({ joint_names: names = [], lower = [], upper = [], units = [], gripper_dims: grippers = [] }) {
   const found = new Map();
   names.forEach((full, index) => {
     const dot = full.indexOf(".");
     const group = dot < 0 ? "joints" : full.slice(0, dot);
     if (!found.has(group)) found.set(group, []);
-    const joint = { index, name: full.slice(dot + 1), full, gripper: grippers.includes(index) };
+    const joint = { index, name: full.slice(dot + 1), full, unit: units[index] ?? "", gripper: grippers.includes(index) };
     found.get(group).push({ ...joint, lower: lower[index] ?? -ENDLESS, upper: upper[index] ?? ENDLESS });
   });
   return [...found].map(([name, joints]) => ({ name, joints }));
 }
 
-/** The step of a joint's field: a five-hundredth of its range, as a round decimal. */
-export function stepOf({ lower, upper }) {
-  return 10 ** Math.round(Math.log10((upper - lower) / 500));
-}
-
 /** A value within the joint's limits: {value, said}, where `said` tells what was clipped. */
-export function within({ lower, upper, full }, value) {
+export function within({ lower, upper, full, unit }, value) {
   const clipped = Math.min(upper, Math.max(lower, value));
   if (clipped === value) return { value, said: "" };
-  return { value: clipped, said: `${full} ends at ${clipped.toFixed(3)}` };
+  return { value: clipped, said: `${full} ends at ${clipped.toFixed(digitsOf({ lower, upper, unit }))}` };
 }
 
 /** Where the robot is, or is told to be: the target to begin with; null where nothing is known. */

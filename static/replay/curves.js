@@ -1,6 +1,7 @@
 // The pane of the curves: which joint, what its values are at the clock, and the plot.
 
 import { Legend } from "../console/curve_legend.js";
+import { jointOptions } from "../console/joint_options.js";
 import { last } from "../site/ascending.js";
 import { Chunks } from "./chunks.js";
 import { joint, message } from "./data.js";
@@ -68,7 +69,7 @@ class Pane {
   #select() {
     const select = document.getElementById("joint");
     const names = this.#episode.header.joints;
-    select.replaceChildren(...names.map((name, index) => new Option(name, String(index))));
+    select.replaceChildren(...jointOptions(names));
     const wanted = names.indexOf(localStorage.getItem(KEY));
     select.selectedIndex = Math.max(0, wanted);
     select.addEventListener("change", () => {

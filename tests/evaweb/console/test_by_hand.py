@@ -233,6 +233,7 @@ FACTS = {
     "joint_names": ["left_arm.joint0", "left_arm.joint6", "right_arm.joint0", "lift"],
     "lower": [-2.6, 0.0, -2.6, None],
     "upper": [2.6, 0.1, 2.6, None],
+    "units": ["rad", "m", "rad", ""],
     "gripper_dims": [1],
 }
 
@@ -245,6 +246,7 @@ def test_joints_come_in_the_robots_groups_with_their_limits() -> None:
         "index": 1,
         "name": "joint6",
         "full": "left_arm.joint6",
+        "unit": "m",
         "gripper": True,
         "lower": 0.0,
         "upper": 0.1,
@@ -264,9 +266,65 @@ def test_a_value_beyond_a_limit_is_clipped_and_said() -> None:
 def test_arrow_keys_go_by_round_steps() -> None:
     body = "return given.map(([lower, upper]) => m.stepOf({ lower, upper }))"
 
-    steps = run("targets.js", body, [[-2.618, 2.618], [0, 0.1], [-6.28, 6.28]])
+    steps = run("units.js", body, [[-2.618, 2.618], [0, 0.1], [-6.28, 6.28], [0, 100], [0, 1]])
 
-    assert steps == pytest.approx([0.01, 0.0001, 0.01])
+    assert steps == pytest.approx([0.01, 0.0001, 0.01, 0.1, 0.001])
+
+
+def test_numbers_have_the_digits_of_their_steps() -> None:
+    ranges = [
+        {"lower": -2.6, "upper": 2.6, "unit": "rad"},
+        {"lower": -0.785, "upper": 0.0, "unit": "rad"},
+        {"lower": 0, "upper": 0.1, "unit": "m"},
+        {"lower": 0, "upper": 100, "unit": "%"},
+        {"lower": 0, "upper": 1, "unit": "opening, 0 to 1"},
+        {"lower": 0, "upper": 1000, "unit": ""},
+    ]
+
+    assert run("units.js", "return given.map((one) => m.digitsOf(one))", ranges) == [3, 3, 4, 1, 3, 0]
+
+
+def test_a_long_unit_stands_elsewhere() -> None:
+    body = "return given.map((unit) => [m.shortUnit(unit), m.unitWords(unit)])"
+
+    assert run("units.js", body, ["rad", "%", "", "opening, 0 to 1"]) == [
+        ["rad", "rad"],
+        ["%", "%"],
+        ["", ""],
+        ["", "opening"],
+    ]
+
+
+def test_how_poses_were_met_is_said_in_words() -> None:
+    chunks = [
+        {},
+        {
+            "rows": 50,
+            "over": 0,
+            "limit": 0,
+            "velocity": 0,
+            "singular": 0,
+            "worst_mm": 0.012,
+            "worst_deg": 0.003,
+        },
+        {
+            "rows": 50,
+            "over": 3,
+            "limit": 3,
+            "velocity": 0,
+            "singular": 1,
+            "worst_mm": 31.4,
+            "worst_deg": 2.06,
+        },
+        {"rows": 50, "over": 1, "limit": 0, "velocity": 1, "worst_mm": None, "worst_deg": None},
+    ]
+
+    assert run("reach.js", "return given.map((ik) => m.reachWords(ik))", chunks) == [
+        "",
+        "50 poses reached, worst 0.012 mm and 0.003°",
+        "3 of 50 poses not reached, worst 31.4 mm and 2.1°; 3 at a joint limit; 1 near singular",
+        "1 of 50 poses not reached; 1 as fast as joints may",
+    ]
 
 
 def test_the_target_begins_where_the_robot_is_told_to_be_else_where_it_is() -> None:
@@ -414,11 +472,19 @@ def test_drives_and_grippers_say_what_is_the_matter() -> None:
 
     assert [one["weight"] for one in words] == ["", "good", "warn", "bad"]
     assert words[3]["text"] == "Fault: overheated"
-    assert run("robot_panel.js", "return given.map((one) => m.gripperWords(one, 'm'))", grippers) == [
-        "locked at 0.050 m",
-        "at 0.100 m",
+    assert run(
+        "robot_panel.js",
+        "return given.map((one) => m.gripperWords(one, { unit: 'm', lower: 0, upper: 0.1 }))",
+        grippers,
+    ) == [
+        "locked at 0.0500 m",
+        "at 0.1000 m",
         "not known",
     ]
+    body = "return m.gripperWords({ at: 57.31 }, { unit: '%', lower: 0, upper: 100 })"
+    assert run("robot_panel.js", body) == "at 57.3 %"
+    body = "return m.gripperWords({ at: 0.5 }, { unit: 'opening, 0 to 1', lower: 0, upper: 1 })"
+    assert run("robot_panel.js", body) == "at 0.500 opening"
 
 
 def test_a_key_with_shift_is_its_own_and_else_the_key_without() -> None:
