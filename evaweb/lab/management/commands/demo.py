@@ -12,6 +12,7 @@ from typing import Any
 from django.conf import settings
 from django.core.management.base import BaseCommand, CommandError
 
+import robots
 from evaweb.errors import EvaError
 from evaweb.lab import programs, seed
 from evaweb.lab.lab import Bench, Lab, a_lab
@@ -21,7 +22,7 @@ from evaweb.lab.seed import Login
 from evaweb.lab.visitor import Visitor
 from evaweb.roles import Role
 
-_DEPLOYMENT = settings.BASE_DIR / "deployments" / "tabletop.toml"
+_DEPLOYMENTS = settings.BASE_DIR / "deployments"
 _STATION, _ROBOT = "bench-1", "agilex_piper"
 _SKILLED, _CLUMSY = "pick-place-40k", "pick-place-8k"
 _POLICIES = {
@@ -49,6 +50,7 @@ class Command(BaseCommand):
         parser.add_argument(
             "--ready-file", type=Path, help="write address and logins there as JSON, for scripts"
         )
+        parser.add_argument("--robot", default=_ROBOT, help="which robot the simulated bench has")
         parser.add_argument("--seed", type=int, default=1, help="of the bench and of the policies")
         parser.add_argument("--position", type=int, default=1, help="with --once: the position of the scene")
         parser.add_argument(
@@ -56,9 +58,10 @@ class Command(BaseCommand):
         )
 
     def handle(self, *args: Any, **options: Any) -> None:
+        deployment = _deployment(options["robot"])
         try:
             with a_lab(options["host"], options["port"]) as lab:
-                url, logins = self._up(lab, options["seed"])
+                url, logins = self._up(lab, deployment, options["robot"], options["seed"])
                 if options["ready_file"]:
                     _announce(options["ready_file"], url, logins, lab.processes.pids())
                 if options["once"]:
@@ -73,11 +76,11 @@ class Command(BaseCommand):
                 options["json"].write_text(json.dumps({"error": str(error)}), "utf-8")
             raise CommandError(str(error)) from None
 
-    def _up(self, lab: Lab, seed_number: int) -> tuple[str, list[Login]]:
-        node = lab.processes.start(programs.tabletop(_ROBOT, seed_number))
+    def _up(self, lab: Lab, deployment: Path, robot: str, seed_number: int) -> tuple[str, list[Login]]:
+        node = lab.processes.start(programs.tabletop(robot, seed_number))
         served = {}
         for name, (description, options) in _POLICIES.items():
-            serving = programs.policy(name, _ROBOT, (*options, "--seed", str(seed_number)))
+            serving = programs.policy(name, robot, (*options, "--seed", str(seed_number)))
             served[name] = lab.processes.start(serving)["url"]
             seed.demo_checkpoint(name=name, description=description, policy={"url": served[name]})
         seed.demo_scene()
@@ -86,7 +89,7 @@ class Command(BaseCommand):
             f'transport.pub_endpoint="{node["action_endpoint"]}"',
             f'policy.url="{served[_SKILLED]}"',
         ]
-        url = lab.up([Bench(_DEPLOYMENT, assignments)])
+        url = lab.up([Bench(deployment, assignments)])
         roles = {"operator": Role.OPERATOR, "admin": Role.ADMIN}
         return url, [seed.demo_login(username=name, role=role) for name, role in roles.items()]
 
@@ -109,6 +112,17 @@ class Command(BaseCommand):
         if options["json"]:
             options["json"].write_text(text, "utf-8")
         self.stdout.write(text)
+
+
+def _deployment(robot: str) -> Path:
+    """The deployment of the tabletop with that robot; CommandError lists those that there are."""
+    found = {_ROBOT: _DEPLOYMENTS / "tabletop.toml"}
+    for name in robots.names():
+        if (path := _DEPLOYMENTS / f"tabletop_{name}.toml").is_file():
+            found[name] = path
+    if robot not in found:
+        raise CommandError(f"--robot {robot}: allowed: {', '.join(sorted(found))}")
+    return found[robot]
 
 
 def _announce(path: Path, url: str, logins: list[Login], pids: Mapping[str, int]) -> None:
