@@ -110,7 +110,7 @@ class Places:
         self._x = np.linspace(belt.x[0] - _BEYOND, belt.x[1] + _BEYOND, _NODES[0])
         self._y = belt.y + np.linspace(-_ACROSS, _ACROSS, _NODES[1])
         postures = Postures(robot, Bench(belt=belt))
-        for arm in robot.arms:
+        for arm in postures.arms:
             solved = self._solved(robot, postures, arm)
             if solved is not None:
                 self._joints = solved

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from runtime.sim.bench import Bench
+from runtime.sim.down import Place
 from runtime.sim.hands import Opening
-from runtime.sim.postures import CLEAR, TILTS, Place, Postures, closed, gripper_dim, jaws, opened
+from runtime.sim.postures import CLEAR, TILTS, Postures, closed, gripper_dim, jaws, opened
 from runtime.types import Float64
 
 if TYPE_CHECKING:

@@ -1,0 +1,54 @@
+"""Fingertips that point down over a place, and the way of such fingertips from one place to another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from runtime.types import Float64
+
+_STRIDE, _SWING = 0.04, 0.25  # m and rad between two points of a way, at most
+
+Place = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Down:
+    """Fingertips over a place at a height [m], pointing down, `tilt` [rad] outwards along `bearing` from the arm.
+
+    The jaws open along `yaw`.
+    """
+
+    place: Place
+    height: float
+    yaw: float
+    bearing: float
+    tilt: float
+
+    def tip(self) -> Float64:
+        """Their frame [4, 4] in the world."""
+        sine, cosine = math.sin(self.tilt), math.cos(self.tilt)
+        ahead = np.array([sine * math.cos(self.bearing), sine * math.sin(self.bearing), -cosine])
+        across = np.array([math.cos(self.yaw), math.sin(self.yaw), 0.0])
+        across -= ahead * (across @ ahead)
+        across /= np.linalg.norm(across)
+        tip = np.eye(4)
+        tip[:3, :3] = np.column_stack([np.cross(across, ahead), across, ahead])
+        tip[:3, 3] = *self.place, self.height
+        return tip
+
+    def towards(self, other: Down) -> Iterator[Down]:
+        """The points on the way to another one, without either end."""
+        numbers = np.array([*self.place, self.height, self.yaw, self.bearing, self.tilt])
+        way = np.array([*other.place, other.height, other.yaw, other.bearing, other.tilt]) - numbers
+        way[3:5] = [math.remainder(turn, 2 * math.pi) for turn in way[3:5]]
+        count = max(
+            math.ceil(float(np.linalg.norm(way[:3])) / _STRIDE),
+            math.ceil(float(np.abs(way[3:]).max()) / _SWING),
+        )
+        for step in range(1, count):
+            x, y, *rest = (numbers + way * step / count).tolist()
+            yield Down((x, y), *rest)

@@ -1,0 +1,35 @@
+"""Cameras on arms see what lies before the fingers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import robots
+from runtime.sim.bench import wrist_camera
+from runtime.sim.eyes import Eye, wrist_eye
+from runtime.sim.limbs import limbs
+
+ROBOTS = robots.names()
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_fingertips_are_in_the_picture_of_every_arms_camera(name):
+    robot = robots.load(name)
+    for arm in robot.arms:
+        tip = limbs(robot)[arm.name].tip(robot.poses["ready"])
+        camera = wrist_camera(tip, 640, 480, wrist_eye(robot, arm.name))
+        u, v = camera.project(tip[:3, 3])
+        assert u == pytest.approx(319.5, abs=1)
+        assert 200 < v < 400
+
+
+def test_a_hand_that_hides_nothing_keeps_the_nearest_place():
+    assert wrist_eye(robots.load("agilex_piper"), "left_arm") == Eye()
+
+
+def test_a_camera_is_not_put_inside_of_a_hand():
+    robot = robots.load("r1_lite")
+    eye = wrist_eye(robot, "left_arm")
+    assert eye.place != Eye().place
+    assert np.sign(eye.up[0]) == np.sign(eye.place[0])
