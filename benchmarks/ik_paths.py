@@ -1,9 +1,8 @@
-"""Chunks of end-effector poses to solve: smooth ones, through singular postures, out of reach, and recorded ones."""
+"""Chunks of end-effector poses to solve: smooth ones, near and through singularities, out of reach, recorded ones."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,42 +13,59 @@ from numpy.typing import NDArray
 from robots import Group, Robot
 
 ROWS = 50
+OUT_OF_REACH = "out_of_reach"
 CHUNKS = 8  # of each kind: the same chunk again and again would flatter the branch predictor
 _UNHURRIED = 0.4  # of a joint's speed limit is the most that a path asks for
 _TURN = 1.0  # rad (m) that a joint moves in a chunk at most
 _BEYOND = 1.2  # m that targets out of reach go, outwards
+_NEAR = 0.01  # smallest singular value that `singular` chunks come by
 _SEARCHES = 400
 _ENDLESS = 3.0  # rad to either side in which joints without limits are moved
 
 Float64 = NDArray[np.float64]
-Solvable = Callable[[Float64], Float64]  # poses of joints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chunk:
-    """Targets [T, arms, 7] for rows `dt` apart, and the joints [D] they are solved from."""
+    """Targets [T, arms, 7] for rows `dt` apart, the joints [D] they are solved from, and whether joints have them."""
 
     targets: Float64
     seed: Float64
     dt: float
+    reachable: bool
 
 
 def invented(robot: Robot) -> dict[str, list[Chunk]]:
-    """Chunks of every kind for any robot; `smooth` and `singular` ones come from joint paths and can be reached."""
+    """Chunks of every kind for any robot, all but those out of reach the poses of an unhurried joint path.
+
+    `singular` ones come close to a singularity in the middle, `through` ones go through it.
+    """
     chance = np.random.default_rng(5)
-    dt = 1 / robot.control_rate
-    made: dict[str, list[Chunk]] = {"smooth": [], "singular": [], "out_of_reach": []}
+    kinds = ("smooth", "singular", "through", OUT_OF_REACH)
+    made: dict[str, list[Chunk]] = {kind: [] for kind in kinds}
     for _ in range(CHUNKS):
-        start, end = _within(robot, chance, 0.25), _within(robot, chance, 0.25)
-        path = _path(robot, start, end, dt)
-        made["smooth"].append(Chunk(_poses(robot, path), path[0], dt))
-        far = np.repeat(_poses(robot, path[:1]), ROWS, axis=0)
-        far[..., :3] += np.linspace(0, _BEYOND, ROWS)[:, None, None] * _outwards(far[0, :, :3])
-        made["out_of_reach"].append(Chunk(far, path[0], dt))
-        through = _singular(robot, chance)
-        path = _path(robot, *_ends_around(robot, through, _within(robot, chance, 0.05)), dt)
-        made["singular"].append(Chunk(_poses(robot, path), path[0], dt))
+        path = _path(robot, _within(robot, chance, 0.25), _within(robot, chance, 0.25))
+        made["smooth"].append(_chunk(robot, path))
+        made[OUT_OF_REACH].append(_leaving(_chunk(robot, path)))
+        for kind, smallest in (("singular", _NEAR), ("through", 0.0)):
+            middle = _with_singular_value(robot, chance, smallest)
+            ends = _ends_around(robot, middle, _within(robot, chance, 0.05))
+            made[kind].append(_chunk(robot, _path(robot, *ends)))
     return made
+
+
+def _chunk(robot: Robot, path: Float64) -> Chunk:
+    poses = np.stack([arm.pose(path) for arm in robot.arms], axis=1)
+    return Chunk(poses, path[0], 1 / robot.control_rate, True)
+
+
+def _leaving(chunk: Chunk) -> Chunk:
+    """Beginning where the chunk begins, and going away from where the arms stand."""
+    first = chunk.targets[0, :, :3]
+    targets = np.repeat(chunk.targets[:1], ROWS, axis=0)
+    outwards = first / np.linalg.norm(first, axis=-1, keepdims=True)
+    targets[..., :3] += np.linspace(0, _BEYOND, ROWS)[:, None, None] * outwards
+    return Chunk(targets, chunk.seed, chunk.dt, False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,27 +75,15 @@ class Recording:
     joints: Float64
     poses: Float64
 
-    def chunks(self, dt: float) -> list[Chunk]:
+    def chunks(self, robot: Robot) -> list[Chunk]:
         """All of it, each chunk from the joints that were measured at its first row."""
-        starts = range(0, len(self.joints) - ROWS + 1, ROWS)
-        return [Chunk(self.poses[at : at + ROWS], self.joints[at], dt) for at in starts]
-
-
-def recorded(folder: Path) -> Recording:
-    """The first episode of a LeRobot dataset with joints and poses of two arms."""
-    file = min(folder.glob("data/*/*.parquet"))
-    table = pyarrow.parquet.read_table(file, columns=["observation.qpos", "observation.eef"])
-    joints, eef = (np.array(column.to_pylist(), dtype=np.float64) for column in table.columns)
-    return Recording(joints, np.ascontiguousarray(eef.reshape(len(eef), -1, 8)[..., :7]))
+        rows = [slice(at, at + ROWS) for at in range(0, len(self.joints) - ROWS + 1, ROWS)]
+        return [Chunk(self.poses[row], self.joints[row.start], 1 / robot.control_rate, True) for row in rows]
 
 
 def arm_dims(robot: Robot) -> NDArray[np.intp]:
     """The places of all joints that kinematics solves."""
     return np.concatenate([arm.joint_dims for arm in robot.arms])
-
-
-def _poses(robot: Robot, path: Float64) -> Float64:
-    return np.stack([arm.pose(path) for arm in robot.arms], axis=1)
 
 
 def _bounds(robot: Robot) -> tuple[Float64, Float64]:
@@ -95,34 +99,31 @@ def _within(robot: Robot, chance: np.random.Generator, margin: float) -> Float64
     return posture
 
 
-def _path(robot: Robot, start: Float64, end: Float64, dt: float) -> Float64:
+def _path(robot: Robot, start: Float64, end: Float64) -> Float64:
     """Joints [T, D] that speed up and slow down from `start` towards `end`, as far as is unhurried."""
     way = end - start
     dims = arm_dims(robot)
-    steepest = math.pi / 2 / (dt * (ROWS - 1))
+    steepest = math.pi / 2 * robot.control_rate / (ROWS - 1)
     rush = np.abs(way[dims]) * steepest / (_UNHURRIED * robot.velocity[dims])
     share = 1 / max(1.0, rush.max(), np.abs(way).max() / _TURN)
     eased = (1 - np.cos(np.linspace(0, math.pi, ROWS))) / 2
     return start + eased[:, None] * share * way
 
 
-def _outwards(points: Float64) -> Float64:
-    return points / np.linalg.norm(points, axis=-1, keepdims=True)
-
-
-def _singular(robot: Robot, chance: np.random.Generator) -> Float64:
-    """A posture in which every arm has a direction that it can hardly move in, found by trying."""
+def _with_singular_value(robot: Robot, chance: np.random.Generator, wanted: float) -> Float64:
+    """A posture in which every arm's Jacobian has nearly that smallest singular value, found by trying."""
     low, high = _bounds(robot)
+    low, high = low + 0.1 * (high - low), high - 0.1 * (high - low)
     posture = _within(robot, chance, 0.1)
     for arm in robot.arms:
-        best, reach = _smallest(arm, posture), 0.5
+        best, reach = abs(_smallest(arm, posture) - wanted), 0.5
         for _ in range(_SEARCHES):
             tried = posture.copy()
             tried[arm.joint_dims] += chance.normal(0, reach, len(arm.joint_dims))
-            tried = np.clip(tried, low + 0.1 * (high - low), high - 0.1 * (high - low))
-            found = _smallest(arm, tried)
-            if found < best:
-                posture, best = tried, found
+            tried = np.clip(tried, low, high)
+            off = abs(_smallest(arm, tried) - wanted)
+            if off < best:
+                posture, best = tried, off
             else:
                 reach = max(1e-3, 0.99 * reach)
     return posture

@@ -40,8 +40,8 @@ class KinematicsSettings(Section):
     rotation_weight: Positive = 10.0
     """Cost of a radian beside it."""
     rest_weight: Annotated[float, Field(ge=0)] = 0.02
-    """Cost of a radian away from the frame before: holds still what the pose leaves open. At 1, reachable poses
-    are missed by millimetres."""
+    """Cost of a radian away from where the frame before leads: holds what the pose leaves open. At 1, reachable
+    poses are missed by millimetres."""
     position_tolerance: Positive = 1e-3
     """Metres within which a target counts as reached."""
     rotation_tolerance: Positive = math.radians(0.5)

@@ -20,6 +20,7 @@ _OVER_TOLERANCE, _AT_LIMIT, _AT_VELOCITY, _NEAR_SINGULAR = 1, 2, 4, 8  # runtime
 _TOUCHING = 1e-9  # rad (m) from a limit: on it
 _WITHIN = 1 - 1e-9  # of the way that a velocity allows is used, so that rounding never exceeds it
 _FOLLOWED = 1e-6  # weighted squared error (20 um) up to which a frame's motion is worth going on with
+_KEPT = 0.9  # of a motion is what a frame rests on: what poses leave open dies away within some ten frames
 _SHORTEST = 1e-12  # square of a quaternion's length
 
 
@@ -67,7 +68,8 @@ class _Frame(NamedTuple):
 
     goal: Float64  # [12]
     q: Float64
-    centre: Float64  # where it begins
+    begin: Float64  # where it begins: the frame before, within the box
+    centre: Float64  # what it rests on
     before: Float64  # what its velocity counts from
     motion: Float64  # of the frame before
     low: Float64
@@ -91,7 +93,16 @@ def solve_chunk(
         return wrong
     n = len(size)
     room = room_for(moving, size)
-    frame = _Frame(np.empty(12), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n))
+    frame = _Frame(
+        np.empty(12),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+    )
     turns, base = np.empty((3, len(carrying))), np.empty((len(carrying) + 1, 12))
     for row in range(len(asked.targets)):
         for dim in range(asked.seed.shape[1]):
@@ -136,8 +147,8 @@ def _follow(
 ) -> None:
     """All frames of one arm; `base` [12] is where its own chain begins.
 
-    A frame whose predecessor met its target is searched from where that one's motion leads: on a smooth path one
-    step is then enough.
+    A frame whose predecessor met its target is searched from where that one's motion leads, and rests on most of
+    that motion: on a smooth path one step is then enough, and where branches meet (at a singularity) it goes straight on.
     """
     n = len(size)
     for i in range(n):
@@ -151,8 +162,10 @@ def _follow(
                 frame.before[i] = asked.anchor[arms.dims[arm, i]]
         _wall_in(size, arm, arms, asked.dt if bound else 0.0, frame)
         for i in range(n):
-            frame.q[i] = frame.centre[i] = min(max(frame.q[i], frame.low[i]), frame.high[i])
+            frame.begin[i] = min(max(frame.q[i], frame.low[i]), frame.high[i])
+            frame.q[i] = frame.centre[i] = frame.begin[i]
             if going:
+                frame.centre[i] += _KEPT * frame.motion[i]
                 frame.q[i] = min(max(frame.q[i] + frame.motion[i], frame.low[i]), frame.high[i])
         _goal_of(asked.targets, row, arm, base, frame.goal)
         error = solve_frame(
@@ -165,7 +178,7 @@ def _follow(
         going = missed <= _FOLLOWED
         bound = row >= asked.anchor_row
         for i in range(n):
-            frame.motion[i] = frame.q[i] - frame.centre[i]
+            frame.motion[i] = frame.q[i] - frame.begin[i]
             frame.before[i] = frame.q[i]
 
 
