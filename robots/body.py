@@ -115,7 +115,7 @@ class _Copy:
     def __init__(self, robot: Robot, tree: Urdf, groups: Sequence[Group]) -> None:
         self._tree = tree
         self._groups = groups
-        joints = _outwards(tree)
+        joints = tree.outwards()
         self._movers = {joint.child: joint for joint in joints}
         self.links = [tree.root, *self._movers]
         self.coupling = np.zeros((len(self.links), robot.dim))
@@ -137,7 +137,7 @@ class _Copy:
             group.name: [
                 link
                 for link, joint in self._movers.items()
-                if _master(self._tree, joint)[0].name in group.gripper.fingers
+                if self._tree.master(joint)[0].name in group.gripper.fingers
             ]
             for group in self._groups
             if group.gripper is not None
@@ -152,7 +152,7 @@ class _Copy:
         """The link's name behind that of the group that moves it (of the first group, where none does)."""
         at = link
         while at in self._movers:
-            master, _, _ = _master(self._tree, self._movers[at])
+            master, _, _ = self._tree.master(self._movers[at])
             for group in self._groups:
                 if master.name in group.urdf_joints or (
                     group.gripper and master.name in group.gripper.fingers
@@ -167,7 +167,7 @@ class _Copy:
 
     def _drive(self, index: int, joint: Joint) -> None:
         """The joint's value is coupling . q + offset within bounds; what no group moves stays as pinned or 0."""
-        master, factor, offset = _master(self._tree, joint)
+        master, factor, offset = self._tree.master(joint)
         for group in self._groups:
             if master.name in group.urdf_joints:
                 dim = group.joint_dims[group.urdf_joints.index(master.name)]
@@ -185,30 +185,6 @@ class _Copy:
             name: value for group in self._groups if group.chain for name, value in group.chain.pinned.items()
         }
         self.offsets[index] = factor * pinned.get(master.name, 0.0) + offset
-
-
-def _master(tree: Urdf, joint: Joint) -> tuple[Joint, float, float]:
-    """The joint that this one follows (itself, unless it is a mimic): value = factor * its value + offset."""
-    factor, offset, seen = 1.0, 0.0, [joint.name]
-    while joint.mimic is not None:
-        offset += factor * joint.mimic.offset
-        factor *= joint.mimic.multiplier
-        joint = tree.joint(joint.mimic.joint)
-        if joint.name in seen:
-            raise RobotError(f"{tree.path}: joints {', '.join(seen)} mimic each other in a circle")
-        seen.append(joint.name)
-    return joint, factor, offset
-
-
-def _outwards(tree: Urdf) -> list[Joint]:
-    """The joints in an order in which every parent link comes before its children."""
-    order: list[Joint] = []
-    links = [tree.root]
-    for link in links:  # grows while it is walked
-        below = [joint for joint in tree.joints.values() if joint.parent == link]
-        order += below
-        links += [joint.child for joint in below]
-    return order
 
 
 def _layers(above: NDArray[np.intp]) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:

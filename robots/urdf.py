@@ -74,6 +74,28 @@ class Urdf:
             link = above[link].parent
         return tuple(reversed(chain))
 
+    def outwards(self) -> tuple[Joint, ...]:
+        """The joints in an order in which every parent link comes before its children."""
+        order: list[Joint] = []
+        links = [self.root]
+        for link in links:  # grows while it is walked
+            below = [joint for joint in self.joints.values() if joint.parent == link]
+            order += below
+            links += [joint.child for joint in below]
+        return tuple(order)
+
+    def master(self, joint: Joint) -> tuple[Joint, float, float]:
+        """The joint that this one follows (itself, unless it is a mimic): value = factor * its value + offset."""
+        factor, offset, seen = 1.0, 0.0, [joint.name]
+        while joint.mimic is not None:
+            offset += factor * joint.mimic.offset
+            factor *= joint.mimic.multiplier
+            joint = self.joint(joint.mimic.joint)
+            if joint.name in seen:
+                raise RobotError(f"{self.path}: joints {', '.join(seen)} mimic each other in a circle")
+            seen.append(joint.name)
+        return joint, factor, offset
+
 
 def read(path: Path) -> Urdf:
     """The kinematic tree in the file; RobotError names the file, the joint and what is wrong with it."""
@@ -92,9 +114,21 @@ def document(path: Path) -> ET.Element:
         robot = ET.parse(path).getroot()
     except (OSError, ET.ParseError) as error:
         raise RobotError(f"{path}: cannot be read as URDF: {error}") from error
+    if _is_xacro(robot):
+        made = f"xacro {path.name} > {path.name.split('.')[0]}.urdf"
+        raise RobotError(f"{path}: this is a xacro, of which a URDF is yet to be made: {made}")
     if robot.tag != "robot":
         raise RobotError(f"{path}: the outermost element is <{robot.tag}>; a URDF has <robot>")
     return robot
+
+
+def _is_xacro(robot: ET.Element) -> bool:
+    """Whether macros or placeholders are left in it."""
+    return any(
+        "xacro" in element.tag or any("${" in value or "$(" in value for value in element.attrib.values())
+        for element in robot.iter()
+        if isinstance(element.tag, str)
+    )
 
 
 def _joint(path: Path, element: ET.Element) -> Joint:

@@ -11,6 +11,8 @@ from robots import RobotError, urdf
 LINKS = '<link name="a"/><link name="b"/>'
 JOINT = '<joint name="j" type="{kind}"><parent link="a"/><child link="b"/>{rest}</joint>'
 
+MIMIC = '<mimic joint="{0}" multiplier="{1}" offset="{2}"/>'
+
 
 def write(folder: Path, body: str, tag: str = "robot") -> Path:
     path = folder / "thing.urdf"
@@ -89,3 +91,51 @@ def test_a_joint_or_link_that_is_not_there_is_answered_with_those_that_are(tmp_p
         tree.between("a", "hand")
     with pytest.raises(RobotError, match="'a' does not hang on link 'b'"):
         tree.between("b", "a")
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        LINKS
+        + '<joint name="j" type="fixed"><parent link="a"/><child link="b"/><origin xyz="0 0 ${height}"/></joint>',
+        '<xacro:include xmlns:xacro="http://www.ros.org/wiki/xacro" filename="arm.xacro"/>' + LINKS,
+        LINKS + '<joint name="$(arg prefix)j" type="fixed"><parent link="a"/><child link="b"/></joint>',
+    ],
+)
+def test_a_xacro_is_refused_with_what_makes_a_urdf_of_it(tmp_path: Path, body: str) -> None:
+    with pytest.raises(RobotError, match=r"this is a xacro.*: xacro thing\.urdf > thing\.urdf"):
+        urdf.read(write(tmp_path, body))
+
+
+def test_a_urdf_that_was_made_of_a_xacro_is_one(tmp_path: Path) -> None:
+    path = tmp_path / "thing.urdf"
+    path.write_text(
+        f'<robot name="thing" xmlns:xacro="http://www.ros.org/wiki/xacro">{LINKS}'
+        f"{JOINT.format(kind='fixed', rest='')}</robot>"
+    )
+    assert urdf.read(path).root == "a"
+
+
+def test_a_mimic_is_traced_to_the_joint_that_moves_by_itself(tmp_path: Path) -> None:
+    joint = '<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/>{3}</joint>'
+    body = "".join(f'<link name="{name}"/>' for name in "abcd")
+    body += joint.format("first", "c", "d", "") + joint.format(
+        "second", "a", "b", MIMIC.format("first", 2, 0.5)
+    )
+    body += joint.format("third", "b", "c", MIMIC.format("second", -3, 0.1))
+    tree = urdf.read(write(tmp_path, body))
+    master, factor, offset = tree.master(tree.joint("third"))
+    assert (master.name, factor) == ("first", -6.0)
+    assert offset == pytest.approx(0.1 - 3 * 0.5)
+    assert tree.master(tree.joint("first"))[1:] == (1.0, 0.0)
+    assert [joint.name for joint in tree.outwards()] == ["second", "third", "first"]
+
+
+def test_mimics_in_a_circle_are_refused(tmp_path: Path) -> None:
+    joint = '<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/>{3}</joint>'
+    body = '<link name="a"/><link name="b"/><link name="c"/>' + joint.format(
+        "x", "a", "b", MIMIC.format("y", 1, 0)
+    )
+    tree = urdf.read(write(tmp_path, body + joint.format("y", "b", "c", MIMIC.format("x", 1, 0))))
+    with pytest.raises(RobotError, match="joints x, y mimic each other in a circle"):
+        tree.master(tree.joint("x"))
