@@ -172,6 +172,17 @@ class Robot:
         binary = [group for group in self.groups if group.gripper is not None and group.gripper.binary]
         return tuple(group.gripper_dim for group in binary if group.gripper_dim is not None)
 
+    @property
+    def speed_dims(self) -> tuple[int, ...]:
+        """The places of numbers that are speeds and not places: those of a base that move no link; 0 stands still."""
+        return tuple(
+            int(dim)
+            for group in self.groups
+            if group.kind == "base"
+            for joint, dim in zip(group.urdf_joints, group.joint_dims, strict=True)
+            if not joint
+        )
+
     def group(self, name: str) -> Group:
         """The group of that name; RobotError lists the names where there is none."""
         for group in self.groups:

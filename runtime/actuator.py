@@ -83,10 +83,10 @@ class Actuator(ABC):
         """Take the robot over where it stands: from now on something is sent on every tick.
 
         The grippers of a robot that was engaged before keep their command: closing on an object, they measure
-        wider than they were told, and would let go.
+        wider than they were told, and would let go. A base stands.
         """
         keep = self._settings.limits.grippers & self.engaged
-        self.commanded = np.where(keep, self.commanded, measured)
+        self.commanded = self._settings.limits.standing(np.where(keep, self.commanded, measured))
         self.velocity = np.zeros(len(measured))
         self.engaged = True
 
@@ -107,7 +107,15 @@ class Actuator(ABC):
         needed = speed * speed / (2.0 * np.maximum(ahead, 1e-9))
         softest = safety.brake_acceleration * self._reach
         rate = np.clip(needed, softest, np.maximum(softest, safety.acceleration * self._reach))
-        return Brake(self.commanded.copy(), speed.copy(), rate, limits.lower, limits.upper)
+        return Brake(
+            self.commanded.copy(),
+            speed.copy(),
+            rate,
+            limits.lower,
+            limits.upper,
+            limits.speeds,
+            limits.velocity,
+        )
 
     def send(
         self, step: int, planned: float, target: Target, action: Float64, notes: tuple[str, ...] = ()
@@ -173,7 +181,8 @@ class RobotActuator(Actuator):
         now = self._clock()
         if self._page.estop is EStop.LATCHED and target.source != "estop":
             # Pressed since this tick looked: the next one takes over, this one repeats the last command.
-            action, notes = self.commanded, ("e-stop pressed within the tick",)
+            action = self._settings.limits.standing(self.commanded)
+            notes = ("e-stop pressed within the tick",)
         eef = None if self._settings.publication is None else self._settings.publication(action)
         self._sink.send(RobotCommand(action.astype(np.float32), step, now, eef))
         return now, action, notes

@@ -32,7 +32,7 @@ class Displacement:
 
     def __init__(self, settings: TickSettings) -> None:
         self._settings = settings
-        self._angles = ~settings.limits.grippers
+        self._angles = settings.limits.places
         self._unseen_since: float | None = None
 
     def __call__(self, robot: RobotActuator, seen: Seen, now: float, held: bool) -> Float64 | None:

@@ -140,7 +140,7 @@ class Follow(Behaviour):
         if not self._expecting or settings.safety.report_only:
             return 0.0, ""
         apart = difference(row, commanded, settings.dims.wrapping)
-        away = np.where(settings.limits.grippers, 0.0, np.abs(apart))
+        away = np.where(settings.limits.places, np.abs(apart), 0.0)
         worst, name = float(away.max()), settings.limits.names[int(away.argmax())]
         return worst, f"{name}: the first action is {worst:.2f} rad from where the robot stands"
 

@@ -106,7 +106,13 @@ class Plan:
         for dim in robot.binary_dims:
             binary[dim] = True
         return Limits(
-            robot.joint_names, robot.lower, robot.upper, robot.velocity, np.array(grippers), np.array(binary)
+            robot.joint_names,
+            robot.lower,
+            robot.upper,
+            robot.velocity,
+            np.array(grippers),
+            np.array(binary),
+            robot.speed_dims,
         )
 
     @property

@@ -11,6 +11,7 @@ from runtime.messages import Event
 from runtime.motion import Trajectory
 from runtime.orders import Orders
 from runtime.page import Page
+from runtime.timeline import difference
 from runtime.types import Float64
 from runtime.ways import Ways
 
@@ -52,7 +53,8 @@ class Going:
         """Whether the arm is there; SetupError, naming the joint, where it does not come."""
         measured = np.array(self._page.observation.read()["qpos"], np.float64)
         limits = self._plan.limits
-        error = np.where(limits.grippers, 0.0, np.abs(measured - self._goal))
+        away = np.abs(difference(measured, self._goal, self._plan.dims.wrapping))
+        error = np.where(limits.places, away, 0.0)
         worst = int(error.argmax())
         if error[worst] <= _ARRIVED_RAD:
             return True

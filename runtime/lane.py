@@ -14,6 +14,7 @@ from runtime.motion import Trajectory
 from runtime.report import Report
 from runtime.safety import SafetyFilter
 from runtime.seen import Seen
+from runtime.timeline import difference
 from runtime.types import Float64
 
 _ARRIVED = 1e-4  # [rad] of a motion's end: it may have been limited on its last steps
@@ -87,7 +88,7 @@ class Lane:
     def move(self, goal: Float64, speed: float) -> None:
         """Come to a stand, then go to `goal` at `speed`, a part of the speed of motions of ours.
 
-        Dimensions that are NaN stay where they come to a stand.
+        Dimensions that are NaN stay where they come to a stand, and what is a speed ends at 0.
         """
         self._begin()
         self._go(goal, speed)
@@ -113,9 +114,12 @@ class Lane:
     def _go(self, goal: Float64, speed: float) -> None:
         limits, safety = self._settings.limits, self._settings.safety
         brake = self.actuator.brake()
-        goal = np.where(np.isnan(goal), brake.at(brake.duration), goal)
+        start = brake.at(brake.duration)
+        goal = limits.standing(np.where(np.isnan(goal), start, goal))  # a copy
+        if turning := list(self._settings.dims.wrapping):  # endless joints go the shorter way
+            goal[turning] = (start + difference(goal, start, turning))[turning]
         top = limits.velocity * safety.motion_velocity_scale * speed
-        path = Trajectory(brake.at(brake.duration), goal, top, safety.motion_acceleration * limits.reach)
+        path = Trajectory(start, goal, top, safety.motion_acceleration * limits.reach)
         self.behaviour = Move(brake, path, goal, speed)
 
     def _holding(self) -> Hold:

@@ -20,22 +20,40 @@ class Motion(ABC):
 
 
 class Brake(Motion):
-    """Constant deceleration of every joint from its velocity to rest, never beyond `lower` and `upper`."""
+    """Constant deceleration of every joint from its velocity to rest, never beyond `lower` and `upper`.
+
+    The numbers at `speeds` are speeds themselves: they go to 0 at the rate `slowing` [D].
+    """
 
     def __init__(
-        self, q: Float64, velocity: Float64, deceleration: Float64, lower: Float64, upper: Float64
+        self,
+        q: Float64,
+        velocity: Float64,
+        deceleration: Float64,
+        lower: Float64,
+        upper: Float64,
+        speeds: tuple[int, ...] = (),
+        slowing: Float64 | None = None,
     ) -> None:
         self._q, self._velocity = q, velocity
         self._deceleration = deceleration
         # A joint that is outside already may stay there.
         self._lower, self._upper = np.minimum(lower, q), np.maximum(upper, q)
         self._stop = np.abs(velocity) / deceleration
+        self._speeds = list(speeds)
+        if self._speeds:
+            assert slowing is not None
+            self._stop[self._speeds] = np.abs(q[self._speeds]) / slowing[self._speeds]
         self.duration = float(self._stop.max(initial=0.0))
 
     def at(self, elapsed: float) -> Float64:
         t = np.minimum(elapsed, self._stop)
         way = self._velocity * t - 0.5 * np.sign(self._velocity) * self._deceleration * t * t
-        return np.clip(self._q + way, self._lower, self._upper)
+        position = np.clip(self._q + way, self._lower, self._upper)
+        if self._speeds:
+            stop = np.maximum(self._stop[self._speeds], 1e-9)
+            position[self._speeds] = self._q[self._speeds] * np.maximum(0.0, 1.0 - elapsed / stop)
+        return position
 
 
 class Trajectory(Motion):

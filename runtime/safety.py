@@ -103,7 +103,11 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The robot's bounds, float64 [D] each; `binary` marks dimensions that switch between two values."""
+    """The robot's bounds, float64 [D] each; `binary` marks dimensions that switch between two values.
+
+    `speeds` are the places of numbers that are speeds (of a base): the robot stands where they are 0, and what is
+    their `velocity` is an acceleration.
+    """
 
     names: tuple[str, ...]
     lower: Float64
@@ -111,6 +115,22 @@ class Limits:
     velocity: Float64
     grippers: np.ndarray  # bool [D]: own unit, not radians
     binary: np.ndarray  # bool [D]
+    speeds: tuple[int, ...] = ()
+
+    @property
+    def places(self) -> np.ndarray:
+        """Which dimensions are places of joints, bool [D]: neither grippers nor speeds."""
+        places = ~self.grippers
+        places[list(self.speeds)] = False
+        return places
+
+    def standing(self, position: Float64) -> Float64:
+        """`position` [D] with everything that is a speed at 0."""
+        if not self.speeds:
+            return position
+        standing = position.copy()
+        standing[list(self.speeds)] = 0.0
+        return standing
 
     @property
     def reach(self) -> Float64:
@@ -144,7 +164,7 @@ class SafetyFilter:
         self._limits = limits
         self._outside = outside  # names the arms whose end effector is outside its box
         self._collisions = collisions
-        self._angles = ~limits.grippers
+        self._angles = limits.places
         self._switching = bool(limits.binary.any())
         self._reach = limits.reach
         self._room = np.zeros((2, len(limits.lower)))  # scratch: to the upper and from the lower limit
@@ -232,9 +252,7 @@ class SafetyFilter:
     def _runs_away(self, action: Float64, state: RobotState) -> str:
         allowed = self._settings.following_error
         error = np.abs(action - state.measured)
-        if (
-            (error <= allowed) | self._limits.grippers
-        ).all():  # NaN, a joint that is measured nowhere, is not
+        if ((error <= allowed) | ~self._angles).all():  # NaN, a joint that is measured nowhere, is not
             return ""
         error = np.where(self._angles, error, 0.0)
         # A blocked arm must still be allowed to come back towards where it is measured.

@@ -58,11 +58,22 @@ class Targets:
             raise RuntimeFault(
                 f"move: say joints or a pose; poses of {self._plan.robot.name}: {self._poses()}"
             )
-        return self.checked("move", self._wanted("move", asked.joints, asked.pose, commanded), commanded)
+        goal = self._wanted("move", asked.joints, asked.pose, commanded)
+        for dim in self._plan.limits.speeds:
+            if goal[dim]:
+                name = self._plan.limits.names[dim]
+                raise RuntimeFault(
+                    f"move: {name} = {goal[dim]:.4f} is a speed; allowed at the end of a motion: 0"
+                )
+        return self.checked("move", goal, commanded)
 
     def checked(self, what: str, goal: Float64, commanded: Float64) -> Float64:
-        """`goal` [D], where limits, workspace boxes and links allow the way there; RuntimeFault for `what` else."""
+        """`goal` [D], where limits, workspace boxes and links allow the way there; RuntimeFault for `what` else.
+
+        Motions of ours end at rest: what is a speed is 0 there.
+        """
         limits = self._plan.limits
+        goal = limits.standing(goal)
         beyond = np.flatnonzero((goal < limits.lower - _TOLERANCE) | (goal > limits.upper + _TOLERANCE))
         if len(beyond):
             worst = int(beyond[0])

@@ -247,7 +247,8 @@ class Tick:
         stopped = self._robot.behaviour if isinstance(self._robot.behaviour, EStopped) else None
         if latched and stopped is None:
             # Before it was ever engaged nothing is known to send, until the robot has been measured.
-            stopped = EStopped(self._actuator.commanded.copy() if self._actuator.engaged else None)
+            commanded = self._settings.limits.standing(self._actuator.commanded.copy())
+            stopped = EStopped(commanded if self._actuator.engaged else None)
             # Or a gripper that is on its way to its lock would go on after the release.
             self._lock(np.full(len(self._locks.on), np.nan))
             self._robot.behaviour, self._simulated = stopped, None
@@ -261,7 +262,8 @@ class Tick:
             if not self._actuator.engaged:
                 self._actuator.engage(measured)
             # An object in the gripper keeps it open: its command stays, or it would let go.
-            seen = np.where(self._settings.limits.grippers, self._actuator.commanded, measured)
+            limits = self._settings.limits
+            seen = limits.standing(np.where(limits.grippers, self._actuator.commanded, measured))
             stopped.see(seen, self._settings.safety.following_error)
 
     def _check_family(self, now: float) -> None:

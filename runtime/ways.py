@@ -9,6 +9,7 @@ import numpy as np
 from runtime.collision import Collisions
 from runtime.errors import RuntimeFault
 from runtime.family import Plan
+from runtime.timeline import difference
 from runtime.types import Float64
 from runtime.workspace import Workspace
 
@@ -22,7 +23,8 @@ class Ways:
 
     def __init__(self, plan: Plan) -> None:
         safety = plan.deployment.safety
-        self._grippers = plan.limits.grippers
+        self._limits = plan.limits
+        self._wrapping = plan.dims.wrapping
         self._workspace = Workspace(plan.robot, safety.workspace)
         self._collisions = Collisions(plan.robot, safety.collision_margin + _SPARE)
 
@@ -41,6 +43,7 @@ class Ways:
 
     def _way(self, start: Float64, goal: Float64) -> Float64:
         """Postures [T, D] from `start` to `goal`, near enough to each other."""
-        farthest = np.abs(goal - start).max(where=~self._grippers, initial=0.0)
+        apart = difference(goal, start, self._wrapping)
+        farthest = np.abs(apart).max(where=self._limits.places, initial=0.0)
         count = max(2, math.ceil(farthest / _STEP) + 1)
-        return np.asarray(start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start))
+        return np.asarray(start + np.linspace(0.0, 1.0, count)[:, None] * apart)

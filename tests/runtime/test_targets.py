@@ -18,6 +18,7 @@ from runtime.requests import AimRequest, Jog, MoveRequest
 from runtime.safety import Limits, SafetySettings, WorkspaceBox
 from runtime.spaces import Spaces
 from runtime.targets import Targets
+from runtime.timeline import Dims
 
 
 @cache
@@ -34,7 +35,7 @@ def targets(workspace: dict[str, WorkspaceBox] | None = None) -> Targets:
         robot.joint_names, robot.lower, robot.upper, robot.velocity, grippers, np.zeros(robot.dim, bool)
     )
     settings = SimpleNamespace(safety=SafetySettings(workspace=workspace or {}))
-    plan: Any = SimpleNamespace(robot=robot, limits=limits, deployment=settings)
+    plan: Any = SimpleNamespace(robot=robot, limits=limits, deployment=settings, dims=Dims())
     return Targets(plan, spaces, kinematics)
 
 

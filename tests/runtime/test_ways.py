@@ -12,6 +12,7 @@ import pytest
 
 from runtime.errors import RuntimeFault
 from runtime.safety import Limits, SafetySettings, WorkspaceBox
+from runtime.timeline import Dims
 from runtime.ways import Ways
 from tests.runtime.collision_samples import collisions, robot, turned
 
@@ -21,7 +22,7 @@ def ways(**safety: Any) -> Ways:
     grippers = np.isin(np.arange(own.dim), own.gripper_dims)
     limits = Limits(own.joint_names, own.lower, own.upper, own.velocity, grippers, np.zeros(own.dim, bool))
     settings = SimpleNamespace(safety=SafetySettings(**safety))
-    plan: Any = SimpleNamespace(robot=own, limits=limits, deployment=settings)
+    plan: Any = SimpleNamespace(robot=own, limits=limits, deployment=settings, dims=Dims())
     return Ways(plan)
 
 
