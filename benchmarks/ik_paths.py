@@ -81,6 +81,14 @@ class Recording:
         return [Chunk(self.poses[row], self.joints[row.start], 1 / robot.control_rate, True) for row in rows]
 
 
+def recorded(folder: Path) -> Recording:
+    """The first episode of a LeRobot dataset with joints and poses of two arms."""
+    file = min(folder.glob("data/*/*.parquet"))
+    table = pyarrow.parquet.read_table(file, columns=["observation.qpos", "observation.eef"])
+    joints, eef = (np.array(column.to_pylist(), dtype=np.float64) for column in table.columns)
+    return Recording(joints, np.ascontiguousarray(eef.reshape(len(eef), -1, 8)[..., :7]))
+
+
 def arm_dims(robot: Robot) -> NDArray[np.intp]:
     """The places of all joints that kinematics solves."""
     return np.concatenate([arm.joint_dims for arm in robot.arms])
