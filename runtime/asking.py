@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from runtime.clock import Clock
+from runtime.errors import SetupError
 from runtime.kinematics.base import IkFlag, IkResult
 from runtime.messages import Event
 from runtime.policies.base import Policy
@@ -122,6 +123,22 @@ class Asking:
         passed = 0 if waited else max(0, step + 1 - shown.step)
         row = passed if k_max is None else min(passed, k_max)
         return Onset(commanded, qpos if rests else commanded, row)
+
+    def compare(self, answered: Answered) -> None:
+        """Hold the poses that the robot measures against those of its joints: they may be of another frame.
+
+        Raises SetupError where the policy depends on them; else it is only said.
+        """
+        shown = answered.observation
+        if answered.eef != "measured" or shown.eef is None:
+            return
+        wrong = self._spaces.disagreement(shown.eef, shown.qpos)
+        if wrong and self.policy.sees_poses:
+            raise SetupError(
+                f'{wrong}; allowed: policy.observation_eef = "fk", or a node that measures that link'
+            )
+        if wrong:
+            self.notes.append(Event("eef_disagrees", wrong, self._clock.now(), shown.step))
 
     def note(self, answered: Answered) -> None:
         """Say what could not be done of an answer."""

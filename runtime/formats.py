@@ -205,5 +205,6 @@ def _dims(pose: PoseFormat, robot: Robot, key: str) -> NDArray[np.intp]:
                 f"{key}.groups = {pose.groups}: {name!r} cannot follow the poses; "
                 f"allowed: each once of {', '.join(others) or 'none'} (groups of {robot.name} without end effector)"
             )
-    parts = [np.arange(group.slice.start, group.slice.stop) for group in map(robot.group, pose.groups)]
+    chosen = [robot.group(name).slice for name in pose.groups]
+    parts = [np.arange(part.start, part.stop) for part in chosen]
     return np.concatenate([np.zeros(0, np.intp), *parts])

@@ -27,7 +27,7 @@ class Frame:
     """
 
     def __init__(self, robot: Robot, name: str, key: str) -> None:
-        self._mounted = name == robot.mount_frame
+        self._mounted = bool(name) and name == robot.mount_frame
         self.own = not name or (not self._mounted and all(arm.frame == name for arm in robot.arms))
         if self.own:
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import Future
 from enum import StrEnum
@@ -20,6 +21,7 @@ from runtime.messages import Event, MediaReport
 from runtime.orders import Orders
 from runtime.page import Page
 from runtime.policies.base import PolicyInfo
+from runtime.timeline import difference
 from runtime.types import Float64
 
 
@@ -130,6 +132,7 @@ class SetUp:
             if self._inference.runner.ready(self._connection):
                 self.info = self._connection.result()
                 self._check_rtc(self.info)
+                self._check_horizon(self.info)
                 self._enter(Stage.OBSERVE)
         elif self.stage is Stage.OBSERVE:
             return self._observe()
@@ -156,6 +159,18 @@ class SetUp:
             raise SetupError(
                 f"strategy 'rtc': the policy {info.name!r} does not continue a chunk that it is given; allowed: "
                 "another strategy, or a server and policy.rtc that do"
+            )
+
+    def _check_horizon(self, info: PolicyInfo) -> None:
+        """More rows cannot be executed of each answer than it has."""
+        wanted = self._plan.deployment.strategy.execution_horizon
+        if wanted is None or info.horizon is None or "execution_horizon" not in self._plan.strategy.USES:
+            return
+        steps = math.floor(info.horizon * self._plan.rate / (info.rate or self._plan.rate) + 1e-9)
+        if wanted > steps:
+            raise SetupError(
+                f"strategy.execution_horizon = {wanted} control steps, but the policy {info.name!r} says that its "
+                f"answers have {info.horizon} rows, {steps} control steps; correct the one that is wrong"
             )
 
     def _check_drives(self) -> None:
@@ -235,6 +250,8 @@ class SetUp:
 
     def _validate(self, answered: Answered) -> None:
         self._inference.asking.note(answered)
+        if self._left == self._plan.deployment.setup.warmup_chunks:
+            self._inference.asking.compare(answered)
         self.first_action = answered.made.meant
         first = first_action(self.first_action, np.asarray(answered.observation.qpos, np.float64), self._plan)
         far = ": far, approach it or start elsewhere" if first["far"] else ""
@@ -245,9 +262,9 @@ class SetUp:
 
 
 def first_action(action: Float64, joints: Float64, plan: Plan) -> dict[str, Any]:
-    """How far an action [D] is from `joints` [D]: {"distance" rad, "joint", "far"}; grippers do not count."""
+    """How far an action [D] is from `joints` [D]: {"distance" rad, "joint", "far"}; joints count, and nothing else."""
     limits = plan.limits
-    away = np.where(limits.grippers, 0.0, np.abs(action - joints))
+    away = np.where(limits.places, np.abs(difference(action, joints, plan.dims.wrapping)), 0.0)
     worst = int(away.argmax())
     far = bool(away[worst] > plan.deployment.safety.first_action_far)
     return {"distance": float(away[worst]), "joint": limits.names[worst], "far": far}

@@ -18,6 +18,7 @@ from runtime.resampling import resample
 from runtime.types import EEF_WIDTH, ActionChunk, Float32, Float64, Observation
 
 _GRIPPER = EEF_WIDTH - 1
+_SAME_PLACE, _SAME_TURN = 0.02, 5.0  # [m, degrees] within which a measured pose is that of the described link
 _LONGEST = 2000  # rows of a chunk, given and at control rate: they are solved one by one, and fit the ring to control
 
 
@@ -73,7 +74,8 @@ class Spaces:
         self._gripped = [index for index, arm in enumerate(arms) if arm.gripper is not None]
         self._grippers = [arm.gripper_dim for arm in arms if arm.gripper_dim is not None]
         self._all = np.arange(robot.dim)
-        self._moving = np.setdiff1d(self._all, robot.gripper_dims)
+        self._speeds = list(robot.speed_dims)
+        self._moving = np.setdiff1d(self._all, [*robot.gripper_dims, *self._speeds])
         solved = np.concatenate([np.zeros(0, np.intp), *(arm.joint_dims for arm in arms)])
         self._still = np.setdiff1d(self._all, solved)
         self._wrapping = np.flatnonzero(np.isinf(robot.lower) & np.isinf(robot.upper))
@@ -137,6 +139,25 @@ class Spaces:
         vectors[..., :_GRIPPER] = self._kinematics.forward(joints)
         vectors[..., self._gripped, _GRIPPER] = joints[..., self._grippers]
         return vectors
+
+    def disagreement(self, measured: ArrayLike, q: ArrayLike) -> str:
+        """How far measured poses [8 * arms] are from those of the joints q [D], worst arm; "" where they agree."""
+        joints = np.asarray(q, dtype=np.float64)
+        expected = self.vectors(joints)
+        given = np.asarray(measured, dtype=np.float64).reshape(self._count, EEF_WIDTH)
+        given = self._layout_of(None).upright(given[None])[0]
+        metres = np.linalg.norm(given[:, :3] - expected[:, :3], axis=-1)
+        cosines = np.abs(np.sum(given[:, 3:7] * expected[:, 3:7], axis=-1))
+        degrees = np.degrees(2.0 * np.arccos(np.clip(cosines, 0.0, 1.0)))
+        worst = int(np.argmax(metres / _SAME_PLACE + degrees / _SAME_TURN))
+        if metres[worst] <= _SAME_PLACE and degrees[worst] <= _SAME_TURN:
+            return ""
+        arm = self._robot.arms[worst]
+        return (
+            f"the robot measures the pose of {arm.name} {1000 * metres[worst]:.0f} mm and {degrees[worst]:.0f} degrees "
+            f"from where its joints have {arm.eef_link} in {arm.frame}; allowed: {1000 * _SAME_PLACE:g} mm and "
+            f"{_SAME_TURN:g} degrees: another frame or another link"
+        )
 
     def _layout_of(self, pose: PoseFormat | None) -> PoseRows:
         """The rows of that format; the last one is kept, because a policy speaks one format."""
@@ -206,9 +227,10 @@ class Spaces:
     def _assembled(
         self, solved: Float64, poses: Float64, layout: PoseRows, joints: Float64, onset: Onset
     ) -> Float64:
-        """Solved arms, grippers and joints of the rows, and everything else held."""
+        """Solved arms, grippers and joints of the rows, and everything else held; a base stands."""
         commands = solved.copy()
         commands[:, self._still] = onset.held[self._still]
+        commands[:, self._speeds] = 0.0  # a base of which the rows say nothing stands
         if layout.pose.gripper:
             commands[:, self._grippers] = poses[:, self._gripped, _GRIPPER]
         commands[:, layout.dims] = joints

@@ -16,7 +16,8 @@ class PolicyInfo:
 
     name: str
     action_space: Space | None = None
-    horizon: int | None = None
+    horizon: int | None = None  # rows of an answer
+    rate: float | None = None  # of its rows [Hz]; None: the control rate
     supports_rtc: bool | None = False  # it continues a chunk that it is given
     metadata: Mapping[str, object] = field(default_factory=dict)
 

@@ -6,6 +6,7 @@ Replies carry no id, so a connection whose answer did not come in time is droppe
 from __future__ import annotations
 
 import contextlib
+import json
 import socket
 import threading
 import time
@@ -46,6 +47,13 @@ class WebsocketLink:
         """Whether a connection is held; the peer may have gone since."""
         return self._connection is not None
 
+    @property
+    def was_left(self) -> bool:
+        """Whether the peer is known to have ended the connection that is held, as servers do with idle ones."""
+        from websockets.protocol import State
+
+        return self._connection is not None and self._connection.state is not State.OPEN
+
     def open(self) -> bytes:
         """Connect anew and return the server's first frame; both together within the connect deadline.
 
@@ -74,6 +82,20 @@ class WebsocketLink:
         with self._dropping_on_error():
             self._send(connection, request, seconds)
             return self._receive(connection, deadline, "an answer", seconds)
+
+    def acknowledged(self, request: bytes, seconds: float, text: str) -> bytes | None:
+        """What answers a request that some servers acknowledge with exactly `text`: None for that, else the bytes.
+
+        Any other text is the server's error; so is every text that answers an `exchange`.
+        """
+        connection = self._connection
+        if connection is None:
+            raise PolicyError(f"there is no connection to {self._url}; connect first")
+        deadline = time.monotonic() + seconds
+        with self._dropping_on_error():
+            self._send(connection, request, seconds)
+            answer = self._frame(connection, deadline, "an acknowledgement", seconds)
+            return None if answer == text else self._binary(answer)
 
     def abort(self) -> None:
         """Unblock, from another thread, whoever waits here: they raise PolicyError, now and later.
@@ -200,19 +222,24 @@ class WebsocketLink:
             watchdog.cancel()
 
     def _receive(self, connection: ClientConnection, deadline: float, what: str, seconds: float) -> bytes:
+        return self._binary(self._frame(connection, deadline, what, seconds))
+
+    def _binary(self, answer: str | bytes) -> bytes:
+        if isinstance(answer, str):
+            raise PolicyError(f"the policy server at {self._url} reports an error: {headline(answer)}")
+        return answer
+
+    def _frame(self, connection: ClientConnection, deadline: float, what: str, seconds: float) -> str | bytes:
         from websockets.exceptions import ConnectionClosed
 
         try:
-            answer = connection.recv(timeout=max(0.0, deadline - time.monotonic()))
+            return connection.recv(timeout=max(0.0, deadline - time.monotonic()))
         except TimeoutError as error:
             raise PolicyTimeout(
                 f"{self._url} did not send {what} within {seconds:g} s; the connection is dropped"
             ) from error
         except ConnectionClosed as error:
             raise self._gone(error) from error
-        if isinstance(answer, str):
-            raise PolicyError(f"the policy server at {self._url} reports an error: {headline(answer)}")
-        return answer
 
     def _gone(self, error: Exception) -> PolicyError:
         if self._aborted:
@@ -237,6 +264,13 @@ def _end(wire: socket.socket) -> None:
 
 
 def headline(text: str) -> str:
-    """A traceback's last line first, because that is the sentence; then the whole of it."""
+    """A traceback's last line first, because that is the sentence, then the whole of it; of JSON what it says."""
+    try:
+        said = json.loads(text)
+    except ValueError:
+        said = None
+    if isinstance(said, dict):
+        words = [str(said[key]) for key in ("error", "message", "code") if said.get(key)]
+        text = ", ".join(words) or text
     lines = text.strip().splitlines() or ["(an empty text)"]
     return lines[-1] if len(lines) == 1 else f"{lines[-1].strip()}\n{text.strip()}"

@@ -6,9 +6,6 @@ configuration, so that the ALOHA, DROID and LIBERO layouts are settings and not 
 
 from __future__ import annotations
 
-import os
-import threading
-import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,41 +14,28 @@ from pydantic import Field
 
 from runtime import codecs
 from runtime.clock import Clock
-from runtime.errors import CodecError, ConfigurationError, PolicyError
+from runtime.errors import PolicyError
 from runtime.formats import PoseFormat
 from runtime.policies.agreement import Declared, agreed
-from runtime.policies.base import Policy, PolicyInfo
-from runtime.policies.link import WebsocketLink
+from runtime.policies.base import PolicyInfo
 from runtime.policies.request import RequestLayout, RequestSettings, poses_of
 from runtime.policies.rows import action_rows
 from runtime.policies.rtc.async_rtc import AsyncRtc, Schedule
 from runtime.policies.rtc.base import Dialect, Plain
 from runtime.policies.rtc.prev_action import PrevAction
+from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
 from runtime.types import ActionChunk, ActionMode, Conditioning, Observation, RelativeFrame, Space
 
 if TYPE_CHECKING:
     from robots import Robot
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Rate = Annotated[float, Field(ge=1, le=1000)]
 
-ANSWER_LIMIT = 64 * 1024 * 1024  # bytes; a chunk of 50 rows is some kilobytes
 
-
-class Config(RequestSettings):
+class Config(ServerSettings, RequestSettings):
     """A policy server that speaks the openpi websocket protocol."""
 
     kind: Literal["openpi"] = "openpi"
-    url: Annotated[str, Field(pattern=r"^wss?://.+")] = "ws://127.0.0.1:8000"
-    """Where the server listens."""
-    api_key_env: str | None = None
-    """Environment variable with the API key; the key itself would end up in every recording's manifest."""
-    connect_deadline: Positive = 5.0
-    """For the connection and the server's metadata [s]."""
-    first_inference_deadline: Positive = 120.0
-    """For the first answer after set-up [s]: the server may have to compile its model."""
-    inference_deadline: Positive = 2.0
-    """For every later answer [s], also of a server that came back; after it the connection is dropped."""
     action_space: Space = "joint"
     """What the rows of the answer are: joint targets, or poses."""
     action_pose: PoseFormat = PoseFormat()
@@ -77,15 +61,13 @@ def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> Op
     return OpenpiPolicy(config, robot, control_rate)
 
 
-class OpenpiPolicy(Policy):
-    """One connection; a timed-out one is dropped, and the next `infer` opens another.
+class OpenpiPolicy(WebsocketPolicy):
+    """A policy on a websocket with openpi's messages, and whatever a dialect of real-time chunking adds to them."""
 
-    Deadlines are real seconds whatever the clock, because a server on a wire knows no other. The long first
-    deadline holds once after `connect`: later no `infer` takes longer than the deadlines of connection and
-    inference together, so that a server that came back mute, or compiles again, is found out quickly.
-    """
+    PROTOCOL = "openpi"
 
     def __init__(self, config: Config, robot: Robot, control_rate: float) -> None:
+        super().__init__(config)
         self._config = config
         self._layout = RequestLayout(config, robot)
         poses = poses_of(config.action_space, config.action_pose, robot, "action_pose")
@@ -103,23 +85,7 @@ class OpenpiPolicy(Policy):
         self.sees_poses = config.observation_space == "eef" or (
             config.action_space == "eef" and config.action_mode != "absolute"
         )
-        self._headers = _headers(config)
         self._dialect = _dialect(config)
-        self._link = self._new_link()
-        self._lock = threading.Lock()  # of the wire: held through every wait
-        self._turning = threading.Lock()  # between open and closed: held for a moment
-        self._closed = False
-        self._warm = False
-
-    def connect(self) -> PolicyInfo:
-        """Reach the server and read its metadata; an open connection is replaced."""
-        with self._lock:
-            self._warm = False
-            self._link.drop()
-            with self._turning:
-                self._closed = False
-                self._link = self._new_link()
-            return self._open()
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
         """The chunk; `timing` has the server's figures [ms] and our `round_trip_ms`.
@@ -130,57 +96,30 @@ class OpenpiPolicy(Policy):
         shown = self.request(observation)
         with self._lock:
             request = codecs.pack(self._dialect.request(shown, conditioning))
-            if self._closed:
-                raise PolicyError(f"the policy at {self._config.url} is closed; connect first")
-            if not self._link.is_open:
-                self._open()
-            started = time.monotonic()
-            reply = self._unpacked(self._exchange(request), "an answer")
-            round_trip = 1e3 * (time.monotonic() - started)
-            result = self._result(reply)
+            self._require_open()
+            answer, round_trip = self._exchange(request)
+            result = self._result(self._unpacked(answer, "an answer"))
         return self._chunk(result, round_trip)
 
     def reset(self) -> None:
         """Nothing to forget: the protocol has no reset, and no answer depends on an earlier one."""
 
-    def close(self) -> None:
-        """Cut the connection and return at once; a call that waits in another thread raises PolicyError.
-
-        What is left of the connection is dropped by whoever uses it, now or at the next `connect`.
-        """
-        with self._turning:
-            self._closed = True
-            self._link.abort()
-
     def request(self, observation: Observation) -> dict[str, object]:
         """The request map for an observation, in the declared layout, without what a dialect adds."""
         return self._layout.of(observation)
 
-    def _new_link(self) -> WebsocketLink:
-        return WebsocketLink(self._config.url, self._headers, self._config.connect_deadline)
-
-    def _open(self) -> PolicyInfo:
-        metadata = self._unpacked(self._link.open(), "metadata")
-        try:
-            space = agreed(metadata, self._declared, "metadata")
-            supports_rtc = self._dialect.supported(metadata)
-        except PolicyError:
-            self._link.drop()
-            raise
+    def _greeted(self, metadata: dict[str, Any]) -> PolicyInfo:
+        space = agreed(metadata, self._declared, "metadata")
+        supports_rtc = self._dialect.supported(metadata)
         horizon = metadata.get("action_horizon")
         return PolicyInfo(
             name=str(metadata.get("name", "openpi")),
             action_space=space,
             horizon=horizon if type(horizon) is int else None,
+            rate=self._config.action_rate,
             supports_rtc=supports_rtc,
             metadata=metadata,
         )
-
-    def _exchange(self, request: bytes) -> bytes:
-        config = self._config
-        seconds = config.inference_deadline if self._warm else config.first_inference_deadline
-        self._warm = True
-        return self._link.exchange(request, seconds)
 
     def _result(self, reply: dict[str, Any]) -> dict[str, Any]:
         try:
@@ -188,21 +127,6 @@ class OpenpiPolicy(Policy):
         except PolicyError:
             self._link.drop()  # after an error the server closes, after another's answer all would be another's
             raise
-
-    def _unpacked(self, payload: bytes, what: str) -> dict[str, Any]:
-        try:
-            message = codecs.unpack(payload, ANSWER_LIMIT)
-        except CodecError as error:
-            self._link.drop()
-            raise PolicyError(
-                f"{self._config.url} sent {what} that is not the openpi protocol: {error}"
-            ) from error
-        if not isinstance(message, dict):
-            self._link.drop()
-            raise PolicyError(
-                f"{self._config.url} sent {what} that is a {type(message).__name__}; expected a map"
-            )
-        return message
 
     def _chunk(self, reply: Mapping[str, Any], round_trip: float) -> ActionChunk:
         if "actions" not in reply:
@@ -227,17 +151,6 @@ def _dialect(config: Config) -> Dialect:
     if config.rtc == "async_rtc":
         return AsyncRtc(config.prefix_attention_schedule, config.max_guidance_weight)
     return PrevAction() if config.rtc == "prev_action" else Plain()
-
-
-def _headers(config: Config) -> dict[str, str]:
-    if config.api_key_env is None:
-        return {}
-    key = os.environ.get(config.api_key_env)
-    if not key:
-        raise ConfigurationError(
-            f"policy.api_key_env names {config.api_key_env}, which is not set in the environment"
-        )
-    return {"Authorization": f"Api-Key {key}"}
 
 
 def _timing(reply: Mapping[str, Any]) -> dict[str, float]:

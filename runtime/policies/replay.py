@@ -9,9 +9,11 @@ from pydantic import Field
 from runtime.clock import Clock
 from runtime.datasets.mapping import ColumnMapping
 from runtime.errors import PolicyError, RecordingError
+from runtime.formats import PoseFormat
 from runtime.policies.base import Policy, PolicyInfo
+from runtime.policies.request import poses_of
 from runtime.section import Section
-from runtime.types import EEF_WIDTH, ActionChunk, Conditioning, Float32, Observation, Space
+from runtime.types import ActionChunk, Conditioning, Float32, Observation, Space
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -29,6 +31,8 @@ class Config(Section):
     """Names of the dataset's columns."""
     space: Space = "joint"
     """Which recorded actions: "joint" takes the action column, "eef" the action_eef column."""
+    action_pose: PoseFormat = PoseFormat()
+    """How poses are written in the action_eef column, where space is "eef"."""
     horizon: int = Field(default=50, ge=1)
     """Rows per chunk, at the recording's rate."""
     latency_s: float = Field(default=0.0, ge=0, allow_inf_nan=False)
@@ -44,6 +48,8 @@ class ReplayPolicy(Policy):
     def __init__(self, config: Config, robot: Robot, clock: Clock, control_rate: float) -> None:
         self._config = config
         self._robot = robot
+        poses = poses_of(config.space, config.action_pose, robot, "action_pose")
+        self._width = robot.dim if poses is None else poses.width
         self._clock = clock
         self._control_rate = control_rate
         self._actions: Float32 | None = None
@@ -67,6 +73,7 @@ class ReplayPolicy(Policy):
             name=f"replay of {config.path}, episode {config.episode}",
             action_space=config.space,
             horizon=config.horizon,
+            rate=episode.fps,
             metadata={"rows": episode.length, "fps": episode.fps, "task": episode.task},
         )
 
@@ -76,12 +83,10 @@ class ReplayPolicy(Policy):
             raise PolicyError(
                 f'policy.space is "{self._config.space}" but policy.mapping.{name} names no column'
             )
-        joint, eef = self._robot.dim, EEF_WIDTH * len(self._robot.arms)
-        width = joint if self._config.space == "joint" else eef
-        if actions.shape[1] != width:
+        if actions.shape[1] != self._width:
             raise PolicyError(
                 f"{self._config.path}: the {name} column is {actions.shape[1]} wide, "
-                f"{self._robot.name} needs {width}"
+                f"{self._robot.name} needs {self._width}"
             )
         return actions
 
@@ -104,6 +109,7 @@ class ReplayPolicy(Policy):
             actions=self._actions[row : row + self._config.horizon].copy(),
             space=self._config.space,
             rate=self._fps,
+            pose=self._config.action_pose,
         )
 
     def reset(self) -> None:

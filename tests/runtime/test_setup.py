@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from runtime import deployment
 from runtime.errors import PolicyError, SetupError
+from runtime.policies.base import PolicyInfo
 from runtime.setup import Stage
 from runtime.transitions import State
 from runtime.types import Observation
@@ -224,4 +228,80 @@ def test_the_e_stop_ends_it(tmp_path: Path) -> None:
     here = station.robot.position.copy()
     station.go(20)
     assert np.array_equal(station.robot.position, here)
+    station.close()
+
+
+# What the server says of itself, what the robot measures
+
+
+def with_horizon(tmp_path: Path, steps: int, **said: Any) -> Station:
+    """A station that is to execute so many steps of each answer; its policy says of itself what is `said`."""
+    made = plan(tmp_path, strategy="sync")
+    strategy = {"strategy": {"execution_horizon": steps}}
+    station = Station(replace(made, resolved=deployment.changed(made.resolved, strategy, "test")))
+    station.policy.connect = lambda: PolicyInfo("stub", **said)  # type: ignore[method-assign]
+    return station
+
+
+@pytest.mark.parametrize(
+    "said", [{"horizon": 20}, {"horizon": 10, "rate": 15.0}, {"horizon": 40, "rate": 60.0}]
+)
+def test_no_more_steps_can_be_executed_of_an_answer_than_it_has(tmp_path: Path, said: dict[str, Any]) -> None:
+    station = with_horizon(tmp_path, 21, **said)
+    assert (
+        f"strategy.execution_horizon = 21 control steps, but the policy 'stub' says that its answers have "
+        f"{said['horizon']} rows, 20 control steps"
+    ) in failed(station)
+    station.close()
+
+
+@pytest.mark.parametrize("said", [{"horizon": 20}, {"horizon": 10, "rate": 15.0}, {}])
+def test_as_many_steps_as_it_has_can_be(tmp_path: Path, said: dict[str, Any]) -> None:
+    with_horizon(tmp_path, 20, **said).ready().close()
+
+
+def measuring(tmp_path: Path, off: float) -> Station:
+    """A station whose robot measures the pose of its right arm `off` metres too high."""
+    station = Station(plan(tmp_path))
+    receive = station.robot.receive
+
+    def with_poses(timeout: float) -> Observation | None:
+        seen = receive(timeout)
+        assert seen is not None
+        poses = station.main.spaces.eef_of(seen.qpos)
+        poses[10] += off
+        return replace(seen, eef=poses, captured={**seen.captured, "eef": seen.arrived})
+
+    station.robot.receive = with_poses  # type: ignore[method-assign]
+    return station
+
+
+def test_measured_poses_of_another_link_are_an_error_where_the_policy_depends_on_them(tmp_path: Path) -> None:
+    station = measuring(tmp_path, 0.1)
+    station.policy.sees_poses = True
+    why = failed(station)
+    assert (
+        "measures the pose of right_arm 100 mm and 0 degrees from where its joints have gripper_base" in why
+    )
+    assert 'allowed: policy.observation_eef = "fk"' in why
+    station.close()
+
+
+def test_they_are_said_where_it_does_not_and_no_matter_where_it_is_shown_those_of_the_joints(
+    tmp_path: Path,
+) -> None:
+    station = measuring(tmp_path / "joints", 0.1).ready()
+    (said,) = station.events("eef_disagrees")
+    assert "right_arm 100 mm" in said
+    station.close()
+    station = measuring(tmp_path / "fk", 0.1)
+    station.policy.sees_poses, station.policy.observation_eef = True, "fk"
+    assert station.ready().events("eef_disagrees") == []
+    station.close()
+
+
+def test_measured_poses_that_agree_are_nothing_to_speak_of(tmp_path: Path) -> None:
+    station = measuring(tmp_path, 0.01)
+    station.policy.sees_poses = True
+    assert station.ready().events("eef_disagrees") == []
     station.close()

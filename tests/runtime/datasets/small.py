@@ -30,10 +30,13 @@ POSES = tuple(
 
 def robot(cameras: tuple[str, ...] = CAMERAS, dim: int = len(JOINTS)) -> Any:
     """As much of a robot description as a dataset needs."""
+    arms = tuple(SimpleNamespace(name=f"{side}_arm", gripper=None, chain=True) for side in ("left", "right"))
     return SimpleNamespace(
         name="small",
         dim=dim,
-        arms=(SimpleNamespace(name="left_arm"), SimpleNamespace(name="right_arm")),
+        joint_names=JOINTS,
+        arms=arms,
+        groups=arms,
         cameras=tuple(SimpleNamespace(name=key, key=key) for key in cameras),
     )
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from runtime.clock import VirtualClock
 from runtime.datasets.mapping import ColumnMapping
 from runtime.errors import PolicyError
+from runtime.formats import PoseFormat
 from runtime.policies import replay
 from runtime.policies.replay import Config, ReplayPolicy
 from runtime.types import Observation
@@ -96,7 +97,16 @@ def test_the_latency_is_waited_for_on_the_clock(root: Path) -> None:
 def test_poses_are_replayed_where_the_space_says_so(root: Path) -> None:
     policy = connected(root, space="eef", mapping=ColumnMapping(action_eef="action_eef"), horizon=3)
     chunk = policy.infer(observation(0))
-    assert (chunk.space, chunk.actions.shape) == ("eef", (3, 16))
+    assert (chunk.space, chunk.actions.shape, chunk.pose) == ("eef", (3, 16), PoseFormat())
+
+
+def test_poses_of_another_width_are_those_of_another_format(root: Path) -> None:
+    poses = {"space": "eef", "mapping": ColumnMapping(action_eef="action_eef")}
+    with pytest.raises(PolicyError, match="action_eef column is 16 wide, small needs 18"):
+        connected(root, **poses, action_pose=PoseFormat(orientation="6d", gripper=False))
+    pose = PoseFormat(orientation="euler", euler_order="ZYX", degrees=True, groups=[])
+    with pytest.raises(PolicyError, match="small needs 14"):
+        connected(root, **poses, action_pose=pose)
 
 
 def test_it_says_what_it_is(root: Path) -> None:

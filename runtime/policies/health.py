@@ -1,0 +1,81 @@
+"""Whether a policy server is well: the HTTP page that some answer beside their websocket."""
+
+from __future__ import annotations
+
+import contextlib
+import http
+import re
+import ssl
+import time
+from collections.abc import Mapping
+from urllib.parse import urlsplit
+
+from runtime.errors import PolicyError, PolicyLostError
+from runtime.policies.reach import reach
+
+_STATUS = re.compile(rb"HTTP/1\.[01] ([0-9]{3})([^\r\n]*)\r?\n")
+_LONGEST = 4096  # bytes of a first line
+
+
+def require_healthy(url: str, path: str, headers: Mapping[str, str], seconds: float) -> None:
+    """GET `path` at the host and port of the websocket `url`, with TLS for wss; returns on status 200.
+
+    PolicyLostError where nobody answers within `seconds`, or the server says that it is not ready (HTTP 5xx);
+    PolicyError where it answers anything else, because then another server is there, or the path is wrong.
+    """
+    try:
+        status, reason = _asked(url, path, headers, time.monotonic() + seconds)
+    except TimeoutError as error:
+        raise PolicyLostError(
+            f"{url}: {path} gave no answer within {seconds:g} s: the host is unreachable, or the server is stuck"
+        ) from error
+    except ssl.SSLError as error:
+        raise PolicyError(
+            f"{url}: no encrypted connection ({error}): check host, port and certificate, or use ws://"
+        ) from error
+    except OSError as error:
+        raise PolicyLostError(
+            f"no policy server listens at {url} ({error}): start it, or correct policy.url"
+        ) from error
+    if status >= 500:
+        raise PolicyLostError(f"the policy server at {url} is not well: {path} says HTTP {status} {reason}")
+    if status != http.HTTPStatus.OK:
+        raise PolicyError(
+            f"{url}: {path} says HTTP {status} {reason}, expected 200: another server listens there, or "
+            "policy.health_path is wrong"
+        )
+
+
+def _asked(url: str, path: str, headers: Mapping[str, str], deadline: float) -> tuple[int, str]:
+    """Status and reason; TimeoutError at the deadline on the monotonic clock however slowly the server speaks."""
+    place = urlsplit(url)
+    secure = place.scheme == "wss"
+    host, port = place.hostname or "", place.port or (443 if secure else 80)
+    lines = [f"GET {path} HTTP/1.1", f"Host: {place.netloc}", "Connection: close"]
+    lines += [f"{name}: {value}" for name, value in headers.items()]
+    with contextlib.ExitStack() as stack:
+        wire = stack.enter_context(reach(host, port, deadline, lambda: None))
+        wire.settimeout(_left(deadline))
+        if secure:
+            wire = stack.enter_context(ssl.create_default_context().wrap_socket(wire, server_hostname=host))
+        wire.sendall("\r\n".join([*lines, "", ""]).encode("latin-1"))
+        answer = b""
+        while b"\n" not in answer and len(answer) < _LONGEST:
+            wire.settimeout(_left(deadline))
+            piece = wire.recv(_LONGEST)
+            if not piece:
+                break
+            answer += piece
+    status = _STATUS.match(answer)
+    if status is None:
+        raise PolicyError(
+            f"{url}: what listens there is no web server, it says {answer[:40]!r}: check host, port and policy.kind"
+        )
+    return int(status[1]), status[2].decode("latin-1").strip()
+
+
+def _left(deadline: float) -> float:
+    left = deadline - time.monotonic()
+    if left <= 0:
+        raise TimeoutError("the deadline is over")
+    return left

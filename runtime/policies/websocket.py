@@ -1,0 +1,142 @@
+"""What policies on a websocket share: a server with deadlines, one conversation at a time, metadata first."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from abc import abstractmethod
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from runtime import codecs
+from runtime.errors import CodecError, ConfigurationError, PolicyError
+from runtime.policies.base import Policy, PolicyInfo
+from runtime.policies.health import require_healthy
+from runtime.policies.link import WebsocketLink
+from runtime.section import Section
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+ANSWER_LIMIT = 64 * 1024 * 1024  # bytes; a chunk of 50 rows is some kilobytes
+
+
+class ServerSettings(Section):
+    """Where a policy server on a websocket listens, and how long it may take."""
+
+    url: Annotated[str, Field(pattern=r"^wss?://.+")] = "ws://127.0.0.1:8000"
+    """Where the server listens: ws or wss, with a path where it has one."""
+    api_key_env: str | None = None
+    """Environment variable with the API key; the key itself would end up in every recording's manifest."""
+    health_path: Annotated[str, Field(pattern=r"^/")] | None = None
+    """Where the same port answers an HTTP GET with 200 while the server is well (openpi: "/healthz"); it is asked
+    before each connection. Without it nothing is asked."""
+    connect_deadline: Positive = 5.0
+    """For the connection and the server's metadata [s]."""
+    first_inference_deadline: Positive = 120.0
+    """For the first answer after set-up [s]: the server may have to compile its model."""
+    inference_deadline: Positive = 2.0
+    """For every later answer [s], also of a server that came back; after it the connection is dropped."""
+
+
+class WebsocketPolicy(Policy):
+    """One connection; a timed-out one is dropped, and the next `infer` opens another.
+
+    Deadlines are real seconds whatever the clock, because a server on a wire knows no other. The long first
+    deadline holds once after `connect`: later no `infer` takes longer than the deadlines of connection and
+    inference together, so that a server that came back mute, or compiles again, is found out quickly.
+    """
+
+    PROTOCOL = ""  # its name in sentences
+
+    def __init__(self, server: ServerSettings) -> None:
+        self._server = server
+        self._headers = headers(server)
+        self._link = self._new_link()
+        self._lock = threading.Lock()  # of the wire: held through every wait
+        self._turning = threading.Lock()  # between open and closed: held for a moment
+        self._closed = False
+        self._warm = False
+
+    @abstractmethod
+    def _greeted(self, metadata: dict[str, Any]) -> PolicyInfo:
+        """What the server says of itself; PolicyError, and the connection is dropped, where it is the wrong one."""
+
+    def connect(self) -> PolicyInfo:
+        """Reach the server and read its metadata; an open connection is replaced."""
+        with self._lock:
+            self._warm = False
+            self._link.drop()
+            with self._turning:
+                self._closed = False
+                self._link = self._new_link()
+            return self._open()
+
+    def close(self) -> None:
+        """Cut the connection and return at once; a call that waits in another thread raises PolicyError.
+
+        What is left of the connection is dropped by whoever uses it, now or at the next `connect`.
+        """
+        with self._turning:
+            self._closed = True
+            self._link.abort()
+
+    def _new_link(self) -> WebsocketLink:
+        return WebsocketLink(self._server.url, self._headers, self._server.connect_deadline)
+
+    def _require_open(self) -> None:
+        """A connection, another one where there is none any more; PolicyError after `close`."""
+        if self._closed:
+            raise PolicyError(f"the policy at {self._server.url} is closed; connect first")
+        if not self._link.is_open:
+            self._open()
+
+    def _open(self) -> PolicyInfo:
+        if self._server.health_path is not None:
+            deadline = self._server.connect_deadline
+            require_healthy(self._server.url, self._server.health_path, self._headers, deadline)
+        metadata = self._unpacked(self._link.open(), "metadata")
+        try:
+            return self._greeted(metadata)
+        except PolicyError:
+            self._link.drop()
+            raise
+
+    def _exchange(self, request: bytes) -> tuple[bytes, float]:
+        """The answer and its round trip [ms]."""
+        seconds = self._server.inference_deadline if self._warm else self._server.first_inference_deadline
+        self._warm = True
+        started = time.monotonic()
+        answer = self._link.exchange(request, seconds)
+        return answer, 1e3 * (time.monotonic() - started)
+
+    def _unpacked(self, payload: bytes, what: str) -> dict[str, Any]:
+        message = self._value(payload, what)
+        if not isinstance(message, dict):
+            self._link.drop()
+            raise PolicyError(
+                f"{self._server.url} sent {what} that is a {type(message).__name__}; expected a map"
+            )
+        return message
+
+    def _value(self, payload: bytes, what: str) -> Any:
+        try:
+            return codecs.unpack(payload, ANSWER_LIMIT)
+        except CodecError as error:
+            self._link.drop()
+            raise PolicyError(
+                f"{self._server.url} sent {what} that is not the {self.PROTOCOL} protocol: {error}"
+            ) from error
+
+
+def headers(server: ServerSettings) -> dict[str, str]:
+    """The request headers; ConfigurationError where the key that is named is not in the environment."""
+    if server.api_key_env is None:
+        return {}
+    key = os.environ.get(server.api_key_env)
+    if not key:
+        raise ConfigurationError(
+            f"policy.api_key_env names {server.api_key_env}, which is not set in the environment"
+        )
+    return {"Authorization": f"Api-Key {key}"}
