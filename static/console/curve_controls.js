@@ -3,7 +3,7 @@
 import { config } from "./config.js";
 import { Legend } from "./curve_legend.js";
 import { Curves } from "./curves.js";
-import { jointOptions } from "./joint_options.js";
+import { jointOptions } from "./joint_names.js";
 import { GHOSTS } from "./scene_ghosts.js";
 import { MarkLegend } from "./mark_legend.js";
 import { Tags } from "./tags.js";
@@ -40,7 +40,7 @@ export async function curvePane(store) {
     add: (samples) => curves.add(samples),
     joints: (names, units) => {
       curves.joints(names);
-      if (names.join() !== [...select.options].map((option) => option.text).join()) joints(curves, names, units);
+      if (names.join() !== [...select.options].map((option) => option.title).join()) joints(curves, names, units);
     },
   };
 }

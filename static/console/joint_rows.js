@@ -50,7 +50,7 @@ export class JointRows {
     Object.assign(slider, { id: `joint-${joint.index}`, min: joint.lower, max: joint.upper, step: "any" });
     Object.assign(number, { step, min: joint.lower, max: joint.upper });
     label.htmlFor = slider.id;
-    label.textContent = joint.gripper ? "gripper" : joint.name;
+    label.textContent = joint.label;
     const { unit } = joint;
     row.title = `${joint.full}: ${joint.lower} to ${joint.upper} ${unit}`.trim();
     row.querySelector(".joint-unit").textContent = shortUnit(unit);

@@ -1,6 +1,6 @@
 // Grippers with their state, and what the drives say of themselves.
 
-import { digitsOf, unitWords } from "./units.js";
+import { digitsOf, withUnit } from "./units.js";
 
 const KEYS = [
   { open: ",", close: ".", lock: "-" },
@@ -9,7 +9,7 @@ const KEYS = [
 
 /** Where a gripper is, in words; `about` has its unit and its range. */
 export function gripperWords({ locked, at }, about = {}) {
-  const place = Number.isFinite(at) ? `at ${at.toFixed(digitsOf(about))} ${unitWords(about.unit)}`.trim() : "";
+  const place = Number.isFinite(at) ? `at ${withUnit(at.toFixed(digitsOf(about)), about.unit)}` : "";
   return locked ? `locked ${place}`.trim() : place || "not known";
 }
 

@@ -8,9 +8,10 @@ export function shortUnit(unit = "") {
   return unit.length <= MOST ? unit : "";
 }
 
-/** The unit's first words: "opening" of "opening, 0 to 1". */
-export function unitWords(unit = "") {
-  return unit.split(",", 1)[0];
+/** A number with its unit; one that is explained by words stands behind the first: "opening 0.500". */
+export function withUnit(number, unit = "") {
+  const [what, range] = unit.split(",", 2);
+  return range ? `${what} ${number}` : `${number} ${unit}`.trim();
 }
 
 /** The step of a field: a five-hundredth of the range, as a round decimal. */

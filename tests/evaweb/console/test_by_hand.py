@@ -246,12 +246,34 @@ def test_joints_come_in_the_robots_groups_with_their_limits() -> None:
         "index": 1,
         "name": "joint6",
         "full": "left_arm.joint6",
+        "label": "gripper",
         "unit": "m",
         "gripper": True,
         "lower": 0.0,
         "upper": 0.1,
     }
     assert groups[2]["joints"][0]["lower"] == pytest.approx(-6.283, abs=0.001)  # turns without an end
+
+
+@pytest.mark.parametrize(
+    ("joints", "labels"),
+    [
+        (["joint0", "joint1"], ["joint0", "joint1"]),
+        (["panda_joint1", "panda_joint2"], ["joint1", "joint2"]),
+        (["idx21_arm_l_joint1", "idx22_arm_l_joint2"], ["joint1", "joint2"]),
+        (
+            ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint"],
+            ["shoulder pan", "shoulder lift", "elbow", "wrist 1"],
+        ),
+        (["left_wheel", "right_wheel"], ["left", "right"]),
+        (["wheel"], ["wheel"]),
+        (["linear_x", "linear_y", "angular_z"], ["x", "y", "z"]),
+        (["arm_1", "leg_1"], ["arm", "leg"]),
+        ([], []),
+    ],
+)
+def test_a_joints_label_is_as_short_as_tells_it_from_others(joints: list[str], labels: list[str]) -> None:
+    assert run("joint_names.js", "return m.labels(given)", joints) == labels
 
 
 def test_a_value_beyond_a_limit_is_clipped_and_said() -> None:
@@ -285,13 +307,13 @@ def test_numbers_have_the_digits_of_their_steps() -> None:
 
 
 def test_a_long_unit_stands_elsewhere() -> None:
-    body = "return given.map((unit) => [m.shortUnit(unit), m.unitWords(unit)])"
+    body = "return given.map((unit) => [m.shortUnit(unit), m.withUnit('0.5', unit)])"
 
     assert run("units.js", body, ["rad", "%", "", "opening, 0 to 1"]) == [
-        ["rad", "rad"],
-        ["%", "%"],
-        ["", ""],
-        ["", "opening"],
+        ["rad", "0.5 rad"],
+        ["%", "0.5 %"],
+        ["", "0.5"],
+        ["", "opening 0.5"],
     ]
 
 
@@ -484,7 +506,7 @@ def test_drives_and_grippers_say_what_is_the_matter() -> None:
     body = "return m.gripperWords({ at: 57.31 }, { unit: '%', lower: 0, upper: 100 })"
     assert run("robot_panel.js", body) == "at 57.3 %"
     body = "return m.gripperWords({ at: 0.5 }, { unit: 'opening, 0 to 1', lower: 0, upper: 1 })"
-    assert run("robot_panel.js", body) == "at 0.500 opening"
+    assert run("robot_panel.js", body) == "at opening 0.500"
 
 
 def test_a_key_with_shift_is_its_own_and_else_the_key_without() -> None:

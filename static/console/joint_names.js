@@ -1,0 +1,53 @@
+// Names of joints, "group.joint": in groups, and as short as still tells one from the other.
+
+const LONG = 22; // letters that a list has room for
+
+/** {group, joint} of a full name. */
+export function parted(full) {
+  const dot = full.indexOf(".");
+  return dot < 0 ? { group: "joints", joint: full } : { group: full.slice(0, dot), joint: full.slice(dot + 1) };
+}
+
+/**
+ * Short labels of the joints of one group: as few of a name's last words as tell all of them apart, without those
+ * at the end that all share ("pan" of "shoulder_pan_joint" says too little where another is "1" of "wrist_1_joint").
+ */
+export function labels(joints) {
+  const words = joints.map((joint) => joint.split("_"));
+  while (words.length > 1 && words.every((one) => one.length > 1 && one.at(-1) === words[0].at(-1))) words.forEach((one) => one.pop());
+  const most = Math.max(...words.map((one) => one.length));
+  for (let count = 1; count < most; count += 1) {
+    const short = words.map((one) => one.slice(-count).join(" "));
+    if (new Set(short).size === short.length && short.every((one) => /^[a-z]/i.test(one))) return short;
+  }
+  return words.map((one) => one.join(" "));
+}
+
+/** Options of value 0, 1, ... for full names; several groups are told apart by headings. */
+export function jointOptions(names) {
+  const groups = new Map();
+  names.forEach((full, index) => {
+    const { group, joint } = parted(full);
+    if (!groups.has(group)) groups.set(group, []);
+    groups.get(group).push({ full, joint, index });
+  });
+  const only = groups.size < 2;
+  const parts = [...groups].map(([group, joints]) => {
+    const short = labels(joints.map(({ joint }) => joint));
+    const options = joints.map(({ full, joint, index }, place) => {
+      const text = only ? joint : full;
+      const option = new Option(text.length > LONG ? `${only ? "" : `${group}.`}${short[place]}` : text, String(index));
+      option.title = full;
+      return option;
+    });
+    return only ? options : heading(group, options);
+  });
+  return parts.flat();
+}
+
+function heading(group, options) {
+  const made = document.createElement("optgroup");
+  made.label = group.replaceAll("_", " ");
+  made.append(...options);
+  return made;
+}
