@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,11 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robots import load
+from robots import Robot, load
 from runtime.errors import PolicyError, SetupError
+from runtime.formats import PoseFormat, PoseRows
+from runtime.kinematics.base import IkFlag
 from runtime.kinematics.compiled import CompiledKinematics
-from runtime.spaces import CommandRows, Spaces
+from runtime.spaces import CommandRows, Onset, Spaces
 from runtime.types import ActionChunk, Observation
+from tests.runtime.odd_robot import odd_robot
 
 ROBOT = load("agilex_piper")
 SPACES = Spaces(ROBOT, CompiledKinematics(ROBOT), 30.0)
@@ -106,7 +110,11 @@ def test_a_pose_that_cannot_be_reached_is_reported_arm_by_arm() -> None:
         (np.zeros((5, 14)), "eef", r"eef actions of shape \(5, 14\); agilex_piper takes \[H, 16\]"),
         (np.zeros((0, 14)), "joint", "at least one row"),
         (np.zeros(14), "joint", r"shape \(14,\)"),
-        (np.zeros((2, 16)), "eef", "no orientation for left_arm in row 0: qw, qx, qy, qz = 0, 0, 0, 0; allowed"),
+        (
+            np.zeros((2, 16)),
+            "eef",
+            "no orientation for left_arm in row 0: qw, qx, qy, qz = 0, 0, 0, 0; allowed",
+        ),
     ],
 )
 def test_an_answer_of_the_wrong_shape_or_without_direction_is_named(
@@ -306,3 +314,227 @@ def test_a_joint_without_end_goes_on_from_where_it_was_seen(at: float, turns: in
     made = spaces.to_command(ActionChunk(rows, rate=15.0), seen(start))
     np.testing.assert_allclose(made.rows[::2, ENDLESS_DIM], way, atol=1e-4)
     assert np.all(np.abs(np.diff(made.rows[:, ENDLESS_DIM])) <= 0.16)
+
+
+# Poses as policies write them
+
+
+FORMATS = [
+    PoseFormat(orientation="xyzw"),
+    PoseFormat(orientation="euler", euler_order="ZYX", degrees=True),
+    PoseFormat(orientation="euler", euler_order="xzx"),
+    PoseFormat(orientation="rotation_vector"),
+    PoseFormat(orientation="6d", sixd="rows", frame="world"),
+    PoseFormat(orientation="6d", frame="world"),
+]
+
+
+def written(spaces: Spaces, robot: Robot, pose: PoseFormat, rows: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Joint rows [T, D] as a policy of that format writes them; what it does not write stands as in `at` [T, D]."""
+    vectors = spaces.vectors(rows.astype(np.float64))
+    return PoseRows(pose, robot).encode(vectors, at.astype(np.float64))
+
+
+@pytest.mark.parametrize("pose", FORMATS, ids=str)
+def test_rows_in_any_format_become_the_joints_that_they_were_made_of(pose: PoseFormat) -> None:
+    rows = path(20)
+    actions = written(SPACES, ROBOT, pose, rows, START[None]).astype(np.float32)
+    made = commanded(ActionChunk(actions, space="eef", pose=pose))
+    assert made.solved is not None
+    assert made.solved.reached.all()
+    np.testing.assert_allclose(made.rows, rows, atol=1e-3)
+
+
+def offsets(rows: np.ndarray, mode: str, frame: str, pose: PoseFormat) -> np.ndarray:
+    """Rows [T, W]: what joint rows are relative to START, in the axes of `pose.frame`, by scipy."""
+    declared = PoseRows(pose, ROBOT).frame
+    everything = declared.express(
+        SPACES.vectors(np.stack([START, *rows]).astype(float)), START[None].astype(float)
+    )
+    flat = everything.reshape(len(everything), 16)
+    moves = relative_poses(flat[1:], flat[0], mode, frame).reshape(-1, 2, 8)
+    there = pose.model_copy(update={"frame": ""})
+    return PoseRows(there, ROBOT).encode(moves, START[None].astype(float))
+
+
+@pytest.mark.parametrize("pose", FORMATS, ids=str)
+@pytest.mark.parametrize("mode", ["relative", "delta"])
+@pytest.mark.parametrize("frame", ["base", "tool"])
+def test_offsets_in_any_format_lie_along_the_declared_frame_or_the_tool(
+    pose: PoseFormat, mode: str, frame: str
+) -> None:
+    rows = path(8)
+    actions = offsets(rows, mode, frame, pose).astype(np.float32)
+    made = commanded(ActionChunk(actions, space="eef", mode=mode, frame=frame, pose=pose))  # type: ignore[arg-type]
+    assert made.solved is not None
+    assert made.solved.reached.all()
+    np.testing.assert_allclose(made.rows, rows, atol=2e-3)
+
+
+def test_rows_without_grippers_leave_them_as_they_are_commanded() -> None:
+    pose = PoseFormat(orientation="6d", gripper=False)
+    actions = written(SPACES, ROBOT, pose, path(4), START[None]).astype(np.float32)
+    chunk = ActionChunk(actions, space="eef", pose=pose)
+    np.testing.assert_array_equal(commanded(chunk).rows[:, [6, 13]], np.tile(START[[6, 13]], (4, 1)))
+    told = START.astype(np.float64) + 0.01
+    made = SPACES.to_command(chunk, seen(), Onset(told, told)).rows
+    np.testing.assert_array_equal(made[:, [6, 13]], np.tile(told[[6, 13]], (4, 1)))
+
+
+@pytest.mark.parametrize(
+    ("pose", "shape", "said"),
+    [
+        (PoseFormat(orientation="6d"), (5, 16), r"\(5, 16\); agilex_piper takes \[H, 20\]"),
+        (
+            PoseFormat(orientation="6d"),
+            (5, 20),
+            "no orientation for left_arm in row 0: ax, ay, az, bx, by, bz",
+        ),
+    ],
+)
+def test_rows_that_are_not_of_the_format_are_named(pose: PoseFormat, shape: Any, said: str) -> None:
+    with pytest.raises(PolicyError, match=said):
+        commanded(ActionChunk(np.zeros(shape, np.float32), space="eef", pose=pose))
+
+
+def test_a_number_that_is_not_finite_is_named_as_the_format_names_it() -> None:
+    actions = np.zeros((3, 12), np.float32)
+    actions[1, 9] = np.nan
+    pose = PoseFormat(orientation="rotation_vector", gripper=False)
+    with pytest.raises(PolicyError, match=r"nan for right_arm\.rx in row 1"):
+        commanded(ActionChunk(actions, space="eef", pose=pose))
+
+
+# Where a chunk takes over
+
+
+def leap(rows: int, by: float = 0.6) -> ActionChunk:
+    """Poses that begin far from START on the first joint, and stay there."""
+    there = START.copy()
+    there[0] += by
+    return ActionChunk(SPACES.eef_of(np.tile(there, (rows, 1))), space="eef")
+
+
+def test_from_where_it_takes_over_no_joint_is_faster_than_it_may_be() -> None:
+    told = START.astype(np.float64).copy()
+    told[0] += 0.1
+    made = SPACES.to_command(leap(20), seen(), Onset(told, told, 4))
+    step = ROBOT.velocity[0] / 30
+    np.testing.assert_allclose(made.rows[:4, 0], START[0] + 0.6, atol=1e-3)  # stale: nobody executes them
+    assert made.rows[4, 0] == pytest.approx(told[0] + step, abs=1e-9)
+    assert np.all(np.abs(np.diff(made.rows[4:], axis=0)) <= ROBOT.velocity / 30 + 1e-9)
+    assert made.rows[-1, 0] == pytest.approx(START[0] + 0.6, abs=1e-3)
+    assert made.solved is not None
+    assert made.solved.flags[4, 0] & IkFlag.AT_VELOCITY
+    assert made.solved.flags[4, 0] & IkFlag.OVER_TOLERANCE
+
+
+def test_where_the_policy_means_to_begin_is_not_hidden_by_how_fast_the_robot_is() -> None:
+    made = commanded(leap(5))
+    assert made.rows[0, 0] == pytest.approx(START[0] + ROBOT.velocity[0] / 30, abs=1e-6)
+    assert made.meant[0] == pytest.approx(START[0] + 0.6, abs=1e-3)
+    stale = SPACES.to_command(leap(5), seen(), Onset(START.astype(float), START.astype(float), 2))
+    assert stale.meant[0] == pytest.approx(START[0] + 0.6, abs=1e-3)
+    np.testing.assert_array_equal(commanded(ActionChunk(path(3))).meant, path(3)[0].astype(float))
+
+
+def test_a_chunk_whose_rows_are_all_stale_is_solved_all_the_same() -> None:
+    made = SPACES.to_command(leap(5), seen(), Onset(START.astype(float), START.astype(float), 50))
+    assert made.rows.shape == (5, 14)
+
+
+# Robots with more than two arms that have grippers
+
+
+@pytest.fixture(scope="module")
+def odd(tmp_path_factory: pytest.TempPathFactory) -> tuple[Robot, Spaces]:
+    robot = odd_robot(tmp_path_factory.mktemp("robots"))
+    return robot, Spaces(robot, CompiledKinematics(robot), 30.0)
+
+
+def test_an_arm_without_a_gripper_has_a_0_that_is_nobodys(odd: tuple[Robot, Spaces]) -> None:
+    robot, spaces = odd
+    home = robot.poses["home"]
+    vector = spaces.eef_of(home)
+    assert vector.shape == (16,)
+    assert vector[7] == 0.0
+    assert vector[15] == np.float32(home[14])
+    rows = np.tile(vector, (3, 1))
+    rows[:, 7] = 9.0
+    made = spaces.to_command(ActionChunk(rows, space="eef"), seen(home))
+    np.testing.assert_allclose(made.rows, np.tile(home, (3, 1)), atol=1e-5)
+    assert made.rows[0, 14] == vector[15]
+
+
+def test_what_rows_say_nothing_of_is_held_where_it_is_commanded(odd: tuple[Robot, Spaces]) -> None:
+    robot, spaces = odd
+    home = robot.poses["home"]
+    told = home + 0.01
+    rows = np.tile(spaces.eef_of(home), (3, 1))
+    made = spaces.to_command(ActionChunk(rows, space="eef"), seen(home), Onset(told, told)).rows
+    np.testing.assert_array_equal(made[:, [0, 1, 15, 16]], np.tile(told[[0, 1, 15, 16]], (3, 1)))
+
+
+@pytest.mark.parametrize("mode", ["absolute", "relative", "delta"])
+def test_joints_that_follow_the_poses_are_commanded_with_them(odd: tuple[Robot, Spaces], mode: str) -> None:
+    robot, spaces = odd
+    home = robot.poses["home"]
+    pose = PoseFormat(orientation="rotation_vector", groups=["hand", "neck"])
+    rows = np.tile(home, (4, 1))
+    rows[:, 0] += [0.1, 0.2, 0.3, 0.4]
+    rows[:, 15] += [0.5, 0.5, 0.5, 0.6]
+    rows[:, 16] = [1.0, 1.0, 0.0, 0.0]
+    actions = written(spaces, robot, pose, rows, rows)
+    if mode != "absolute":
+        before = np.tile(home, (4, 1)) if mode == "relative" else np.stack([home, *rows[:-1]])
+        actions[:, :14] = 0.0  # no move of the arms
+        actions[:, [6, 13]] = [0.0, home[14]]
+        actions[:, 14:] -= np.where(np.arange(4) == 1, 0.0, before[:, [15, 16, 0, 1]])
+    chunk = ActionChunk(actions.astype(np.float32), space="eef", mode=mode, pose=pose, rate=15.0)  # type: ignore[arg-type]
+    made = spaces.to_command(chunk, seen(home))
+    np.testing.assert_allclose(made.rows[::2], rows, atol=1e-5)
+    np.testing.assert_allclose(
+        made.rows[1::2, 0], [home[0] + at for at in (0.15, 0.25, 0.35, 0.4)], atol=1e-6
+    )
+    assert made.rows[:, 16].tolist() == [1, 1, 1, 1, 0, 0, 0, 0]
+
+
+TORSO = load("r1_lite", ["left_arm", "right_arm", "torso"])
+CARRIED = Spaces(TORSO, CompiledKinematics(TORSO), 30.0)
+STANDS = TORSO.poses["ready"] if "ready" in TORSO.poses else TORSO.poses["home"]
+
+
+@pytest.mark.parametrize("frame", ["", "torso_link3"])
+@pytest.mark.parametrize("appended", [True, False])
+def test_arms_reach_their_poses_while_rows_move_the_torso_that_carries_them(
+    frame: str, appended: bool
+) -> None:
+    pose = PoseFormat(orientation="6d", frame=frame, groups=["torso"] if appended else [])
+    rows = np.tile(STANDS, (6, 1))
+    rows[:, 0] += 0.02 * np.arange(6)
+    if appended:
+        rows[:, TORSO.group("torso").slice] += 0.01 * np.arange(6)[:, None]
+    actions = written(CARRIED, TORSO, pose, rows, rows)
+    made = CARRIED.to_command(ActionChunk(actions.astype(np.float32), space="eef", pose=pose), seen(STANDS))
+    assert made.solved is not None
+    assert made.solved.reached.all()
+    np.testing.assert_allclose(CARRIED.vectors(made.rows)[..., :3], CARRIED.vectors(rows)[..., :3], atol=1e-3)
+    np.testing.assert_allclose(
+        made.rows[:, TORSO.group("torso").slice], rows[:, TORSO.group("torso").slice], atol=1e-5
+    )
+
+
+# Measured poses
+
+
+def test_how_far_measured_poses_are_from_those_of_the_joints_is_said_of_the_worst_arm() -> None:
+    measured = SPACES.eef_of(START)
+    assert SPACES.disagreement(measured, START) == ""
+    measured[3:7] *= -1.0
+    assert SPACES.disagreement(measured, START) == ""
+    turn = Rotation.from_quat(measured[11:15], scalar_first=True) * Rotation.from_rotvec([0, 0, 0.5])
+    measured[11:15] = turn.as_quat(scalar_first=True)
+    said = SPACES.disagreement(measured, START)
+    assert "right_arm 0 mm and 29 degrees from where its joints have gripper_base in base_link" in said
+    with pytest.raises(PolicyError, match="the robot measured no orientation for left_arm"):
+        SPACES.disagreement(np.zeros(16), START)
