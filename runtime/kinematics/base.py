@@ -39,7 +39,7 @@ class KinematicsSettings(Section):
     """Cost of a metre beside the pose."""
     rotation_weight: Positive = 10.0
     """Cost of a radian beside it."""
-    rest_weight: Annotated[float, Field(ge=0)] = 0.02
+    rest_weight: Annotated[float, Field(ge=0)] = 0.01
     """Cost of a radian away from where the frame before leads: holds what the pose leaves open. At 1, reachable
     poses are missed by millimetres."""
     position_tolerance: Positive = 1e-3
