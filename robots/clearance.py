@@ -94,17 +94,19 @@ class Clearance:
         lower = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
         upper = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
         apart = self.distances(np.random.default_rng(0).uniform(lower, upper, (_POSTURES, robot.dim)))
-        touching = dict.fromkeys(map(_alike, self.pairs), 0.0)
-        for pair, share in zip(self.pairs, (apart < MARGIN).mean(axis=0), strict=True):
-            touching[_alike(pair)] = max(touching[_alike(pair)], float(share))
-        parting = np.array([touching[_alike(pair)] < _NEARLY_ALWAYS for pair in self.pairs], dtype=bool)
+        columns: dict[tuple[str, str], list[int]] = {}
+        for index, pair in enumerate(self.pairs):
+            columns.setdefault(pair, []).append(index)
+        touching: dict[tuple[str, ...], float] = {}
+        for pair, own in columns.items():
+            share = float((apart[:, own].min(axis=1) < MARGIN).mean())
+            touching[_alike(pair)] = max(share, touching.get(_alike(pair), 0.0))
+        telling = np.array([touching[_alike(pair)] < _NEARLY_ALWAYS for pair in self.pairs], dtype=bool)
+        for pair, own in columns.items():
+            if TABLE in pair and np.ptp(apart[:, own], axis=0).max() <= _LEVEL:
+                telling[own] = False
         count = len(self._first)
-        tilting = np.ptp(apart[:, count:], axis=0) > _LEVEL
-        return (
-            self._first[parting[:count]],
-            self._second[parting[:count]],
-            self._over[parting[count:] & tilting],
-        )
+        return self._first[telling[:count]], self._second[telling[:count]], self._over[telling[count:]]
 
 
 def _alike(pair: tuple[str, str]) -> tuple[str, ...]:
