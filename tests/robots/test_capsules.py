@@ -89,11 +89,10 @@ def test_a_link_round_a_corner_is_two_thin_capsules_and_not_a_fat_one() -> None:
 
 
 def test_a_link_has_the_capsule_that_its_robot_declares_or_none(edited: Edit) -> None:
-    declared = """[collision]
-capsules.link1 = { start = [0.0, 0.0, -0.1], end = [0.0, 0.0, 0.1], radius = 0.2 }
+    declared = """capsules.link1 = { start = [0.0, 0.0, -0.1], end = [0.0, 0.0, 0.1], radius = 0.2 }
 without = ["link5"]
 ignore = ["""
-    robot = robots.load(edited(("[collision]\nignore = [", declared)))
+    robot = robots.load(edited(("ignore = [", declared)))
     made = capsules(robot)
     (own,) = made["link1"]
     assert (own.start.tolist(), own.end.tolist(), own.radius) == ([0, 0, -0.1], [0, 0, 0.1], 0.2)
