@@ -46,12 +46,14 @@ class InPoses(Script):
         return posed
 
     def of(self, joints: Float64, q: Float64) -> Float32:
-        """Rows float32 [H, width] of joint rows [H, D]; what carries an arm's frame stands as in q [D]."""
+        """Rows float32 [H, width] of joint rows [H, D].
+
+        What carries a declared frame stands as in q [D], unless its joints follow the poses.
+        """
         vectors = np.stack([_vectors(arm, joints) for arm in self._robot.arms], axis=1)
-        rows = self._rows.encode(vectors, q[None])
-        appended = joints[:, self._rows.dims]
-        rows[:, rows.shape[1] - appended.shape[1] :] = appended
-        return rows.astype(np.float32)
+        at = np.tile(q, (len(joints), 1))
+        at[:, self._rows.dims] = joints[:, self._rows.dims]
+        return self._rows.encode(vectors, at).astype(np.float32)
 
 
 def pose_format(assignments: Sequence[str]) -> PoseFormat:
@@ -63,7 +65,7 @@ def pose_format(assignments: Sequence[str]) -> PoseFormat:
             raise SetupError(f"--pose {text}; allowed: KEY=VALUE with {', '.join(PoseFormat.model_fields)}")
         given[key.strip()] = _value(value)
     try:
-        return PoseFormat(**given)
+        return PoseFormat.model_validate(given)
     except (ValidationError, RuntimeFault) as error:
         raise SetupError(f"--pose {' '.join(assignments)}: {error}") from None
 

@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 
 from runtime import family
-from runtime.deployment import load
+from runtime.deployment import changed, load
+from runtime.errors import ConfigurationError, SetupError
 from runtime.family import Lifeline, plan
+from runtime.formats import PoseFormat
 from runtime.page import Page
 from runtime.timeline import Dims
+from runtime.transports import zmq
+from runtime.transports.base import Capabilities
 
 DEPLOYMENTS = Path(__file__).parents[2] / "deployments"
 
@@ -97,3 +101,46 @@ def test_angles_without_limits_wrap_and_grippers_that_know_two_places_switch(res
     group = replace(made.robot.groups[1], gripper=replace(made.robot.groups[1].gripper, binary=True))
     turning = replace(made.robot, lower=lower, upper=upper, groups=(made.robot.groups[0], group))
     assert replace(made, robot=turning).dims == Dims(switched=(13,), wrapping=(2,))
+
+
+# --- publication ------------------------------------------------------------------------------------------
+
+
+def publishing(resolved, **publication):
+    return changed(resolved, {"publication": publication}, "test")
+
+
+def test_poses_are_published_only_over_a_transport_that_has_such_a_command(resolved):
+    said = "publication.space = 'eef' with transport 'zmq', which has no such command; allowed: joint$"
+    with pytest.raises(SetupError, match=said):
+        plan(publishing(resolved, space="eef"))
+
+
+@pytest.fixture
+def taking_poses(monkeypatch):
+    """The transport of the deployment, as one that takes poses of one format beside joints."""
+    taken = Capabilities(True, spaces=frozenset({"joint", "eef"}), poses=(PoseFormat(orientation="xyzw"),))
+    monkeypatch.setattr(zmq, "capabilities", lambda config: taken)
+
+
+def test_poses_are_published_as_the_transport_takes_them(resolved, taking_poses):
+    made = plan(publishing(resolved, space="eef", pose={"orientation": "xyzw"}))
+    home = made.robot.poses["home"]
+    row = made.publication()(home)
+    expected = made.spaces().eef_of(home)
+    assert row.dtype == np.float32
+    np.testing.assert_allclose(row[:3], expected[:3], atol=1e-6)
+    np.testing.assert_allclose(row[3:7], expected[[4, 5, 6, 3]], atol=1e-6)
+    with pytest.raises(
+        SetupError, match=r"publication.pose = 6d of columns with transport 'zmq'; allowed: xyzw$"
+    ):
+        plan(publishing(resolved, space="eef", pose={"orientation": "6d"}))
+
+
+def test_a_format_of_published_poses_that_does_not_fit_the_robot_is_refused(resolved, taking_poses):
+    with pytest.raises(ConfigurationError, match=r"publication\.pose\.frame = 'moon' is no frame"):
+        plan(publishing(resolved, space="eef", pose={"orientation": "xyzw", "frame": "moon"}))
+
+
+def test_joints_alone_are_published_where_nothing_is_said(resolved):
+    assert plan(resolved).publication() is None
