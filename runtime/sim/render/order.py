@@ -10,23 +10,25 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.sim.render.solids import Placed
 from runtime.types import Float32
 
 Bool = NDArray[np.bool_]
 
 
 class Order:
-    """The separating sides of solids as they stand; `hides` and `painted` for as many cameras as wanted."""
+    """The separating sides of solids as they stand; `hides` and `painted` for as many cameras as wanted.
 
-    def __init__(self, placed: Placed, halves: Float32) -> None:
+    The box around each has three unit axes, the rows of `axes` [S, 3, 3], its centre [S, 3] and half sizes [S, 3].
+    """
+
+    def __init__(self, axes: Float32, centres: Float32, halves: Float32) -> None:
         count = len(halves)
-        self._placed = placed
+        self._axes, self._centres = axes, centres
         self._halves = halves
-        normals = placed.axes.reshape(-1, 3)  # [3 S, 3]
+        normals = axes.reshape(-1, 3)  # [3 S, 3]
         reach = np.abs(normals @ normals.T).reshape(-1, count, 3)  # of every axis along every normal
         radius = (reach * halves).sum(-1).reshape(count, 3, count)
-        along = (normals @ placed.centres.T).reshape(count, 3, count)
+        along = (normals @ centres.T).reshape(count, 3, count)
         offset = along - along[np.arange(count), :, np.arange(count)][..., None]  # of the others' centres
         gap = np.abs(offset) - halves[..., None] - radius  # [S, 3, S] between side and other
         self._side = gap.argmax(1)  # [S, S]
@@ -36,7 +38,7 @@ class Order:
 
     def hides(self, eye: Float32) -> Bool:
         """[S, S]: whether the second, as seen from `eye` [3], lies in front of the first."""
-        across = np.einsum("skd,sd->sk", self._placed.axes, eye - self._placed.centres)
+        across = np.einsum("skd,sd->sk", self._axes, eye - self._centres)
         beyond = np.stack([-across > self._halves, across > self._halves], -1)  # [S, 3, 2]
         rows = np.arange(len(beyond))[:, None]
         mine: Bool = beyond[rows, self._side, self._sign.astype(np.intp)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +30,8 @@ class Painter:
     def __init__(self, solids: Solids, placed: Placed) -> None:
         self._solids = solids
         self._placed = placed
-        self._order = Order(placed, solids.halves)
+        self._kept = np.flatnonzero(placed.seen)
+        self._order = Order(placed.axes[self._kept], placed.centres[self._kept], solids.halves[self._kept])
         self._corners = placed.vertices[solids.face_corner]
         normals = placed.normals
         lit = 0.50 + 0.10 * normals[:, 2] + 0.40 * np.maximum(normals @ LIGHT, 0)
@@ -43,53 +46,58 @@ class Painter:
         solids, placed = self._solids, self._placed
         eye = camera.pose[:3, 3].astype(np.float32)
         inside = (placed.vertices - eye) @ camera.pose[:3, :3].astype(np.float32)
-        chosen = np.flatnonzero(_in_view(camera, inside, solids) & placed.seen)
+        among = np.flatnonzero(_in_view(camera, inside, solids)[self._kept])
+        chosen = self._kept[among]
         near = np.minimum.reduceat(inside[:, 2], solids.starts) < _NEAR
         pixels = _pixels(camera, inside)
         low = np.minimum.reduceat(pixels, solids.starts)
         high = np.maximum.reduceat(pixels, solids.starts)
         low[near], high[near] = -_FAR_OUT, _FAR_OUT
         overlap = _overlap(low[chosen], high[chosen])
-        hides = self._order.hides(eye)[np.ix_(chosen, chosen)]
+        hides = self._order.hides(eye)[np.ix_(among, among)]
         distance = np.linalg.norm(placed.centres[chosen] - eye, axis=1)
-        facing, colours = self._facing(eye)
+        facing = self._facing(eye, chosen)
         corners = (pixels * (1 << _SHIFT)).round().astype(np.int32)
         for place in painted(hides, overlap, distance):
             solid = int(chosen[place])
             if near[solid]:
-                self._paint_near(picture, camera, inside, solid, facing, colours)
+                self._paint_near(picture, camera, inside, solid, facing)
             else:
-                self._paint_solid(picture, corners, solid, facing, colours)
+                self._paint_solid(picture, corners, solid, facing)
 
-    def _facing(self, eye: Float32) -> tuple[list[bool], list[tuple[float, ...]]]:
-        """Which faces [F] the eye sees from outside, and in which colour (blue, green, red)."""
-        ray = eye - self._corners
-        facing = np.einsum("fd,fd->f", ray, self._placed.normals) > 0
+    def _facing(self, eye: Float32, chosen: NDArray[np.intp]) -> dict[int, tuple[float, ...]]:
+        """The faces of chosen solids that the eye sees from outside, and in which colour (blue, green, red)."""
+        solids, normals = self._solids, self._placed.normals
+        wanted = np.zeros(len(solids.solids), bool)
+        wanted[chosen] = True
+        faces = np.flatnonzero(wanted[solids.face_solids])
+        ray = eye - self._corners[faces]
+        outside = np.einsum("fd,fd->f", ray, normals[faces]) > 0
+        faces, ray = faces[outside], ray[outside]
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         half = ray + LIGHT
         half /= np.linalg.norm(half, axis=1, keepdims=True)
-        gloss = np.maximum(np.einsum("fd,fd->f", half, self._placed.normals), 0) ** _SHINE
-        gloss[self._solids.face_matt] = 0
-        colours = np.minimum(self._colours + (255 * _GLOSS) * gloss[:, None], 255)
-        return facing.tolist(), list(map(tuple, colours[:, ::-1].tolist()))
+        gloss = np.maximum(np.einsum("fd,fd->f", half, normals[faces]), 0) ** _SHINE
+        gloss[solids.face_matt[faces]] = 0
+        colours = np.minimum(self._colours[faces] + (255 * _GLOSS) * gloss[:, None], 255)
+        return dict(zip(faces.tolist(), map(tuple, colours[:, ::-1].tolist()), strict=True))
 
     def _paint_solid(
         self,
         picture: UInt8,
         corners: NDArray[np.int32],
         solid: int,
-        facing: list[bool],
-        colours: list[tuple[float, ...]],
+        facing: Mapping[int, tuple[float, ...]],
     ) -> None:
         solids = self._solids
-        faces = [face for face in solids.faces_of[solid] if facing[face]]
+        faces = [face for face in solids.faces_of[solid] if face in facing]
         hull = cv2.convexHull(corners[solids.starts[solid] : solids.stops[solid]])
         cv2.fillConvexPoly(picture, hull, self._rims[solid], cv2.LINE_AA, _SHIFT)
         for face in faces:
-            cv2.fillConvexPoly(picture, corners[solids.faces[face]], colours[face], cv2.LINE_AA, _SHIFT)
+            cv2.fillConvexPoly(picture, corners[solids.faces[face]], facing[face], cv2.LINE_AA, _SHIFT)
         if solids.solids[solid].painted:
             for face in faces:
-                edge = [min(255.0, 1.18 * part + 12) for part in colours[face]]
+                edge = [min(255.0, 1.18 * part + 12) for part in facing[face]]
                 cv2.polylines(picture, [corners[solids.faces[face]]], True, edge, 1, cv2.LINE_AA, _SHIFT)
 
     def _paint_near(
@@ -98,13 +106,12 @@ class Painter:
         camera: PinholeCamera,
         inside: Float32,
         solid: int,
-        facing: list[bool],
-        colours: list[tuple[float, ...]],
+        facing: Mapping[int, tuple[float, ...]],
     ) -> None:
         """A solid that reaches behind the camera: only what of its faces lies ahead."""
         for face in self._solids.faces_of[solid]:
-            if facing[face]:
-                fill_ahead(picture, camera, inside[self._solids.faces[face]], colours[face])
+            if face in facing:
+                fill_ahead(picture, camera, inside[self._solids.faces[face]], facing[face])
 
 
 def fill_ahead(

@@ -27,7 +27,9 @@ def test_open_and_close_are_as_far_apart_as_declared_and_the_block_fits_between(
 
 def test_a_number_that_rises_as_the_jaws_close_is_turned_round():
     gripper = replace(robots.load("agilex_piper").arms[0].gripper, open=0.0, close=2.0, apart=(0.01, 0.05))
-    assert [Opening(gripper).metres(number) for number in (0.0, 1.0, 2.0)] == pytest.approx([0.05, 0.03, 0.01])
+    assert [Opening(gripper).metres(number) for number in (0.0, 1.0, 2.0)] == pytest.approx(
+        [0.05, 0.03, 0.01]
+    )
 
 
 @pytest.mark.parametrize(("name", "arm"), GRIPPERS, ids=[f"{name}-{arm.name}" for name, arm in GRIPPERS])

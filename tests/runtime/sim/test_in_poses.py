@@ -40,7 +40,9 @@ def test_its_rows_are_the_poses_of_the_joint_rows(name, pose):
 def test_groups_that_follow_the_poses_come_as_joints():
     robot = robots.load("agibot_g2")
     q = robot.poses["ready"]
-    rows = InPoses(Waving(robot, 5, 30.0), robot, 30.0, PoseFormat(groups=["body", "head"])).begin()(q, {}, "")
+    rows = InPoses(Waving(robot, 5, 30.0), robot, 30.0, PoseFormat(groups=["body", "head"])).begin()(
+        q, {}, ""
+    )
     expected = np.concatenate([q[robot.group("body").slice], q[robot.group("head").slice]])
     np.testing.assert_allclose(rows[:, -len(expected) :], np.tile(expected, (5, 1)), atol=1e-6)
 

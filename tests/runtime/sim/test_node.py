@@ -147,6 +147,46 @@ def test_poses_are_those_of_the_joints(bench: Bench) -> None:
     np.testing.assert_allclose(said["eef"]["left_arm"][:7], expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", [name for name in robots.names() if name != "agilex_piper"])
+def test_any_robot_goes_where_it_is_told_and_measures_what_its_chains_say(name: str) -> None:
+    robot = robots.load(name)
+    clock = VirtualClock()
+    line = [
+        "--robot",
+        name,
+        "--bench",
+        "tabletop",
+        "--width",
+        "96",
+        "--height",
+        "72",
+        "--start-pose",
+        "ready",
+    ]
+    node = Node(robot, parser().parse_args(line), clock)
+    start = robot.poses["ready"]
+    target = np.clip(start + 0.05 * np.minimum(1.0, robot.upper - robot.lower), robot.lower, robot.upper)
+    for _ in range(45):
+        clock.advance(PERIOD)
+        said = codecs.unpack(
+            node.exchange([codecs.pack({"t": 0.0, "action": target.astype(np.float32)})], PERIOD)
+        )
+    found = np.asarray(robot.join(said["state"]), np.float64)
+    np.testing.assert_allclose(found, target, atol=1e-3)
+    assert said["refused"] == {}
+    assert {key: picture.shape for key, picture in said["images"].items()} == {
+        camera.key: (72, 96, 3) for camera in robot.cameras
+    }
+    for arm in robot.arms:
+        np.testing.assert_allclose(said["eef"][arm.name][:7], arm.pose(found), atol=1e-5)
+        assert said["eef"][arm.name][7] == np.float32(found[arm.gripper_dim])
+
+
+def test_a_robot_that_measures_no_poses_sends_none() -> None:
+    node = Node(ROBOT, parser().parse_args(["--robot", "agilex_piper", *SMALL, "--no-eef"]), VirtualClock())
+    assert "eef" not in codecs.unpack(node.exchange([], PERIOD))
+
+
 def test_frame_numbers_in_the_message_and_in_the_pictures_agree(bench: Bench) -> None:
     for _ in range(3):
         said = bench.tick()
@@ -554,6 +594,7 @@ def test_it_ends_when_its_lifeline_ends(start: Any) -> None:
         (["--robot", "agilex_piper", *FREE, "--rate", "0"], "0 is not above zero"),
         (["--robot", "agilex_piper", *FREE, "--start-pose", "x"], "has no pose 'x'; it has home, ready"),
         (["--robot", "agilex_piper", *FREE, "--bench", "tabletop", "--blocks", "0"], "0 blocks by seed 0"),
+        (["--robot", "agilex_piper", *FREE, "--groups", "left_arm,tail"], "tail"),
     ],
 )
 def test_a_wrong_option_ends_it_with_a_sentence(arguments: list[str], says: str) -> None:

@@ -81,3 +81,20 @@ def test_an_arm_that_does_not_say_how_far_it_opens_cannot_pick_and_leaves_it_to_
 def mute(arm):
     """The arm, with a gripper that does not say how far it opens."""
     return replace(arm, gripper=replace(jaws(arm), unit="percent", apart=None))
+
+
+@pytest.mark.parametrize("name", robots.names())
+def test_every_arm_of_every_robot_goes_straight_down_on_what_is_near_it(name):
+    robot = robots.load(name)
+    postures, home = Postures(robot, Bench()), robot.poses["home"]
+    assert postures.arms == robot.arms
+    for arm in robot.arms:
+        side = np.sign(postures.tip(arm, home)[0, 3]) if len(robot.arms) > 1 else 0.0
+        place = (0.1 * side, 0.28)
+        down, over = postures.stations(arm, home, (*place, 0.3), (0.1 * side, 0.38), 0.0, TILTS[0])
+        assert over is not None
+        tips = np.stack([tip_in_world(robot, arm, q) for q in down])
+        np.testing.assert_allclose(tips[:, :2, 3], np.broadcast_to(place, (4, 2)), atol=2e-3)
+        assert -tips[-1, 2, 2] == pytest.approx(1.0, abs=1e-3)
+        assert abs(math.remainder(math.atan2(tips[-1, 1, 1], tips[-1, 0, 1]) - 0.3, math.pi / 2)) < 0.02
+        assert np.abs(np.diff(down, axis=0)).max() < 0.7

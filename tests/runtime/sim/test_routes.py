@@ -144,3 +144,21 @@ def test_a_route_from_the_table_rises_first():
     route = planned(q=low)
     assert route.legs[0].name == "rise"
     assert bench.tip_in_world(ROBOT, LEFT, route.legs[0].end)[2, 3] == pytest.approx(CLEAR, abs=0.003)
+
+
+@pytest.mark.parametrize("name", [name for name in robots.names() if name != ROBOT.name])
+def test_every_robot_reaches_every_layout_slowly_and_above_the_table(name):
+    robot = robots.load(name)
+    planner, ready = Planner(robot, RATE, Bench()), robot.poses["ready"]
+    moving = np.setdiff1d(np.arange(robot.dim), robot.gripper_dims)
+    for seed in range(25):
+        layout = layout_of(seed)
+        route = planner.pick_and_place(ready, layout.blocks[0], layout.plate, SURE)
+        assert route is not None, seed
+        assert (np.abs(np.diff(route.rows, axis=0))[:, moving].max() * RATE) < 1.5
+        assert (route.rows >= robot.lower).all()
+        assert (route.rows <= robot.upper).all()
+        heights = [bench.tip_in_world(robot, route.arm, row)[2, 3] for row in route.rows[::4]]
+        assert min(heights) > 0.012
+        others = np.setdiff1d(np.arange(robot.dim), np.arange(route.arm.slice.start, route.arm.slice.stop))
+        assert np.ptp(route.rows[:, others], axis=0).max(initial=0.0) == 0.0

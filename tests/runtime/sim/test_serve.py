@@ -17,7 +17,7 @@ from websockets.sync.client import ClientConnection, connect
 import robots
 from runtime import codecs
 from runtime.clock import MonotonicClock
-from runtime.errors import PolicyError
+from runtime.errors import ContradictionError, PolicyError
 from runtime.policies import openpi
 from runtime.policies.link import PolicyGone
 from runtime.policies.pictures import fitted, laid_out
@@ -196,6 +196,13 @@ def test_the_chase_says_what_it_is_and_moves_only_for_a_block_that_it_sees(serve
         (("--noise", "5"), "--noise and --failure-rate are for --behaviour pick_place"),
         (("--behaviour", "pick_place", "--failure-rate", "1.5"), "1.5 was given; allowed: 0 to 1"),
         (("--behaviour", "dance"), "invalid choice: 'dance'"),
+        (("--pose", "orientation=xyzw"), "--pose orientation=xyzw: allowed with --space eef"),
+        (
+            ("--space", "eef", "--rtc", "prev_action"),
+            "--rtc prev_action with --space eef: it continues joint rows",
+        ),
+        (("--space", "eef", "--pose", "frame=moon"), "moon"),
+        (("--groups", "left_arm,tail"), "tail"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(options: tuple[str, ...], said: str) -> None:
@@ -203,3 +210,39 @@ def test_options_that_make_no_sense_are_refused(options: tuple[str, ...], said: 
     ended = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60)
     assert ended.returncode == 2
     assert said in ended.stderr
+
+
+def test_it_answers_in_poses_of_the_format_that_is_asked_for_and_says_so(serve: Any) -> None:
+    url = serve("--space", "eef", "--pose", "orientation=6d", "--pose", "gripper=false").ready["url"]
+    with conversation(url) as connection:
+        metadata = receive(connection)
+        connection.send(request())
+        answer = receive(connection)
+    assert (metadata["action_space"], metadata["action_dim"]) == ("eef", 18)
+    assert metadata["action_pose"]["orientation"] == "6d"
+    assert answer["actions"].shape == (50, 18)
+    assert "origin_actions" not in answer
+    pose = ROBOT.arms[0].pose(HOME)
+    np.testing.assert_allclose(answer["actions"][0, :3], pose[:3], atol=0.02)
+
+
+def test_a_client_that_has_it_otherwise_is_told_so(serve: Any) -> None:
+    url = serve("--space", "eef", "--pose", "orientation=xyzw").ready["url"]
+    config = openpi.Config(url=url, action_space="eef")
+    said = r"action_pose.orientation = 'xyzw', .* = 'wxyz'"
+    policy = openpi.build(config, ROBOT, MonotonicClock(), 30.0)
+    with contextlib.closing(policy), pytest.raises(ContradictionError, match=said):
+        policy.connect()
+
+
+def test_a_robot_may_have_its_optional_groups(start: Any) -> None:
+    groups = ["left_arm", "right_arm", "torso"]
+    robot = robots.load("r1_lite", groups)
+    arguments = ("openpi", "--robot", "r1_lite", "--groups", ",".join(groups), "--port", "0")
+    with conversation(start("runtime.sim.serve", *arguments).ready["url"]) as connection:
+        receive(connection)
+        connection.send(request(state=robot.poses["home"].astype(np.float32)))
+        actions = receive(connection)["actions"]
+    torso = robot.group("torso").slice
+    assert actions.shape == (50, robot.dim)
+    np.testing.assert_allclose(actions[:, torso], np.tile(robot.poses["home"][torso], (50, 1)), atol=1e-6)

@@ -13,7 +13,8 @@ def placed_at(*boxes: tuple[tuple[float, float, float], tuple[float, float, floa
         origin[:3, 3] = centre
         solids.append(Solid(0, "box", size, origin, (0.5, 0.5, 0.5)))
     all_of_them = Solids(solids)
-    return Order(all_of_them.placed(np.eye(4)[None]), all_of_them.halves)
+    placed = all_of_them.placed(np.eye(4)[None])
+    return Order(placed.axes, placed.centres, all_of_them.halves)
 
 
 def test_what_lies_on_a_large_thing_hides_it_although_its_middle_is_farther_from_the_eye() -> None:

@@ -47,3 +47,19 @@ def test_solids_move_with_their_frames_and_their_boxes_with_them() -> None:
     np.testing.assert_allclose(placed.centres, [TURNED[:3, 3]] * 2, atol=1e-6)
     np.testing.assert_allclose(solids.halves, [[0.1, 0.2, 0.3], [0.1, 0.1, 0.4]], atol=1e-6)
     np.testing.assert_allclose(placed.axes[0], TURNED[:3, :3].T, atol=1e-6)
+
+
+def test_what_stands_in_the_table_ends_at_its_surface_and_what_is_under_it_is_not_seen() -> None:
+    def box(z: float) -> Solid:
+        place = np.eye(4)
+        place[2, 3] = z
+        return Solid(0, "box", (0.2, 0.2, 0.2), place, (1.0, 1.0, 1.0))
+
+    solids = Solids([box(0.05), box(-0.3), box(0.5)])
+    whole = solids.placed(np.eye(4)[None])
+    cut = solids.above_table(whole)
+    assert whole.seen.all()
+    assert whole.vertices[:, 2].min() == pytest.approx(-0.4)
+    assert cut.seen.tolist() == [True, False, True]
+    assert cut.vertices[:8, 2].min() == 0.0
+    np.testing.assert_array_equal(cut.vertices[16:], whole.vertices[16:])
