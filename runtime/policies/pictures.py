@@ -12,8 +12,10 @@ Resize = Literal["pad", "stretch"]
 Layout = Literal["chw", "hwc"]
 
 
-def fitted(picture: UInt8, height: int, width: int, how: Resize) -> UInt8:
-    """RGB uint8 [height, width, 3] from [H, W, 3], bilinear with Pillow because policies are trained with it.
+def fitted(
+    picture: UInt8, height: int, width: int, how: Resize, by: Literal["bilinear", "lanczos"] = "bilinear"
+) -> UInt8:
+    """RGB uint8 [height, width, 3] from [H, W, 3], with Pillow because policies are trained with it.
 
     "pad" keeps the aspect and centres the picture on black; sides are rounded down, as openpi does it.
     """
@@ -23,14 +25,14 @@ def fitted(picture: UInt8, height: int, width: int, how: Resize) -> UInt8:
     if (rows, columns) == (height, width):
         return picture
     image = Image.fromarray(picture)
-    bilinear = Image.Resampling.BILINEAR
+    filtered = Image.Resampling.BILINEAR if by == "bilinear" else Image.Resampling.LANCZOS
     if how == "stretch":
-        return np.asarray(image.resize((width, height), bilinear))
+        return np.asarray(image.resize((width, height), filtered))
     ratio = max(columns / width, rows / height)
     inner_width, inner_height = max(1, int(columns / ratio)), max(1, int(rows / ratio))
     top, left = (height - inner_height) // 2, (width - inner_width) // 2
     canvas = np.zeros((height, width, 3), np.uint8)
-    inner = np.asarray(image.resize((inner_width, inner_height), bilinear))
+    inner = np.asarray(image.resize((inner_width, inner_height), filtered))
     canvas[top : top + inner_height, left : left + inner_width] = inner
     return canvas
 

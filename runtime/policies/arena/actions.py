@@ -1,0 +1,156 @@
+"""What the rows of a RoboArena answer are: joints or poses, targets or velocities, grippers as DROID counts them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from runtime.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.formats import PoseFormat, PoseRows
+from runtime.policies.arena.grip import Convention, Grip
+from runtime.policies.arena.wants import ActionSpace, Wants
+from runtime.policies.rows import action_rows
+from runtime.section import Section
+from runtime.types import ActionChunk, Float32
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+Step = Annotated[float, Field(gt=0, le=1.0)]
+Rate = Annotated[float, Field(ge=1, le=1000)]
+
+
+class VelocitySteps(Section):
+    """What a velocity of 1.0 moves within one row of the answer; the defaults are DROID's, at 15 rows per second."""
+
+    joint: Step = 0.2
+    """Of each joint [rad]."""
+    linear: Step = 0.075
+    """Of the end effector [m]."""
+    angular: Step = 0.15
+    """Of the end effector [rad]."""
+
+
+class MeantSettings(Section):
+    """What the answers of a server of the RoboArena family are."""
+
+    action_space: ActionSpace = "joint_position"
+    """What the rows are; a server that says otherwise is refused."""
+    action_pose: PoseFormat = PoseFormat(orientation="euler")
+    """How poses are written in the answer, where action_space is a cartesian one."""
+    velocity_steps: VelocitySteps | None = None
+    """With joint_velocity or cartesian_velocity, which mean nothing without it: what 1.0 moves per row."""
+    action_rate: Rate | None = None
+    """Rows per second of the answer [Hz], 15 for DROID; the control rate where it is not given."""
+    action_keys: Annotated[list[str], Field(min_length=1)] | None = None
+    """Names of the parts of an answer that comes in parts, in the order of the row; without it the server's own."""
+
+
+class Meant:
+    """Reads answers; ConfigurationError where a setting does not fit the robot."""
+
+    def __init__(self, settings: MeantSettings, convention: Convention, robot: Robot) -> None:
+        self._settings = settings
+        self._grip = Grip(convention, robot)
+        self.cartesian = settings.action_space.startswith("cartesian")
+        self.velocity = settings.action_space.endswith("velocity")
+        self._steps = _steps(settings) if self.velocity else VelocitySteps()
+        self._grippers = list(robot.gripper_dims)
+        self._still = [dim for dim in range(robot.dim) if dim not in robot.gripper_dims]
+        self._poses = PoseRows(settings.action_pose, robot, "policy.action_pose") if self.cartesian else None
+        self.width = robot.dim if self._poses is None else self._poses.width
+        self._arms = len(robot.arms)
+        self._each = 0 if self._poses is None else (self.width - len(self._poses.dims)) // self._arms
+        self._gripped = [arm for arm, group in enumerate(robot.arms) if group.gripper is not None]
+        self._parts: tuple[str, ...] = tuple(settings.action_keys or ())
+
+    def agree(self, wants: Wants) -> None:
+        """Hold the server's words against the deployment's; ContradictionError with both sides."""
+        settings = self._settings
+        if wants.space != settings.action_space:
+            raise ContradictionError(
+                f"the server's metadata has action_space = {wants.space!r}, policy.action_space = "
+                f"{settings.action_space!r}; correct the one that is wrong"
+            )
+        if wants.width is not None and wants.width != self.width:
+            raise ContradictionError(
+                f"the server's metadata has action_dim = {wants.width}, this robot has {self.width} numbers in "
+                f"{settings.action_space}; correct policy.action_space, or another robot's policy is served"
+            )
+        self._parts = tuple(settings.action_keys or wants.parts)
+
+    def chunk(self, reply: Any, timing: Mapping[str, float]) -> ActionChunk:
+        """From an answer's value: an array, a map with `actions`, or a map of named parts."""
+        rows = action_rows("actions", self._array(reply), self.width)
+        rows = self._joints(rows) if self._poses is None else self._cartesian(rows)
+        return ActionChunk(
+            actions=rows,
+            space="eef" if self.cartesian else "joint",
+            rate=self._settings.action_rate,
+            mode="delta" if self.velocity else "absolute",
+            pose=self._settings.action_pose if self.cartesian else None,
+            timing=timing,
+        )
+
+    def _array(self, reply: Any) -> object:
+        if isinstance(reply, Mapping) and "actions" in reply:
+            reply = reply["actions"]
+        if not isinstance(reply, Mapping):
+            return reply
+        missing = [name for name in self._parts if name not in reply]
+        if missing or not self._parts:
+            found = ", ".join(map(str, reply)) or "nothing"
+            raise PolicyError(
+                f"the answer has no 'actions' but {found}; allowed: an array, a map with 'actions', or parts named "
+                f"in policy.action_keys ({', '.join(self._parts) or 'none'})"
+            )
+        parts = [action_rows(name, reply[name]) for name in self._parts]
+        if len({len(part) for part in parts}) != 1:
+            lengths = ", ".join(f"{name} {len(part)}" for name, part in zip(self._parts, parts, strict=True))
+            raise PolicyError(f"the parts of the answer have different numbers of rows: {lengths}")
+        return np.concatenate(parts, axis=1)
+
+    def _joints(self, rows: Float32) -> Float32:
+        if self.velocity:
+            rows[:, self._still] = np.clip(rows[:, self._still], -1.0, 1.0) * np.float32(self._steps.joint)
+        rows[:, self._grippers] = self._grip.meant(rows[:, self._grippers])
+        return rows
+
+    def _cartesian(self, rows: Float32) -> Float32:
+        pose = self._settings.action_pose
+        each = self._each
+        arms = rows[:, : each * self._arms].reshape(len(rows), self._arms, each)
+        if self.velocity:
+            arms[..., :3] = _bounded(arms[..., :3]) * np.float32(self._steps.linear)
+            arms[..., 3:6] = _bounded(arms[..., 3:6]) * np.float32(self._steps.angular)
+        if pose.gripper and self._gripped:
+            arms[:, self._gripped, -1] = self._grip.meant(arms[:, self._gripped, -1])
+        return np.concatenate([arms.reshape(len(rows), -1), rows[:, each * self._arms :]], axis=1)
+
+
+def _bounded(vectors: Float32) -> Float32:
+    """None longer than 1, its direction kept."""
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    bounded: Float32 = vectors / np.maximum(lengths, np.float32(1.0))
+    return bounded
+
+
+def _steps(settings: MeantSettings) -> VelocitySteps:
+    if settings.velocity_steps is None:
+        raise ConfigurationError(
+            f"policy.action_space = {settings.action_space!r} without policy.velocity_steps: velocities are shares "
+            "of a step that the server does not tell; allowed: a table with what 1.0 moves per row (DROID: joint = "
+            "0.2, linear = 0.075, angular = 0.15, action_rate = 15.0), or a position space"
+        )
+    pose = settings.action_pose
+    if settings.action_space == "cartesian_velocity" and (
+        pose.orientation not in ("euler", "rotation_vector") or pose.degrees
+    ):
+        raise ConfigurationError(
+            f"policy.action_pose is {pose} with cartesian_velocity; allowed: three turning speeds, orientation = "
+            '"euler" or "rotation_vector", in radians'
+        )
+    return settings.velocity_steps

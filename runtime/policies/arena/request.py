@@ -1,0 +1,130 @@
+"""An observation as a RoboArena request: flat keys with slashes, pictures in the size that the server asks for."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from runtime.errors import PolicyError
+from runtime.formats import PoseFormat, PoseRows
+from runtime.policies.arena.cameras import Cameras, Numbering, Slot
+from runtime.policies.arena.grip import Convention, Grip
+from runtime.policies.arena.wants import Wants
+from runtime.policies.pictures import fitted
+from runtime.policies.request import Size
+from runtime.section import Section
+from runtime.types import EEF_WIDTH, Float32, Observation, UInt8
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+_FIELD_SIZE = (288, 512)  # to which the field's client brings every picture first
+
+
+class ShownSettings(Section):
+    """What a server of the RoboArena family is shown."""
+
+    cameras: dict[str, Slot] = Field(default_factory=dict)
+    """Observation key = slot: "first" and "second" are the exterior views, "wrist", and "first_stereo" and so on the
+    right pictures of stereo cameras. Of these the ones that the server wants are sent."""
+    numbering: Numbering = "0-based"
+    """How the request counts the exterior views: exterior_image_0_left first (RoboArena's servers, DreamZero,
+    IsaacLab-Arena), or exterior_image_1_left (the field's client). A wrong one is no error to a server."""
+    image_size: Size | None = None
+    """Height and width of pictures; without it what the server asks for. Both given have to agree."""
+    resize: Literal["pad", "stretch", "droid"] = "pad"
+    """"pad" keeps the aspect on black, "stretch" does not, "droid" does as the field's client: by Lanczos to
+    288 x 512, then to the size."""
+    frames: Annotated[int, Field(ge=1, le=64)] = 1
+    """Pictures per camera: 1 sends the newest, [H, W, 3], and leaves the history to the server; more send the newest
+    that this policy was asked with, [T, H, W, 3], from the second request of a run on, the oldest repeated."""
+    gripper: Convention = "droid"
+    """"droid": 0 is open, 1 closed, in observation and answer; "robot": the robot's own numbers."""
+    cartesian_position: Literal["pose", "zeros"] = "pose"
+    """What goes under observation/cartesian_position: the end effector's pose, or zeros as simulators send them."""
+    observation_pose: PoseFormat = PoseFormat(orientation="euler", gripper=False)
+    """How that pose is written."""
+    observation_eef: Literal["measured", "fk"] = "measured"
+    """Poses as the robot measures them, where it does; or as its joints have them in any case."""
+
+
+class Shown:
+    """Builds requests; `agree` first with what the server wants. ConfigurationError where a setting does not fit."""
+
+    def __init__(self, settings: ShownSettings, robot: Robot) -> None:
+        self._settings = settings
+        self._cameras = Cameras(settings.cameras, settings.numbering, robot)
+        self._grip = Grip(settings.gripper, robot)
+        self._grippers = list(robot.gripper_dims)
+        self._joints = [dim for dim in range(robot.dim) if dim not in robot.gripper_dims]
+        self._dim, self._arms = robot.dim, len(robot.arms)
+        poses = robot.arms and settings.cartesian_position == "pose"
+        self._poses = PoseRows(settings.observation_pose, robot, "policy.observation_pose") if poses else None
+        self._keys: Mapping[str, str] = {}
+        self._size: tuple[int, int] | None = None
+        self._seen: deque[dict[str, UInt8]] = deque(maxlen=settings.frames)
+
+    @property
+    def sees_poses(self) -> bool:
+        """Whether poses are shown."""
+        return self._poses is not None
+
+    def agree(self, wants: Wants) -> None:
+        """Which pictures are sent from now on, and in which size; ContradictionError where a view is missing."""
+        self._keys = self._cameras.of(wants)
+        own = self._settings.image_size
+        self._size = wants.resolution if own is None else (own[0], own[1])
+
+    def forget(self) -> None:
+        """No picture was shown yet."""
+        self._seen.clear()
+
+    def of(self, observation: Observation) -> dict[str, Any]:
+        """The request without session and endpoint; PolicyError where the observation lacks what belongs into it."""
+        if observation.qpos.shape != (self._dim,):
+            raise PolicyError(f"the state has shape {list(observation.qpos.shape)}; expected [{self._dim}]")
+        qpos = observation.qpos.astype(np.float64)
+        grip = self._grip.shown(qpos[self._grippers]) if self._grippers else np.zeros(1)
+        return {
+            **self._pictures(observation),
+            "observation/joint_position": qpos[self._joints].astype(np.float32),
+            "observation/cartesian_position": self._pose(observation),
+            "observation/gripper_position": grip.astype(np.float32),
+            "prompt": observation.prompt,
+        }
+
+    def _pictures(self, observation: Observation) -> dict[str, UInt8]:
+        first = not self._seen
+        self._seen.append({key: self._picture(observation, camera) for key, camera in self._keys.items()})
+        newest = self._seen[-1]
+        if self._settings.frames == 1 or first:
+            return dict(newest)
+        shown = [self._seen[0]] * (self._settings.frames - len(self._seen)) + list(self._seen)
+        return {key: np.stack([pictures[key] for pictures in shown]) for key in newest}
+
+    def _picture(self, observation: Observation, camera: str) -> UInt8:
+        picture = observation.pictures.get(camera)
+        if picture is None:
+            given = ", ".join(observation.pictures) or "none"
+            raise PolicyError(f"the observation has no picture {camera!r}; it has {given}")
+        if self._settings.resize == "droid":
+            picture = fitted(picture, *_FIELD_SIZE, "stretch", "lanczos")
+            return picture if self._size is None else fitted(picture, *self._size, "stretch", "lanczos")
+        return picture if self._size is None else fitted(picture, *self._size, self._settings.resize)
+
+    def _pose(self, observation: Observation) -> Float32:
+        if self._poses is None:
+            return np.zeros(6 * max(1, self._arms), np.float32)
+        if observation.eef is None or observation.eef.size != EEF_WIDTH * self._arms:
+            given = 0 if observation.eef is None else observation.eef.size
+            raise PolicyError(
+                f"the observation has {given} numbers of poses; expected {EEF_WIDTH * self._arms}, or allowed: "
+                'policy.cartesian_position = "zeros"'
+            )
+        vectors = observation.eef.astype(np.float64).reshape(1, -1, EEF_WIDTH)
+        row = self._poses.encode(vectors, observation.qpos.astype(np.float64)[None])
+        return np.asarray(row[0], dtype=np.float32)

@@ -1,0 +1,100 @@
+"""What a server of the RoboArena family wants: its first frame, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from runtime.errors import PolicyError
+
+ActionSpace = Literal["joint_position", "joint_velocity", "cartesian_position", "cartesian_velocity"]
+SPACES: tuple[ActionSpace, ...] = get_args(ActionSpace)
+_FIELDS = (
+    "image_resolution",
+    "needs_wrist_camera",
+    "n_external_cameras",
+    "needs_stereo_camera",
+    "needs_session_id",
+    "action_space",
+)
+_PIXELS = range(8, 4097)
+
+
+@dataclass(frozen=True, slots=True)
+class Wants:
+    """The server's configuration; `resolution` is (height, width), None where it asks for no resizing.
+
+    The last three are extras of vLLM-Omni: rows of an answer, numbers of a row, names of its parts.
+    """
+
+    resolution: tuple[int, int] | None
+    wrist: bool
+    externals: int
+    stereo: bool
+    session: bool
+    space: ActionSpace
+    horizon: int | None = None
+    width: int | None = None
+    parts: tuple[str, ...] = ()
+
+
+def wanted(metadata: Mapping[str, Any]) -> Wants:
+    """From the metadata, with the defaults of the field's clients; PolicyError names what is wrong in them."""
+    if not any(name in metadata for name in _FIELDS):
+        found = ", ".join(map(str, metadata)) or "nothing"
+        raise PolicyError(
+            f"the server's metadata have none of {', '.join(_FIELDS)}, but {found}: it is no server of the "
+            'RoboArena family; correct policy.kind (a plain openpi server: "openpi") or policy.url'
+        )
+    parts = metadata.get("action_keys")
+    return Wants(
+        resolution=_resolution(metadata.get("image_resolution", [224, 224])),
+        wrist=_flag(metadata, "needs_wrist_camera", True),
+        externals=_externals(metadata.get("n_external_cameras", 1)),
+        stereo=_flag(metadata, "needs_stereo_camera", False),
+        session=_flag(metadata, "needs_session_id", False),
+        space=_space(metadata.get("action_space", "joint_position")),
+        horizon=_positive(metadata, "action_horizon"),
+        width=_positive(metadata, "action_dim"),
+        parts=tuple(map(str, parts)) if isinstance(parts, list) else (),
+    )
+
+
+def _resolution(given: Any) -> tuple[int, int] | None:
+    if given is None:
+        return None
+    if isinstance(given, list) and len(given) == 2 and all(type(n) is int and n in _PIXELS for n in given):
+        return given[0], given[1]
+    raise _wrong("image_resolution", given, "[height, width] from 8 to 4096 each, or nil")
+
+
+def _externals(given: Any) -> int:
+    if type(given) is int and 0 <= given <= 2:
+        return given
+    raise _wrong("n_external_cameras", given, "0, 1 or 2")
+
+
+def _flag(metadata: Mapping[str, Any], name: str, default: bool) -> bool:
+    given = metadata.get(name, default)
+    if isinstance(given, bool):
+        return given
+    raise _wrong(name, given, "true or false")
+
+
+def _space(given: Any) -> ActionSpace:
+    for space in SPACES:
+        if given == space:
+            return space
+    raise _wrong("action_space", given, ", ".join(SPACES))
+
+
+def _positive(metadata: Mapping[str, Any], name: str) -> int | None:
+    given = metadata.get(name)
+    if given is None or (type(given) is int and given > 0):
+        return given
+    raise _wrong(name, given, "a whole number above 0")
+
+
+def _wrong(name: str, given: Any, allowed: str) -> PolicyError:
+    return PolicyError(f"the server's metadata have {name} = {given!r}; allowed: {allowed}")

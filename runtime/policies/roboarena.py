@@ -1,0 +1,160 @@
+"""The RoboArena policy protocol, which DreamZero, IsaacLab-Arena and vLLM-Omni speak too, over openpi's arrays.
+
+The server's first frame says what it wants. Every request names an endpoint, infer or reset. A text frame is an
+acknowledgement only where a reset was asked for and it says exactly "reset successful"; any other is an error.
+Source: robo-arena's policy server and clients, and the openpi endpoint of vLLM-Omni.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal
+
+from runtime import codecs
+from runtime.clock import Clock
+from runtime.errors import ContradictionError, PolicyError
+from runtime.policies.arena.actions import Meant, MeantSettings
+from runtime.policies.arena.request import Shown, ShownSettings
+from runtime.policies.arena.wants import Wants, wanted
+from runtime.policies.base import PolicyInfo
+from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
+from runtime.types import ActionChunk, Conditioning, Observation
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+ACKNOWLEDGED = "reset successful"
+
+
+class Config(ServerSettings, ShownSettings, MeantSettings):
+    """A policy server of the RoboArena family: RoboArena, DreamZero, or vLLM-Omni with its path in the url."""
+
+    kind: Literal["roboarena"] = "roboarena"
+    first_inference_deadline: Positive = 600.0
+    """For the first answer after set-up [s]: DreamZero's first inferences take minutes."""
+    inference_deadline: Positive = 10.0
+    """For every later answer [s]; after it the connection is dropped. DreamZero takes up to three."""
+    reset_deadline: Positive = 10.0
+    """For the acknowledgement of a reset [s]; after it the connection is dropped."""
+
+
+def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> RoboarenaPolicy:
+    """The policy, not yet connected; ConfigurationError where a setting does not fit the robot."""
+    return RoboarenaPolicy(config, robot)
+
+
+class RoboarenaPolicy(WebsocketPolicy):
+    """One session per run: `reset` ends it on the server, and the next request begins another.
+
+    A connection that the server ended between two requests, as vLLM-Omni does after half a minute, is opened anew.
+    """
+
+    PROTOCOL = "RoboArena"
+
+    def __init__(self, config: Config, robot: Robot) -> None:
+        super().__init__(config)
+        self._config = config
+        self._shown = Shown(config, robot)
+        self._meant = Meant(config, config.gripper, robot)
+        self.observation_eef = config.observation_eef
+        self.sees_poses = self._shown.sees_poses or self._meant.velocity
+        self._wants: Wants | None = None
+        self._session = _new_session()
+        self._asked = False  # in this session
+        self._ending: dict[str, str] | None = (
+            None  # what a session that is not yet ended on the server is called
+        )
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        """The chunk; `timing` has our `round_trip_ms`, the protocol has no figures of the server's.
+
+        PolicyLostError where the server is not there or does not answer: the next call opens another connection.
+        """
+        if conditioning is not None:
+            raise PolicyError("the RoboArena protocol has no real-time chunking; choose another strategy")
+        with self._lock:
+            self._reopen()
+            self._end_session()
+            request = codecs.pack(self._shown.of(observation) | self._session_field() | {"endpoint": "infer"})
+            self._asked = True
+            answer, round_trip = self._exchange(request)
+            reply = self._value(answer, "an answer")
+        _require_no_error(reply)
+        return self._meant.chunk(reply, {"round_trip_ms": round_trip})
+
+    def reset(self) -> None:
+        """End the session on the server and wait for its acknowledgement; nothing is sent where it never began.
+
+        Where that fails, the next `infer` tries it again before it asks: the server may keep a history.
+        """
+        with self._lock:
+            if self._asked:
+                self._ending = self._session_field()
+                self._session, self._asked = _new_session(), False
+                self._shown.forget()
+            if self._ending is not None:
+                self._reopen()
+                self._end_session()
+
+    def _end_session(self) -> None:
+        if self._ending is None:
+            return
+        request = codecs.pack(self._ending | {"endpoint": "reset"})
+        answer = self._link.acknowledged(request, self._config.reset_deadline, ACKNOWLEDGED)
+        if answer is not None:
+            self._require_acknowledged(self._value(answer, "an acknowledgement"))
+        self._ending = None
+
+    def _reopen(self) -> None:
+        if self._link.was_left:
+            self._link.drop()
+        self._require_open()
+
+    def _session_field(self) -> dict[str, str]:
+        return {"session_id": self._session} if self._wants is not None and self._wants.session else {}
+
+    def _greeted(self, metadata: dict[str, Any]) -> PolicyInfo:
+        wants = wanted(metadata)
+        own = self._config.image_size
+        if own is not None and wants.resolution is not None and own != list(wants.resolution):
+            raise ContradictionError(
+                f"the server's metadata has image_resolution = {list(wants.resolution)}, policy.image_size = {own}; "
+                "correct the one that is wrong"
+            )
+        self._shown.agree(wants)
+        self._meant.agree(wants)
+        self._wants = wants
+        return PolicyInfo(
+            name=str(metadata.get("name", "roboarena")),
+            action_space="eef" if self._meant.cartesian else "joint",
+            horizon=wants.horizon,
+            rate=self._config.action_rate,
+            metadata=metadata,
+        )
+
+    def _require_acknowledged(self, reply: Any) -> None:
+        _require_no_error(reply)
+        if not isinstance(reply, Mapping) or reply.get("status") != ACKNOWLEDGED:
+            self._link.drop()  # whatever this answers, it is no reset
+            raise PolicyError(
+                f"{self._config.url} answered a reset with {_short(reply)}; expected the text or the status "
+                f"{ACKNOWLEDGED!r}"
+            )
+
+
+def _require_no_error(reply: Any) -> None:
+    """vLLM-Omni tells errors as a map and stays connected."""
+    if isinstance(reply, Mapping) and reply.get("type") == "error":
+        said = reply.get("message") or reply.get("error") or "nothing more"
+        raise PolicyError(f"the policy server reports an error: {said}")
+
+
+def _short(value: Any) -> str:
+    text = ", ".join(map(str, value)) if isinstance(value, Mapping) else repr(value)
+    what = f"a {type(value).__name__}"
+    return f"{what} ({text[:80]})"
+
+
+def _new_session() -> str:
+    return str(uuid.uuid4())
