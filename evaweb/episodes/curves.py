@@ -42,7 +42,7 @@ def curves(folder: Path) -> bytes:
     return encode(
         streams,
         joints=names if isinstance(names, list) else [f"joint {k}" for k in range(episode.layout.dim)],
-        units=_units(episode),
+        **_numbers(episode),
         frames=episode.frames,
         fps=episode.layout.fps,
         period=_period(episode),
@@ -51,12 +51,13 @@ def curves(folder: Path) -> bytes:
     )
 
 
-def _units(episode: Episode) -> list[str]:
-    """The unit of every joint, "" where the robot is not known any more, or is another one today."""
+def _numbers(episode: Episode) -> dict[str, Any]:
+    """The `units` of the joints and which are `grippers`; nobody knows where the robot is another one today."""
     try:
-        return list(looks_in(episode.manifest).units)
+        looks = looks_in(episode.manifest)
     except NotFound:
-        return [""] * episode.layout.dim
+        return {"units": [""] * episode.layout.dim, "grippers": []}
+    return {"units": list(looks.units), "grippers": list(looks.robot.gripper_dims)}
 
 
 def _start(episode: Episode) -> float:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -13,21 +14,44 @@ from numpy.typing import NDArray
 import robots
 from evaweb.errors import NotFound
 from robots.units import units_of
+from runtime.kinematics.links import Links
 
+log = logging.getLogger(__name__)
 _KEPT = 64  # robots in the groups of some station or episode
+_kernels = ThreadPoolExecutor(1, "links")
 
 
-@dataclass(frozen=True, eq=False)
 class Looks:
-    """A robot as it is drawn: its description and its scene."""
+    """A robot as it is drawn: its description and its scene.
 
-    robot: robots.Robot
-    scene: robots.RobotScene
+    Kernels are compiled, or loaded from disk, in a thread of their own: nobody waits for them, who asks before they
+    are there is answered by numpy.
+    """
+
+    def __init__(self, robot: robots.Robot, scene: robots.RobotScene) -> None:
+        self.robot = robot
+        self.scene = scene
+        self._links = _kernels.submit(Links, scene)
+        self._links.add_done_callback(_compiled)
 
     def poses(self, q: NDArray[Any]) -> NDArray[np.float32]:
-        """World <- part for joints [..., D] as float32 [..., P, 16], each matrix column by column."""
-        found = np.swapaxes(self.scene.poses(np.asarray(q, np.float64)), -1, -2)
+        """World <- part for joints [..., D] as float32 [..., P, 16], each matrix column by column.
+
+        Where a joint is not a number nothing is: all of its row is NaN.
+        """
+        joints = np.asarray(q, np.float64)
+        found = self._links.result().poses(joints) if self.compiled else self._placed(joints)
+        found[~np.isfinite(joints).all(axis=-1)] = np.nan
+        return found
+
+    def _placed(self, joints: NDArray[np.float64]) -> NDArray[np.float32]:
+        found = np.swapaxes(self.scene.poses(joints), -1, -2)
         return found.reshape(*found.shape[:-2], 16).astype(np.float32)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the kernels are there."""
+        return self._links.done() and self._links.exception() is None
 
     def tips(self, links: NDArray[np.float32]) -> NDArray[np.float32]:
         """Where the fingertips are for parts at `links` [..., P, 16]: float32 [..., arms, 3], in the world [m]."""
@@ -58,6 +82,11 @@ class Looks:
             "cameras": [camera.key for camera in self.robot.cameras],
             "rate": self.robot.control_rate,
         }
+
+
+def _compiled(links: Future[Links]) -> None:
+    if (error := links.exception()) is not None:
+        log.error("links are placed by numpy, thirty times slower: %s", error)
 
 
 def tip_of(arm: robots.Group) -> NDArray[np.float64]:

@@ -38,16 +38,16 @@ export async function curvePane(store) {
   });
   return {
     add: (samples) => curves.add(samples),
-    joints: (names, units) => {
+    joints: (names, units, grippers) => {
       curves.joints(names);
-      if (names.join() !== [...select.options].map((option) => option.title).join()) joints(curves, names, units);
+      if (names.join() !== [...select.options].map((option) => option.title).join()) joints(curves, names, units, grippers);
     },
   };
 }
 
-function joints(curves, names, units) {
+function joints(curves, names, units, grippers = []) {
   const select = document.getElementById("joint");
-  select.replaceChildren(...jointOptions(names));
+  select.replaceChildren(...jointOptions(names, grippers));
   const wanted = names.indexOf(localStorage.getItem(KEY));
   select.selectedIndex = names.length ? Math.max(0, wanted) : -1;
   const show = () => {

@@ -23,8 +23,14 @@ export function labels(joints) {
   return words.map((one) => one.join(" "));
 }
 
-/** Options of value 0, 1, ... for full names; several groups are told apart by headings. */
-export function jointOptions(names) {
+/** Joints of one group [{joint, index}] with a short `label` each; a gripper is called so. */
+export function labelled(joints, grippers) {
+  const short = labels(joints.filter(({ index }) => !grippers.includes(index)).map(({ joint }) => joint));
+  return joints.map((one) => ({ ...one, label: grippers.includes(one.index) ? "gripper" : short.shift() }));
+}
+
+/** Options of value 0, 1, ... for full names, `grippers` among them; several groups are told apart by headings. */
+export function jointOptions(names, grippers = []) {
   const groups = new Map();
   names.forEach((full, index) => {
     const { group, joint } = parted(full);
@@ -33,10 +39,9 @@ export function jointOptions(names) {
   });
   const only = groups.size < 2;
   const parts = [...groups].map(([group, joints]) => {
-    const short = labels(joints.map(({ joint }) => joint));
-    const options = joints.map(({ full, joint, index }, place) => {
+    const options = labelled(joints, grippers).map(({ full, joint, label, index }) => {
       const text = only ? joint : full;
-      const option = new Option(text.length > LONG ? `${only ? "" : `${group}.`}${short[place]}` : text, String(index));
+      const option = new Option(text.length > LONG ? `${only ? "" : `${group}.`}${label}` : text, String(index));
       option.title = full;
       return option;
     });

@@ -4,7 +4,7 @@ import { three } from "./scene_shapes.js";
 
 const FIELD = 38; // degrees, from top to bottom
 const ROOM = 1.09; // around what has to be in view
-const TOOLS = 36; // px over the scene that its buttons take
+const TOOLS = 46; // px at the top of the pane that its buttons take
 const ROUNDS = 6; // until the middle of what is seen is in the middle
 const WRIST = { behind: 0.28, aside: 0.4, ahead: 0 }; // m from a fingertip
 
@@ -26,26 +26,31 @@ function unit(vector) {
 
 /**
  * From where all `corners` are seen, looking against `direction`: {eye, target}. `wide` and `high` are the tangents
- * of the half angles of view to the sides and up.
+ * of the half angles to the sides and up in which they have to be, `lower` that of how far their middle is to be
+ * below the middle of the view.
  */
-export function eyeFor(corners, direction, wide, high) {
+export function eyeFor(corners, direction, wide, high, lower = 0) {
   const back = unit(direction);
   const right = unit(cross([0, 0, 1], back));
   const up = cross(back, right);
   let target = corners[0].map((_, axis) => corners.reduce((sum, corner) => sum + corner[axis], 0) / corners.length);
-  let distance = 0;
-  for (let round = 0; round < ROUNDS; round += 1) {
+  const look = () => {
     const seen = corners.map((corner) => {
       const off = corner.map((value, axis) => value - target[axis]);
       return { x: dot(off, right), y: dot(off, up), z: dot(off, back) };
     });
-    distance = Math.max(...seen.map(({ x, y, z }) => z + Math.max(Math.abs(x) / wide, Math.abs(y) / high)));
+    return { seen, distance: Math.max(...seen.map(({ x, y, z }) => z + Math.max(Math.abs(x) / wide, Math.abs(y) / high))) };
+  };
+  for (let round = 0; round < ROUNDS; round += 1) {
+    const { seen, distance } = look();
     const middle = (axis) => {
       const slopes = seen.map((point) => point[axis] / Math.max(1e-3, distance - point.z));
       return ((Math.min(...slopes) + Math.max(...slopes)) / 2) * distance;
     };
     target = along(along(target, right, middle("x")), up, middle("y"));
   }
+  const { distance } = look();
+  target = along(target, up, lower * distance);
   return { eye: along(target, back, distance), target };
 }
 
@@ -114,9 +119,9 @@ export class Views {
 
   #look(direction) {
     const { camera, dom_element: pane } = this.#viewer;
-    const high = Math.tan(((FIELD / 2) * Math.PI) / 180) / ROOM;
-    const kept = 1 - TOOLS / Math.max(4 * TOOLS, pane.clientHeight);
-    const { eye, target } = eyeFor(this.#corners, direction, high * (camera.aspect || 1), high * kept);
+    const high = Math.tan(((FIELD / 2) * Math.PI) / 180);
+    const tools = TOOLS / Math.max(3 * TOOLS, pane.clientHeight);
+    const { eye, target } = eyeFor(this.#corners, direction, (high / ROOM) * (camera.aspect || 1), (high / ROOM) * (1 - tools), high * tools);
     this.#place(eye, target);
   }
 

@@ -1,26 +1,20 @@
 // Where a person wants the robot to go: joints by group, within their limits, and what the station said of it.
 
-import { labels, parted } from "./joint_names.js";
+import { labelled, parted } from "./joint_names.js";
 import { digitsOf } from "./units.js";
 
 const ENDLESS = 2 * Math.PI; // a joint without a limit is offered one turn each way
 
-/** Joints of `facts` in groups, in order: [{name, joints: [{index, name, label, full, lower, upper, unit, gripper}]}]. */
+/** Joints of `facts` in groups, in order: [{name, joints: [{index, joint, label, full, lower, upper, unit, gripper}]}]. */
 export function groups({ joint_names: names = [], lower = [], upper = [], units = [], gripper_dims: grippers = [] }) {
   const found = new Map();
   names.forEach((full, index) => {
-    const { group, joint: name } = parted(full);
+    const { group, joint: own } = parted(full);
     if (!found.has(group)) found.set(group, []);
-    const joint = { index, name, full, unit: units[index] ?? "", gripper: grippers.includes(index) };
+    const joint = { index, joint: own, full, unit: units[index] ?? "", gripper: grippers.includes(index) };
     found.get(group).push({ ...joint, lower: lower[index] ?? -ENDLESS, upper: upper[index] ?? ENDLESS });
   });
-  return [...found].map(([name, joints]) => ({ name, joints: labelled(joints) }));
-}
-
-/** With a short label each. */
-function labelled(joints) {
-  const short = labels(joints.filter(({ gripper }) => !gripper).map(({ name }) => name));
-  return joints.map((joint) => ({ ...joint, label: joint.gripper ? "gripper" : short.shift() }));
+  return [...found].map(([name, joints]) => ({ name, joints: labelled(joints, grippers) }));
 }
 
 /** A value within the joint's limits: {value, said}, where `said` tells what was clipped. */

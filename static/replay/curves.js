@@ -69,7 +69,7 @@ class Pane {
   #select() {
     const select = document.getElementById("joint");
     const names = this.#episode.header.joints;
-    select.replaceChildren(...jointOptions(names));
+    select.replaceChildren(...jointOptions(names, this.#episode.header.grippers));
     const wanted = names.indexOf(localStorage.getItem(KEY));
     select.selectedIndex = Math.max(0, wanted);
     select.addEventListener("change", () => {

@@ -244,7 +244,7 @@ def test_joints_come_in_the_robots_groups_with_their_limits() -> None:
     assert [group["name"] for group in groups] == ["left_arm", "right_arm", "joints"]
     assert groups[0]["joints"][1] == {
         "index": 1,
-        "name": "joint6",
+        "joint": "joint6",
         "full": "left_arm.joint6",
         "label": "gripper",
         "unit": "m",

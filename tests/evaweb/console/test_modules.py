@@ -232,6 +232,29 @@ def test_the_film_of_a_chunk_takes_as_long_as_the_chunk_and_begins_again() -> No
     ]
 
 
+@pytest.mark.parametrize("direction", [[0.75, 0.62, 0.62], [0, 1, 0.12], [0.0, -0.002, 1], [-1, 1, 0.3]])
+@pytest.mark.parametrize("lower", [0.0, 0.02])
+def test_everything_that_has_to_be_in_view_is(direction: list[float], lower: float) -> None:
+    wide, high = 0.5, 0.3
+    low, top = np.array([-0.5, -0.9, -0.7]), np.array([0.4, 0.6, 1.1])
+    corners = [[(low, top)[bits >> axis & 1][axis] for axis in range(3)] for bits in range(8)]
+    body = "return m.eyeFor(given.corners, given.direction, given.wide, given.high, given.lower)"
+    given = {"corners": corners, "direction": direction, "wide": wide, "high": high, "lower": lower}
+    found = run("scene_views.js", body, given)
+
+    eye, back = np.array(found["eye"]), np.array(direction) / np.linalg.norm(direction)
+    assert np.allclose(np.cross(eye - found["target"], back), 0, atol=1e-9)
+    right = np.cross([0, 0, 1], back)
+    right /= np.linalg.norm(right)
+    off = np.array(corners) - eye
+    depth = -off @ back
+    across, up = off @ right / depth, off @ np.cross(back, right) / depth + lower
+    assert (depth > 0).all()
+    assert np.abs(across).max() <= wide * 1.03
+    assert np.abs(up).max() <= high * 1.04
+    assert max(np.abs(across).max() / wide, np.abs(up).max() / high) > 0.93  # and no farther away than needed
+
+
 def test_a_film_of_one_row_stands_still() -> None:
     assert run("scene_preview.js", "return m.moment([0], 0.1, 5)") == {"from": 0, "to": 0, "share": 0}
 

@@ -7,7 +7,9 @@ import pytest
 
 import robots
 from evaweb.errors import NotFound
-from evaweb.stations.looks import facts_of, groups_of, looks_of
+from evaweb.stations import looks as looks_module
+from evaweb.stations.looks import Looks, facts_of, groups_of, looks_of
+from runtime.kinematics.base import KinematicsError
 from runtime.sim.bench import tip_in_world
 
 
@@ -19,6 +21,44 @@ def test_matrices_go_column_by_column(name):
     assert poses.shape == (2, len(looks.scene.parts), 16)
     assert poses.dtype == np.float32
     assert np.allclose(poses[0].reshape(-1, 4, 4).swapaxes(-1, -2), looks.scene.poses(q), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", robots.names())
+def test_until_the_kernels_are_there_numpy_says_the_same(name):
+    looks = looks_of(name)
+    q = np.random.default_rng(1).uniform(looks.robot.lower, looks.robot.upper, (2, 3, looks.robot.dim))
+    looks._links.result(60)
+    assert looks.compiled
+    compiled = looks.poses(q)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Looks, "compiled", False)
+        assert np.allclose(looks.poses(q), compiled, atol=1e-6)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_joint_that_is_no_number_leaves_no_part_of_the_robot_anywhere(monkeypatch, compiled):
+    looks = looks_of("agilex_piper")
+    looks._links.result(60)
+    monkeypatch.setattr(Looks, "compiled", compiled)
+    q = np.zeros((3, 14))
+    q[1, 13] = np.nan
+    found = looks.poses(q)
+    assert np.isnan(found[1]).all()
+    assert np.isfinite(found[[0, 2]]).all()
+    assert np.isnan(looks.poses(q[1])).all()
+
+
+def test_kernels_that_cannot_be_made_leave_the_robot_drawn(monkeypatch, caplog):
+    def broken(scene):
+        raise KinematicsError("no numba")
+
+    monkeypatch.setattr(looks_module, "Links", broken)
+    known = looks_of("agilex_piper")
+    looks = Looks(known.robot, known.scene)
+    assert isinstance(looks._links.exception(60), KinematicsError)
+    assert not looks.compiled
+    assert looks.poses(np.zeros(14)).shape == (len(known.scene.parts), 16)
+    assert "no numba" in caplog.text
 
 
 @pytest.mark.parametrize("name", robots.names())
