@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from robots import Robot, RobotError, description, load, names
-from robots.inspection import inspect
+from robots.draft import draft
+from robots.inspection import Inspection, inspect
+from robots.loading import folders
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,6 +43,16 @@ def _parser() -> argparse.ArgumentParser:
         "q", metavar="Q", type=float, nargs=argparse.REMAINDER, help="joints [rad], without the gripper"
     )
     fk.set_defaults(run=_fk)
+    new = commands.add_parser("new", help="draft a robot's folder from a URDF, with every guess marked")
+    new.add_argument("name", metavar="NAME", help="small letters, digits and _")
+    new.add_argument("--urdf", type=Path, required=True, metavar="FILE")
+    new.add_argument(
+        "--into", type=Path, metavar="FOLDER", help="default: the first of $EVA_ROBOTS, else here"
+    )
+    new.add_argument(
+        "--copies", type=int, default=1, metavar="N", help="of the one arm in the URDF, side by side"
+    )
+    new.set_defaults(run=_new)
     return parser
 
 
@@ -60,7 +72,10 @@ def _list(_: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    found = inspect(options.name)
+    return _said(inspect(options.name))
+
+
+def _said(found: Inspection) -> int:
     print("\n".join(found.lines))
     print("\n".join(f"warning: {sentence}" for sentence in found.warnings) or "no warnings")
     for sentence in found.errors:
@@ -102,6 +117,26 @@ def _fk(options: argparse.Namespace) -> int:
     }
     print(json.dumps(answer))
     return 0
+
+
+def _new(options: argparse.Namespace) -> int:
+    """Drafts, then says what the draft comes to as `check` does, and what comes next."""
+    into = options.into or next(iter(folders()), Path())
+    made = draft(options.name, options.urdf, into, options.copies)
+    said = _said(made.inspection)
+    for word, links in (
+        ("not found or unreadable", made.pictures.missing),
+        ("stand-ins for", made.pictures.drawn),
+    ):
+        if links:
+            print(f"shapes: {word}: {', '.join(links)}")
+    print(f"drafted: {made.folder}")
+    if options.name not in names():
+        print(f"found by name once EVA_ROBOTS={into.resolve()} is set; until then by its folder")
+    print(
+        f"next: verify what {made.folder / 'README.md'} lists, edit robot.toml, python -m robots check {options.name}"
+    )
+    return said
 
 
 if __name__ == "__main__":

@@ -29,11 +29,16 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(_known()))
 
 
+def folders() -> tuple[Path, ...]:
+    """The folders of $EVA_ROBOTS, in which robots of one's own lie."""
+    parts = os.environ.get("EVA_ROBOTS", "").split(os.pathsep)
+    return tuple(Path(part).expanduser() for part in parts if part)
+
+
 def _known() -> dict[str, Path]:
     """Folders by name; what comes with the program is never replaced by another of the same name."""
-    further = [Path(part).expanduser() for part in os.environ.get("EVA_ROBOTS", "").split(os.pathsep) if part]
     found: dict[str, Path] = {}
-    for root in (_HERE, *further):
+    for root in (_HERE, *folders()):
         for file in sorted(root.glob(f"*/{_FILE}")):
             found.setdefault(file.parent.name, file.parent.resolve())
     return found

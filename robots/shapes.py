@@ -70,8 +70,8 @@ def _read(path: Path, *, everywhere: bool) -> tuple[Shape, ...]:
     robot = document(path)
     materials = {
         text_of(path, element, "name"): _colour(path, f"material {element.get('name')!r}", colour)
-        for element in robot.findall("material")
-        if (colour := element.find("color")) is not None
+        for element in robot.iter("material")  # one that a visual declares is known by its name to all others
+        if element.get("name") and (colour := element.find("color")) is not None
     }
     return tuple(
         shape

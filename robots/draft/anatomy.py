@@ -1,0 +1,271 @@
+"""Which groups a URDF suggests, by names and by the shape of the tree: arms, hands, torso, head, base."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robots.description import Kind
+from robots.draft.geometry import places
+from robots.errors import RobotError
+from robots.urdf import Joint, Urdf
+
+_WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
+_FINGERS = ("finger", "grip", "jaw", "claw", "knuckle", "thumb")
+_WHEELS = ("wheel", "caster", "steer", "chassis")
+_ARM = {"arm", "forearm", "upperarm", "shoulder", "elbow", "wrist", "hand"}
+_WORDS: tuple[tuple[Kind, set[str]], ...] = (  # what is told first counts
+    ("arm", _ARM),
+    ("head", {"head", "neck"}),
+    ("torso", {"torso", "waist", "body", "trunk", "spine", "chest", "lift", "column", "elevator"}),
+    ("base", {"base", "platform", "rail", "gantry"}),
+    ("other", {"leg", "hip", "knee", "ankle", "foot", "tail"}),
+)
+_TURNS = {"roll", "pitch", "yaw", "rotate", "rotation", "wrist"}  # what a finger's joint is not called
+_SIDES = {"left": {"left", "l", "lh"}, "right": {"right", "r", "rh"}}
+_ORDER: tuple[Kind, ...] = ("arm", "hand", "torso", "head", "base", "other")
+_FORK = 3  # joints in a row behind which two that end there are fingers
+_ARM_LENGTH = 4  # joints in a row that make an arm of what has no telling name
+_BEYOND_LIFT, _BEYOND_TURN = 4, 6  # joints that an arm has to have beyond a torso in one row with it
+_SIDEWAYS = 0.01  # m off the middle from which an arm is on a side
+
+
+@dataclass(frozen=True, slots=True)
+class Limb:
+    """A group: `joints` of the URDF outwards, `fingers` of its gripper; `above` is the link that it begins on.
+
+    `side` is "left", "right" or "". `wheels` are joints that roll and that nobody commands one by one: a base that
+    has them is commanded in speeds.
+    """
+
+    name: str
+    kind: Kind
+    side: str
+    joints: tuple[str, ...]
+    fingers: tuple[str, ...]
+    above: str
+    wheels: tuple[str, ...] = ()
+
+
+def anatomy(tree: Urdf) -> tuple[Limb, ...]:
+    """The groups that the tree suggests, arms first; RobotError where nothing moves."""
+    moving = [joint for joint in tree.outwards() if joint.kind != "fixed" and joint.mimic is None]
+    if not moving:
+        raise RobotError(f"{tree.path}: no joint moves by itself; needed: at least one")
+    skeleton = _Skeleton(tree, moving)
+    wheels = [joint.name for joint in moving if _has(joint.name, _WHEELS)]
+    wheels += [name for name in skeleton.names if skeleton.under(name) & set(wheels)]
+    fingers = skeleton.fingers(set(wheels))
+    runs = skeleton.runs({*wheels, *fingers})
+    limbs = [limb for run in runs for limb in _limbs(skeleton, run, fingers, alone=len(runs) == 1)]
+    limbs += _loose(skeleton, limbs, fingers)
+    if wheels:
+        limbs.append(Limb("base", "base", "", (), (), tree.root, tuple(dict.fromkeys(wheels))))
+    return _named(_sided(tree, _joined(limbs)))
+
+
+class _Skeleton:
+    """The joints that move by themselves, and which hangs on which."""
+
+    def __init__(self, tree: Urdf, moving: Sequence[Joint]) -> None:
+        self.tree = tree
+        self.names = [joint.name for joint in moving]
+        self._above = {joint.child: joint for joint in tree.joints.values()}
+        self.parent = {name: self._next_above(tree.joint(name).parent) for name in self.names}
+        self.masters = {
+            tree.master(joint)[0].name for joint in tree.joints.values() if joint.mimic is not None
+        }
+
+    def children(self, name: str | None, without: Iterable[str] = ()) -> list[str]:
+        """The joints right behind one; behind None those on the root."""
+        return [child for child in self.names if self.parent[child] == name and child not in without]
+
+    def under(self, name: str) -> set[str]:
+        """All joints that one of them above is `name`."""
+        below = self.children(name)
+        return set(below).union(*(self.under(child) for child in below))
+
+    def depth(self, name: str | None) -> int:
+        """How many joints there are from the root to this one."""
+        return 0 if name is None else 1 + self.depth(self.parent[name])
+
+    def fingers(self, wheels: set[str]) -> dict[str, str | None]:
+        """The joints of fingers, each with the joint that carries its hand (None: the root does)."""
+        found: set[str] = set()
+        for name in reversed(self.names):  # from the tips inwards
+            if name not in wheels and found.issuperset(self.children(name)) and self._is_finger(name):
+                found.add(name)
+        carriers: dict[str, str | None] = {}
+        for name in self.names:
+            if name in found:
+                carrier = self.parent[name]
+                while carrier in found:
+                    carrier = self.parent[carrier]
+                carriers[name] = carrier
+        return carriers
+
+    def runs(self, without: set[str]) -> list[tuple[tuple[str, ...], bool]]:
+        """Joints in a row without a branch, outwards, each with whether it ends there."""
+        found: list[tuple[tuple[str, ...], bool]] = []
+        starts = self.children(None, without)
+        for start in starts:  # grows while it is walked
+            run = [start]
+            while len(behind := self.children(run[-1], without)) == 1:
+                run += behind
+            found.append((tuple(run), not behind))
+            starts += behind
+        return found
+
+    def _next_above(self, link: str) -> str | None:
+        while link in self._above:
+            joint = self._above[link]
+            if joint.name in self.names:
+                return joint.name
+            link = joint.parent
+        return None
+
+    def _is_finger(self, name: str) -> bool:
+        joint = self.tree.joint(name)
+        behind = self.children(name)
+        if name in self.masters:
+            return True
+        if _has(name, _FINGERS) and not (behind and _words(name) & (_TURNS | _ARM - {"hand"})):
+            return True
+        if behind:
+            return False
+        beside = [other for other in self.children(self.parent[name]) if other != name]
+        twins = [other for other in beside if self.tree.joint(other).parent == joint.parent]
+        if not twins or any(self.children(other) for other in beside):
+            return False
+        slides = joint.kind == "prismatic" and all(
+            self.tree.joint(other).kind == "prismatic" for other in twins
+        )
+        return slides or (self.depth(self.parent[name]) >= _FORK and not _kind_of(name))
+
+
+def _limbs(
+    skeleton: _Skeleton, run: tuple[tuple[str, ...], bool], fingers: dict[str, str | None], *, alone: bool
+) -> list[Limb]:
+    """What a run of joints is; a torso or base that leads to an arm without a branch is a limb of its own."""
+    joints, ends = run
+    own = tuple(name for name, carrier in fingers.items() if carrier == joints[-1])
+    cut = _trunk(skeleton.tree, joints) if ends else len(joints)
+    limbs = [_limb(skeleton, _kind(joints[:cut]) or "torso", joints[:cut])] if cut else []
+    if not ends:
+        return limbs
+    rest = joints[cut:]
+    kind = _kind(rest)
+    if kind in (None, "torso", "base"):
+        long = len(rest) >= (_FORK if alone else _ARM_LENGTH)
+        kind = "arm" if own or (long and kind is None) else kind
+    kind = kind or "other"
+    gripper = own if kind == "arm" and _one_gripper(skeleton, own) else ()
+    return [*limbs, replace(_limb(skeleton, kind, rest), fingers=gripper)]
+
+
+def _trunk(tree: Urdf, joints: tuple[str, ...]) -> int:
+    """How many joints at the beginning of a row that ends in an arm are a torso or a base."""
+    cut = next((i for i, name in enumerate(joints) if _kind_of(name) not in ("torso", "base")), 0)
+    slides = any(tree.joint(name).kind == "prismatic" for name in joints[:cut])
+    return cut if len(joints) - cut >= (_BEYOND_LIFT if slides else _BEYOND_TURN) else 0
+
+
+def _limb(skeleton: _Skeleton, kind: Kind, joints: tuple[str, ...]) -> Limb:
+    above = skeleton.parent[joints[0]]
+    tree = skeleton.tree
+    return Limb("", kind, _side(tree, joints), joints, (), tree.joint(above).child if above else _base(tree))
+
+
+def _base(tree: Urdf) -> str:
+    """The link that everything stands on: the root, or what is fixed to a root that is only the world."""
+    behind = [joint for joint in tree.joints.values() if joint.parent == tree.root]
+    if tree.root in ("world", "map", "odom", "ground") and len(behind) == 1 and behind[0].kind == "fixed":
+        return behind[0].child
+    return tree.root
+
+
+def _one_gripper(skeleton: _Skeleton, fingers: Sequence[str]) -> bool:
+    """Whether the fingers open and close by one number; more of them, or with joints of their own, are a hand."""
+    return 0 < len(fingers) <= _FORK and not any(skeleton.parent[name] in fingers for name in fingers)
+
+
+def _loose(skeleton: _Skeleton, limbs: Sequence[Limb], fingers: dict[str, str | None]) -> list[Limb]:
+    """Hands: fingers that are no arm's gripper, by what carries them."""
+    taken = {name for limb in limbs for name in limb.fingers}
+    hands: dict[str | None, list[str]] = {}
+    for name, carrier in fingers.items():
+        if name not in taken:
+            hands.setdefault(carrier, []).append(name)
+    return [_limb(skeleton, "hand", tuple(names)) for names in hands.values()]
+
+
+def _joined(limbs: Sequence[Limb]) -> list[Limb]:
+    """One torso and one base, however often they branch."""
+    found: list[Limb] = []
+    for limb in limbs:
+        same = next(
+            (i for i, other in enumerate(found) if other.kind == limb.kind in ("torso", "base")), None
+        )
+        if same is None:
+            found.append(limb)
+        else:
+            first = found[same]
+            found[same] = replace(first, joints=first.joints + limb.joints, wheels=first.wheels + limb.wheels)
+    return found
+
+
+def _sided(tree: Urdf, limbs: Sequence[Limb]) -> list[Limb]:
+    """Two arms whose names tell no side are left and right where they begin on different sides (y is left)."""
+    arms = [limb for limb in limbs if limb.kind == "arm"]
+    if len(arms) != 2 or any(arm.side for arm in arms):
+        return list(limbs)
+    at = places(tree, {})
+    y = [float(at[tree.joint(arm.joints[0]).child][1, 3]) for arm in arms]
+    if not min(y) < -_SIDEWAYS < _SIDEWAYS < max(y):
+        return list(limbs)
+    sides = {id(arm): "left" if value > 0 else "right" for arm, value in zip(arms, y, strict=True)}
+    return [replace(limb, side=sides.get(id(limb), limb.side)) for limb in limbs]
+
+
+def _named(limbs: Sequence[Limb]) -> tuple[Limb, ...]:
+    """With names that each occur once: left_arm, torso, other2; arms first, left before right."""
+    ordered = sorted(limbs, key=lambda limb: (_ORDER.index(limb.kind), limb.side != "left", limb.side == ""))
+    plain = ["_".join(filter(None, (limb.side, limb.kind))) for limb in ordered]
+    names = []
+    for index, name in enumerate(plain):
+        names.append(name if plain.count(name) == 1 else f"{name}{plain[: index + 1].count(name)}")
+    return tuple(replace(limb, name=name) for limb, name in zip(ordered, names, strict=True))
+
+
+def _words(name: str) -> set[str]:
+    return {word.lower() for word in _WORD.findall(name)}
+
+
+def _has(name: str, parts: Iterable[str]) -> bool:
+    return any(part in name.lower() for part in parts)
+
+
+def _kind_of(name: str) -> Kind | None:
+    words = _words(name)
+    return next((kind for kind, telling in _WORDS if words & telling), None)
+
+
+def _kind(joints: Sequence[str]) -> Kind | None:
+    """What at least half of the names say."""
+    kinds = [_kind_of(name) for name in joints]
+    likely = max(dict.fromkeys(kinds), key=kinds.count)
+    return likely if 2 * kinds.count(likely) >= len(kinds) else None
+
+
+def _side(tree: Urdf, joints: Sequence[str]) -> str:
+    """The side that the names of most joints, or else of the links behind them, tell."""
+    for names in (joints, [tree.joint(name).child for name in joints]):
+        told = np.array([[bool(_words(name) & words) for words in _SIDES.values()] for name in names]).sum(
+            axis=0
+        )
+        if told.max() * 2 > len(names) and told[0] != told[1]:
+            return list(_SIDES)[int(told.argmax())]
+    return ""

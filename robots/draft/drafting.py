@@ -1,0 +1,85 @@
+"""Makes a robot's folder of a URDF: robot.toml, the URDF, its meshes, a README; loads it before it is left there."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from robots import urdf
+from robots.draft.pictures import Pictures, copy_urdf
+from robots.draft.postures import Postures
+from robots.draft.sheet import Sheet, sheet
+from robots.draft.text import readme, robot_toml
+from robots.errors import RobotError
+from robots.inspection import Inspection, inspect
+from robots.loading import load, names
+from robots.robot import Robot
+from robots.rotations import Float64
+
+_NAME = re.compile(r"[a-z][a-z0-9_]*")
+_MOST = 8  # copies of one arm
+
+
+@dataclass(frozen=True, slots=True)
+class Drafted:
+    """A robot's new `folder`, what was made of its shapes, and what a look at it says."""
+
+    folder: Path
+    pictures: Pictures
+    inspection: Inspection
+
+
+def draft(name: str, source: Path, into: Path, copies: int = 1) -> Drafted:
+    """Drafts the robot `name` from the URDF `source` in a new folder of `into`; RobotError leaves nothing behind.
+
+    `copies` is how many of the one arm that the URDF describes stand side by side.
+    """
+    folder = _free(name, into)
+    if not 1 <= copies <= _MOST:
+        raise RobotError(f"{copies} copies; allowed: 1 to {_MOST}")
+    tree = urdf.read(source)
+    title = urdf.document(source).get("name") or name
+    into.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{name}-", dir=into) as scratch:
+        made = Path(scratch) / name
+        made.mkdir()
+        shown = made / f"{name}.urdf"
+        pictures = copy_urdf(tree, shown)
+        guessed = sheet(tree, shown, title, copies)
+        (made / "README.md").write_text(readme(name, guessed, pictures), "utf-8")
+        _write(made, guessed)
+        made.rename(folder)
+    return Drafted(folder, pictures, inspect(folder))
+
+
+def _free(name: str, into: Path) -> Path:
+    if not _NAME.fullmatch(name):
+        raise RobotError(
+            f"{name!r} is no name for a robot; allowed: a letter, then letters, digits and _, all small"
+        )
+    folder = into / name
+    if folder.exists():
+        raise RobotError(f"{folder} is there already; allowed: a new folder")
+    if name in names():
+        raise RobotError(f"there is a robot {name!r} already; there are {', '.join(names())}")
+    return folder
+
+
+def _write(folder: Path, guessed: Sheet) -> None:
+    """robot.toml, first with every group at rest, then with postures in which nothing touches."""
+    file = folder / "robot.toml"
+    home = {group.name: group.rest for group in guessed.groups}
+    file.write_text(robot_toml(guessed, {"home": home}, ()), "utf-8")
+    robot = load(folder, [group.name for group in guessed.groups])
+    postures = Postures(robot, urdf.read(robot.urdf))
+    found = {"home": postures.home()}
+    found["ready"] = postures.ready(found["home"])
+    poses = {name: _parts(robot, q) for name, q in found.items()}
+    file.write_text(robot_toml(guessed, poses, postures.touching(found)), "utf-8")
+
+
+def _parts(robot: Robot, q: Float64) -> Mapping[str, Sequence[float]]:
+    return {name: part.tolist() for name, part in robot.split(q).items()}

@@ -1,0 +1,35 @@
+"""Where the links of a URDF stand and how far their shapes reach, before there is a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from robots.chain import motion_table, motions
+from robots.rotations import Float64
+from robots.shapes import Shape
+from robots.urdf import Urdf
+
+
+def places(tree: Urdf, values: Mapping[str, float]) -> dict[str, Float64]:
+    """Root <- link [4, 4] by link, for values of joints that move by themselves [rad or m]; 0 where none is given."""
+    found = {tree.root: np.eye(4)}
+    for joint in tree.outwards():
+        here = joint.origin
+        if joint.kind != "fixed":
+            master, factor, offset = tree.master(joint)
+            value = np.array([factor * values.get(master.name, 0.0) + offset])
+            here = motions(value, motion_table(joint.origin, joint)[None])[0]
+        found[joint.child] = found[joint.parent] @ here
+    return found
+
+
+def corners(shapes: Iterable[Shape]) -> dict[str, Float64]:
+    """The corners [n, 3] of the boxes about a link's shapes, in the link, by link."""
+    found: dict[str, list[Float64]] = {}
+    for shape in shapes:
+        ends = np.array(shape.bounds())  # [2, 3]
+        box = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i, j, k in np.ndindex(2, 2, 2)])
+        found.setdefault(shape.link, []).append(box @ shape.origin[:3, :3].T + shape.origin[:3, 3])
+    return {link: np.concatenate(boxes) for link, boxes in found.items()}

@@ -1,0 +1,260 @@
+"""What a URDF says of a gripper: its number, which end is open, how far its fingers are apart, where their tips are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import numpy as np
+
+from robots.draft.anatomy import Limb
+from robots.draft.geometry import places
+from robots.draft.limits import FASTEST
+from robots.rotations import Float64, quaternion_of_matrix
+from robots.urdf import Joint, Urdf
+
+_SLIDE, _TURN = 0.04, 1.0  # m and rad: the way of a finger of which the URDF says none
+_SECONDS = 0.5  # for the whole way, where the URDF gives no speed
+_PAD = 0.01  # m from the end of a finger's shapes to what it holds
+_TINY = 1e-6
+_GRASPS = ("tcp", "grasp", "center", "centre", "eef", "ee_link")
+_PREFERRED = (*_GRASPS, "tool0", "ee", "tip", "flange", "hand")
+
+
+@dataclass(frozen=True, slots=True)
+class GripperDraft:
+    """A gripper's number is the position of `driver`; `fingers` are values at `lower` and at `upper`.
+
+    `apart` is how far they part [m] from `close` to `open`, None where they do not; `tip` [7] lies in the end
+    effector. `doubts` are sentences about what is a placeholder.
+    """
+
+    driver: str
+    unit: str
+    lower: float
+    upper: float
+    open: float
+    close: float
+    velocity: float
+    fingers: Mapping[str, tuple[float, float]]
+    apart: float | None
+    tip: Float64
+    doubts: tuple[str, ...]
+
+
+def end_link(tree: Urdf, limb: Limb) -> str:
+    """An arm's end effector: a leaf behind its last joint that is named so, else the link that fingers hang on."""
+    last = tree.joint(limb.joints[-1]).child
+    if limb.fingers:
+        return _hand(tree, limb, last)
+    rigid = _rigid(tree, last)
+    leaves = [link for link in rigid if not any(joint.parent == link for joint in tree.joints.values())]
+    return next((link for word in _PREFERRED for link in leaves if word in link.lower()), last)
+
+
+def _hand(tree: Urdf, limb: Limb, last: str) -> str:
+    """A frame for grasping behind the last joint, else the link that the fingers hang on."""
+    rigid = _rigid(tree, last)
+    named = (link for word in _GRASPS for link in rigid if word in link.lower())
+    return next(named, tree.joint(limb.fingers[0]).parent)
+
+
+def _rigid(tree: Urdf, link: str) -> list[str]:
+    """The link and all that is fixed to it, outwards."""
+    found = [link]
+    for here in found:  # grows while it is walked
+        found += [
+            joint.child for joint in tree.joints.values() if joint.parent == here and joint.kind == "fixed"
+        ]
+    return found
+
+
+def gripper_of(tree: Urdf, limb: Limb, eef_link: str, corners: Mapping[str, Float64]) -> GripperDraft:
+    """The gripper of an arm with fingers."""
+    followed = {tree.master(joint)[0].name for joint in tree.joints.values() if joint.mimic is not None}
+    driver = tree.joint(
+        max(limb.fingers, key=lambda name: (name in followed, tree.joint(name).kind == "prismatic"))
+    )
+    doubts: list[str] = []
+    lower, upper = _range(driver, doubts)
+    jaws = _Jaws(tree, limb, eef_link, corners)
+    fingers = jaws.together(driver.name, (lower, upper), _ways(tree, limb, driver.name))
+    opening, closed, open_at = jaws.opening(fingers, lower, upper)
+    if opening is None:
+        doubts.append("which end is open cannot be read off the URDF")
+    return GripperDraft(
+        driver=driver.name,
+        unit="m" if driver.kind == "prismatic" else "rad",
+        lower=lower,
+        upper=upper,
+        open=open_at,
+        close=lower if open_at == upper else upper,
+        velocity=_velocity(driver, upper - lower, doubts),
+        fingers=fingers,
+        apart=opening,
+        tip=jaws.tip(closed),
+        doubts=tuple(doubts),
+    )
+
+
+def _range(joint: Joint, doubts: list[str]) -> tuple[float, float]:
+    lower, upper = joint.lower, joint.upper
+    if lower is not None and upper is not None and np.isfinite([lower, upper]).all() and lower < upper:
+        return lower, upper
+    doubts.append(f"the URDF gives {joint.name} no range: lower and upper are placeholders")
+    return 0.0, _SLIDE if joint.kind == "prismatic" else _TURN
+
+
+def _velocity(joint: Joint, way: float, doubts: list[str]) -> float:
+    if joint.velocity is not None and 0 < joint.velocity <= FASTEST:
+        return joint.velocity
+    given = "no velocity" if joint.velocity is None else f"{joint.velocity:g}/s"
+    doubts.append(f"the URDF gives {joint.name} {given}: the whole way in {_SECONDS:g} s is a placeholder")
+    return round(way / _SECONDS, 4)
+
+
+def _ways(tree: Urdf, limb: Limb, driver: str) -> dict[str, tuple[float, float]]:
+    """The ends of the fingers that move by themselves beside the driver and that have ends."""
+    joints = [tree.joint(name) for name in limb.fingers if name != driver]
+    return {joint.name: _range(joint, []) for joint in joints if joint.kind != "continuous"}
+
+
+class _Jaws:
+    """The fingers' branches, with a point near the end of each, seen from the end effector."""
+
+    def __init__(self, tree: Urdf, limb: Limb, eef_link: str, corners: Mapping[str, Float64]) -> None:
+        self._tree = tree
+        self._eef = eef_link
+        self._corners = corners
+        moving = [
+            joint
+            for joint in tree.outwards()
+            if joint.kind != "fixed" and tree.master(joint)[0].name in limb.fingers
+        ]
+        self._hand = moving[0].parent
+        self._branches: list[list[str]] = []
+        for joint in moving:
+            if not any(joint.child in branch for branch in self._branches):
+                self._branches.append(_behind(tree, joint.child))
+        self._pairs = list(combinations(range(len(self._branches)), 2)) or [(0, -1)]  # -1: the hand
+        half = {name: sum(_range(tree.joint(name), [])) / 2 for name in limb.fingers}
+        at = self._in_eef(half)
+        self._z = self._pointing(at)
+        self._ends = [self._end(branch, at) for branch in self._branches]
+
+    def together(
+        self, driver: str, ends: tuple[float, float], others: Mapping[str, tuple[float, float]]
+    ) -> dict[str, tuple[float, float]]:
+        """Every finger's values at the driver's ends: those with which they come together and part most."""
+        choices = [
+            {driver: ends} | dict(zip(others, turned, strict=True))
+            for turned in product(*((way, way[::-1]) for way in others.values()))
+        ]
+        return max(choices, key=lambda fingers: max(self._partings(fingers)))
+
+    def opening(
+        self, fingers: Mapping[str, tuple[float, float]], lower: float, upper: float
+    ) -> tuple[float | None, dict[str, float], float]:
+        """How far they part [m], the fingers' values when closed, and the driver's value when open."""
+        partings = self._partings(fingers)
+        pair = self._pairs[int(np.argmax(partings))]
+        at_lower, at_upper = ({name: ends[end] for name, ends in fingers.items()} for end in (0, 1))
+        if max(partings) < _TINY:
+            return None, at_lower, upper
+        gaps = [float(np.linalg.norm(self._between(pair, values))) for values in (at_lower, at_upper)]
+        if len(self._branches) == 1:  # against a jaw that stands still: open is where it goes
+            gaps = [abs(lower), abs(upper)]
+        opened = round(max(partings), 4)
+        return (opened, at_upper, lower) if gaps[0] > gaps[1] else (opened, at_lower, upper)
+
+    def tip(self, closed: Mapping[str, float]) -> Float64:
+        """The frame [7] between the fingertips in the end effector: z the way they point, y the way they open."""
+        at = self._in_eef(closed)
+        points = [self._point(index, at) for index in range(len(self._ends))]
+        far = max(float(point @ self._z) for point in points)
+        middle = np.mean([point for point in points if point @ self._z > far - 2 * _PAD], axis=0)
+        y = self._opens_along(closed)
+        y = y - self._z * (y @ self._z)
+        y = np.roll(self._z, 1) if np.linalg.norm(y) < _TINY else y / np.linalg.norm(y)
+        frame = np.column_stack([np.cross(y, self._z), y, self._z])
+        reach = self._reach(at)
+        if reach is not None:
+            middle = middle + self._z * (reach - _PAD - middle @ self._z)
+        return np.concatenate([middle, quaternion_of_matrix(frame)])
+
+    def _pointing(self, at: Mapping[str, Float64]) -> Float64:
+        """The axis of the end effector along which the fingers reach away from the hand."""
+        hand = at[self._hand][:3, 3]
+        reaching = [
+            max(
+                (self._centre(link, at) - hand for link in branch), key=lambda way: float(np.linalg.norm(way))
+            )
+            for branch in self._branches
+        ]
+        return _along(np.mean(reaching, axis=0))
+
+    def _end(self, branch: list[str], at: Mapping[str, Float64]) -> tuple[str, Float64]:
+        """The link of a branch that reaches farthest, and the middle of its far end in that link."""
+        seen = {link: self._seen(link, at) for link in branch}
+        link = max(branch, key=lambda name: float((seen[name] @ self._z).max()))
+        along = seen[link] @ self._z
+        near, far = along.min(), along.max()
+        end = seen[link][along >= far - 0.3 * (far - near)].mean(axis=0)
+        return link, np.linalg.inv(at[link]) @ np.append(end, 1.0)
+
+    def _partings(self, fingers: Mapping[str, tuple[float, float]]) -> list[float]:
+        """By how much [m] each pair of branches moves against each other from one end to the other."""
+        at_lower, at_upper = ({name: ends[end] for name, ends in fingers.items()} for end in (0, 1))
+        ways = [self._between(pair, at_upper) - self._between(pair, at_lower) for pair in self._pairs]
+        return [float(np.linalg.norm(way)) for way in ways]
+
+    def _opens_along(self, closed: Mapping[str, float]) -> Float64:
+        """The direction in the end effector in which fingers begin to part."""
+        step = {name: value + 1e-3 for name, value in closed.items()}
+        ways = [self._between(pair, step) - self._between(pair, closed) for pair in self._pairs]
+        return max(ways, key=lambda way: float(np.linalg.norm(way)))
+
+    def _between(self, pair: tuple[int, int], values: Mapping[str, float]) -> Float64:
+        at = self._in_eef(values)
+        first, second = (self._point(index, at) if index >= 0 else np.zeros(3) for index in pair)
+        return np.asarray(first - second)
+
+    def _point(self, index: int, at: Mapping[str, Float64]) -> Float64:
+        link, end = self._ends[index]
+        return np.asarray((at[link] @ end)[:3])
+
+    def _in_eef(self, values: Mapping[str, float]) -> dict[str, Float64]:
+        at = places(self._tree, values)
+        back = np.linalg.inv(at[self._eef])
+        return {link: back @ place for link, place in at.items()}
+
+    def _seen(self, link: str, at: Mapping[str, Float64]) -> Float64:
+        """The corners [n, 3] of a link's shapes, or else its origin, in the end effector."""
+        shapes = self._corners.get(link, np.zeros((1, 3)))
+        return np.asarray(shapes @ at[link][:3, :3].T + at[link][:3, 3])
+
+    def _centre(self, link: str, at: Mapping[str, Float64]) -> Float64:
+        seen = self._seen(link, at)
+        return np.asarray((seen.min(axis=0) + seen.max(axis=0)) / 2)
+
+    def _reach(self, at: Mapping[str, Float64]) -> float | None:
+        """How far the fingers' shapes reach along z."""
+        shown = [link for branch in self._branches for link in branch if link in self._corners]
+        return max((float((self._seen(link, at) @ self._z).max()) for link in shown), default=None)
+
+
+def _behind(tree: Urdf, link: str) -> list[str]:
+    """The link and all that hangs on it, outwards."""
+    found = [link]
+    for here in found:  # grows while it is walked
+        found += [joint.child for joint in tree.joints.values() if joint.parent == here]
+    return found
+
+
+def _along(direction: Float64) -> Float64:
+    """The axis, to either side, that the direction goes along most; z where it is none."""
+    axis = np.zeros(3)
+    index = int(np.abs(direction).argmax()) if np.abs(direction).max() > _TINY else 2
+    axis[index] = -1.0 if direction[index] < 0 else 1.0
+    return axis

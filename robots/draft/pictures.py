@@ -1,0 +1,190 @@
+"""A URDF with all that it shows, copied into a robot's folder: meshes beside it, stand-ins for what cannot be shown."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+
+from robots import meshes, shapes
+from robots.errors import RobotError
+from robots.rotations import Float64
+from robots.urdf import Urdf
+
+_MESHES = "meshes"
+_STICK, _THICKEST, _THINNEST = 0.15, 0.04, 0.012  # of its length, m, m: the radius of a stand-in
+_SHORTEST = 0.02  # m between two joints from which a stand-in is drawn
+_KNOB = 0.015  # m: the radius of what stands in for the end of a chain
+_COLOUR = "0.55 0.58 0.63 1"
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """What became of the shapes: `copied` are files, `missing` are meshes that were not found or cannot be read.
+
+    `drawn` are links that stand-ins show, `plain` are links whose material was not declared.
+    """
+
+    copied: tuple[str, ...]
+    missing: tuple[str, ...]
+    drawn: tuple[str, ...]
+    plain: tuple[str, ...]
+
+
+def copy_urdf(tree: Urdf, target: Path) -> Pictures:
+    """Writes the URDF to `target` and its meshes into the folder meshes/ beside it.
+
+    It is copied as it is where it shows what can be shown. Otherwise visuals of missing meshes are replaced by
+    cylinders from joint to joint, as in all links where none shows anything.
+    """
+    document = ET.parse(tree.path, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
+    robot = document.getroot()
+    work = _Work(tree, target, robot)
+    work.meshes()
+    work.stand_ins()
+    work.materials()
+    if work.changed:
+        ET.indent(document)
+        document.write(target, encoding="utf-8", xml_declaration=True)
+    else:
+        shutil.copyfile(tree.path, target)
+    shapes.read(target)  # what still cannot be shown is refused here, not when it is drawn
+    return Pictures(tuple(work.copied), tuple(work.missing), tuple(work.drawn), tuple(work.plain))
+
+
+class _Work:
+    def __init__(self, tree: Urdf, target: Path, robot: ET.Element) -> None:
+        self._tree = tree
+        self._target = target
+        self._robot = robot
+        self._taken: dict[str, Path] = {}
+        self._bare: list[ET.Element] = []
+        self.copied: list[str] = []
+        self.missing: list[str] = []
+        self.drawn: list[str] = []
+        self.plain: list[str] = []
+
+    @property
+    def changed(self) -> bool:
+        return bool(self.copied or self.drawn or self.plain or self._bare)
+
+    def meshes(self) -> None:
+        """Copies meshes that can be read and points to the copies; takes out visuals that cannot be shown."""
+        for link in self._robot.findall("link"):
+            for visual in link.findall("visual"):
+                geometry = visual.find("geometry")
+                mesh = None if geometry is None else geometry.find("mesh")
+                if mesh is not None and self._copied(mesh):
+                    continue
+                if (
+                    mesh is None
+                    and geometry is not None
+                    and len(geometry) == 1
+                    and geometry[0].tag in shapes.KINDS
+                ):
+                    continue
+                link.remove(visual)
+                if link not in self._bare:
+                    self._bare.append(link)
+
+    def stand_ins(self) -> None:
+        """Cylinders in links that lost a visual and have none left; in all links where nothing is shown at all."""
+        links = self._robot.findall("link")
+        if not any(link.find("visual") is not None for link in links):
+            self._bare = links
+        for link in self._bare:
+            if link.find("visual") is None:
+                shown = list(self._sticks(link.get("name", "")))
+                link.extend(shown)
+                self.drawn += [link.get("name", "")] if shown else []
+
+    def materials(self) -> None:
+        """Takes out materials that nobody declares: such a shape has the plain colour."""
+        declared = {
+            material.get("name")
+            for material in self._robot.iter("material")
+            if material.find("color") is not None
+        }
+        for link in self._robot.findall("link"):
+            for visual in link.findall("visual"):
+                material = visual.find("material")
+                if material is None or material.find("color") is not None:
+                    continue
+                if not material.get("name") or material.get("name") not in declared:
+                    visual.remove(material)
+                    if link.get("name", "") not in self.plain:
+                        self.plain.append(link.get("name", ""))
+
+    def _copied(self, mesh: ET.Element) -> bool:
+        named = mesh.get("filename", "")
+        file = next((place for place in _places(self._tree.path, named) if _readable(place)), None)
+        if file is None:
+            self.missing += [named] if named not in self.missing else []
+            return False
+        name = file.name
+        if self._taken.setdefault(name, file) != file:  # another of the same name
+            name = f"{file.parent.name}_{file.name}"
+            self._taken.setdefault(name, file)
+        folder = self._target.parent / _MESHES
+        folder.mkdir(exist_ok=True)
+        shutil.copyfile(file, folder / name)
+        mesh.set("filename", f"{_MESHES}/{name}")
+        self.copied += [name] if name not in self.copied else []
+        return True
+
+    def _sticks(self, link: str) -> Iterator[ET.Element]:
+        """Visuals from the link's origin to each joint on it; a knob where nothing more comes."""
+        behind = [joint for joint in self._tree.joints.values() if joint.parent == link]
+        above = next((joint for joint in self._tree.joints.values() if joint.child == link), None)
+        ways = [joint.origin[:3, 3] for joint in behind]
+        long = [way for way in ways if np.linalg.norm(way) >= _SHORTEST]
+        if not long and above is not None and above.kind != "fixed":
+            yield _visual(np.zeros(3), "0 0 0", ET.Element("sphere", radius=f"{_KNOB:g}"))
+        for way in long:
+            length = float(np.linalg.norm(way))
+            radius = min(max(_STICK * length, _THINNEST), _THICKEST)
+            pitch, yaw = math.acos(way[2] / length), math.atan2(way[1], way[0])
+            stick = ET.Element("cylinder", radius=f"{radius:.4f}", length=f"{length:.4f}")
+            yield _visual(way / 2, f"0 {pitch:.6f} {yaw:.6f}", stick)
+
+
+def _visual(centre: Float64, rpy: str, shape: ET.Element) -> ET.Element:
+    visual = ET.Element("visual")
+    ET.SubElement(visual, "origin", xyz=" ".join(f"{value:.6f}" for value in centre), rpy=rpy)
+    ET.SubElement(visual, "geometry").append(shape)
+    material = ET.SubElement(visual, "material", name="stand_in")
+    ET.SubElement(material, "color", rgba=_COLOUR)
+    return visual
+
+
+def _places(source: Path, named: str) -> Iterator[Path]:
+    """Where a mesh that the URDF `source` names may lie: beside it, or in its package somewhere above or beside."""
+    scheme, separator, rest = named.partition("://")
+    folder = source.resolve().parent
+    if not separator:
+        yield folder / named
+    elif scheme == "file":
+        yield Path(unquote(rest))
+    elif scheme in ("package", "model"):
+        package, _, inside = rest.partition("/")
+        for above in (folder, *folder.parents):
+            if above.name == package:
+                yield above / inside
+            yield above / package / inside
+        yield folder / inside
+
+
+def _readable(place: Path) -> bool:
+    if not place.is_file() or place.suffix.lower() not in meshes.SUFFIXES:
+        return False
+    try:
+        meshes.bounds(place)
+    except RobotError:
+        return False
+    return True

@@ -1,0 +1,197 @@
+"""Home and ready for a robot of which only the URDF is known: clear of itself and of the table."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robots.body import Body
+from robots.clearance import MARGIN, Clearance
+from robots.draft.geometry import places
+from robots.robot import Group, Robot
+from robots.rotations import Float64
+from robots.urdf import Urdf
+
+CLEAR = 0.01  # m between links that a posture is to have
+_INSIDE = 0.05  # of a joint's range, from its ends
+_SAMPLES, _FEW, _ELITE, _ROUNDS = 256, 64, 24, 14  # of a search by the cross-entropy method
+_STARTS = 4  # of a search
+_WAY = 24  # points between home and ready
+_LOOKED_AT = np.array([0.3, 0.6, 1.0])  # of them, while searching
+_HEIGHT, _AHEAD, _ASIDE = 0.2, 0.2, 0.3  # m: where fingertips are to be, an arm on a side as far to it
+_NEAR, _ALIKE = 0.02, 1e-3  # m, and of a cosine: within which two arms mirror each other
+
+
+def rest(lower: Float64, upper: Float64) -> Float64:
+    """Zero, or as near to it as keeps a twentieth of the range to both limits."""
+    inside = _INSIDE * (upper - lower)
+    return np.clip(np.zeros_like(lower), lower + inside, upper - inside)
+
+
+class Postures:
+    """Looks for postures of the robot's arms; all other groups, and grippers, stay as at home."""
+
+    def __init__(self, robot: Robot, tree: Urdf) -> None:
+        self._robot = robot
+        self._tree = tree
+        self._body = Body(robot)
+        self._clearance = Clearance(robot)
+        self._looked_at = np.ones(len(self._clearance.pairs), dtype=bool)
+        self._arms = robot.arms
+        pairs = ((arm.name, self._mirroring(self._arms[0], arm)) for arm in self._arms[1:])
+        self._signs = {name: signs for name, signs in pairs if signs is not None}
+        inside = _INSIDE * (robot.upper - robot.lower)
+        self._low, self._high = robot.lower + inside, robot.upper - inside
+        self._draw = np.random.default_rng(0)  # the same URDF gives the same draft
+
+    def home(self) -> Float64:
+        """The robot's home, or the posture nearest to it in which fewest links touch, mirrored where arms are."""
+        home = self._robot.poses["home"]
+        dims = self._dims()
+        best, fewest = home, int(self._touching(home))
+        for reach in np.linspace(0.1, 1.0, 10):
+            if not fewest or not len(dims):
+                break
+            tried = np.tile(home, (_SAMPLES, 1))
+            aims = self._draw.uniform(self._low[dims], self._high[dims], (_SAMPLES, len(dims)))
+            tried[:, dims] = (home[dims] + reach * (aims - home[dims])).round(3)
+            for arm in self._arms:
+                tried = self._mirrored(arm, tried)
+            counts = self._touching(tried)
+            if counts.min() < fewest:
+                fewest = int(counts.min())
+                found = tried[counts == fewest]
+                best = found[np.abs(found - home).max(axis=1).argmin()]
+        self._looked_at &= (
+            self._clearance.distances(best) >= MARGIN
+        )  # what touches anyway tells postures not apart
+        return best
+
+    def ready(self, home: Float64) -> Float64:
+        """Every arm over its side of the table, fingers down; as at home where no such posture can be gone to."""
+        ready = home.copy()
+        for arm in self._arms:
+            found = self._mirrored(arm, ready)
+            if found is ready or not self._clear_way(home, found):
+                found = self._search(arm, ready, home)
+            ready = found
+        return ready
+
+    def touching(self, poses: dict[str, Float64]) -> tuple[tuple[str, str], ...]:
+        """The pairs that touch at these postures all the same."""
+        found = {
+            pair
+            for q in poses.values()
+            for pair, apart in zip(self._clearance.pairs, self._clearance.distances(q), strict=True)
+            if apart < MARGIN
+        }
+        return tuple(sorted(found))
+
+    def _touching(self, q: Float64) -> NDArray[np.intp]:
+        """How many pairs are too near [...]."""
+        return np.asarray((self._clearance.distances(q) < CLEAR).sum(axis=-1))
+
+    def _apart(self, q: Float64) -> Float64:
+        """The least distance [...] of the pairs that are looked at."""
+        return np.asarray(self._clearance.distances(q)[..., self._looked_at].min(axis=-1, initial=np.inf))
+
+    def _dims(self) -> NDArray[np.intp]:
+        arms = [arm.joint_dims for arm in self._arms]
+        return np.concatenate(arms) if arms else np.empty(0, dtype=np.intp)
+
+    def _clear_way(self, home: Float64, ready: Float64) -> bool:
+        way = home + np.linspace(0.0, 1.0, _WAY)[:, None] * (ready - home)
+        return bool(self._apart(way).min() >= min(MARGIN, float(self._apart(home))))
+
+    def _search(self, arm: Group, start: Float64, home: Float64) -> Float64:
+        """The best posture of one arm to which the straight way is clear; `start` where none is found.
+
+        By the cross-entropy method: draw, keep the best, draw about them; begun anew from wherever.
+        """
+        for _ in range(_STARTS):
+            best = self._refined(arm, start, home)
+            if self._clear_way(home, best):
+                return best
+        return start
+
+    def _refined(self, arm: Group, start: Float64, home: Float64) -> Float64:
+        dims = arm.joint_dims
+        low, high = self._low[dims], self._high[dims]
+        middle, spread = self._draw.uniform(low, high), (high - low) / 2
+        best, least = start, np.inf
+        for _ in range(_ROUNDS):
+            tried = np.tile(start, (_SAMPLES, 1))
+            drawn = middle + spread * self._draw.standard_normal((_SAMPLES, len(dims)))
+            tried[:, dims] = np.clip(drawn, low, high)
+            costs = self._costs(arm, tried, home)
+            few = np.argsort(costs)[:_FEW]
+            tried, costs = tried[few], costs[few] + self._obstacles(tried[few], home)
+            order = np.argsort(costs)[:_ELITE]
+            middle = tried[order][:, dims].mean(axis=0)
+            spread = tried[order][:, dims].std(axis=0) + 1e-3
+            if costs[order[0]] < least:
+                best, least = tried[order[0]], float(costs[order[0]])
+        return np.asarray(best.round(3))
+
+    def _costs(self, arm: Group, q: Float64, home: Float64) -> Float64:
+        """How far from where fingertips are to be, how far from down, how near to limits, how far from home."""
+        at = self._tips(arm, q)
+        wanted = np.array([self._side(arm) * _ASIDE, _AHEAD, _HEIGHT])
+        away = np.linalg.norm(at[:, :3, 3] - wanted, axis=-1) / 0.1
+        upright = 1 + at[:, 2, 2]  # 0 where the fingers point straight down
+        dims = arm.joint_dims
+        ranges = self._robot.upper[dims] - self._robot.lower[dims]
+        room = np.minimum(q[:, dims] - self._robot.lower[dims], self._robot.upper[dims] - q[:, dims]) / ranges
+        tight = np.maximum(0.15 - room, 0.0).sum(axis=-1)
+        turned = np.abs(q[:, dims] - home[dims]).mean(axis=-1)
+        return np.asarray(away + 4 * upright + 4 * tight + turned)
+
+    def _obstacles(self, q: Float64, home: Float64) -> Float64:
+        """How deep links would be in each other, at the posture or on the way to it."""
+        way = home + _LOOKED_AT[:, None, None] * (q - home)
+        return np.asarray(20 * np.maximum(2 * CLEAR - self._apart(way), 0.0).max(axis=0) / CLEAR)
+
+    def _tips(self, arm: Group, q: Float64) -> Float64:
+        end = self._body.poses(q)[..., self._body.link_of(arm.name, str(arm.eef_link)), :, :]
+        return end if arm.tip is None else end @ arm.tip
+
+    def _side(self, arm: Group) -> float:
+        """-1 for the arm that begins on the left side of the scene, 1 for the right one, 0 where there is but one."""
+        if len(self._arms) == 1:
+            return 0.0
+        child = self._tree.joint(arm.urdf_joints[0]).child
+        x = float(self._body.poses(self._robot.poses["home"])[self._body.link_of(arm.name, child), 0, 3])
+        return float(np.sign(x)) if abs(x) > _NEAR else 0.0
+
+    def _mirrored(self, arm: Group, q: Float64) -> Float64:
+        """The same postures [..., D], but that the arm mirrors the first one, within its limits, where it is such."""
+        if arm.name not in self._signs:
+            return q
+        found, dims = q.copy(), arm.joint_dims
+        mirror = self._signs[arm.name] * q[..., self._arms[0].joint_dims]
+        found[..., dims] = np.clip(mirror, self._robot.lower[dims], self._robot.upper[dims])
+        return found
+
+    def _mirroring(self, first: Group, second: Group) -> Float64 | None:
+        """For each joint 1 or -1 by which values of `first` mirror it in `second` (y turned round); None if none do."""
+        if len(first.urdf_joints) != len(second.urdf_joints):
+            return None
+        at = places(self._tree, {})
+        signs = []
+        for one, other in zip(first.urdf_joints, second.urdf_joints, strict=True):
+            joints = (self._tree.joint(one), self._tree.joint(other))
+            if joints[0].kind != joints[1].kind and "prismatic" in (joints[0].kind, joints[1].kind):
+                return None
+            here, there = (at[joint.child] for joint in joints)
+            axes = [at[joint.child][:3, :3] @ joint.axis for joint in joints]
+            slides = joints[0].kind == "prismatic"
+            axis = axes[0] * (
+                [1, -1, 1] if slides else [-1, 1, -1]
+            )  # an axis of turning mirrors the other way
+            off = there[:3, 3] - here[:3, 3] * [1, -1, 1]
+            off = off if slides else off - axis * (off @ axis)  # where on its axis a joint is drawn is nothing
+            cosine = float(axis @ axes[1])
+            if abs(abs(cosine) - 1) > _ALIKE or np.abs(off).max() > _NEAR:
+                return None
+            signs.append(np.sign(cosine))
+        return np.array(signs)

@@ -1,0 +1,199 @@
+"""What a draft declares: the tables of robot.toml as they are guessed, before they are written down."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from robots import shapes
+from robots.description import Kind
+from robots.draft.anatomy import Limb, anatomy
+from robots.draft.geometry import corners, places
+from robots.draft.gripper import GripperDraft, end_link, gripper_of
+from robots.draft.limits import Placeholder, placeholder
+from robots.draft.postures import rest
+from robots.errors import RobotError
+from robots.rotations import Float64
+from robots.urdf import Urdf
+
+_SPEEDS = (("vx", 0.3, "m/s"), ("vy", 0.3, "m/s"), ("wz", 0.5, "rad/s"))
+_SPACING = 0.5  # m between arms that are copies of one
+_HIGHEST = 0.6  # m over the root: a shoulder above is no arm's that stands on a table
+_SHOULDER = 0.35  # m over the table, of a robot that stands before it
+_BEFORE = -0.2  # m: the table's near side, where such a robot's shoulders are
+_QUARTER = (0.7071067811865476, 0.0, 0.0, 0.7071067811865476)  # the robot's x looks over the table
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """x, y, z [m] and unit quaternion w, x, y, z."""
+
+    xyz: tuple[float, float, float]
+    wxyz: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class GroupSheet:
+    """One group; `numbers` are names on the wire, the gripper's last. `rest` are its values at home."""
+
+    name: str
+    kind: Kind
+    optional: bool
+    numbers: tuple[str, ...]
+    urdf_joints: tuple[str, ...]
+    frame: str | None
+    eef_link: str | None
+    gripper: GripperDraft | None
+    pinned: Mapping[str, float]
+    mount: Place | None
+    overrides: tuple[Placeholder, ...]
+    rest: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """A whole draft; `idle` are joints that no group moves."""
+
+    title: str
+    urdf: str
+    groups: tuple[GroupSheet, ...]
+    cameras: Mapping[str, str]
+    stand: Place | None
+    idle: tuple[str, ...]
+
+
+def sheet(tree: Urdf, shown: Path, title: str, copies: int) -> Sheet:
+    """The draft of a robot with that URDF, whose shapes are those of the file `shown`; RobotError if nothing moves."""
+    limbs = anatomy(tree)
+    arms = [limb for limb in limbs if limb.kind == "arm"]
+    if copies > 1 and len(arms) != 1:
+        raise RobotError(
+            f"{tree.path}: {copies} copies of {len(arms)} arms; allowed: copies of a URDF with one arm"
+        )
+    groups = [_group(tree, shown, limb, limbs) for limb in limbs]
+    if copies > 1:
+        groups = [_copy(group, index, copies) for index in range(copies) for group in groups]
+        groups.sort(key=lambda group: (group.kind != "arm", group.optional))
+    names = {joint.name for joint in tree.joints.values() if joint.kind != "fixed" and joint.mimic is None}
+    moved = set(chain.from_iterable(limb.joints + limb.fingers for limb in limbs))
+    return Sheet(
+        title=title,
+        urdf=shown.name,
+        groups=tuple(groups),
+        cameras=_cameras([group.name for group in groups if group.kind == "arm"]),
+        stand=None if copies > 1 else _stand(tree, limbs),
+        idle=tuple(name for name in tree.joints if name in names - moved),
+    )
+
+
+def _group(tree: Urdf, shown: Path, limb: Limb, limbs: Sequence[Limb]) -> GroupSheet:
+    if limb.wheels and not limb.joints:
+        return _speeds(limb)
+    eef_link = end_link(tree, limb) if limb.kind == "arm" else None
+    gripper = None
+    if limb.fingers and eef_link is not None:
+        gripper = gripper_of(tree, limb, eef_link, corners(shapes.read(shown)))
+    values = _rest(tree, limb.joints)
+    return GroupSheet(
+        name=limb.name,
+        kind=limb.kind,
+        optional=limb.kind not in ("arm", "hand") and any(other.kind == "arm" for other in limbs),
+        numbers=(*limb.joints, *([gripper.driver] if gripper else [])),
+        urdf_joints=limb.joints,
+        frame=limb.above if eef_link is not None else None,
+        eef_link=eef_link,
+        gripper=gripper,
+        pinned=_pinned(tree, limb, limbs),
+        mount=None,
+        overrides=tuple(filter(None, (placeholder(tree.joint(name)) for name in limb.joints))),
+        rest=(*values, *([gripper.open] if gripper else [])),
+    )
+
+
+def _rest(tree: Urdf, joints: Sequence[str]) -> tuple[float, ...]:
+    ends = [_ends(tree, name) for name in joints]
+    return tuple(
+        rest(np.array([low for low, _ in ends]), np.array([high for _, high in ends])).round(4).tolist()
+    )
+
+
+def _ends(tree: Urdf, name: str) -> tuple[float, float]:
+    """A joint's position limits as the draft has them."""
+    joint = tree.joint(name)
+    instead = placeholder(joint)
+    if instead is not None and instead.lower is not None and instead.upper is not None:
+        return instead.lower, instead.upper
+    assert joint.lower is not None  # or there would be a placeholder
+    assert joint.upper is not None
+    return joint.lower, joint.upper
+
+
+def _pinned(tree: Urdf, limb: Limb, limbs: Sequence[Limb]) -> dict[str, float]:
+    """Where optional groups stay in drawings while nobody moves them, as far as that is not 0; at the first arm."""
+    if limb.kind != "arm" or limb is not next(other for other in limbs if other.kind == "arm"):
+        return {}
+    others = [other for other in limbs if other.kind in ("torso", "head", "other", "base")]
+    values = {
+        name: value
+        for other in others
+        for name, value in zip(other.joints, _rest(tree, other.joints), strict=True)
+    }
+    return {name: value for name, value in values.items() if value}
+
+
+def _speeds(limb: Limb) -> GroupSheet:
+    """A base on wheels: numbers that move no joint of the URDF."""
+    overrides = tuple(
+        Placeholder(
+            name, -fastest, fastest, 2 * fastest, f"{fastest:g} {unit} is a placeholder, and so is its change"
+        )
+        for name, fastest, unit in _SPEEDS
+    )
+    names = tuple(name for name, _, _ in _SPEEDS)
+    return GroupSheet(
+        name=limb.name,
+        kind="base",
+        optional=True,
+        numbers=names,
+        urdf_joints=("",) * len(names),
+        frame=None,
+        eef_link=None,
+        gripper=None,
+        pinned={},
+        mount=None,
+        overrides=overrides,
+        rest=(0.0,) * len(names),
+    )
+
+
+def _copy(group: GroupSheet, index: int, copies: int) -> GroupSheet:
+    """The group of one of several equal arms, side by side, the first on the left."""
+    side = ("left", "right")[index] if copies == 2 else ""
+    name = f"{side}_{group.name}" if side else f"{group.name}{index + 1}"
+    x = round((index - (copies - 1) / 2) * _SPACING, 4)
+    values = {key: getattr(group, key) for key in GroupSheet.__slots__}
+    return GroupSheet(**values | {"name": name, "mount": Place((x, 0.0, 0.0), _QUARTER)})
+
+
+def _cameras(arms: Sequence[str]) -> dict[str, str]:
+    """One over the table and one per wrist, named as policies are mostly trained with."""
+    sides = [name.replace("arm", "wrist") for name in arms]
+    return {"front": "cam_high"} | {side: f"cam_{side}" for side in sides}
+
+
+def _stand(tree: Urdf, limbs: Sequence[Limb]) -> Place:
+    """Where the root stands such that arms reach over the table: on it, or on the floor before it."""
+    at = places(tree, {})
+    shoulders: list[Float64] = [
+        at[tree.joint(limb.joints[0]).child][:3, 3] for limb in limbs if limb.kind == "arm" and limb.joints
+    ]
+    if not shoulders:
+        return Place((0.0, 0.0, 0.0), _QUARTER)
+    x, _, z = np.mean(shoulders, axis=0).tolist()
+    if z <= _HIGHEST and not any(limb.wheels for limb in limbs):
+        return Place((0.0, round(-x, 4) + 0.0, 0.0), _QUARTER)
+    return Place((0.0, round(_BEFORE - x, 4), round(_SHOULDER - z, 4)), _QUARTER)
