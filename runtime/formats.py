@@ -66,7 +66,7 @@ class PoseFormat(Section):
         for key, wrong in strange.items():
             if wrong:
                 needed = {"euler_order": '"euler"', "degrees": '"euler" or "rotation_vector"', "sixd": '"6d"'}
-                raise ConfigurationError(
+                raise ValueError(
                     f"{key} = {getattr(self, key)!r} beside orientation = {chosen!r}, which has no such thing; "
                     f"allowed: with orientation = {needed[key]}, or without {key}"
                 )

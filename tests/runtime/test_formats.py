@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from robots import Robot, load
+from runtime.deployment import load as load_deployment
 from runtime.errors import ConfigurationError, PolicyError
 from runtime.formats import CANONICAL, PoseFormat, PoseRows
 from tests.runtime.odd_robot import odd_robot
@@ -171,8 +173,15 @@ def test_a_format_that_does_not_fit_the_robot_is_refused(settings_: dict[str, An
     ],
 )
 def test_a_key_that_the_orientation_has_no_use_for_is_refused(settings_: dict[str, Any], said: str) -> None:
-    with pytest.raises(ConfigurationError, match=said):
+    with pytest.raises(ValidationError, match=said):
         PoseFormat(**settings_)
+
+
+def test_a_file_with_such_a_key_is_refused_by_its_name() -> None:
+    file = Path(__file__).parents[2] / "deployments" / "tabletop.toml"
+    said = r"policy.action_pose = .*: degrees = True beside orientation = '6d'"
+    with pytest.raises(ConfigurationError, match=said):
+        load_deployment(file, ["policy.action_pose.orientation=6d", "policy.action_pose.degrees=true"])
 
 
 @pytest.mark.parametrize("order", ["xyZ", "xxy", "xy", "abc", "xyzx", ""])
