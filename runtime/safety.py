@@ -7,64 +7,24 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
-from robots.clearance import MARGIN
 from runtime.collision import Collision, Collisions
-from runtime.section import Section
+from runtime.limits import Limits
+from runtime.safety_settings import SafetySettings, WorkspaceBox
 from runtime.types import Float64
+
+__all__ = [
+    "Limits",
+    "Path",
+    "RobotState",
+    "SafetyFilter",
+    "SafetySettings",
+    "Verdict",
+    "WorkspaceBox",
+]
 
 _TOLERANCE = 1e-6
 _MARGIN = 1.05
-# At the default 60 rad/s2 a gripper then covers its travel from rest to rest in 0.1 s, as real ones do.
-GRIPPER_TRAVEL = 6.7
-
-
-class WorkspaceBox(Section):
-    """A box in an arm's declared frame that its end effector must stay in [m]."""
-
-    lower: list[float] = Field(min_length=3, max_length=3)
-    """Corner with the smallest x, y and z."""
-    upper: list[float] = Field(min_length=3, max_length=3)
-    """Corner with the largest x, y and z."""
-
-
-class SafetySettings(Section):
-    """Limits on every action; the defaults come from what a real demonstration reaches."""
-
-    report_only: bool = False
-    """Judge and report, but send actions as they are; refused for a transport that can move a robot."""
-    joint_age_s: float = Field(default=0.2, gt=0)
-    """Oldest joint measurement that a policy action may be based on [s]."""
-    picture_age_s: float = Field(default=0.5, gt=0)
-    """Oldest picture of any camera that a policy action may be based on [s]."""
-    following_error: float = Field(default=0.5, gt=0)
-    """Farthest that a target may be from the measured joints [rad]."""
-    jump: float = Field(default=0.5, gt=0)
-    """Farthest that an action may be from the last command [rad]."""
-    velocity_scale: float = Field(default=1.0, gt=0, le=1)
-    """Part of the robot's joint velocities that may be used."""
-    acceleration: float = Field(default=60.0, gt=0)
-    """Joint acceleration on the policy path [rad/s2]."""
-    motion_acceleration: float = Field(default=5.0, gt=0)
-    """Joint acceleration of motions of ours, such as homing [rad/s2]."""
-    motion_velocity_scale: float = Field(default=0.3, gt=0, le=1)
-    """Part of the joint velocities that motions of ours use."""
-    brake_acceleration: float = Field(default=20.0, gt=0)
-    """Deceleration of a stop or a halt [rad/s2]."""
-    refusals_to_hold: int = Field(default=10, ge=1)
-    """Refused actions in a row that lead to holding."""
-    first_action_far: float = Field(default=0.3, gt=0)
-    """Distance of the policy's first action from the present pose that a person is warned of [rad]."""
-    workspace: dict[str, WorkspaceBox] = Field(default_factory=dict)
-    """Boxes by arm name; an action that leaves one is refused, never clamped. Motions of ours do not leave one that
-    they are in."""
-    collision: Literal["off", "warn", "refuse"] = "warn"
-    """What becomes of a policy's action that brings links of the robot near each other or the table: an event, or a
-    refusal unless it parts what is near already. Motions of ours are always refused then."""
-    collision_margin: float = Field(default=MARGIN, ge=0, le=0.5)
-    """Distance within which links count as colliding [m]; the capsules that stand for them cover them whole, so
-    that little is needed on top."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,47 +59,6 @@ class Verdict:
     @property
     def refused(self) -> bool:
         return self.action is None
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """The robot's bounds, float64 [D] each; `binary` marks dimensions that switch between two values.
-
-    `speeds` are the places of numbers that are speeds (of a base): the robot stands where they are 0, and what is
-    their `velocity` is an acceleration.
-    """
-
-    names: tuple[str, ...]
-    lower: Float64
-    upper: Float64
-    velocity: Float64
-    grippers: np.ndarray  # bool [D]: own unit, not radians
-    binary: np.ndarray  # bool [D]
-    speeds: tuple[int, ...] = ()
-
-    @property
-    def places(self) -> np.ndarray:
-        """Which dimensions are places of joints, bool [D]: neither grippers nor speeds."""
-        places = ~self.grippers
-        places[list(self.speeds)] = False
-        return places
-
-    def standing(self, position: Float64) -> Float64:
-        """`position` [D] with everything that is a speed at 0."""
-        if not self.speeds:
-            return position
-        standing = position.copy()
-        standing[list(self.speeds)] = 0.0
-        return standing
-
-    @property
-    def reach(self) -> Float64:
-        """What one radian is worth in each dimension [D]: 1 for angles.
-
-        A gripper's accelerations are scaled so that its whole travel counts as much as GRIPPER_TRAVEL radians,
-        whatever its unit: metres, 0..1, 0..100.
-        """
-        return np.where(self.grippers, (self.upper - self.lower) * GRIPPER_TRAVEL, 1.0)
 
 
 Path = Literal["policy", "motion"]

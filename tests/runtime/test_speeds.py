@@ -10,13 +10,16 @@ import pytest
 
 import robots
 from runtime.errors import RuntimeFault
+from runtime.kinematics.base import IkResult, Kinematics
 from runtime.messages import LockGrippers, encode
 from runtime.motion import Brake
 from runtime.page import EStop
 from runtime.requests import MoveRequest
 from runtime.safety import Limits, RobotState, SafetyFilter, SafetySettings
+from runtime.spaces import Spaces
 from runtime.targets import Targets
 from runtime.timeline import Dims
+from runtime.types import ActionChunk, Float64, Observation
 from tests.runtime.tick_bench import PERIOD, Bench, following
 
 DRIVEN = Limits(
@@ -156,3 +159,32 @@ def test_a_person_cannot_have_a_base_driven_by_a_motion_and_an_approach_leaves_i
     ):
         targets.goal(MoveRequest(joints=driving.tolist()), robot.poses["home"])
     assert np.array_equal(targets.checked("approach", driving, robot.poses["home"]), robot.poses["home"])
+
+
+class StandingArms(Kinematics):
+    """Has the arms where they are, whatever is asked."""
+
+    def __init__(self, robot: robots.Robot) -> None:
+        self._robot = robot
+
+    def forward(self, q: Float64) -> Float64:
+        return np.stack([arm.pose(q) for arm in self._robot.arms], axis=-2)
+
+    def solve(self, targets: Float64, seed: Float64, *_: Any, **__: Any) -> IkResult:
+        none = np.zeros(targets.shape[:2])
+        return IkResult(np.tile(seed, (len(targets), 1)), none, none, none.astype(np.uint8))
+
+
+def test_a_policy_in_poses_leaves_the_base_standing_and_one_in_steps_names_its_speed() -> None:
+    robot = robots.load("r1_lite", ["left_arm", "base"])
+    spaces = Spaces(robot, StandingArms(robot), 30.0)
+    qpos = robot.poses["ready"].copy()
+    qpos[list(robot.speed_dims)] = 0.3
+    seen = Observation(1, 0.0, {}, qpos.astype(np.float32), {})
+    made = spaces.to_command(ActionChunk(np.tile(spaces.eef_of(qpos), (5, 1)), space="eef"), seen)
+    assert (made.rows[:, list(robot.speed_dims)] == 0.0).all()
+    steps = np.zeros((5, robot.dim), np.float32)
+    steps[:, robot.speed_dims[0]] = 0.1
+    made = spaces.to_command(ActionChunk(steps, space="joint", mode="delta"), seen)
+    assert np.allclose(made.rows[:, robot.speed_dims[0]], 0.1)
+    assert (made.rows[:, robot.speed_dims[1]] == 0.0).all()

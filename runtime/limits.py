@@ -1,0 +1,53 @@
+"""What a robot can do: the bounds of each of its numbers, and what kind of number it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from runtime.types import Float64
+
+# At the default 60 rad/s2 a gripper then covers its travel from rest to rest in 0.1 s, as real ones do.
+GRIPPER_TRAVEL = 6.7
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """The robot's bounds, float64 [D] each; `binary` marks dimensions that switch between two values.
+
+    `speeds` are the places of numbers that are speeds (of a base): the robot stands where they are 0, and what is
+    their `velocity` is an acceleration.
+    """
+
+    names: tuple[str, ...]
+    lower: Float64
+    upper: Float64
+    velocity: Float64
+    grippers: np.ndarray  # bool [D]: own unit, not radians
+    binary: np.ndarray  # bool [D]
+    speeds: tuple[int, ...] = ()
+
+    @property
+    def places(self) -> np.ndarray:
+        """Which dimensions are places of joints, bool [D]: neither grippers nor speeds."""
+        places = ~self.grippers
+        places[list(self.speeds)] = False
+        return places
+
+    def standing(self, position: Float64) -> Float64:
+        """`position` [D] with everything that is a speed at 0."""
+        if not self.speeds:
+            return position
+        standing = position.copy()
+        standing[list(self.speeds)] = 0.0
+        return standing
+
+    @property
+    def reach(self) -> Float64:
+        """What one radian is worth in each dimension [D]: 1 for angles.
+
+        A gripper's accelerations are scaled so that its whole travel counts as much as GRIPPER_TRAVEL radians,
+        whatever its unit: metres, 0..1, 0..100.
+        """
+        return np.where(self.grippers, (self.upper - self.lower) * GRIPPER_TRAVEL, 1.0)
