@@ -25,7 +25,11 @@ NAMES = {
     "action_mode": "says that its actions are :MODE",
     "no_rtc": "says that it continues no chunk, and continues none",
     "envelope_version": "with --rtc async_rtc: speaks version :N of the envelope (3)",
-    "request_id": "with --rtc async_rtc: answers carry the number of another request",
+    "request_id": "with --rtc async_rtc, and starvla: answers carry the number of another request",
+    "not_loaded": "vllm: says as JSON that no policy is served",
+    "reset_text": "roboarena, vllm: answers a reset with another word",
+    "normalized": "starvla: answers with rows that are yet to be un-normalised",
+    "refused": "starvla: answers with a map that says that the model failed",
 }
 
 

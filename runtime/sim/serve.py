@@ -102,12 +102,12 @@ def _rtc(options: argparse.Namespace) -> Name:
 
 def _spoken(script: Script, robot: Robot, rate: float, options: argparse.Namespace) -> Script:
     """The script, in the space that was asked for."""
-    from runtime.sim.in_poses import InPoses, pose_format
-
     if options.space == "joint":
         if options.pose:
             raise SetupError(f"--pose {' '.join(options.pose)}: allowed with --space eef")
         return script
+    from runtime.sim.in_poses import InPoses, pose_format
+
     return InPoses(script, robot, rate, pose_format(options.pose))
 
 

@@ -16,7 +16,7 @@ Bool = NDArray[np.bool_]
 
 
 class Order:
-    """The separating sides of solids as they stand; `hides` and `painted` for as many cameras as wanted.
+    """The separating sides of solids as they stand; what hides what for an eye.
 
     The box around each has three unit axes, the rows of `axes` [S, 3, 3], its centre [S, 3] and half sizes [S, 3].
     """

@@ -30,8 +30,6 @@ class Painter:
     def __init__(self, solids: Solids, placed: Placed) -> None:
         self._solids = solids
         self._placed = placed
-        self._kept = np.flatnonzero(placed.seen)
-        self._order = Order(placed.axes[self._kept], placed.centres[self._kept], solids.halves[self._kept])
         self._corners = placed.vertices[solids.face_corner]
         normals = placed.normals
         lit = 0.50 + 0.10 * normals[:, 2] + 0.40 * np.maximum(normals @ LIGHT, 0)
@@ -46,15 +44,16 @@ class Painter:
         solids, placed = self._solids, self._placed
         eye = camera.pose[:3, 3].astype(np.float32)
         inside = (placed.vertices - eye) @ camera.pose[:3, :3].astype(np.float32)
-        among = np.flatnonzero(_in_view(camera, inside, solids)[self._kept])
-        chosen = self._kept[among]
+        chosen = np.flatnonzero(_in_view(camera, inside, solids) & placed.seen)
+        if not len(chosen):
+            return
         near = np.minimum.reduceat(inside[:, 2], solids.starts) < _NEAR
         pixels = _pixels(camera, inside)
         low = np.minimum.reduceat(pixels, solids.starts)
         high = np.maximum.reduceat(pixels, solids.starts)
         low[near], high[near] = -_FAR_OUT, _FAR_OUT
         overlap = _overlap(low[chosen], high[chosen])
-        hides = self._order.hides(eye)[np.ix_(among, among)]
+        hides = Order(placed.axes[chosen], placed.centres[chosen], solids.halves[chosen]).hides(eye)
         distance = np.linalg.norm(placed.centres[chosen] - eye, axis=1)
         facing = self._facing(eye, chosen)
         corners = (pixels * (1 << _SHIFT)).round().astype(np.int32)
