@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
 from robots import Chain, Group, Robot
 from runtime.errors import SetupError
 from runtime.kinematics.base import IkResult, Kinematics, KinematicsError, KinematicsSettings
-from runtime.kinematics.tables import Way, tables_of
+from runtime.kinematics.tables import Records, Way, chains_of
 from runtime.types import Float64
 
-if TYPE_CHECKING:
-    from runtime.kinematics.kernels.chunks import Arms
+_WRONG = {  # by what runtime.kinematics.kernels.chunks says
+    1: "a target, the seed or the anchor holds a number that is not finite",
+    2: "a target's quaternion has length zero; allowed: any other",
+}
 
 
 class Config(KinematicsSettings):
@@ -34,26 +37,22 @@ class CompiledKinematics(Kinematics):
 
     def __init__(self, robot: Robot, config: Config | None = None) -> None:
         try:
-            from runtime.kinematics.kernels import chains, chunks, frames, sizes
+            from runtime.kinematics.kernels import chains, chunks, frames
         except ImportError as error:
             raise SetupError(str(error)) from error
-        self._config = config or Config()
+        config = config or Config()
         self._dim = robot.dim
         own = [(group, chain) for group in robot.arms if (chain := group.chain) is not None]
-        self._count = len(own)
-        self._whole = tables_of([_whole(group, chain) for group, chain in own])
-        self._arms = _arms_of(robot, own, self._config.velocity_scale)
-        self._chains, self._chunks = chains, chunks
-        self._reach = sizes.size_of(self._whole.drive.shape[1])
-        self._sizes = (
-            sizes.size_of(self._arms.own.drive.shape[1]),
-            sizes.size_of(self._arms.carriers.drive.shape[1]),
-            sizes.size_of(self._arms.dims.shape[1]),
+        self._whole = chains_of([_whole(group, chain) for group, chain in own])
+        self._arms = _arms_of(robot, own, config.velocity_scale)
+        self._poses_of, self._solve_chunk = chains.poses_of, chunks.solve_chunk
+        self._reach_type = chains.reach_type(self._whole["drive"].shape[1])
+        self._scratch_type = chunks.scratch_type(*_lengths(self._arms))
+        self._costs = frames.Costs(
+            config.position_weight, config.rotation_weight, config.rest_weight, config.max_iterations
         )
-        weights = np.array([self._config.position_weight, self._config.rotation_weight])
-        self._costs = frames.Costs(weights, self._config.rest_weight, self._config.max_iterations)
         self._tolerances = chunks.Tolerances(
-            self._config.position_tolerance, self._config.rotation_tolerance, self._config.singular_below
+            config.position_tolerance, config.rotation_tolerance, config.singular_below
         )
 
     def warm_up(self) -> None:
@@ -66,9 +65,10 @@ class CompiledKinematics(Kinematics):
         q = np.array(q, dtype=np.float64, order="C")
         if q.shape[-1:] != (self._dim,):
             raise KinematicsError(f"joints of shape {q.shape} were given; allowed: [..., {self._dim}]")
-        poses = np.empty((*q.shape[:-1], self._count, 7))
+        poses = np.empty((*q.shape[:-1], len(self._arms), 7))
         rows = q.reshape(-1, self._dim)
-        self._chains.poses_of(self._reach, self._whole, rows, poses.reshape(len(rows), self._count, 7))
+        reach = np.empty(1, dtype=self._reach_type)
+        self._poses_of(self._whole, rows, reach, poses.reshape(len(rows), len(self._arms), 7))
         return poses
 
     def solve(
@@ -92,30 +92,33 @@ class CompiledKinematics(Kinematics):
         if anchor_row < 0:
             raise KinematicsError(f"anchor_row = {anchor_row} was given; allowed: 0 or above")
         held = seed if anchor is None else self._vector("an anchor", anchor)
-        asked = self._chunks.Asked(
-            targets, seed[None], float(dt or 0.0), held, -1 if anchor is None else int(anchor_row)
+        frames = (len(targets), len(self._arms))
+        q, away, astray = np.empty((len(targets), self._dim)), np.empty(frames), np.empty(frames)
+        flags = np.empty(frames, dtype=np.uint8)
+        wrong = self._solve_chunk(
+            self._arms,
+            self._costs,
+            self._tolerances,
+            targets,
+            seed[None],
+            float(dt or 0.0),
+            held,
+            -1 if anchor is None else int(anchor_row),
+            np.empty(1, dtype=self._scratch_type),
+            q,
+            away,
+            astray,
+            flags,
         )
-        frames = (len(targets), self._count)
-        solved = self._chunks.Solved(
-            np.empty((len(targets), self._dim)),
-            np.empty(frames),
-            np.empty(frames),
-            np.empty(frames, dtype=np.uint8),
-        )
-        wrong = self._chunks.solve_chunk(
-            *self._sizes, self._arms, self._costs, self._tolerances, asked, solved
-        )
-        if wrong == self._chunks.NOT_FINITE:
-            raise KinematicsError("a target, the seed or the anchor holds a number that is not finite")
-        if wrong == self._chunks.NO_QUATERNION:
-            raise KinematicsError("a target's quaternion has length zero; allowed: any other")
-        return IkResult(*solved)
+        if wrong:
+            raise KinematicsError(_WRONG[wrong])
+        return IkResult(q, away, astray, flags)
 
     def _targets(self, given: Float64) -> Float64:
         targets = np.array(given, dtype=np.float64, order="C")
-        if targets.ndim != 3 or targets.shape[1:] != (self._count, 7):
+        if targets.ndim != 3 or targets.shape[1:] != (len(self._arms), 7):
             raise KinematicsError(
-                f"targets of shape {targets.shape} were given; allowed: [T, {self._count}, 7]"
+                f"targets of shape {targets.shape} were given; allowed: [T, {len(self._arms)}, 7]"
             )
         return targets
 
@@ -133,28 +136,35 @@ def _whole(group: Group, chain: Chain) -> Way:
     return Way([group.carrier, chain], [group.carrier_dims.tolist(), group.joint_dims.tolist()])
 
 
-def _arms_of(robot: Robot, own: list[tuple[Group, Chain]], velocity_scale: float) -> Arms:
-    from runtime.kinematics.kernels.chunks import Arms
+def _arms_of(robot: Robot, own: Sequence[tuple[Group, Chain]], velocity_scale: float) -> Records:
+    """The arms as records; where they differ in length, shorter ones are filled up with what stands still."""
+    from runtime.kinematics.kernels.chunks import arm_type
 
-    size = max((chain.size for _, chain in own), default=0)
-    arms = Arms(
-        own=tables_of([Way([chain], [list(range(chain.size))]) for _, chain in own]),
-        carriers=tables_of(
-            [
-                Way([], []) if group.carrier is None else Way([group.carrier], [group.carrier_dims.tolist()])
-                for group, _ in own
-            ]
-        ),
-        sizes=np.array([chain.size for _, chain in own], dtype=np.int64),
-        dims=np.zeros((len(own), size), dtype=np.int64),
-        lower=np.zeros((len(own), size)),
-        upper=np.zeros((len(own), size)),
-        speed=np.zeros((len(own), size)),
-    )
-    for arm, (group, chain) in enumerate(own):
+    chains = chains_of([Way([chain], [range(chain.size)]) for _, chain in own])
+    carriers = chains_of([_carrying(group) for group, _ in own])
+    size = max((chain.size for _, chain in own), default=1)
+    arms = np.zeros(len(own), dtype=arm_type(chains["drive"].shape[1], carriers["drive"].shape[1], size))
+    arms["own"], arms["carrier"] = chains, carriers
+    for arm, (group, chain) in zip(arms, own, strict=True):
         dims, count = group.joint_dims, chain.size
-        arms.dims[arm, :count] = dims
-        arms.lower[arm, :count] = robot.lower[dims]
-        arms.upper[arm, :count] = robot.upper[dims]
-        arms.speed[arm, :count] = robot.velocity[dims] * velocity_scale
+        arm["joints"] = count
+        arm["dims"][:count] = dims
+        arm["lower"][:count] = robot.lower[dims]
+        arm["upper"][:count] = robot.upper[dims]
+        arm["speed"][:count] = robot.velocity[dims] * velocity_scale
     return arms
+
+
+def _carrying(group: Group) -> Way:
+    if group.carrier is None:
+        return Way([], [])
+    return Way([group.carrier], [group.carrier_dims.tolist()])
+
+
+def _lengths(arms: Records) -> tuple[int, int, int]:
+    """Moving joints of the arms' own chains, of those that carry them, and numbers that drive them."""
+    return (
+        arms["own"]["drive"].shape[1],
+        arms["carrier"]["drive"].shape[1],
+        arms["dims"].shape[1],
+    )

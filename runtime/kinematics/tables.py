@@ -1,31 +1,40 @@
-"""Kinematic chains as tables of numbers, in the form that compiled loops read."""
+"""Kinematic chains as records of numbers, in the form that compiled loops read.
+
+A record's fields have their lengths in their type: the compiler knows every address and unrolls every small loop.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robots import Chain
-from runtime.types import Float64, UInt8
+from runtime.types import Float64
+
+Record = Any  # one element of an array of the types below: fields by name, lengths known to the compiler
+Records = NDArray[np.void]
 
 
-class ChainTables(NamedTuple):
-    """Several chains [A] of M moving joints each, shorter ones filled up with joints that stand still.
+def chain_type(moving: int) -> np.dtype[np.void]:
+    """A chain of up to so many moving joints; shorter ones are filled up with joints that stand still.
 
-    `fixed` float64 [A, M + 1, 12]: what lies before each joint, and behind the last: a rotation row by row, then
-    the origin [m]; each joint turns about the z that this leads to, or slides along it where `slides` [A, M] is 1,
-    by factor * q[drive] + offset [A, M]; drive is -1 where it stands still.
+    `fixed` is what lies before each joint, and behind the last: a rotation row by row, then the origin [m]. Each
+    joint turns about the z that this leads to, or slides along it where `slides` is 1, by factor * q[drive] +
+    offset; drive is -1 where it stands still.
     """
-
-    fixed: Float64
-    slides: UInt8
-    drive: NDArray[np.int64]
-    factor: Float64
-    offset: Float64
+    return np.dtype(
+        [
+            ("fixed", np.float64, (moving + 1, 12)),
+            ("factor", np.float64, (moving,)),
+            ("offset", np.float64, (moving,)),
+            ("drive", np.int64, (moving,)),
+            ("slides", np.int64, (moving,)),
+        ]
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,36 +45,31 @@ class Way:
     dims: Sequence[Sequence[int]]
 
 
-def tables_of(ways: Sequence[Way]) -> ChainTables:
-    """The tables of ways of any length."""
+def chains_of(ways: Sequence[Way]) -> Records:
+    """Records [A] of ways of any length, all as long as the longest."""
     longest = max((sum(len(chain.moving) for chain in way.chains) for way in ways), default=0)
-    shape = (len(ways), longest)
-    tables = ChainTables(
-        np.tile(_flat(np.eye(4)), (len(ways), longest + 1, 1)),
-        np.zeros(shape, dtype=np.uint8),
-        np.full(shape, -1, dtype=np.int64),
-        np.zeros(shape),
-        np.zeros(shape),
-    )
-    for row, way in enumerate(ways):
-        _fill(tables, row, way)
-    return tables
+    records = np.zeros(len(ways), dtype=chain_type(max(1, longest)))
+    records["fixed"] = _flat(np.eye(4))
+    records["drive"] = -1
+    for record, way in zip(records, ways, strict=True):
+        _fill(record, way)
+    return records
 
 
-def _fill(tables: ChainTables, row: int, way: Way) -> None:
+def _fill(record: Record, way: Way) -> None:
     place, before = 0, np.eye(4)
     for chain, dims in zip(way.chains, way.dims, strict=True):
         for joint in chain.moving:
             basis = _basis(joint.axis)
-            tables.fixed[row, place] = _flat(before @ joint.origin @ basis)
-            tables.slides[row, place] = joint.slides
-            tables.drive[row, place] = dims[joint.drive]
-            tables.factor[row, place] = joint.factor
-            tables.offset[row, place] = joint.offset
+            record["fixed"][place] = _flat(before @ joint.origin @ basis)
+            record["factor"][place] = joint.factor
+            record["offset"][place] = joint.offset
+            record["drive"][place] = dims[joint.drive]
+            record["slides"][place] = joint.slides
             before = basis.T
             place += 1
         before = before @ chain.tail
-    tables.fixed[row, place] = _flat(before)
+    record["fixed"][place] = _flat(before)
 
 
 def _basis(axis: Float64) -> Float64:

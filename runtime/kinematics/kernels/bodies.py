@@ -38,7 +38,7 @@ def place_parts(parts: Parts, q: Float64, placed: Float32) -> None:
             drive = parts.drive[part]
             value = parts.offset[part] + (parts.factor[part] * q[row, drive] if drive >= 0 else 0.0)
             turns[0, part] = min(max(value, parts.low[part]), parts.high[part])
-        sines_of(turns[0], turns[1], turns[2])
+        sines_of(turns)
         for part in range(count):
             value, sine, cosine = turns[0, part], turns[1, part], turns[2, part]
             for k in range(12):

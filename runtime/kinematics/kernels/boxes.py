@@ -2,109 +2,112 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from runtime.kinematics.kernels.compiling import part
-from runtime.kinematics.kernels.sizes import Size
-from runtime.types import Float64, UInt8
+from runtime.kinematics.tables import Record
 
 _DEFINITE = 1e-13  # of its diagonal must be left of a row
 
 
+def box_type(size: int) -> np.dtype[np.void]:
+    """A quadratic in `size` numbers, the walls around 0, the step that is found, and what finding it overwrites."""
+    vector, square = (size,), (size, size)
+    return np.dtype(
+        [
+            ("system", np.float64, square),  # below its diagonal
+            ("gradient", np.float64, vector),
+            ("low", np.float64, vector),
+            ("high", np.float64, vector),
+            ("step", np.float64, vector),
+            ("factors", np.float64, square),
+            ("slope", np.float64, vector),
+            ("move", np.float64, vector),
+            ("held", np.int64, vector),
+        ]
+    )
+
+
 @part
-def step_in_box(
-    size: Size,
-    system: Float64,
-    gradient: Float64,
-    lower: Float64,
-    upper: Float64,
-    step: Float64,
-    factors: Float64,
-    slope: Float64,
-    move: Float64,
-    held: UInt8,
-) -> bool:
-    """Into `step` [n] the d in [lower, upper], which holds 0, that minimises gradient . d + d . system . d / 2.
+def step_in_box(box: Record, damping: float) -> bool:
+    """Into box.step the d in [low, high], which holds 0, that minimises gradient . d + d . damped system . d / 2.
 
     Primal active set for a strictly convex problem (Nocedal and Wright, Numerical Optimization, 16.5): walk to the
     first wall, hold that joint, solve again for the others; let go of a wall that the slope leaves. Each part lowers
-    the value, so a step that is cut short still descends. `system` [n, n] is read below its diagonal; `factors`
-    [n, n], `slope`, `move` and `held` [n] are overwritten. False where the system is not positive definite.
+    the value, so a step that is cut short still descends. False where the system is not positive definite.
     """
-    n = len(size)
+    gradient, low, high, step, move, held = box.gradient, box.low, box.high, box.step, box.move, box.held
+    n = len(gradient)
     for i in range(n):
         step[i] = 0.0
-        slope[i] = gradient[i]
-        held[i] = (lower[i] >= 0 and gradient[i] > 0) or (upper[i] <= 0 and gradient[i] < 0)
+        box.slope[i] = gradient[i]
+        held[i] = (low[i] >= 0 and gradient[i] > 0) or (high[i] <= 0 and gradient[i] < 0)
     for _ in range(4 * n):
-        if not _solved(size, system, slope, held, factors, move):
+        if not _solve(box, damping):
             return False
         first, share = -1, 1.0
         for i in range(n):
-            room = (upper[i] if move[i] > 0 else lower[i]) - step[i]
-            if not held[i] and abs(move[i]) > abs(room) and (first < 0 or abs(room) < share * abs(move[i])):
-                first, share = i, abs(room) / abs(move[i])
+            room = abs((high[i] if move[i] > 0 else low[i]) - step[i])
+            if not held[i] and room < share * abs(move[i]):
+                first, share = i, room / abs(move[i])
         for i in range(n):
-            if not held[i]:
-                step[i] += share * move[i]
+            step[i] += share * move[i]  # a held joint's move is 0
         if first >= 0:
-            step[first] = upper[first] if move[first] > 0 else lower[first]
+            step[first] = high[first] if move[first] > 0 else low[first]
             held[first] = 1
-        elif not _any(size, held):
-            return True
-        _slope_of(size, system, gradient, step, slope)
-        if first < 0 and not _let_go(size, lower, upper, step, slope, held):
-            return True
+            _set_slope(box, damping)
+        elif not _let_go(box, damping):
+            break
     return True
 
 
 @part
-def _any(size: Size, held: UInt8) -> bool:
-    found = 0
-    for i in range(len(size)):
-        found += held[i]
-    return found > 0
+def _set_slope(box: Record, damping: float) -> None:
+    n = len(box.step)
+    for i in range(n):
+        total = box.gradient[i] + damping * (1 + box.system[i, i]) * box.step[i]
+        for j in range(n):
+            total += (box.system[i, j] if j <= i else box.system[j, i]) * box.step[j]
+        box.slope[i] = total
 
 
 @part
-def _slope_of(size: Size, system: Float64, gradient: Float64, step: Float64, slope: Float64) -> None:
-    for i in range(len(size)):
-        total = gradient[i]
-        for j in range(len(size)):
-            total += (system[i, j] if j <= i else system[j, i]) * step[j]
-        slope[i] = total
-
-
-@part
-def _let_go(size: Size, lower: Float64, upper: Float64, step: Float64, slope: Float64, held: UInt8) -> bool:
+def _let_go(box: Record, damping: float) -> bool:
     """Frees the held joint that the slope pulls hardest from its wall; whether there was one."""
+    n = len(box.step)
+    holding = 0
+    for i in range(n):
+        holding += box.held[i]
+    if holding == 0:
+        return False
+    _set_slope(box, damping)
     hardest, pull = -1, 0.0
-    for i in range(len(size)):
-        inwards = slope[i] if step[i] >= upper[i] else -slope[i]
-        if held[i] and lower[i] < upper[i] and inwards > pull:
+    for i in range(n):
+        inwards = box.slope[i] if box.step[i] >= box.high[i] else -box.slope[i]
+        if box.held[i] and box.low[i] < box.high[i] and inwards > pull:
             hardest, pull = i, inwards
     if hardest >= 0:
-        held[hardest] = 0
+        box.held[hardest] = 0
     return hardest >= 0
 
 
 @part
-def _solved(
-    size: Size, system: Float64, slope: Float64, held: UInt8, factors: Float64, move: Float64
-) -> bool:
-    """Into `move` what takes the slope to zero in all joints that are not held, by Cholesky's L D L^T.
+def _solve(box: Record, damping: float) -> bool:
+    """Into box.move what takes the slope to zero in all joints that are not held, by Cholesky's L D L^T.
 
     Column by column; below the diagonal stands what is left of the system, on it 1 / D, above it L transposed.
     A held joint is a row of the identity: it moves by nothing.
     """
-    n = len(size)
+    factors, move, held = box.factors, box.move, box.held
+    n = len(move)
     for i in range(n):
-        move[i] = 0.0 if held[i] else -slope[i]
-        for j in range(i + 1):
-            factors[i, j] = 0.0 if held[i] or held[j] else system[i, j]
-        if held[i]:
-            factors[i, i] = 1.0
+        move[i] = 0.0 if held[i] else -box.slope[i]
+        for j in range(i):
+            factors[i, j] = 0.0 if held[i] or held[j] else box.system[i, j]
+        factors[i, i] = 1.0 if held[i] else box.system[i, i] + damping * (1 + box.system[i, i])
     definite = True
     for j in range(n):
-        definite = definite and factors[j, j] > _DEFINITE * system[j, j]
+        definite = definite and factors[j, j] > _DEFINITE * box.system[j, j]
         inverse = 1 / factors[j, j]
         factors[j, j] = inverse
         for i in range(j + 1, n):

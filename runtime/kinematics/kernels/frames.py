@@ -6,13 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runtime.kinematics.kernels.boxes import step_in_box
-from runtime.kinematics.kernels.chains import frames_of, jacobian_of
+from runtime.kinematics.kernels.boxes import box_type, step_in_box
+from runtime.kinematics.kernels.chains import jacobian_of, reach_for, reach_type
 from runtime.kinematics.kernels.compiling import part
-from runtime.kinematics.kernels.rotations import rotation_between
-from runtime.kinematics.kernels.sizes import Size
-from runtime.kinematics.tables import ChainTables
-from runtime.types import Float64, UInt8
+from runtime.kinematics.kernels.rotations import rotation_vector, turned_back
+from runtime.kinematics.tables import Record
 
 _LARGEST_STEP = 0.5  # rad (m) of one iteration: linearisation is worth nothing farther out
 _CLOSE_ENOUGH = 1e-9  # weighted squared error: below 1 um and 5 urad
@@ -22,220 +20,173 @@ _LEAST_DAMPING = 1e-8  # below it there is none
 
 
 class Costs(NamedTuple):
-    """What a solve weighs: [position per m, rotation per rad], and a radian away from the frame before."""
+    """What a solve weighs: a metre and a radian beside the pose, a radian (m) away from what a frame rests on."""
 
-    weights: Float64
+    position: float
+    rotation: float
     rest: float
     max_iterations: int
 
 
-class Room(NamedTuple):
-    """Arrays that a solve overwrites, made once per chunk; of the errors one is for the joints tried."""
-
-    turns: Float64  # [3, M]
-    frames: Float64  # [M + 1, 12]
-    jacobian: Float64  # [6, n]
-    errors: tuple[Float64, Float64]  # [6]
-    spare: Float64  # [13]
-    system: Float64  # [n, n]
-    damped: Float64  # [n, n]
-    factors: Float64  # [n, n]
-    gradient: Float64  # [n]
-    slope: Float64
-    move: Float64
-    step: Float64
-    low: Float64
-    high: Float64
-    held: UInt8
-    trial: Float64  # [1, n]
-    normal: Float64  # [6, 6]
-
-
-@part
-def room_for(moving: Size, size: Size) -> Room:
-    """Room for chains of so many moving joints, driven by so many numbers."""
-    n = len(size)
-    return Room(
-        np.empty((3, len(moving))),
-        np.empty((len(moving) + 1, 12)),
-        np.empty((6, n)),
-        (np.empty(6), np.empty(6)),
-        np.empty(13),
-        np.empty((n, n)),
-        np.empty((n, n)),
-        np.empty((n, n)),
-        np.empty(n),
-        np.empty(n),
-        np.empty(n),
-        np.empty(n),
-        np.empty(n),
-        np.empty(n),
-        np.empty(n, dtype=np.uint8),
-        np.empty((1, n)),
-        np.empty((6, 6)),
+def frame_type(moving: int, size: int) -> np.dtype[np.void]:
+    """One frame while it is solved, for a chain of so many moving joints that `size` numbers drive."""
+    vector = (size,)
+    return np.dtype(
+        [
+            ("reach", reach_type(moving)),
+            ("box", box_type(size)),
+            ("goal", np.float64, (12,)),
+            ("q", np.float64, vector),
+            ("tried", np.float64, (1, size)),
+            ("lower", np.float64, vector),  # the box that q may not leave
+            ("upper", np.float64, vector),
+            ("begin", np.float64, vector),  # where it begins: the frame before, within the box
+            ("centre", np.float64, vector),  # what it rests on
+            ("before", np.float64, vector),  # what its velocity counts from
+            ("motion", np.float64, vector),  # of the frame before
+            ("jacobian", np.float64, (6, size)),  # weighted
+            ("error", np.float64, (6,)),  # weighted: position, then rotation vector from goal to tip
+            ("attempt", np.float64, (6,)),  # that of `tried`
+            ("normal", np.float64, (6, 6)),
+        ]
     )
 
 
 @part
-def solve_frame(
-    moving: Size,
-    size: Size,
-    chain: int,
-    tables: ChainTables,
-    costs: Costs,
-    goal: Float64,
-    centre: Float64,
-    lower: Float64,
-    upper: Float64,
-    q: Float64,
-    room: Room,
-) -> Float64:
-    """Into `q` [n] the joints in [lower, upper] whose tip comes closest to `goal` [12], found from q on.
+def solve_frame(chain: Record, costs: Costs, frame: Record) -> float:
+    """Into frame.q the joints in [lower, upper] whose tip comes closest to `goal`, found from frame.tried on.
 
     Levenberg-Marquardt, undamped until a step fails, then damped by the gain ratio (Nielsen 1999, IMM-REP-1999-05);
-    every step is a small quadratic problem in the box. `centre` [n] is what the rest weight holds to. Ends when the
-    error is negligible or its cost has stopped falling, which bounds what an unreachable target takes. Gives the
-    weighted error [6] of q, whose weighted Jacobian is then room.jacobian.
+    every step is a small quadratic problem in the box. Ends when the error is negligible or its cost has stopped
+    falling, which bounds what an unreachable target takes. Gives the weighted squared error of q; `error` and
+    `jacobian` are its.
     """
-    n = len(size)
-    error, other = room.errors
+    n = len(frame.q)
+    q, tried, box = frame.q, frame.tried, frame.box
     rest = costs.rest * costs.rest
-    cost, predicted, damping, growth = np.inf, 0.0, 0.0, 2.0
-    for i in range(n):
-        room.trial[0, i] = q[i]
+    cost, missed, predicted, damping, growth = np.inf, np.inf, 0.0, 0.0, 2.0
     for iteration in range(costs.max_iterations + 1):
-        frames_of(moving, chain, tables, room.trial, 0, room.turns, room.frames)
-        missed = _error_of(moving, costs, goal, room, other)
+        reach_for(chain, tried, 0, frame.reach)
+        off = _attempt(costs, frame)
         strayed = 0.0
         for i in range(n):
-            strayed += (room.trial[0, i] - centre[i]) ** 2
-        fall = cost - (missed + rest * strayed)
+            strayed += (tried[0, i] - frame.centre[i]) ** 2
+        fall = cost - (off + rest * strayed)
         if fall > 0 or iteration == 0:
-            error, other = other, error
-            for i in range(n):
-                q[i] = room.trial[0, i]
-            jacobian_of(moving, chain, tables, room.frames, costs.weights, room.jacobian)
             stalled = iteration > 0 and fall <= _STALLED * cost
-            cost = missed + rest * strayed
+            cost, missed = off + rest * strayed, off
+            for i in range(n):
+                q[i] = tried[0, i]
+            for k in range(6):
+                frame.error[k] = frame.attempt[k]
+            jacobian_of(chain, frame.reach, costs.position, costs.rotation, frame.jacobian)
             if stalled or (missed <= _CLOSE_ENOUGH and (iteration > 0 or strayed == 0.0)):
                 break
             if damping > 0:
                 damping *= max(1 / 3, 1 - (2 * fall / predicted - 1) ** 3)
                 damping = damping if damping > _LEAST_DAMPING else 0.0
             growth = 2.0
-            _quadratic_of(size, rest, error, centre, q, room)
-            for i in range(n):
-                room.low[i] = max(lower[i] - q[i], -_LARGEST_STEP)
-                room.high[i] = min(upper[i] - q[i], _LARGEST_STEP)
+            _set_quadratic(rest, frame)
         else:
             damping = max(damping * growth, _FIRST_DAMPING)
             growth *= 2.0
-        if not _stepped(size, damping, room):
+        if not step_in_box(box, damping):
             damping = max(damping * growth, _FIRST_DAMPING)
             growth *= 2.0
-            _stepped(size, damping, room)
-        predicted = _promised(size, room)
+            step_in_box(box, damping)
+        predicted = _promised(box)
         if predicted <= 1e-3 * _STALLED * cost:
             break
         for i in range(n):
-            room.trial[0, i] = min(max(q[i] + room.step[i], lower[i]), upper[i])
-    return error
+            tried[0, i] = min(max(q[i] + box.step[i], frame.lower[i]), frame.upper[i])
+    return missed
 
 
 @part
-def _error_of(moving: Size, costs: Costs, goal: Float64, room: Room, error: Float64) -> float:
-    """Into `error` [6] that of the tip, weighted: position, then the rotation vector from goal to tip; its square.
+def _attempt(costs: Costs, frame: Record) -> float:
+    """Into frame.attempt the weighted error of the tip; its square.
 
-    The derivative of that vector is taken as the geometric one, which leaves the gradient exact.
+    The derivative of its rotation vector is taken as the geometric one, which leaves the gradient exact.
     """
-    m = len(moving)
-    rotation_between(room.frames[m], goal, error[3:], room.spare)
+    frames, goal = frame.reach.frames, frame.goal
+    last = len(frames) - 1
+    turned = rotation_vector(turned_back(frames, last, goal))
     total = 0.0
     for k in range(3):
-        error[k] = costs.weights[0] * (room.frames[m, 9 + k] - goal[9 + k])
-        error[3 + k] *= costs.weights[1]
-        total += error[k] * error[k] + error[3 + k] * error[3 + k]
+        away, astray = costs.position * (frames[last, 9 + k] - goal[9 + k]), costs.rotation * turned[k]
+        frame.attempt[k], frame.attempt[3 + k] = away, astray
+        total += away * away + astray * astray
     return total
 
 
 @part
-def _quadratic_of(size: Size, rest: float, error: Float64, centre: Float64, q: Float64, room: Room) -> None:
-    """The system and the gradient of half the cost at q."""
-    for i in range(len(size)):
-        room.gradient[i] = rest * (q[i] - centre[i])
+def _set_quadratic(rest: float, frame: Record) -> None:
+    """The system, the gradient of half the cost at q, and how far a step may go."""
+    box, jacobian = frame.box, frame.jacobian
+    for i in range(len(frame.q)):
+        slope = rest * (frame.q[i] - frame.centre[i])
         for k in range(6):
-            room.gradient[i] += room.jacobian[k, i] * error[k]
+            slope += jacobian[k, i] * frame.error[k]
+        box.gradient[i] = slope
         for j in range(i + 1):
             total = rest if i == j else 0.0
             for k in range(6):
-                total += room.jacobian[k, i] * room.jacobian[k, j]
-            room.system[i, j] = total
+                total += jacobian[k, i] * jacobian[k, j]
+            box.system[i, j] = total
+        box.low[i] = max(frame.lower[i] - frame.q[i], -_LARGEST_STEP)
+        box.high[i] = min(frame.upper[i] - frame.q[i], _LARGEST_STEP)
 
 
 @part
-def _stepped(size: Size, damping: float, room: Room) -> bool:
-    """The step of the damped system; False where even so it is not positive definite."""
-    for i in range(len(size)):
-        for j in range(i):
-            room.damped[i, j] = room.system[i, j]
-        room.damped[i, i] = room.system[i, i] + damping * (1.0 + room.system[i, i])
-    return step_in_box(
-        size,
-        room.damped,
-        room.gradient,
-        room.low,
-        room.high,
-        room.step,
-        room.factors,
-        room.slope,
-        room.move,
-        room.held,
-    )
-
-
-@part
-def _promised(size: Size, room: Room) -> float:
-    """By how much the step would lower the cost if that were the quadratic."""
+def _promised(box: Record) -> float:
+    """By how much the step would lower the cost if that were the undamped quadratic."""
     total = 0.0
-    for i in range(len(size)):
-        across = 2 * room.gradient[i]
-        for j in range(len(size)):
-            across += (room.system[i, j] if j <= i else room.system[j, i]) * room.step[j]
-        total -= room.step[i] * across
+    for i in range(len(box.step)):
+        across = 2 * box.gradient[i] + box.system[i, i] * box.step[i]
+        for j in range(i):
+            across += 2 * box.system[i, j] * box.step[j]
+        total -= box.step[i] * across
     return total
 
 
 @part
-def near_singular(size: Size, joints: int, below: float, weights: Float64, room: Room) -> bool:
-    """Whether the smallest singular value of the unweighted Jacobian lies below `below`.
+def near_singular(joints: int, below: float, costs: Costs, frame: Record) -> bool:
+    """Whether the smallest singular value of the unweighted Jacobian of so many joints lies below `below`.
 
     It does where J J^T - below^2 (J^T J with fewer than six joints) has a pivot that is not positive.
     """
-    normal = room.normal
+    normal = frame.normal
+    _set_normal(joints, costs, frame)
     for i in range(6):
-        for j in range(i + 1):
-            normal[i, j] = _product(size, joints, weights, room.jacobian, i, j)
         normal[i, i] -= below * below
     for j in range(6):
         if not normal[j, j] > 0:
             return True
+        inverse = 1 / normal[j, j]
         for i in range(j + 1, 6):
-            share = normal[i, j] / normal[j, j]
+            share = normal[i, j] * inverse
             for k in range(j + 1, i + 1):
                 normal[i, k] -= share * normal[k, j]
     return False
 
 
 @part
-def _product(size: Size, joints: int, weights: Float64, jacobian: Float64, i: int, j: int) -> float:
-    """Entry i, j of J J^T, or of J^T J filled up with an identity where there are fewer than six joints."""
-    total = 0.0
-    if joints >= 6:
-        for k in range(len(size)):
-            total += jacobian[i, k] * jacobian[j, k]
-        return total / float(weights[i // 3] * weights[j // 3])
-    if i >= joints:
-        return 2.0 if i == j else 0.0
-    for k in range(6):
-        total += jacobian[k, i] * jacobian[k, j] / (weights[k // 3] * weights[k // 3])
-    return total
+def _set_normal(joints: int, costs: Costs, frame: Record) -> None:
+    """J J^T below its diagonal; J^T J, filled up with an identity, where there are fewer than six joints."""
+    normal, jacobian = frame.normal, frame.jacobian
+    metre, radian = 1 / (costs.position * costs.position), 1 / (costs.rotation * costs.rotation)
+    mixed = 1 / (costs.position * costs.rotation)
+    for i in range(6):
+        for j in range(i + 1):
+            total = 0.0
+            if joints >= 6:
+                for k in range(jacobian.shape[1]):
+                    total += jacobian[i, k] * jacobian[j, k]
+                total *= metre if i < 3 else (mixed if j < 3 else radian)
+            elif i < joints:
+                for k in range(3):
+                    total += metre * jacobian[k, i] * jacobian[k, j]
+                    total += radian * jacobian[3 + k, i] * jacobian[3 + k, j]
+            elif i == j:
+                total = np.inf
+            normal[i, j] = total

@@ -1,4 +1,4 @@
-"""Rotations between quaternions (w, x, y, z), matrices and rotation vectors, one at a time."""
+"""Rotations between quaternions (w, x, y, z), matrices and rotation vectors, one at a time, in plain numbers."""
 
 from __future__ import annotations
 
@@ -7,26 +7,25 @@ import math
 from runtime.kinematics.kernels.compiling import part
 from runtime.types import Float64
 
-_SMALL = 0.02  # sine below which five terms of the arc sine's series are exact to the last digit
+_SMALL = 0.02  # sine below which four terms of the arc sine's series are exact to the last digit
 _TURNED = -0.5  # cosine below which a matrix no longer shows its axis as a difference
+
+Quaternion = tuple[float, float, float, float]
+Vector = tuple[float, float, float]
+Matrix = tuple[float, float, float, float, float, float, float, float, float]  # row by row
 
 
 @part
-def matrix_of(quaternion: Float64, matrix: Float64) -> None:
-    """Into `matrix` [9], row by row, of a quaternion [4] of any length above zero."""
-    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+def matrix_of(w: float, x: float, y: float, z: float) -> Matrix:
+    """The rotation that a quaternion of any length above zero stands for."""
     scale = 2.0 / (w * w + x * x + y * y + z * z)
-    matrix[0], matrix[1], matrix[2] = (
+    return (
         1 - scale * (y * y + z * z),
         scale * (x * y - w * z),
         scale * (x * z + w * y),
-    )
-    matrix[3], matrix[4], matrix[5] = (
         scale * (x * y + w * z),
         1 - scale * (x * x + z * z),
         scale * (y * z - w * x),
-    )
-    matrix[6], matrix[7], matrix[8] = (
         scale * (x * z - w * y),
         scale * (y * z + w * x),
         1 - scale * (x * x + y * y),
@@ -34,54 +33,59 @@ def matrix_of(quaternion: Float64, matrix: Float64) -> None:
 
 
 @part
-def quaternion_of(matrix: Float64, quaternion: Float64) -> None:
-    """Into `quaternion` [4], with w >= 0, of a matrix [9]: from the largest of its four squares (Shepperd 1978)."""
+def quaternion_of(matrix: Matrix) -> Quaternion:
+    """The unit quaternion with w >= 0, from the largest of its four squares (Shepperd 1978)."""
     a, b, c = matrix[0], matrix[4], matrix[8]
-    squares = (1 + a + b + c, 1 + a - b - c, 1 - a + b - c, 1 - a - b + c)
     x, y, z = matrix[7] - matrix[5], matrix[2] - matrix[6], matrix[3] - matrix[1]
     xy, xz, yz = matrix[3] + matrix[1], matrix[2] + matrix[6], matrix[7] + matrix[5]
-    largest = 0
-    for index in range(1, 4):
-        if squares[index] > squares[largest]:
-            largest = index
-    if largest == 0:
-        row = (squares[0], x, y, z)
-    elif largest == 1:
-        row = (x, squares[1], xy, xz)
-    elif largest == 2:
-        row = (y, xy, squares[2], yz)
+    if a + b + c >= 0:
+        row = (1 + a + b + c, x, y, z)
+    elif a >= b and a >= c:
+        row = (x, 1 + a - b - c, xy, xz)
+    elif b >= c:
+        row = (y, xy, 1 - a + b - c, yz)
     else:
-        row = (z, xz, yz, squares[3])
+        row = (z, xz, yz, 1 - a - b + c)
     length = math.sqrt(row[0] * row[0] + row[1] * row[1] + row[2] * row[2] + row[3] * row[3])
     scale = -1 / length if row[0] < 0 else 1 / length
-    for index in range(4):
-        quaternion[index] = scale * row[index]
+    return scale * row[0], scale * row[1], scale * row[2], scale * row[3]
 
 
 @part
-def rotation_between(found: Float64, wanted: Float64, vector: Float64, spare: Float64) -> None:
-    """Into vector[0:3] the rotation [rad, axes of the frame] that leads from `wanted` to `found`, matrices [9].
-
-    `spare` [13] is overwritten.
-    """
-    for i in range(3):
-        for j in range(3):
-            spare[3 * i + j] = (
-                found[3 * i] * wanted[3 * j]
-                + found[3 * i + 1] * wanted[3 * j + 1]
-                + found[3 * i + 2] * wanted[3 * j + 2]
-            )
-    x, y, z = 0.5 * (spare[7] - spare[5]), 0.5 * (spare[2] - spare[6]), 0.5 * (spare[3] - spare[1])
+def rotation_vector(matrix: Matrix) -> Vector:
+    """Axis times angle, the angle in [0, pi] rad."""
+    x, y, z = 0.5 * (matrix[7] - matrix[5]), 0.5 * (matrix[2] - matrix[6]), 0.5 * (matrix[3] - matrix[1])
     square = x * x + y * y + z * z
-    cosine = 0.5 * (spare[0] + spare[4] + spare[8] - 1)
-    if cosine < _TURNED:
-        quaternion_of(spare[:9], spare[9:])
-        x, y, z = spare[10], spare[11], spare[12]
-        sine = math.sqrt(x * x + y * y + z * z)
-        scale = 2 * math.atan2(sine, spare[9]) / sine
-    elif square < _SMALL * _SMALL and cosine > 0:
+    cosine = 0.5 * (matrix[0] + matrix[4] + matrix[8] - 1)
+    if square < _SMALL * _SMALL and cosine > 0:
         scale = 1 + square * (1 / 6 + square * (3 / 40 + square * (15 / 336 + square * (105 / 3456))))
-    else:
+    elif cosine > _TURNED:
         sine = math.sqrt(square)
         scale = math.atan2(sine, cosine) / sine
-    vector[0], vector[1], vector[2] = scale * x, scale * y, scale * z
+    else:
+        w, x, y, z = quaternion_of(matrix)
+        sine = math.sqrt(x * x + y * y + z * z)
+        scale = 2 * math.atan2(sine, w) / sine
+    return scale * x, scale * y, scale * z
+
+
+@part
+def turned_back(frames: Float64, row: int, wanted: Float64) -> Matrix:
+    """The rotation of frames[row] [12] times the transpose of that of `wanted` [12]: from `wanted` to the frame."""
+    a, b, c = frames[row, 0], frames[row, 1], frames[row, 2]
+    d, e, f = frames[row, 3], frames[row, 4], frames[row, 5]
+    g, h, i = frames[row, 6], frames[row, 7], frames[row, 8]
+    p, q, r = wanted[0], wanted[1], wanted[2]
+    s, t, u = wanted[3], wanted[4], wanted[5]
+    v, w, x = wanted[6], wanted[7], wanted[8]
+    return (
+        a * p + b * q + c * r,
+        a * s + b * t + c * u,
+        a * v + b * w + c * x,
+        d * p + e * q + f * r,
+        d * s + e * t + f * u,
+        d * v + e * w + f * x,
+        g * p + h * q + i * r,
+        g * s + h * t + i * u,
+        g * v + h * w + i * x,
+    )

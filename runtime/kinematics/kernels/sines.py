@@ -22,10 +22,10 @@ _C4, _C5, _C6 = -2.75573143513906633035e-07, 2.08757232129817482790e-09, -1.1359
 
 
 @part
-def sines_of(angles: Float64, sines: Float64, cosines: Float64) -> None:
-    """Into `sines` and `cosines` of `angles` [rad], all [N]; within 2e-16 up to 1e5 rad."""
-    for index in range(len(angles)):
-        angle = angles[index]
+def sines_of(turns: Float64) -> None:
+    """Into rows 1 and 2 of `turns` [3, N] the sines and cosines of row 0 [rad]; within 2e-16 up to 1e5 rad."""
+    for index in range(turns.shape[1]):
+        angle = turns[0, index]
         quarters = np.floor(angle * _QUARTERS + 0.5)
         rest = ((angle - quarters * _FIRST) - quarters * _SECOND) - quarters * _THIRD
         square = rest * rest
@@ -36,5 +36,5 @@ def sines_of(angles: Float64, sines: Float64, cosines: Float64) -> None:
         turn = quarters - 4 * np.floor(0.25 * quarters)  # 0, 1, 2 or 3 quarters
         swapped = turn == 1.0 or turn == 3.0
         of_sine, of_cosine = (cosine, sine) if swapped else (sine, cosine)
-        sines[index] = -of_sine if turn >= 2.0 else of_sine
-        cosines[index] = -of_cosine if turn == 1.0 or turn == 2.0 else of_cosine
+        turns[1, index] = -of_sine if turn >= 2.0 else of_sine
+        turns[2, index] = -of_cosine if turn == 1.0 or turn == 2.0 else of_cosine
