@@ -7,16 +7,15 @@ configuration, so that the ALOHA, DROID and LIBERO layouts are settings and not 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import Field
 
 from runtime import codecs
 from runtime.clock import Clock
 from runtime.errors import PolicyError
-from runtime.formats import PoseFormat
 from runtime.policies.agreement import Declared, agreed
+from runtime.policies.answers import AnswerSettings
 from runtime.policies.base import PolicyInfo
 from runtime.policies.request import RequestLayout, RequestSettings, poses_of
 from runtime.policies.rows import action_rows
@@ -24,30 +23,16 @@ from runtime.policies.rtc.async_rtc import AsyncRtc, Schedule
 from runtime.policies.rtc.base import Dialect, Plain
 from runtime.policies.rtc.prev_action import PrevAction
 from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
-from runtime.types import ActionChunk, ActionMode, Conditioning, Observation, RelativeFrame, Space
+from runtime.types import ActionChunk, Conditioning, Observation
 
 if TYPE_CHECKING:
     from robots import Robot
 
-Rate = Annotated[float, Field(ge=1, le=1000)]
 
-
-class Config(ServerSettings, RequestSettings):
+class Config(ServerSettings, RequestSettings, AnswerSettings):
     """A policy server that speaks the openpi websocket protocol."""
 
     kind: Literal["openpi"] = "openpi"
-    action_space: Space = "joint"
-    """What the rows of the answer are: joint targets, or poses."""
-    action_pose: PoseFormat = PoseFormat()
-    """How poses are written in the answer, where action_space is "eef"."""
-    action_mode: ActionMode = "absolute"
-    """What their numbers are: targets; "relative" to the observation; or "delta", each to the row before.
-
-    Grippers are absolute in every mode. A server's own metadata key action_mode names the space, not this."""
-    relative_frame: RelativeFrame = "base"
-    """Axes of relative poses: those of the frame that poses are declared in, or the tool as observed."""
-    action_rate: Rate | None = None
-    """Rows per second of the answer [Hz]; the control rate where it is not given."""
     rtc: Literal["none", "prev_action", "async_rtc"] = "none"
     """How the server is told what the robot is committed to: flat keys, or the openpi-async-rtc envelope."""
     prefix_attention_schedule: Schedule = "exp"

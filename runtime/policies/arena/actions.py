@@ -10,6 +10,7 @@ from pydantic import Field
 
 from runtime.errors import ConfigurationError, ContradictionError, PolicyError
 from runtime.formats import PoseFormat, PoseRows
+from runtime.policies.answers import Rate
 from runtime.policies.arena.grip import Convention, Grip
 from runtime.policies.arena.wants import ActionSpace, Wants
 from runtime.policies.rows import action_rows
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from robots import Robot
 
 Step = Annotated[float, Field(gt=0, le=1.0)]
-Rate = Annotated[float, Field(ge=1, le=1000)]
 
 
 class VelocitySteps(Section):

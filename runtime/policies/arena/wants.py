@@ -18,7 +18,7 @@ _FIELDS = (
     "needs_session_id",
     "action_space",
 )
-_PIXELS = range(8, 4097)
+_PIXELS = range(1, 4097)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ def _resolution(given: Any) -> tuple[int, int] | None:
         return None
     if isinstance(given, list) and len(given) == 2 and all(type(n) is int and n in _PIXELS for n in given):
         return given[0], given[1]
-    raise _wrong("image_resolution", given, "[height, width] from 8 to 4096 each, or nil")
+    raise _wrong("image_resolution", given, "[height, width] from 1 to 4096 each, or nil")
 
 
 def _externals(given: Any) -> int:

@@ -1,0 +1,292 @@
+"""The StarVLA websocket protocol: typed envelopes with a list of views in a declared order.
+
+Source: starVLA's websocket policy server and its policy wrapper. Frames and arrays are openpi's. The server's
+process ends after a while without requests, so a ping goes out where nothing else does.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from runtime import codecs
+from runtime.clock import Clock
+from runtime.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.formats import PoseFormat
+from runtime.policies.answers import AnswerSettings
+from runtime.policies.base import PolicyInfo
+from runtime.policies.link import headline
+from runtime.policies.pictures import Resize
+from runtime.policies.request import RequestLayout, RequestSettings, Size, poses_of
+from runtime.policies.rows import action_rows
+from runtime.policies.statistics import Statistics
+from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
+from runtime.types import ActionChunk, Conditioning, Observation, Space
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+log = logging.getLogger(__name__)
+_ENVIRONMENT = "starvla_policy_server"
+
+
+class Config(ServerSettings, AnswerSettings):
+    """A policy server of StarVLA."""
+
+    kind: Literal["starvla"] = "starvla"
+    url: Annotated[str, Field(pattern=r"^wss?://.+")] = "ws://127.0.0.1:10093"
+    """Where the server listens: ws or wss, with a path where it has one."""
+    cameras: list[str] = Field(default_factory=list)
+    """Observation keys of the views, in the order in which the policy was trained with them."""
+    image_size: Size | None = None
+    """Height and width of the views; without it what the server says it was trained with, else as they are."""
+    resize: Resize = "pad"
+    """"pad" keeps the aspect on black, "stretch" does not."""
+    state: Space | Literal["none"] = "joint"
+    """What is sent as state, [1, D]: joints, poses, or nothing, as to checkpoints that were trained without."""
+    observation_pose: PoseFormat = PoseFormat()
+    """How poses are written in the state, where state is "eef"."""
+    observation_eef: Literal["measured", "fk"] = "measured"
+    """Poses as the robot measures them, where it does; or as its joints have them in any case."""
+    unnorm_key: str | None = None
+    """Whose statistics the server brings actions back to the robot's numbers with; its own default without it."""
+    statistics: Statistics | None = None
+    """The same statistics, for servers that answer with `normalized_actions` alone; without it they are refused."""
+    ping_every: Positive | None = 60.0
+    """Longest silence [s], after which a ping goes out: a server ends by itself when nobody asks. None: no ping."""
+
+
+def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> StarvlaPolicy:
+    """The policy, not yet connected; ConfigurationError where a setting does not fit the robot."""
+    return StarvlaPolicy(config, robot)
+
+
+class StarvlaPolicy(WebsocketPolicy):
+    """One example per request; a connection that the server ended between two requests is opened anew."""
+
+    PROTOCOL = "StarVLA"
+
+    def __init__(self, config: Config, robot: Robot) -> None:
+        super().__init__(config)
+        if not config.cameras or len(set(config.cameras)) != len(config.cameras):
+            raise ConfigurationError(
+                f"policy.cameras = {config.cameras}; allowed: the views in the order of the training, each once of "
+                f"{', '.join(camera.key for camera in robot.cameras)}"
+            )
+        self._config = config
+        self._robot = robot
+        poses = poses_of(config.action_space, config.action_pose, robot, "action_pose")
+        self._width = robot.dim if poses is None else poses.width
+        if config.statistics is not None:
+            config.statistics.require_width(self._width)
+        self._layout = self._layout_for(config.image_size)
+        self.observation_eef = config.observation_eef
+        self.sees_poses = config.state == "eef" or (
+            config.action_space == "eef" and config.action_mode != "absolute"
+        )
+        self._unnorm_key = config.unnorm_key
+        self._number = 0
+        self._spoken = time.monotonic()
+        self._silent = threading.Event()
+        self._silent.set()
+
+    def connect(self) -> PolicyInfo:
+        """Reach the server, read its metadata, and have it answer a ping: nothing but StarVLA's server does."""
+        info = super().connect()
+        if self._config.ping_every is not None and self._silent.is_set():
+            self._silent = threading.Event()
+            threading.Thread(
+                target=self._keep_awake,
+                args=(self._silent, self._config.ping_every),
+                name="starvla-ping",
+                daemon=True,
+            ).start()
+        return info
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        """The chunk; `timing` has our `round_trip_ms`.
+
+        PolicyLostError where the server is not there or does not answer: the next call opens another connection.
+        """
+        if conditioning is not None:
+            raise PolicyError("the StarVLA protocol has no real-time chunking; choose another strategy")
+        with self._lock:
+            if self._link.was_left:
+                self._link.drop()
+            self._require_open()
+            envelope = self._envelope("infer") | {"payload": self.payload(observation)}
+            answer, round_trip = self._exchange(codecs.pack(envelope))
+            self._spoken = time.monotonic()
+            reply = self._unpacked(answer, "an answer")
+            self._require_answered(reply, envelope)
+        return self._chunk(reply.get("data"), round_trip)
+
+    def reset(self) -> None:
+        """Nothing to forget: the protocol has no reset, and no answer depends on an earlier one."""
+
+    def close(self) -> None:
+        """As every policy; no ping goes out any more."""
+        self._silent.set()
+        super().close()
+
+    def payload(self, observation: Observation) -> dict[str, Any]:
+        """One example, and whose statistics are meant."""
+        shown = self._layout.of(observation)
+        example: dict[str, Any] = {"image": list(shown["images"].values()), "lang": observation.prompt}
+        if self._config.state != "none":
+            example["state"] = shown["state"][None]
+        return {"examples": [example]} | ({"unnorm_key": self._unnorm_key} if self._unnorm_key else {})
+
+    def _layout_for(self, size: list[int] | None) -> RequestLayout:
+        config = self._config
+        settings = RequestSettings(
+            observation_space="eef" if config.state == "eef" else "joint",
+            observation_pose=config.observation_pose,
+            cameras={key: key for key in config.cameras},
+            image_size=size,
+            resize=config.resize,
+            image_layout="hwc",
+            state_key="" if config.state == "none" else "state",
+            prompt_key="",
+        )
+        return RequestLayout(settings, self._robot)
+
+    def _greeted(self, metadata: dict[str, Any]) -> PolicyInfo:
+        said = metadata.get("env")
+        if said != _ENVIRONMENT and "available_unnorm_keys" not in metadata and "ckpt_path" not in metadata:
+            found = ", ".join(map(str, metadata)) or "nothing"
+            raise PolicyError(
+                f"the server's metadata have env = {said!r} and {found}; expected env = {_ENVIRONMENT!r}: it is no "
+                "StarVLA server; correct policy.kind or policy.url"
+            )
+        self._unnorm_key = _unnorm_key(metadata, self._config.unnorm_key)
+        self._layout = self._layout_for(self._agreed_size(metadata.get("training_obs_image_size")))
+        self._ping(self._config.connect_deadline)
+        horizon = metadata.get("action_chunk_size")
+        return PolicyInfo(
+            name=str(metadata.get("ckpt_path", "starvla")),
+            horizon=horizon if type(horizon) is int else None,
+            rate=self._config.action_rate,
+            metadata=metadata,
+        )
+
+    def _agreed_size(self, said: Any) -> list[int] | None:
+        """Height and width of the views; ContradictionError where both sides say something else."""
+        trained = _size(said)
+        own = self._config.image_size
+        if own is not None and trained is not None and own != trained:
+            raise ContradictionError(
+                f"the server's metadata has training_obs_image_size = {said!r}, policy.image_size = {own}; correct "
+                "the one that is wrong"
+            )
+        return own or trained
+
+    def _envelope(self, kind: str) -> dict[str, Any]:
+        self._number += 1
+        return {"type": kind, "request_id": f"{kind}-{self._number}"}
+
+    def _ping(self, seconds: float) -> None:
+        envelope = self._envelope("ping")
+        reply = self._unpacked(self._link.exchange(codecs.pack(envelope), seconds), "an answer to a ping")
+        self._require_answered(reply, envelope)
+        self._spoken = time.monotonic()
+
+    def _keep_awake(self, silent: threading.Event, every: float) -> None:
+        """Ping while nobody asks; a request that is under way is no silence."""
+        while not silent.wait(every / 2):
+            if not self._lock.acquire(blocking=False):
+                continue
+            try:
+                if self._link.is_open and time.monotonic() - self._spoken >= every / 2:
+                    self._ping(self._config.inference_deadline)
+            except PolicyError as error:
+                log.warning("the policy server did not answer a ping, the connection is dropped: %s", error)
+                self._link.drop()
+            finally:
+                self._lock.release()
+
+    def _require_answered(self, reply: Mapping[str, Any], envelope: Mapping[str, Any]) -> None:
+        """An answer to this very request that is no error; any other is followed by another connection."""
+        asked, found = envelope["request_id"], reply.get("request_id")
+        if found != asked:
+            self._link.drop()
+            raise PolicyError(
+                f"the answer has request_id {found!r}, asked was {asked!r}: it is another request's, or no StarVLA "
+                "server answers here"
+            )
+        if reply.get("ok") is not True or reply.get("status") != "ok":
+            error = reply.get("error")
+            said = error.get("message") if isinstance(error, Mapping) else error
+            raise PolicyError(f"the policy server reports an error: {headline(str(said))}")
+
+    def _chunk(self, data: Any, round_trip: float) -> ActionChunk:
+        if not isinstance(data, Mapping):
+            raise PolicyError(f"the answer has data that are a {type(data).__name__}; expected a map")
+        config = self._config
+        return ActionChunk(
+            actions=self._rows(data),
+            space=config.action_space,
+            rate=config.action_rate,
+            mode=config.action_mode,
+            frame=config.relative_frame,
+            pose=config.action_pose,
+            timing={"round_trip_ms": round_trip},
+        )
+
+    def _rows(self, data: Mapping[str, Any]) -> np.ndarray[Any, np.dtype[np.float32]]:
+        if "actions" in data:
+            return action_rows("actions", data["actions"], self._width)
+        if "normalized_actions" not in data:
+            raise PolicyError(
+                "the answer has neither 'actions' nor 'normalized_actions'; it has "
+                f"{', '.join(map(str, data)) or 'nothing'}"
+            )
+        rows = action_rows("normalized_actions", data["normalized_actions"], self._width)
+        if self._config.statistics is None:
+            raise PolicyError(
+                "the server answers with normalized_actions, which are no robot's numbers; allowed: a server that "
+                "un-normalises them, or its statistics in policy.statistics (low, high, mask)"
+            )
+        return self._config.statistics.undone(rows)
+
+
+def _unnorm_key(metadata: Mapping[str, Any], own: str | None) -> str | None:
+    """Ours, else the server's default; PolicyError where it has others, or several and no default."""
+    available = metadata.get("available_unnorm_keys")
+    known = [str(key) for key in available] if isinstance(available, list) else []
+    if own is not None:
+        if known and own not in known:
+            raise ContradictionError(
+                f"policy.unnorm_key = {own!r}, the server's metadata has available_unnorm_keys = {', '.join(known)}"
+            )
+        return own
+    default = metadata.get("default_unnorm_key")
+    if isinstance(default, str) and default:
+        return default
+    if len(known) > 1:
+        raise ContradictionError(
+            f"the server has statistics of {', '.join(known)} and no default; policy.unnorm_key has to name one"
+        )
+    return known[0] if known else None
+
+
+def _size(said: Any) -> list[int] | None:
+    """Height and width of one number (a square), two, or three with the channels; None where nothing is said."""
+    if said is None:
+        return None
+    numbers = [said, said] if type(said) is int else said
+    if (
+        isinstance(numbers, list)
+        and len(numbers) in (2, 3)
+        and all(type(n) is int and n > 0 for n in numbers)
+    ):
+        return numbers[1:] if len(numbers) == 3 and numbers[0] == 3 else numbers[:2]
+    raise PolicyError(
+        f"the server's metadata have training_obs_image_size = {said!r}; expected height and width"
+    )

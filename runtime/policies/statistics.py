@@ -1,0 +1,53 @@
+"""Back from a model's own -1 .. 1 to the robot's numbers, where the server leaves that to its clients."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from runtime.errors import ConfigurationError
+from runtime.section import Section
+from runtime.types import Float32
+
+Numbers = Annotated[list[float], Field(min_length=1)]
+
+
+class Statistics(Section):
+    """What -1 and 1 stand for, per number of a row: the minimum and maximum, or quantiles, of the training data."""
+
+    low: Numbers
+    """What -1 stands for."""
+    high: Numbers
+    """What 1 stands for."""
+    mask: list[bool] | None = None
+    """Which numbers were normalised at all; those that were not (grippers, mostly) stay as they are."""
+
+    @model_validator(mode="after")
+    def _fit(self) -> Statistics:
+        mask = self.mask if self.mask is not None else [True] * len(self.low)
+        if not len(self.low) == len(self.high) == len(mask):
+            raise ConfigurationError(
+                f"low has {len(self.low)} numbers, high {len(self.high)}, mask {len(mask)}; allowed: the same"
+            )
+        wrong = [n for n, (a, b, m) in enumerate(zip(self.low, self.high, mask, strict=True)) if m and a >= b]
+        if wrong:
+            raise ConfigurationError(
+                f"low is not below high at {wrong}; allowed: low < high where mask is true"
+            )
+        return self
+
+    def require_width(self, width: int) -> None:
+        """ConfigurationError where rows have another number of numbers."""
+        if len(self.low) != width:
+            raise ConfigurationError(
+                f"policy.statistics has {len(self.low)} numbers; the rows of this robot have {width}"
+            )
+
+    def undone(self, rows: Float32) -> Float32:
+        """The robot's numbers of normalised rows [T, W]; what is beyond -1 and 1 is at them."""
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        made = low + (np.clip(rows, -1.0, 1.0) + 1.0) / 2.0 * (high - low)
+        mask = np.ones(len(low), bool) if self.mask is None else np.asarray(self.mask)
+        return np.where(mask, made, rows).astype(np.float32)
