@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robots import shapes, urdf
+from robots.draft.pictures import Pictures, copy_urdf
+from tests.robots.draft.urdfs import arm, base, joint, link, single, write
+
+MESH = '<visual><geometry><mesh filename="{}" scale="0.001 0.001 0.001"/></geometry></visual>'
+
+
+def copied(source: Path, folder: Path) -> tuple[Pictures, Path]:
+    folder.mkdir()
+    target = folder / "copy.urdf"
+    return copy_urdf(urdf.read(source), target), target
+
+
+def stl(path: Path, length: float = 100.0) -> Path:
+    """A triangle along x."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    triangle = struct.pack("<12fH", 0, 0, 1, 0, 0, 0, length, 0, 0, 0, 10, 0, 0)
+    path.write_bytes(bytes(80) + struct.pack("<I", 1) + triangle)
+    return path
+
+
+def test_a_urdf_of_simple_shapes_is_copied_to_the_last_byte(tmp_path: Path) -> None:
+    source = write(tmp_path, single())
+    pictures, target = copied(source, tmp_path / "to")
+    assert target.read_bytes() == source.read_bytes()
+    assert pictures == Pictures((), (), (), ())
+
+
+@pytest.mark.parametrize("named", ["../meshes/link.stl", "package://my_robot/meshes/link.stl", "file://{}"])
+def test_meshes_come_along_wherever_the_urdf_says_they_are(tmp_path: Path, named: str) -> None:
+    mesh = stl(tmp_path / "my_robot" / "meshes" / "link.stl")
+    body = "<!-- kept -->" + link("base_link", MESH.format(named.format(mesh))) + arm("base_link")
+    source = write(tmp_path / "my_robot" / "urdf", body)
+    pictures, target = copied(source, tmp_path / "to")
+    assert (pictures.copied, pictures.missing, pictures.drawn) == (("link.stl",), (), ())
+    shape = shapes.read(target)[0]
+    assert shape.file == tmp_path / "to" / "meshes" / "link.stl"
+    np.testing.assert_allclose(shape.bounds()[1], [0.1, 0.01, 0], atol=1e-6)
+    assert "<!-- kept -->" in target.read_text()
+    assert set(urdf.read(target).joints) == set(urdf.read(source).joints)
+
+
+def test_meshes_of_one_name_in_two_folders_stay_two(tmp_path: Path) -> None:
+    stl(tmp_path / "a" / "link.stl", 100.0)
+    stl(tmp_path / "b" / "link.stl", 200.0)
+    body = link("base_link", MESH.format("a/link.stl")) + link("tool", MESH.format("b/link.stl"))
+    _, target = copied(write(tmp_path, body + joint("j", "base_link", "tool")), tmp_path / "to")
+    ends = [float(shape.bounds()[1][0]) for shape in shapes.read(target)]
+    assert ends == pytest.approx([0.1, 0.2])
+
+
+@pytest.mark.parametrize("named", ["package://elsewhere/link.stl", "link.glb", "torn.stl"])
+def test_cylinders_stand_in_for_meshes_that_are_missing_or_unreadable(tmp_path: Path, named: str) -> None:
+    (tmp_path / "link.glb").write_bytes(b"glTF")
+    (tmp_path / "torn.stl").write_bytes(b"torn")
+    body = base() + arm("base_link").replace(BOX_OF_LINK, MESH.format(named))
+    pictures, target = copied(write(tmp_path, body), tmp_path / "to")
+    assert (pictures.copied, pictures.missing) == ((), (named,))
+    assert pictures.drawn == tuple(f"link{number}" for number in range(1, 7))
+    shown = {shape.link: shape for shape in shapes.read(target)}
+    assert [shown["base_link"].kind, shown["link1"].kind, shown["link6"].kind] == [
+        "box",
+        "cylinder",
+        "sphere",
+    ]
+    length = shown["link1"].size[1]
+    assert length == pytest.approx(0.12)
+    np.testing.assert_allclose(shown["link1"].origin[:3, 3], [0, 0, 0.06], atol=1e-6)
+
+
+BOX_OF_LINK = '<visual><origin xyz="0 0 0.05"/><geometry><box size="0.04 0.04 0.08"/></geometry></visual>'
+
+
+def test_a_stand_in_leads_from_joint_to_joint(tmp_path: Path) -> None:
+    body = link("base_link") + link("a") + joint("j", "base_link", "a", xyz="0.1 -0.2 0.2")
+    _, target = copied(write(tmp_path, body), tmp_path / "to")
+    stick = shapes.read(target)[0]
+    ends = [(stick.origin @ [0, 0, side * stick.size[1] / 2, 1])[:3] for side in (-1, 1)]
+    np.testing.assert_allclose(ends, [[0, 0, 0], [0.1, -0.2, 0.2]], atol=1e-5)
+
+
+def test_a_urdf_that_shows_nothing_is_drawn_in_sticks(tmp_path: Path) -> None:
+    pictures, target = copied(
+        write(tmp_path, link("base_link") + arm("base_link", visual=False)), tmp_path / "to"
+    )
+    assert pictures.drawn == ("base_link", *(f"link{number}" for number in range(1, 7)))
+    assert {shape.link for shape in shapes.read(target)} == set(pictures.drawn)
+
+
+def test_a_material_that_nobody_declares_is_plain(tmp_path: Path) -> None:
+    body = base().replace("</visual>", '<material name="chrome"/></visual>') + arm("base_link")
+    pictures, target = copied(write(tmp_path, body), tmp_path / "to")
+    assert pictures.plain == ("base_link",)
+    assert shapes.read(target)[0].colour == shapes.PLAIN
