@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
 import robots
@@ -43,7 +44,12 @@ def seen(robot: Robot, value: float = 0.1, **changes: Any) -> Observation:
 @contextlib.contextmanager
 def serving(handler: Handler) -> Iterator[str]:
     """A websocket server whose every conversation is `handler`; its address."""
-    with serve(handler, "127.0.0.1", 0, compression=None, max_size=None, close_timeout=0.5) as server:
+
+    def converse(connection: ServerConnection) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            handler(connection)
+
+    with serve(converse, "127.0.0.1", 0, compression=None, max_size=None, close_timeout=0.5) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:
