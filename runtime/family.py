@@ -19,9 +19,11 @@ from runtime import deployment, log
 from runtime.clock import Clock
 from runtime.config import Deployment
 from runtime.deployment import Resolved
+from runtime.end_effectors import EndEffectors
 from runtime.errors import ConfigurationError, RuntimeFault, SetupError
 from runtime.formats import PoseRows
 from runtime.kinematics.base import Kinematics
+from runtime.kinematics.forward import ChainForward
 from runtime.page import Page, PageLayout
 from runtime.plugins import variants
 from runtime.policies.base import Policy
@@ -131,12 +133,16 @@ class Plan:
         """The robot's action spaces, with its kinematics."""
         return Spaces(self.robot, self.kinematics(), self.rate)
 
+    def end_effectors(self) -> EndEffectors:
+        """Where joints put the robot's end effectors: all that processes need that solve nothing."""
+        return EndEffectors(self.robot, ChainForward(self.robot))
+
     def publication(self) -> Publication | None:
         """What makes the poses that are published of a joint command; None where joints alone are."""
         wanted = self.deployment.publication
         if wanted.space == "joint":
             return None
-        return Publication(PoseRows(wanted.pose, self.robot, "publication.pose"), self.spaces())
+        return Publication(PoseRows(wanted.pose, self.robot, "publication.pose"), self.end_effectors())
 
 
 def plan(resolved: Resolved) -> Plan:

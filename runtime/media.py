@@ -206,7 +206,7 @@ class Media:
 
 def make_recorder(plan: Plan, now: Callable[[], float], patient: bool = False) -> Recorder:
     """The recorder of a deployment; `patient` waits for encoders, as lockstep may."""
-    robot, spaces = plan.robot, plan.spaces()
+    robot = plan.robot
     described = {
         "name": robot.name,
         "joint_names": list(robot.joint_names),
@@ -217,7 +217,7 @@ def make_recorder(plan: Plan, now: Callable[[], float], patient: bool = False) -
     }
     root = plan.deployment.episodes_dir
     journal = EpisodeJournal(root, plan.deployment.recording, patient=patient)
-    grid = Grid(described, plan.layout.cameras, plan.rate, plan.fps, spaces.eef_of)
+    grid = Grid(described, plan.layout.cameras, plan.rate, plan.fps, plan.end_effectors().eef_of)
     return Recorder(journal, root, grid, now)
 
 

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
+from runtime.end_effectors import EndEffectors
 from runtime.formats import PoseRows
-from runtime.spaces import Spaces
 from runtime.types import Float32, Float64
 
 
 class Publication:
     """Called with every joint command [D] that is sent: float32 [W], each row continuing the one before."""
 
-    def __init__(self, rows: PoseRows, spaces: Spaces) -> None:
+    def __init__(self, rows: PoseRows, end_effectors: EndEffectors) -> None:
         self._rows = rows
-        self._spaces = spaces
+        self._end_effectors = end_effectors
         self._previous: Float64 | None = None
 
     def __call__(self, action: Float64) -> Float32:
         joints = action[None]
-        row: Float64 = self._rows.encode(self._spaces.vectors(joints), joints, self._previous)[0]
+        row: Float64 = self._rows.encode(self._end_effectors.vectors(joints), joints, self._previous)[0]
         self._previous = row
         return row.astype(np.float32)

@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from robots import Robot
 from robots.rotations import quaternion_of_matrix, transform_of
+from runtime.end_effectors import EndEffectors
 from runtime.errors import PolicyError, SetupError
 from runtime.formats import CANONICAL, PoseFormat, PoseRows, continuous
 from runtime.kinematics.base import IkResult, Kinematics
-from runtime.orientations import continuous_signs
 from runtime.poses import absolute
 from runtime.resampling import resample
-from runtime.types import EEF_WIDTH, ActionChunk, Float32, Float64, Observation
+from runtime.types import EEF_WIDTH, ActionChunk, Float64, Observation
 
 _GRIPPER = EEF_WIDTH - 1
 _SAME_PLACE, _SAME_TURN = 0.02, 5.0  # [m, degrees] within which a measured pose is that of the described link
@@ -56,7 +56,7 @@ class CommandRows:
         return self.rows[0] if self.first is None else self.first
 
 
-class Spaces:
+class Spaces(EndEffectors):
     """One robot's action spaces: joint rows [H, D], and rows of poses that become joints by kinematics.
 
     An arm's vector is x, y, z [m], unit quaternion w, x, y, z, gripper, in the arm's declared frame, whatever the
@@ -66,13 +66,11 @@ class Spaces:
     def __init__(self, robot: Robot, kinematics: Kinematics, control_rate: float) -> None:
         if not control_rate > 0:
             raise SetupError(f"control_rate = {control_rate} Hz; allowed: above zero")
+        super().__init__(robot, kinematics)
         self._robot = robot
         self._kinematics = kinematics
         self._control_rate = control_rate
         arms = robot.arms
-        self._count = len(arms)
-        self._gripped = [index for index, arm in enumerate(arms) if arm.gripper is not None]
-        self._grippers = [arm.gripper_dim for arm in arms if arm.gripper_dim is not None]
         self._all = np.arange(robot.dim)
         self._speeds = list(robot.speed_dims)
         self._moving = np.setdiff1d(self._all, [*robot.gripper_dims, *self._speeds])
@@ -115,30 +113,6 @@ class Spaces:
         rows, source = resample(rows, rate, self._control_rate, [*self._held, *binary], self._quaternions)
         onset = self._near(onset or Onset(qpos, qpos), qpos)
         return self._solved(rows, source, layout, qpos, onset)
-
-    def eef_of(self, q: ArrayLike, previous: ArrayLike | None = None) -> Float32:
-        """End-effector vectors float32 [..., 8 * arms] that joints [..., D] and their grippers amount to.
-
-        Rows [T, D] come out sign-continuous. The (first) quaternion has w >= 0, or the sign nearer to
-        `previous` [8 * arms] where that is given, so that a stream of single calls is continuous too.
-        """
-        joints = np.asarray(q, dtype=np.float64)
-        vectors = self.vectors(joints)
-        if previous is not None:
-            before = np.asarray(previous, dtype=np.float64).reshape(self._count, EEF_WIDTH)
-            first = vectors if joints.ndim == 1 else vectors[0]
-            turned = np.sum(first[:, 3:7] * before[:, 3:7], axis=-1) < 0
-            first[turned, 3:7] *= -1.0
-        if joints.ndim > 1:
-            vectors[..., 3:7] *= continuous_signs(vectors[..., 3:7])
-        return vectors.reshape(*joints.shape[:-1], -1).astype(np.float32)
-
-    def vectors(self, joints: Float64) -> Float64:
-        """The same as float64 [..., arms, 8], each quaternion with w >= 0; 0 for a gripper that an arm has not."""
-        vectors = np.zeros((*joints.shape[:-1], self._count, EEF_WIDTH))
-        vectors[..., :_GRIPPER] = self._kinematics.forward(joints)
-        vectors[..., self._gripped, _GRIPPER] = joints[..., self._grippers]
-        return vectors
 
     def disagreement(self, measured: ArrayLike, q: ArrayLike) -> str:
         """How far measured poses [8 * arms] are from those of the joints q [D], worst arm; "" where they agree."""

@@ -74,12 +74,16 @@ class IkResult:
         return within
 
 
-class Kinematics(ABC):
-    """Forward and inverse kinematics of one robot: arms in its order, poses in each arm's declared frame."""
+class Forward(ABC):
+    """Where the end effectors of one robot are: arms in its order, poses in each arm's declared frame."""
 
     @abstractmethod
     def forward(self, q: Float64) -> Float64:
         """Poses [..., arms, 7] (x, y, z, qw, qx, qy, qz with qw >= 0) for joint vectors [..., D]."""
+
+
+class Kinematics(Forward):
+    """Forward and inverse kinematics of one robot."""
 
     @abstractmethod
     def solve(

@@ -1,0 +1,48 @@
+"""The end-effector vectors that joints amount to."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from robots import Robot
+from runtime.kinematics.base import Forward
+from runtime.orientations import continuous_signs
+from runtime.types import EEF_WIDTH, Float32, Float64
+
+_GRIPPER = EEF_WIDTH - 1
+
+
+class EndEffectors:
+    """Those of one robot's arms: x, y, z [m], unit quaternion w, x, y, z in the arm's declared frame, gripper."""
+
+    def __init__(self, robot: Robot, forward: Forward) -> None:
+        arms = robot.arms
+        self._forward = forward
+        self._count = len(arms)
+        self._gripped = [index for index, arm in enumerate(arms) if arm.gripper is not None]
+        self._grippers = [arm.gripper_dim for arm in arms if arm.gripper_dim is not None]
+
+    def eef_of(self, q: ArrayLike, previous: ArrayLike | None = None) -> Float32:
+        """End-effector vectors float32 [..., 8 * arms] that joints [..., D] and their grippers amount to.
+
+        Rows [T, D] come out sign-continuous. The (first) quaternion has w >= 0, or the sign nearer to
+        `previous` [8 * arms] where that is given, so that a stream of single calls is continuous too.
+        """
+        joints = np.asarray(q, dtype=np.float64)
+        vectors = self.vectors(joints)
+        if previous is not None:
+            before = np.asarray(previous, dtype=np.float64).reshape(self._count, EEF_WIDTH)
+            first = vectors if joints.ndim == 1 else vectors[0]
+            turned = np.sum(first[:, 3:7] * before[:, 3:7], axis=-1) < 0
+            first[turned, 3:7] *= -1.0
+        if joints.ndim > 1:
+            vectors[..., 3:7] *= continuous_signs(vectors[..., 3:7])
+        return vectors.reshape(*joints.shape[:-1], -1).astype(np.float32)
+
+    def vectors(self, joints: Float64) -> Float64:
+        """The same as float64 [..., arms, 8], each quaternion with w >= 0; 0 for a gripper that an arm has not."""
+        vectors = np.zeros((*joints.shape[:-1], self._count, EEF_WIDTH))
+        vectors[..., :_GRIPPER] = self._forward.forward(joints)
+        vectors[..., self._gripped, _GRIPPER] = joints[..., self._grippers]
+        return vectors
