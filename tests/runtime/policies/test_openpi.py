@@ -24,7 +24,9 @@ from runtime.policies import openpi
 from runtime.policies.link import PolicyGone, PolicyTimeout, WebsocketLink
 from runtime.policies.openpi import Config, OpenpiPolicy
 from runtime.sim.faults import NONE, Fault
+from runtime.sim.in_poses import InPoses
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
+from runtime.sim.script import Waving
 from runtime.types import Conditioning, Observation
 
 ROBOT = robots.load("agilex_piper")
@@ -542,6 +544,44 @@ def test_metadata_that_say_the_same_are_no_contradiction(
 ) -> None:
     with stub(replying({}, metadata)) as url, policy_at(url, **settings) as policy:
         assert policy.connect().action_space is None
+
+
+@contextlib.contextmanager
+def posing(pose: PoseFormat) -> Iterator[str]:
+    """The stand-in server, answering in poses of that format and saying so."""
+    script = InPoses(Waving(ROBOT, 12, 30.0), ROBOT, 30.0, pose)
+    with contextlib.closing(OpenpiServer(ROBOT, Behaviour(horizon=12, rtc="none"), script=script)) as server:
+        yield str(server.start()["url"])
+
+
+def test_a_server_that_answers_in_the_declared_format_is_understood() -> None:
+    pose = PoseFormat(orientation="euler", euler_order="YXZ", frame="world", gripper=False)
+    with posing(pose) as url, policy_at(url, action_space="eef", action_pose=pose) as policy:
+        assert policy.connect().action_space == "eef"
+        chunk = policy.infer(observation())
+    assert chunk.actions.shape == (12, 12)
+    assert chunk.pose == pose
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"frame": ""}, "action_pose.frame = 'world', policy.action_pose.frame = ''"),
+        ({"euler_order": "yxz"}, "euler_order = 'YXZ', policy.action_pose.euler_order = 'yxz'"),
+        ({"gripper": True}, "action_dim = 12"),
+    ],
+)
+def test_a_server_that_answers_in_another_format_is_refused_at_set_up(
+    changes: dict[str, Any], says: str
+) -> None:
+    pose = PoseFormat(orientation="euler", euler_order="YXZ", frame="world", gripper=False)
+    other = pose.model_copy(update=changes)
+    with (
+        posing(pose) as url,
+        policy_at(url, action_space="eef", action_pose=other) as policy,
+        pytest.raises(ContradictionError, match=says),
+    ):
+        policy.connect()
 
 
 # What goes wrong with an answer
