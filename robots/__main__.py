@@ -124,12 +124,15 @@ def _new(options: argparse.Namespace) -> int:
     into = options.into or next(iter(folders()), Path())
     made = draft(options.name, options.urdf, into, options.copies)
     said = _said(made.inspection)
-    for word, links in (
-        ("not found or unreadable", made.pictures.missing),
-        ("stand-ins for", made.pictures.drawn),
-    ):
-        if links:
-            print(f"shapes: {word}: {', '.join(links)}")
+    if missing := made.pictures.missing:
+        print(
+            f"shapes: {len(missing)} meshes were not found or cannot be read, {missing[0]} the first; put them where"
+        )
+        print(
+            "  the URDF says they are and draft again, or as LINK.stl into the robot's folder of $EVA_ROBOT_MESHES"
+        )
+    if drawn := made.pictures.drawn:
+        print(f"shapes: cylinders from joint to joint stand in for {', '.join(drawn)}")
     print(f"drafted: {made.folder}")
     if options.name not in names():
         print(f"found by name once EVA_ROBOTS={into.resolve()} is set; until then by its folder")

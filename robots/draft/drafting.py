@@ -48,7 +48,7 @@ def draft(name: str, source: Path, into: Path, copies: int = 1) -> Drafted:
         made.mkdir()
         shown = made / f"{name}.urdf"
         pictures = copy_urdf(tree, shown)
-        guessed = sheet(tree, shown, title, copies)
+        guessed = sheet(tree, shown, pictures.drawn, title, copies)
         (made / "README.md").write_text(readme(name, guessed, pictures), "utf-8")
         _write(made, guessed)
         made.rename(folder)

@@ -71,7 +71,7 @@ def _rigid(tree: Urdf, link: str) -> list[str]:
 
 
 def gripper_of(tree: Urdf, limb: Limb, eef_link: str, corners: Mapping[str, Float64]) -> GripperDraft:
-    """The gripper of an arm with fingers."""
+    """The gripper of an arm with fingers; `corners` [n, 3] of the shapes of links that show what they are."""
     followed = {tree.master(joint)[0].name for joint in tree.joints.values() if joint.mimic is not None}
     driver = tree.joint(
         max(limb.fingers, key=lambda name: (name in followed, tree.joint(name).kind == "prismatic"))
@@ -93,7 +93,7 @@ def gripper_of(tree: Urdf, limb: Limb, eef_link: str, corners: Mapping[str, Floa
         velocity=_velocity(driver, upper - lower, doubts),
         fingers=fingers,
         apart=opening,
-        tip=jaws.tip(closed),
+        tip=jaws.tip(closed, named=any(word in eef_link.lower() for word in _GRASPS)),
         doubts=tuple(doubts),
     )
 
@@ -168,8 +168,11 @@ class _Jaws:
         opened = round(max(partings), 4)
         return (opened, at_upper, lower) if gaps[0] > gaps[1] else (opened, at_lower, upper)
 
-    def tip(self, closed: Mapping[str, float]) -> Float64:
-        """The frame [7] between the fingertips in the end effector: z the way they point, y the way they open."""
+    def tip(self, closed: Mapping[str, float], *, named: bool) -> Float64:
+        """The frame [7] between the fingertips in the end effector: z the way they point, y the way they open.
+
+        Its place is read off the fingers' shapes; where they have none, it is that of an end effector `named` so.
+        """
         at = self._in_eef(closed)
         points = [self._point(index, at) for index in range(len(self._ends))]
         far = max(float(point @ self._z) for point in points)
@@ -179,7 +182,9 @@ class _Jaws:
         y = np.roll(self._z, 1) if np.linalg.norm(y) < _TINY else y / np.linalg.norm(y)
         frame = np.column_stack([np.cross(y, self._z), y, self._z])
         reach = self._reach(at)
-        if reach is not None:
+        if reach is None and named:
+            middle = np.zeros(3)
+        elif reach is not None:
             middle = middle + self._z * (reach - _PAD - middle @ self._z)
         return np.concatenate([middle, quaternion_of_matrix(frame)])
 

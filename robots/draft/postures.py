@@ -62,10 +62,22 @@ class Postures:
                 fewest = int(counts.min())
                 found = tried[counts == fewest]
                 best = found[np.abs(found - home).max(axis=1).argmin()]
+        best = self._plain(best, home, fewest)
         self._looked_at &= (
             self._clearance.distances(best) >= MARGIN
         )  # what touches anyway tells postures not apart
         return best
+
+    def _plain(self, q: Float64, home: Float64, fewest: int) -> Float64:
+        """The posture with every joint back where it was at home that need not be elsewhere."""
+        for dim in self._dims():
+            tried = q.copy()
+            tried[dim] = home[dim]
+            for arm in self._arms:
+                tried = self._mirrored(arm, tried)
+            if self._touching(tried) <= fewest:
+                q = tried
+        return q
 
     def ready(self, home: Float64) -> Float64:
         """Every arm over its side of the table, fingers down; as at home where no such posture can be gone to."""
@@ -189,7 +201,9 @@ class Postures:
                 [1, -1, 1] if slides else [-1, 1, -1]
             )  # an axis of turning mirrors the other way
             off = there[:3, 3] - here[:3, 3] * [1, -1, 1]
-            off = off if slides else off - axis * (off @ axis)  # where on its axis a joint is drawn is nothing
+            off = (
+                off if slides else off - axis * (off @ axis)
+            )  # where on its axis a joint is drawn is nothing
             cosine = float(axis @ axes[1])
             if abs(abs(cosine) - 1) > _ALIKE or np.abs(off).max() > _NEAR:
                 return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -66,15 +66,19 @@ class Sheet:
     idle: tuple[str, ...]
 
 
-def sheet(tree: Urdf, shown: Path, title: str, copies: int) -> Sheet:
-    """The draft of a robot with that URDF, whose shapes are those of the file `shown`; RobotError if nothing moves."""
+def sheet(tree: Urdf, shown: Path, drawn: Collection[str], title: str, copies: int) -> Sheet:
+    """The draft of a robot with that URDF, whose shapes are those of the file `shown`; RobotError if nothing moves.
+
+    The shapes of the links `drawn` only stand in for what they are.
+    """
     limbs = anatomy(tree)
     arms = [limb for limb in limbs if limb.kind == "arm"]
     if copies > 1 and len(arms) != 1:
         raise RobotError(
             f"{tree.path}: {copies} copies of {len(arms)} arms; allowed: copies of a URDF with one arm"
         )
-    groups = [_group(tree, shown, limb, limbs) for limb in limbs]
+    real = {link: box for link, box in corners(shapes.read(shown)).items() if link not in drawn}
+    groups = [_group(tree, real, limb, limbs) for limb in limbs]
     if copies > 1:
         groups = [_copy(group, index, copies) for index in range(copies) for group in groups]
         groups.sort(key=lambda group: (group.kind != "arm", group.optional))
@@ -90,13 +94,13 @@ def sheet(tree: Urdf, shown: Path, title: str, copies: int) -> Sheet:
     )
 
 
-def _group(tree: Urdf, shown: Path, limb: Limb, limbs: Sequence[Limb]) -> GroupSheet:
+def _group(tree: Urdf, real: Mapping[str, Float64], limb: Limb, limbs: Sequence[Limb]) -> GroupSheet:
     if limb.wheels and not limb.joints:
         return _speeds(limb)
     eef_link = end_link(tree, limb) if limb.kind == "arm" else None
     gripper = None
     if limb.fingers and eef_link is not None:
-        gripper = gripper_of(tree, limb, eef_link, corners(shapes.read(shown)))
+        gripper = gripper_of(tree, limb, eef_link, real)
     values = _rest(tree, limb.joints)
     return GroupSheet(
         name=limb.name,

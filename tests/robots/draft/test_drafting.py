@@ -203,7 +203,7 @@ def test_new_outside_of_eva_robots_says_how_it_is_found(
     assert main(["new", "mine", "--urdf", str(source), "--into", str(tmp_path / "here")]) == 0
     shown = capsys.readouterr().out
     assert f"EVA_ROBOTS={tmp_path / 'here'}" in shown
-    assert "shapes: stand-ins for: base_link, link1" in shown
+    assert "stand in for base_link, link1" in shown
 
 
 def test_new_refuses_a_xacro_and_says_what_makes_a_urdf_of_it(
@@ -229,8 +229,11 @@ def test_a_robot_that_is_not_among_ours_stands_where_its_maker_says(
     file = folder / "robot.toml"
     text = file.read_text()
     assert 'eef_link = "link_tcp"' in text
+    assert "tip = { xyz = [0.0, 0.0, 0.0]" in text  # nothing shows where fingers end: where the URDF says
     file.write_text(text.replace('eef_link = "link_tcp"', 'eef_link = "link6"'))
-    capsys.readouterr()
+    assert (
+        "shapes: 14 meshes were not found or cannot be read, package://xarm_desc" in capsys.readouterr().out
+    )
     assert main(["fk", str(folder), "arm", *["0"] * 6]) == 0
     answer = json.loads(capsys.readouterr().out)
     np.testing.assert_allclose(answer["position"], [0.207, 0.0, 0.112], atol=5e-4)
