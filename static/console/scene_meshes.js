@@ -30,6 +30,7 @@ export class Meshes {
     const { geometry, material } = this.#viewer.scene_tree.find([...path, "<object>"]).object;
     this.#viewer.delete_path(path);
     if (!geometry?.attributes.position?.count) throw new Error(`a ${format} file without triangles`);
+    if (format === "stl") geometry.computeVertexNormals(); // many files leave them zero
     const metres = format === "dae" ? unit(bytes) : 1;
     geometry.scale(metres, metres, metres); // which the loader leaves to who draws it
     return { geometry, material: format === "dae" ? material : null };

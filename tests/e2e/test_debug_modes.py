@@ -2,80 +2,11 @@
 
 import pytest
 
-from tests.e2e.bench_page import BenchPage
+from tests.e2e.by_hand import SOON_S, ByHand
 from tests.e2e.lab import STATION, WIDE
 from tests.processes import eventually
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
-MODE_KEYS = {"sim": "1", "step": "2", "preview": "3", "continuous": "4", "manual": "5"}
-SOON_S = 30
-
-
-class ByHand(BenchPage):
-    """Somebody at the Debug tab who uses keys wherever there are some."""
-
-    def snapshot(self):
-        return self.api(f"stations/{STATION}")["snapshot"]
-
-    def keys(self, *pressed):
-        for key in pressed:
-            self.page.keyboard.press(key)
-
-    def says(self, part, words, seconds=SOON_S):
-        """The part of the page says these words."""
-        place = self.page.locator(part)
-        eventually(lambda: words in place.inner_text(), seconds, f"{part} says {words!r}")
-
-    def quiet(self, part):
-        self.page.locator(part).wait_for(state="hidden")
-
-    def set_up(self):
-        if self.state() == "HOLDING":
-            self.press("stop")
-        self.at_rest()
-        began = self.snapshot()["sequence"]
-        self.press("setup")
-        eventually(lambda: self.snapshot()["sequence"] > began + 1, 60, "the set-up has begun and ended")
-        self.reaches("READY")
-        self.at_the_pose()
-
-    def at_the_pose(self):
-        """The page has seen the robot where the set-up has brought it."""
-        pose = self.snapshot()["facts"]["home"][:7]
-        there = pytest.approx(pose, abs=0.02)
-        eventually(lambda: self.joints() == there, SOON_S, f"the page shows the robot at {pose}")
-
-    def run_in(self, mode):
-        """Choose the mode and begin."""
-        self.reaches("READY")
-        self.keys(MODE_KEYS[mode])
-        self.press("run")
-        self.reaches("RUNNING")
-        begun = self.page.locator("[data-grip=open][aria-disabled=false]").first  # its recording is open
-        begun.wait_for(state="attached")
-        assert self.snapshot()["mode"] == mode
-
-    def stop(self):
-        self.press("stop")
-        self.reaches("READY")
-
-    def joints(self):
-        """Where the left arm is told to be, as the sliders show it while nobody moves them [rad]."""
-        fields = self.page.locator("#joints input[type=number]")
-        return fields.evaluate_all("all => all.map((field) => Number(field.value))")
-
-    def moved_from(self, before, by=0.02):
-        return max(abs(now - then) for now, then in zip(self.joints(), before, strict=True)) > by
-
-    def stands(self):
-        """Whether what the robot is told does not change; the phase may still be that of before a press."""
-        before = self.joints()
-        self.page.wait_for_timeout(400)
-        return self.joints() == before
-
-    def said(self):
-        """What is said of the target."""
-        return self.page.locator("[data-target=said]").inner_text()
 
 
 @pytest.fixture(scope="module")
