@@ -16,6 +16,7 @@ _LARGEST_STEP = 0.5  # rad (m) of one iteration: linearisation is worth nothing 
 _CLOSE_ENOUGH = 1e-9  # weighted squared error: below 1 um and 5 urad
 _STALLED = 1e-4  # a relative fall of the cost below which another iteration is not worth its time
 _FIRST_DAMPING = 1e-4  # part of the diagonal that is added once a step has failed
+_GREATEST_DAMPING = 1e6  # with which any system is positive definite
 _LEAST_DAMPING = 1e-8  # below it there is none
 
 
@@ -90,10 +91,9 @@ def solve_frame(chain: Record, costs: Costs, frame: Record) -> float:
         else:
             damping = max(damping * growth, _FIRST_DAMPING)
             growth *= 2.0
-        if not step_in_box(box, damping):
+        while not step_in_box(box, damping) and damping < _GREATEST_DAMPING:
             damping = max(damping * growth, _FIRST_DAMPING)
             growth *= 2.0
-            step_in_box(box, damping)
         predicted = _promised(box)
         if predicted <= 1e-3 * _STALLED * cost:
             break

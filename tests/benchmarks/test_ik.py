@@ -1,0 +1,113 @@
+"""The chunks that the benchmark of inverse kinematics solves, and what it makes of the solutions."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks.ik import _case, _figures
+from benchmarks.ik_paths import CHUNKS, OUT_OF_REACH, ROWS, Chunk, arm_dims, invented
+from robots import Robot, load
+from runtime.kinematics.base import IkFlag, IkResult, Kinematics
+
+ROBOT = load("agilex_piper")
+DIMS = arm_dims(ROBOT)
+
+
+@cache
+def chunks() -> dict[str, list[Chunk]]:
+    return invented(ROBOT)
+
+
+class Guess(Kinematics):
+    """Answers every chunk with the same joints."""
+
+    def __init__(self, result: IkResult) -> None:
+        self._result = result
+        self.asked = 0
+
+    def forward(self, q: np.ndarray) -> np.ndarray:
+        raise AssertionError("the benchmark solves alone")
+
+    def solve(
+        self,
+        targets: np.ndarray,
+        seed: np.ndarray,
+        dt: float | None = None,
+        anchor: np.ndarray | None = None,
+        anchor_row: int = 0,
+    ) -> IkResult:
+        assert anchor is seed
+        assert anchor_row == 0
+        self.asked += 1
+        return self._result
+
+
+def guess(q: np.ndarray, away: float, flags: int = 0) -> Guess:
+    shape = (len(q), 2)
+    return Guess(IkResult(q, np.full(shape, away), np.full(shape, 0.0), np.full(shape, flags, np.uint8)))
+
+
+@pytest.mark.parametrize("kind", ["smooth", "singular", "through", OUT_OF_REACH])
+def test_every_kind_has_chunks_of_all_arms_that_begin_where_their_seed_is(kind: str) -> None:
+    assert len(chunks()[kind]) == CHUNKS
+    for chunk in chunks()[kind]:
+        assert chunk.targets.shape == (ROWS, 2, 7)
+        assert chunk.reachable == (kind != OUT_OF_REACH)
+        assert ((chunk.seed >= ROBOT.lower) & (chunk.seed <= ROBOT.upper)).all()
+        for index, arm in enumerate(ROBOT.arms):
+            np.testing.assert_allclose(chunk.targets[0, index], arm.pose(chunk.seed), atol=1e-12)
+
+
+def test_no_two_chunks_are_the_same_and_those_out_of_reach_leave_by_more_than_a_metre() -> None:
+    assert len({chunk.seed.tobytes() for chunk in chunks()["smooth"]}) == CHUNKS
+    away = chunks()[OUT_OF_REACH][0].targets[..., :3]
+    assert (np.linalg.norm(away[-1] - away[0], axis=-1) > 1).all()
+
+
+def row(robot: Robot, backend: Kinematics, chunk: Chunk, trajectory: str = "smooth") -> dict[str, object]:
+    made = _case(robot, {"compiled": backend}, [chunk], 0.0)[0]
+    return {"robot": "r", "trajectory": trajectory, **made}
+
+
+def test_speed_counts_from_the_seed_and_what_is_beyond_a_limit_is_counted() -> None:
+    chunk = chunks()["smooth"][0]
+    q = np.tile(chunk.seed, (ROWS, 1))
+    q[:, DIMS[0]] += 0.5 * ROBOT.velocity[DIMS[0]] * chunk.dt
+    q[3:5, DIMS[2]] = ROBOT.upper[DIMS[2]] + 1e-6
+    made = row(ROBOT, guess(q, 0.0), chunk)
+    assert made["violations"] == 2
+    q[3:5, DIMS[2]] = chunk.seed[DIMS[2]]
+    made = row(ROBOT, guess(q, 0.0), chunk)
+    assert made["velocity_ratio"] == pytest.approx(0.5)
+    assert made["violations"] == 0
+
+
+def test_errors_are_those_of_frames_that_no_wall_holds_back_and_the_others_stand_beside_them() -> None:
+    chunk = chunks()["smooth"][0]
+    solved = guess(np.tile(chunk.seed, (ROWS, 1)), 1e-5)._result
+    solved.flags[10:20, 0] = int(IkFlag.AT_VELOCITY)
+    solved.position_error[10:20, 0] = 0.004
+    solved.rotation_error[0, 1] = math.radians(0.01)
+    made = row(ROBOT, Guess(solved), chunk)
+    assert made["position_error_mm"] == pytest.approx(0.01)
+    assert made["position_error_held_mm"] == pytest.approx(4.0)
+    assert made["held_share"] == pytest.approx(0.1)
+    assert made["rotation_error_deg"] == pytest.approx(0.01)
+
+
+def test_bounds_are_for_the_default_backend_and_exactness_only_where_it_is_possible() -> None:
+    backend = guess(np.tile(chunks()["smooth"][0].seed, (ROWS, 1)), 1e-3)
+    made = row(ROBOT, backend, chunks()["smooth"][0])
+    assert backend.asked >= 4
+    holds = {figure.name: figure.holds for figure in _figures(made)}
+    assert holds["position_error_mm.r.smooth"] is False
+    assert holds["rotation_error_deg.r.smooth"] is True
+    assert holds["velocity_ratio.r.smooth"] is True
+    far = {f.name: f.holds for f in _figures({**made, "trajectory": OUT_OF_REACH})}
+    assert far["position_error_mm.r.out_of_reach"] is None
+    other = {f.name: f.holds for f in _figures({**made, "kind": "other"})}
+    assert other["position_error_mm.r.smooth.other"] is None
