@@ -21,6 +21,8 @@ from runtime.policies.request import RequestLayout, RequestSettings, poses_of
 from runtime.policies.rows import action_rows
 from runtime.policies.rtc.async_rtc import AsyncRtc, Schedule
 from runtime.policies.rtc.base import Dialect, Plain
+from runtime.policies.rtc.kai0 import Kai0
+from runtime.policies.rtc.openpi_rtc import EnvelopeKeys, OpenpiRtc, Rows
 from runtime.policies.rtc.prev_action import PrevAction
 from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
 from runtime.types import ActionChunk, Conditioning, Observation
@@ -33,12 +35,19 @@ class Config(ServerSettings, RequestSettings, AnswerSettings):
     """A policy server that speaks the openpi websocket protocol."""
 
     kind: Literal["openpi"] = "openpi"
-    rtc: Literal["none", "prev_action", "async_rtc"] = "none"
-    """How the server is told what the robot is committed to: flat keys, or the openpi-async-rtc envelope."""
+    rtc: Literal["none", "prev_action", "openpi_rtc", "kai0", "async_rtc"] = "none"
+    """How the server is told what the robot is committed to: flat keys, the envelope of openpi-rtc and its forks,
+    kai0's flat keys, or the openpi-async-rtc envelope."""
+    rtc_envelope: EnvelopeKeys = EnvelopeKeys()
+    """With openpi_rtc: what its parts are called, and how many rows the server takes off the chunk before."""
+    rtc_rows: Rows = "aligned"
+    """With openpi_rtc and kai0: "aligned" sends the chunk before so that the server continues from the first row that
+    the robot has not consumed; "whole" as it was answered, as these dialects' own clients do, which is right only
+    where the robot has consumed what the server assumes."""
     prefix_attention_schedule: Schedule = "exp"
     """With async_rtc: how the weight of the rows before falls after the predicted delay."""
-    max_guidance_weight: Positive = 10.0
-    """With async_rtc: most that those rows may bend an inference."""
+    max_guidance_weight: Positive | None = None
+    """Most that those rows may bend an inference: 10 with async_rtc, 0.5 with kai0 (whose server ignores it)."""
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> OpenpiPolicy:
@@ -119,7 +128,7 @@ class OpenpiPolicy(WebsocketPolicy):
                 f"the answer has no 'actions'; it has {', '.join(map(str, reply)) or 'nothing'}"
             )
         agreed(reply, self._declared, "answer")
-        origin = reply.get("origin_actions")
+        origin = reply.get("origin_actions") if self._dialect.continues_model_rows else None
         return ActionChunk(
             actions=action_rows("actions", reply["actions"], self._width),
             space=self._config.action_space,
@@ -133,8 +142,13 @@ class OpenpiPolicy(WebsocketPolicy):
 
 
 def _dialect(config: Config) -> Dialect:
+    weight = config.max_guidance_weight
     if config.rtc == "async_rtc":
-        return AsyncRtc(config.prefix_attention_schedule, config.max_guidance_weight)
+        return AsyncRtc(config.prefix_attention_schedule, 10.0 if weight is None else weight)
+    if config.rtc == "kai0":
+        return Kai0(config.rtc_rows, 0.5 if weight is None else weight)
+    if config.rtc == "openpi_rtc":
+        return OpenpiRtc(config.rtc_envelope, config.rtc_rows)
     return PrevAction() if config.rtc == "prev_action" else Plain()
 
 

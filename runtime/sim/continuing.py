@@ -55,6 +55,11 @@ class ModelSpace:
         self._centre, self._half = (upper + lower) / 2, (upper - lower) / 2
         self.width = max(_MODEL_WIDTH, robot.dim)
 
+    @property
+    def dim(self) -> int:
+        """Numbers of a joint row."""
+        return len(self._centre)
+
     def of(self, joints: Float32) -> Float32:
         """Model rows [H, width] of joint rows [H, D]."""
         made = np.zeros((len(joints), self.width), np.float32)

@@ -1,4 +1,4 @@
-"""The two ways in which the stand-in policy server is told what the robot is committed to."""
+"""The ways in which the stand-in policy server is told what the robot is committed to."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from runtime.policies.rtc import async_rtc
 from runtime.sim.continuing import STAND_IN, ModelSpace, Prefix
 from runtime.sim.faults import Fault
 
-Name = Literal["none", "prev_action", "async_rtc"]
+Name = Literal["none", "prev_action", "openpi_rtc", "kai0", "async_rtc"]
+_SHIFT, _FROZEN = 25, 10  # rows that openpi-rtc takes off, and that it keeps to
 _FIELDS = (
     "prev_chunk_left_over",
     "inference_delay",
@@ -95,6 +96,46 @@ class Flat(Ignorant):
         return Asked(message, Prefix(left, consumed, len(left)))
 
 
+class Ancestor(Ignorant):
+    """openpi-rtc: takes a fixed number of rows off the chunk before, whatever the robot has executed."""
+
+    @property
+    def _shift(self) -> int:
+        return min(_SHIFT, self._horizon // 2)
+
+    def metadata(self) -> dict[str, object]:
+        dialect = "openpi_rtc" if self._continues else "none"
+        return {"rtc": {"dialect": dialect, "stand_in": STAND_IN, "shift": self._shift}}
+
+    def read(self, message: Any) -> Asked:
+        observation = message.get("obs", message)
+        if not self._continues or not message.get("is_rtc") or "prev_action" not in message:
+            return Asked(observation)
+        left = self._space.joints(message["prev_action"])[self._shift :]
+        return Asked(observation, Prefix(left, min(_FROZEN, len(left)), len(left)))
+
+
+class Kai0Flat(Ignorant):
+    """kai0: row n of the chunk before is row n of the new one."""
+
+    def metadata(self) -> dict[str, object]:
+        return {"rtc": {"dialect": "kai0" if self._continues else "none", "stand_in": STAND_IN}}
+
+    def read(self, message: Any) -> Asked:
+        delay, end = message["inference_delay"], message["execute_horizon"]
+        if not isinstance(delay, int) or not isinstance(end, int) or delay < 0 or end < 1:
+            raise ValueError(f"inference_delay {delay!r}, execute_horizon {end!r}: expected 0 and 1 or more")
+        if not self._continues or "prev_action_chunk" not in message:
+            return Asked(message)
+        rows = np.asarray(message["prev_action_chunk"], np.float64)
+        if rows.ndim != 2 or rows.shape[1] < self._space.dim:
+            raise ValueError(
+                f"prev_action_chunk has shape {rows.shape}, expected [T, {self._space.dim}] or wider"
+            )
+        end = max(delay, min(end, len(rows)))
+        return Asked(message, Prefix(rows[:, : self._space.dim], delay, end))
+
+
 class Envelope(Wire):
     """openpi-async-rtc, version 2."""
 
@@ -158,4 +199,10 @@ class Envelope(Wire):
         return Prefix(rows, delay, end)
 
 
-WIRES: dict[Name, type[Wire]] = {"none": Ignorant, "prev_action": Flat, "async_rtc": Envelope}
+WIRES: dict[Name, type[Wire]] = {
+    "none": Ignorant,
+    "prev_action": Flat,
+    "openpi_rtc": Ancestor,
+    "kai0": Kai0Flat,
+    "async_rtc": Envelope,
+}

@@ -16,7 +16,10 @@ class Dialect(ABC):
     """Wraps requests and unwraps replies; one per connection's policy, for one thread.
 
     There is no common standard. Each dialect says what it found where a server speaks another one.
+    `continues_model_rows` is whether a chunk is given back in the model's own space where the server returned that.
     """
+
+    continues_model_rows = True
 
     @abstractmethod
     def supported(self, metadata: Mapping[str, Any]) -> bool | None:
@@ -53,6 +56,20 @@ class Plain(Dialect):
     def result(self, reply: Message) -> Message:
         """The reply itself."""
         return reply
+
+
+def dialect_told(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
+    """The map under the metadata key `rtc`, that of our bundled server; None where the server does not say.
+
+    PolicyError for a server that takes versioned envelopes alone, or whose key is something else.
+    """
+    refuse_envelopes(metadata, name)
+    said = metadata.get("rtc")
+    if said is None:
+        return None
+    if not isinstance(said, Mapping) or not isinstance(said.get("dialect"), str):
+        raise PolicyError(f"the server's metadata have rtc = {said!r}; expected a map with a dialect")
+    return said
 
 
 def refuse_envelopes(metadata: Mapping[str, Any], configured: str) -> None:

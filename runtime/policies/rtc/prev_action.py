@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.errors import PolicyError
-from runtime.policies.rtc.base import Dialect, Message, refuse_envelopes
+from runtime.policies.rtc.base import Dialect, Message, dialect_told
 from runtime.types import Conditioning, Float32
 
 NAME = "prev_action"
@@ -23,13 +22,8 @@ class PrevAction(Dialect):
 
     def supported(self, metadata: Mapping[str, Any]) -> bool | None:
         """What the metadata key `rtc` says (that of our bundled server), None without it."""
-        refuse_envelopes(metadata, NAME)
-        said = metadata.get("rtc")
-        if said is None:
-            return None
-        if not isinstance(said, Mapping) or not isinstance(said.get("dialect"), str):
-            raise PolicyError(f"the server's metadata have rtc = {said!r}; expected a map with a dialect")
-        return bool(said["dialect"] == NAME)
+        said = dialect_told(metadata, NAME)
+        return None if said is None else bool(said["dialect"] == NAME)
 
     def request(self, observation: Message, conditioning: Conditioning | None) -> Message:
         """The observation with both keys, or as it is."""

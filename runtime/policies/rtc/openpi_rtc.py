@@ -1,0 +1,94 @@
+"""The envelope of openpi-rtc and its forks: the observation in a map, beside the chunk before.
+
+These servers take rows off that chunk by themselves: the ancestor always 25, whatever the robot has executed, forks
+as many as the request says. The rows are put so that what the server is left with begins at the first row that the
+robot has not consumed; where it has consumed exactly as many as the server takes off, that is the chunk as it was
+answered, which is all that these servers' own clients ever send.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from runtime.errors import ConfigurationError, ContradictionError
+from runtime.policies.rtc.base import Dialect, Message, dialect_told
+from runtime.section import Section
+from runtime.types import Conditioning, Float32
+
+NAME = "openpi_rtc"
+Rows = Literal["aligned", "whole"]
+
+
+class EnvelopeKeys(Section):
+    """What the parts of the envelope are called, and how many rows the server takes off."""
+
+    observation: Literal["obs", "observation"] = "obs"
+    """Key of the observation."""
+    flag: Literal["is_rtc", "use_rtc"] = "is_rtc"
+    """Key of whether a chunk is to be continued."""
+    shift: str = ""
+    """Key under which a server is told how many rows to take off ("s_param" of one fork); "" where it is not."""
+    delay: str = ""
+    """Key under which it is told the predicted delay in rows ("d_param"); "" where it is not."""
+    server_shift: int | None = None
+    """How many rows the server takes off by itself, where it is not told: 25 for the ancestor."""
+
+
+class OpenpiRtc(Dialect):
+    """`prev_action` float32 [T, W] is the chunk before, absent on the first request and after a reset."""
+
+    def __init__(self, keys: EnvelopeKeys, rows: Rows) -> None:
+        if rows == "aligned" and not keys.shift and keys.server_shift is None:
+            raise ConfigurationError(
+                "policy.rtc = 'openpi_rtc' without policy.rtc_envelope.server_shift: the server takes rows off the "
+                "chunk before, and another number than the robot has consumed would make it jump; allowed: "
+                'server_shift = 25 (the ancestor\'s), shift = "s_param" for a fork that is told, or rtc_rows = '
+                "'whole'"
+            )
+        self._keys = keys
+        self._rows = rows
+
+    def supported(self, metadata: Mapping[str, Any]) -> bool | None:
+        """What the metadata key `rtc` says, None without it; ContradictionError for another number of rows."""
+        said = dialect_told(metadata, NAME)
+        if said is None:
+            return None
+        shift = said.get("shift")
+        if shift is not None and self._keys.server_shift not in (None, shift):
+            raise ContradictionError(
+                f"the server's metadata has rtc.shift = {shift!r}, policy.rtc_envelope.server_shift = "
+                f"{self._keys.server_shift}; correct the one that is wrong"
+            )
+        return bool(said["dialect"] == NAME)
+
+    def request(self, observation: Message, conditioning: Conditioning | None) -> Message:
+        """The envelope."""
+        keys = self._keys
+        message: Message = {keys.observation: observation}
+        if conditioning is not None:
+            message["prev_action"] = self._placed(conditioning)
+        message[keys.flag] = conditioning is not None
+        if conditioning is not None and keys.shift:
+            message[keys.shift] = conditioning.consumed
+        if conditioning is not None and keys.delay:
+            message[keys.delay] = conditioning.predicted_delay
+        return message
+
+    def result(self, reply: Message) -> Message:
+        """The reply itself."""
+        return reply
+
+    def _placed(self, conditioning: Conditioning) -> Float32:
+        previous = conditioning.previous
+        if self._rows == "whole" or self._keys.shift or self._keys.server_shift is None:
+            return np.ascontiguousarray(previous, np.float32)
+        return moved(previous, conditioning.consumed - self._keys.server_shift)
+
+
+def moved(rows: Float32, by: int) -> Float32:
+    """Row n is row n + `by` [T, W]; what is before the first or after the last row repeats that."""
+    places = np.clip(np.arange(len(rows)) + by, 0, len(rows) - 1)
+    return np.ascontiguousarray(rows[places], np.float32)
