@@ -18,7 +18,11 @@ _SAMPLES, _FEW, _ELITE, _ROUNDS = 256, 64, 24, 14  # of a search by the cross-en
 _STARTS = 4  # of a search
 _WAY = 24  # points between home and ready
 _LOOKED_AT = np.array([0.3, 0.6, 1.0])  # of them, while searching
-_HEIGHT, _AHEAD, _ASIDE = 0.2, 0.2, 0.3  # m: where fingertips are to be, an arm on a side as far to it
+_HEIGHT, _AHEAD, _ASIDE = (
+    0.2,
+    0.15,
+    0.33,
+)  # m: where fingertips are to be, beside what they work on and cameras see
 _NEAR, _ALIKE = 0.02, 1e-3  # m, and of a cosine: within which two arms mirror each other
 
 
@@ -168,12 +172,10 @@ class Postures:
         return end if arm.tip is None else end @ arm.tip
 
     def _side(self, arm: Group) -> float:
-        """-1 for the arm that begins on the left side of the scene, 1 for the right one, 0 where there is but one."""
-        if len(self._arms) == 1:
-            return 0.0
+        """-1 for an arm that begins on the left side of the scene or in its middle, 1 for one on the right."""
         child = self._tree.joint(arm.urdf_joints[0]).child
         x = float(self._body.poses(self._robot.poses["home"])[self._body.link_of(arm.name, child), 0, 3])
-        return float(np.sign(x)) if abs(x) > _NEAR else 0.0
+        return 1.0 if x > _NEAR else -1.0
 
     def _mirrored(self, arm: Group, q: Float64) -> Float64:
         """The same postures [..., D], but that the arm mirrors the first one, within its limits, where it is such."""
