@@ -30,6 +30,12 @@ NAMES = {
     "reset_text": "roboarena, vllm: answers a reset with another word",
     "normalized": "starvla: answers with rows that are yet to be un-normalised",
     "refused": "starvla: answers with a map that says that the model failed",
+    "unknown_endpoint": "gr00t: knows none of its endpoints",
+    "error_bytes": "gr00t: answers with the bytes ERROR, as very old servers do",
+    "malformed": "gr00t, lerobot: answers with bytes that nobody can read",
+    "two_frames": "gr00t: answers with two frames",
+    "missing_key": "gr00t: answers without one of its action keys",
+    "uneven": "gr00t: one action key has a row less than the others",
 }
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import sys
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Protocol
 
 from runtime.errors import RuntimeFault, SetupError
 from runtime.sim import faults, standin
@@ -17,6 +18,14 @@ if TYPE_CHECKING:
     from runtime.sim.rtc_wires import Name
 
 
+class StandInServer(Protocol):
+    """What every stand-in server is to this command: it starts, says where it is, and ends."""
+
+    def start(self) -> dict[str, object]: ...
+
+    def close(self) -> None: ...
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     line = argparse.ArgumentParser(
@@ -24,7 +33,7 @@ def parser() -> argparse.ArgumentParser:
         description="A stand-in policy server.",
         epilog="faults: " + "; ".join(f"{name}: {text}" for name, text in faults.NAMES.items()),
     )
-    line.add_argument("protocol", choices=["openpi"])
+    line.add_argument("protocol", choices=list(_PROTOCOLS))
     line.add_argument("--robot", required=True, help="name of a folder in robots/, or a path")
     line.add_argument(
         "--groups", type=standin.names, metavar="NAME,...", help="of the robot, as the deployment has them"
@@ -58,10 +67,29 @@ def parser() -> argparse.ArgumentParser:
     )
     line.add_argument(
         "--rtc",
-        choices=["none", "prev_action", "async_rtc"],
-        help="how it is told what the robot is committed to, which it then copies: flat keys (plain requests are "
-        "understood too; the default), envelopes alone, or not at all, as always with --space eef",
+        choices=["none", "prev_action", "openpi_rtc", "kai0", "async_rtc"],
+        help="openpi: how it is told what the robot is committed to, which it then copies: prev_action's flat keys "
+        "(plain requests are understood too; the default), the dialects of openpi-rtc or kai0, versioned envelopes "
+        "alone, or not at all, as always with --space eef",
     )
+    arena = line.add_argument_group("roboarena and vllm")
+    arena.add_argument(
+        "--reply", choices=["dict", "bare", "parts"], default="dict", help="form of its answers"
+    )
+    arena.add_argument("--velocity", action="store_true", help="joint velocities instead of positions")
+    arena.add_argument("--resolution", type=_resolution, default=(224, 224), metavar="HxW", help="or none")
+    arena.add_argument("--externals", type=int, choices=[0, 1, 2], default=1, help="exterior views it wants")
+    arena.add_argument("--numbering", type=int, choices=[0, 1], default=0, help="of the first exterior view")
+    arena.add_argument("--no-session", action="store_true", help="it wants no session id")
+    arena.add_argument("--idle", type=float, metavar="S", help="leaves a silent client; vllm after 30 s")
+    groot = line.add_argument_group("gr00t")
+    groot.add_argument("--version", choices=["n1.5", "n1.6", "n1.7"], default="n1.6", help="of the server")
+    groot.add_argument(
+        "--use-sim-policy-wrapper",
+        action="store_true",
+        help="flat keys, as its own server's option of this name",
+    )
+    groot.add_argument("--token-env", metavar="NAME", help="environment variable with the API token it wants")
     line.add_argument("--fault", type=faults.parse, default=faults.NONE, metavar="NAME[:ARG]")
     standin.add_arguments(line)
     return line
@@ -70,24 +98,85 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until SIGTERM, SIGINT or the end of the lifeline."""
     import robots
-    from runtime.sim.openpi_server import Behaviour, OpenpiServer
 
     options = parser().parse_args(arguments)
     told = standin.ending(options.lifeline)
     try:
         robot = robots.load(options.robot, options.groups)
         rate = options.rate or robot.control_rate
-        behaviour = Behaviour(
-            options.horizon, rate, options.latency_ms / 1e3, options.fault, options.seed, _rtc(options)
-        )
         played = _spoken(_script(robot, rate, options), robot, rate, options)
-        with contextlib.closing(OpenpiServer(robot, behaviour, options.port, played)) as server:
+        made = _PROTOCOLS[options.protocol](robot, rate, played, options)
+        with contextlib.closing(made) as server:
             standin.announce(server.start(), options.ready_file)
             told.wait()
     except (RuntimeFault, robots.RobotError) as error:
         print(error, file=sys.stderr)
         return 2
     return 0
+
+
+def _openpi(robot: Robot, rate: float, script: Script, options: argparse.Namespace) -> StandInServer:
+    from runtime.sim.openpi_server import Behaviour, OpenpiServer
+
+    latency = options.latency_ms / 1e3
+    behaviour = Behaviour(options.horizon, rate, latency, options.fault, options.seed, _rtc(options))
+    return OpenpiServer(robot, behaviour, options.port, script)
+
+
+def _gr00t(robot: Robot, rate: float, script: Script, options: argparse.Namespace) -> StandInServer:
+    from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
+
+    token = os.environ.get(options.token_env, "") if options.token_env else ""
+    if options.token_env and not token:
+        raise SetupError(f"--token-env {options.token_env}: it is not set in the environment")
+    behaviour = Gr00tBehaviour(
+        options.version,
+        options.use_sim_policy_wrapper,
+        options.horizon,
+        rate,
+        options.latency_ms / 1e3,
+        options.fault,
+        options.seed,
+        token,
+    )
+    return Gr00tServer(robot, behaviour, options.port, script)
+
+
+def _roboarena(robot: Robot, rate: float, script: Script, options: argparse.Namespace) -> StandInServer:
+    from runtime.sim.roboarena_server import Arena, RoboarenaServer
+
+    arena = Arena(
+        options.horizon,
+        rate,
+        options.latency_ms / 1e3,
+        options.fault,
+        options.seed,
+        variant=options.protocol,
+        reply=options.reply,
+        resolution=options.resolution,
+        externals=options.externals,
+        session=not options.no_session,
+        space="joint_velocity" if options.velocity else "joint_position",
+        numbering=options.numbering,
+        idle=options.idle,
+    )
+    return RoboarenaServer(robot, arena, options.port, script)
+
+
+def _starvla(robot: Robot, rate: float, script: Script, options: argparse.Namespace) -> StandInServer:
+    from runtime.sim.starvla_server import Star, StarvlaServer
+
+    star = Star(options.horizon, rate, options.latency_ms / 1e3, options.fault, options.seed)
+    return StarvlaServer(robot, star, options.port, script)
+
+
+_PROTOCOLS: dict[str, Callable[[Robot, float, Script, argparse.Namespace], StandInServer]] = {
+    "openpi": _openpi,
+    "gr00t": _gr00t,
+    "roboarena": _roboarena,
+    "vllm": _roboarena,
+    "starvla": _starvla,
+}
 
 
 def _rtc(options: argparse.Namespace) -> Name:
@@ -136,6 +225,14 @@ def _length(text: str) -> float:
 def _share(text: str) -> float:
     """A probability."""
     return _number(text, 1.0)
+
+
+def _resolution(text: str) -> tuple[int, int] | None:
+    """Height and width, None for "none"."""
+    if text == "none":
+        return None
+    height, _, width = text.partition("x")
+    return int(height), int(width)
 
 
 def _number(text: str, highest: float) -> float:

@@ -5,13 +5,13 @@ Only time is virtual. Of the cameras the overhead one alone is drawn, six times 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.pick_place import PickPlace, Skill, poses_apart
 from runtime.sim.plant import Plant
 from runtime.sim.render import Renderer
+from runtime.sim.script import Script
 from runtime.sim.surroundings import Surroundings
 from runtime.sim.tabletop import Reset, Tabletop
 from runtime.transports import zmq
@@ -111,11 +112,29 @@ class Trial:
     seconds: float
 
 
-def planned(name: str, seed: int, data: Path, url: str, assignments: Sequence[str] = ()) -> TabletopPlan:
+class PolicyServer(Protocol):
+    """A stand-in server of any protocol."""
+
+    def start(self) -> dict[str, object]: ...
+
+    def close(self) -> None: ...
+
+
+Serve = Callable[[TabletopPlan, Script], PolicyServer]
+"""Makes the server that plays a script, for a plan that does not know its address yet."""
+
+
+def openpi_server(made: TabletopPlan, script: Script) -> PolicyServer:
+    """What is served where nothing else is said."""
+    return OpenpiServer(made.robot, Behaviour(HORIZON, made.rate, rtc="none"), 0, script)
+
+
+def planned(
+    name: str, seed: int, data: Path, url: str | None, assignments: Sequence[str] = ()
+) -> TabletopPlan:
     """The station of the deployment `name` with the bench laid out by `seed`; nothing is recorded."""
-    given = [
-        f'policy.url="{url}"', f'data_dir="{data}"', "recording.enabled=false", "lockstep.delay_ticks=3", *assignments
-    ]  # fmt: skip
+    given = [f'data_dir="{data}"', "recording.enabled=false", "lockstep.delay_ticks=3", *assignments]
+    given += [] if url is None else [f'policy.url="{url}"']
     made = family.plan(deployment.load(DEPLOYMENTS / f"{name}.toml", given))
     bench = SlowEye(made.robot, Tabletop(made.robot, seed))
     return TabletopPlan(made.resolved, made.robot, bench, {})
@@ -123,16 +142,16 @@ def planned(name: str, seed: int, data: Path, url: str, assignments: Sequence[st
 
 @contextmanager
 def served(
-    name: str, seed: int, data: Path, assignments: Sequence[str] = ()
+    name: str, seed: int, data: Path, assignments: Sequence[str] = (), serve: Serve = openpi_server
 ) -> Iterator[tuple[TabletopPlan, Lockstep]]:
     """A station that is not yet connected, and its policy served on loopback on the station's clock."""
-    made = planned(name, seed, data, "ws://127.0.0.1:1", assignments)
+    made = planned(name, seed, data, None, assignments)
     policy = made.deployment.policy
     in_poses = policy.action_space == "eef"
     skill, apart = Skill(_NOISE, seed=seed), poses_apart if in_poses else None
     script = PickPlace(made.robot, HORIZON, made.rate, skill, clock=_Later(), apart=apart)
     spoken = InPoses(script, made.robot, made.rate, policy.action_pose) if in_poses else script
-    server = OpenpiServer(made.robot, Behaviour(HORIZON, made.rate, rtc="none"), 0, spoken)
+    server = serve(made, spoken)
     url = str(server.start()["url"])
     with closing(server):
         made = planned(name, seed, data, url, assignments)
@@ -151,9 +170,11 @@ class _Later(Clock):
         raise AssertionError(f"nobody waits until {deadline}")
 
 
-def pick_and_place(name: str, seed: int, data: Path, assignments: Sequence[str] = ()) -> Trial:
+def pick_and_place(
+    name: str, seed: int, data: Path, assignments: Sequence[str] = (), serve: Serve = openpi_server
+) -> Trial:
     """Set up, run until the block lies on the plate or for so long."""
-    with served(name, seed, data, assignments) as (made, station):
+    with served(name, seed, data, assignments, serve) as (made, station):
         session, table = station.main.session, made.bench.table
         station.connect()
         station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")

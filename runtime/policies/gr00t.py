@@ -1,0 +1,232 @@
+"""GR00T's policy servers N1.5, N1.6 and N1.7: one request, one answer over a ZMQ REQ socket.
+
+The server is asked first what its model is shown and answers (its modality configuration); requests are built of
+that by maps that the deployment declares. Arrays are sent in the form that every version reads (NPY); its
+`kill` endpoint is never used. Source: Isaac-GR00T's PolicyServer and PolicyClient.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import threading
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field
+
+from runtime.clock import Clock
+from runtime.errors import CodecError, ConfigurationError, PolicyError
+from runtime.policies.base import Policy, PolicyInfo
+from runtime.policies.groot import arrays
+from runtime.policies.groot.link import ReqLink
+from runtime.policies.groot.modality import modalities
+from runtime.policies.groot.request import Gr00tRequest, RequestSettings
+from runtime.policies.link import headline
+from runtime.types import ActionChunk, Conditioning, Observation
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+ANSWER_LIMIT = 64 * 1024 * 1024  # bytes
+_HINTS = (  # what servers of one form say to requests in another
+    (
+        r"must contain a '(video|state|language)'|KeyError: '(video|state|language)'",
+        'policy.dialect = "nested"',
+    ),
+    (
+        r"'?(video|state)\.\w+'? (key )?(must|is missing)|KeyError: '(video|state)\.",
+        '"sim_wrapper" or "n1.5"',
+    ),
+)
+
+
+class Config(RequestSettings):
+    """A policy server of Isaac GR00T."""
+
+    kind: Literal["gr00t"] = "gr00t"
+    url: Annotated[str, Field(pattern=r"^tcp://[^/:]+:\d{1,5}$|^tcp://\[[0-9a-fA-F:]+\]:\d{1,5}$")] = (
+        "tcp://127.0.0.1:5555"
+    )
+    """Where the server listens."""
+    api_token_env: str | None = None
+    """Environment variable with the server's API token; the token itself would end up in every manifest."""
+    connect_deadline: Positive = 5.0
+    """For the connection and the server's modality configuration [s]; for a reset too."""
+    first_inference_deadline: Positive = 120.0
+    """For the first answer after set-up [s]: the server may have to compile its model."""
+    inference_deadline: Positive = 2.0
+    """For every later answer [s], also of a server that came back; after it the connection is dropped."""
+
+
+def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> Gr00tPolicy:
+    """The policy, not yet connected; ConfigurationError where its maps do not fit the robot."""
+    return Gr00tPolicy(config, robot, control_rate)
+
+
+class UnknownEndpoint(PolicyError):
+    """The server does not know what it was asked for."""
+
+
+class Gr00tPolicy(Policy):
+    """One REQ socket; after a timeout or a lost reply it is dropped, and the next `infer` makes another.
+
+    Deadlines are real seconds whatever the clock. The long first deadline holds once after `connect`.
+    """
+
+    def __init__(self, config: Config, robot: Robot, control_rate: float) -> None:
+        self._config = config
+        self._token = _token(config)
+        self._request = Gr00tRequest(config, robot, control_rate)
+        self.observation_eef = config.observation_eef
+        self.sees_poses = config.sees_poses
+        self._link = self._new_link()
+        self._lock = threading.Lock()  # of the wire: held through every wait
+        self._turning = threading.Lock()  # between open and closed: held for a moment
+        self._closed = False
+        self._warm = False
+        self._asked = False  # since the last reset
+
+    def connect(self) -> PolicyInfo:
+        """Reach the server and read its modality configuration; an open connection is replaced."""
+        with self._lock:
+            self._warm = False
+            self._link.drop()
+            with self._turning:
+                self._closed = False
+                self._link = self._new_link()
+            return self._open()
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        """The chunk; `timing` has our `round_trip_ms`.
+
+        PolicyLostError where the server is not there or does not answer: the next call opens another connection.
+        """
+        if conditioning is not None:
+            raise PolicyError("the GR00T protocol has no real-time chunking; choose another strategy")
+        moment = self._request.moment(observation)
+        with self._lock:
+            self._require_open()
+            data = self._request.of(moment, observation.prompt)
+            seconds = self._config.inference_deadline if self._warm else self._config.first_inference_deadline
+            self._warm = self._asked = True
+            started = time.monotonic()
+            reply = self._call("get_action", seconds, data)
+            round_trip = 1e3 * (time.monotonic() - started)
+            rows = self._request.rows(reply)
+        return self._config.chunk(rows, {"round_trip_ms": round_trip})
+
+    def reset(self) -> None:
+        """Forget what was seen, here and on the server, which N1.5 has no word for."""
+        with self._lock:
+            self._request.forget()
+            if not self._asked or self._config.dialect == "n1.5":
+                return
+            self._require_open()
+            self._asked = False
+            with contextlib.suppress(UnknownEndpoint):  # a server without it has nothing to forget
+                self._call("reset", self._config.connect_deadline, {"options": None})
+
+    def close(self) -> None:
+        """Return at once; a call that waits in another thread raises PolicyError.
+
+        What is left of the connection is dropped by whoever uses it, now or at the next `connect`.
+        """
+        with self._turning:
+            self._closed = True
+            self._link.abort()
+        if self._lock.acquire(blocking=False):  # else whoever waits drops it
+            try:
+                self._link.drop()
+            finally:
+                self._lock.release()
+
+    def _new_link(self) -> ReqLink:
+        return ReqLink(self._config.url, self._config.connect_deadline, ANSWER_LIMIT)
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise PolicyError(f"the policy at {self._config.url} is closed; connect first")
+        if not self._link.is_open:
+            self._open()
+
+    def _open(self) -> PolicyInfo:
+        left = self._link.open()
+        try:
+            wanted = modalities(self._call("get_modality_config", left))
+            self._request.agree(wanted)
+        except PolicyError:
+            self._link.drop()
+            raise
+        return PolicyInfo(
+            name="GR00T N1.5" if wanted.early else "GR00T",
+            action_space=None,
+            horizon=self._request.horizon,
+            rate=self._config.action_rate,
+            metadata={"modality": wanted.plain()},
+        )
+
+    def _call(self, endpoint: str, seconds: float, data: Mapping[str, Any] | None = None) -> Any:
+        """The result of an endpoint; PolicyError for the server's own error, after which it goes on serving."""
+        message: dict[str, Any] = {"endpoint": endpoint}
+        message |= {} if data is None else {"data": data}
+        message |= {} if self._token is None else {"api_token": self._token}
+        reply = self._link.exchange(arrays.pack(message), seconds, f"an answer to {endpoint}")
+        if reply == b"ERROR":
+            raise PolicyError(
+                f"{self._config.url} answers {endpoint} with ERROR: see the server's own output"
+            )
+        try:
+            result = arrays.unpack(reply, ANSWER_LIMIT)
+        except CodecError as error:
+            self._link.drop()
+            raise PolicyError(
+                f"{self._config.url} sent an answer that is not the GR00T protocol: {error}"
+            ) from error
+        if isinstance(result, dict) and set(result) == {"error"}:
+            raise self._error(endpoint, str(result["error"]))
+        return result
+
+    def _error(self, endpoint: str, text: str) -> PolicyError:
+        url = self._config.url
+        if text.startswith("Unknown endpoint"):
+            return UnknownEndpoint(
+                f"the policy server at {url} has no endpoint {endpoint!r} ({text}): it is of another version"
+            )
+        return PolicyError(self._told(text))
+
+    def _told(self, text: str) -> str:
+        url = self._config.url
+        if text.startswith("Unauthorized"):
+            given = "a wrong one was given" if self._token else "none was given"
+            return (
+                f"the policy server at {url} wants an API token, {given} ({text}): set policy.api_token_env to the "
+                "name of the environment variable that holds it"
+            )
+        said = f"the policy server at {url} reports an error: {headline(text)}"
+        for pattern, allowed in _HINTS:
+            if re.search(pattern, text):
+                return (
+                    f"{said}\nIt wants requests in another form: policy.dialect is {self._config.dialect!r}, see "
+                    f"{allowed}"
+                )
+        if "must be a numpy array" in text:
+            return (
+                f"{said}\nIt does not read arrays in NPY, which every GR00T server does: it is another server"
+            )
+        return said
+
+
+def _token(config: Config) -> str | None:
+    if config.api_token_env is None:
+        return None
+    token = os.environ.get(config.api_token_env)
+    if not token:
+        raise ConfigurationError(
+            f"policy.api_token_env names {config.api_token_env}, which is not set in the environment"
+        )
+    return token

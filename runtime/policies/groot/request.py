@@ -1,0 +1,254 @@
+"""An observation as GR00T is shown it, and its answer as rows: by maps that a deployment declares."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from runtime.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.policies.groot.modality import Modalities, Modality, listed
+from runtime.policies.meaning import MeaningSettings
+from runtime.policies.request import Dims
+from runtime.policies.rows import action_rows
+from runtime.types import Float32, Observation, UInt8
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+Parts = Annotated[dict[str, Dims], Field(min_length=1)]
+_MOST_STEPS = 64  # of a modality; more pictures than that in one request are a mistake
+
+
+class RequestSettings(MeaningSettings):
+    """Which keys of the model hold what, and in what form the server wants them."""
+
+    dialect: Literal["nested", "sim_wrapper", "n1.5"] = "nested"
+    """"nested": N1.6 and N1.7; "sim_wrapper": the same started with --use-sim-policy-wrapper, with flat keys;
+    "n1.5": flat keys without a batch axis."""
+    video: dict[str, str]
+    """The model's video key = observation key of a camera; without the prefix "video."."""
+    state: Parts
+    """The model's state key = places of the state vector; without the prefix "state."."""
+    actions: Parts
+    """The model's action key = places of the row that its numbers take, in their order; together every place once."""
+    ignored_actions: list[str] = Field(default_factory=list)
+    """Action keys of the model that this robot has no use for."""
+    language_key: str | None = None
+    """The model's language key; the only one that it has where it is not given."""
+    history: Literal["none", "repeat", "nearest"] = "none"
+    """For models that see more than the newest moment: "repeat" shows that one for all; "nearest" shows, of the
+    moments at which it was asked since the last reset, those nearest to what it wants; "none" is an error then."""
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """What one observation shows."""
+
+    step: int
+    pictures: Mapping[str, UInt8]  # by video key
+    state: Float32
+
+
+class Gr00tRequest:
+    """Builds requests once `agree` was told what the server wants. Not for two threads at once."""
+
+    def __init__(self, settings: RequestSettings, robot: Robot, control_rate: float) -> None:
+        self._settings = settings
+        width, self._row_width = settings.widths(robot)
+        _check_parts(settings.state, width)
+        _check_cover(settings.actions, self._row_width)
+        cameras = {camera: camera for camera in settings.video.values()}
+        self._layout = settings.layout(robot, cameras)
+        self._pace = control_rate / (
+            settings.action_rate or control_rate
+        )  # control steps per step of the model
+        self._wanted: Modalities | None = None
+        self._language = ""
+        self._moments: deque[Moment] = deque()
+
+    def agree(self, wanted: Modalities) -> None:
+        """Hold what the server wants against the deployment; ContradictionError names both sides."""
+        settings = self._settings
+        if wanted.early != (settings.dialect == "n1.5"):
+            version = "of version N1.5" if wanted.early else "newer than N1.5"
+            raise ContradictionError(
+                f"the server is {version}, policy.dialect = {settings.dialect!r}; correct the one that is wrong"
+            )
+        _same_keys("video", wanted.video, settings.video)
+        _same_keys("state", wanted.state, settings.state)
+        if wanted.action.keys:
+            _same_keys("actions", wanted.action, [*settings.actions, *settings.ignored_actions])
+        self._language = _language_key(wanted.language, settings.language_key)
+        for name, one in (("video", wanted.video), ("state", wanted.state)):
+            _check_steps(name, one, settings.history)
+        self._wanted = wanted
+
+    @property
+    def horizon(self) -> int | None:
+        """Rows of an answer, as far as the server says."""
+        steps = None if self._wanted is None else self._wanted.action.steps
+        return len(steps) if steps is not None and len(steps) > 1 else None
+
+    def forget(self) -> None:
+        """An episode ended: what was seen in it is not shown any more."""
+        self._moments.clear()
+
+    def moment(self, observation: Observation) -> Moment:
+        """What the observation shows; PolicyError where something is missing."""
+        shown = self._layout.of(observation)
+        pictures = {key: shown["images"][camera] for key, camera in self._settings.video.items()}
+        return Moment(observation.step, pictures, shown["state"])
+
+    def of(self, moment: Moment, prompt: str) -> dict[str, Any]:
+        """The data of get_action for the newest moment, which is remembered as far as later ones need it."""
+        wanted = self._wanted
+        assert wanted is not None, "agree comes first"
+        self._remember(moment)
+        settings = self._settings
+        seen, felt = self._at(wanted.video.steps), self._at(wanted.state.steps)
+        video = {key: np.stack([one.pictures[key] for one in seen]) for key in settings.video}
+        states = np.stack([one.state for one in felt])
+        state = {key: np.ascontiguousarray(states[:, dims]) for key, dims in settings.state.items()}
+        if settings.dialect == "n1.5":
+            return _prefixed("video", video) | _prefixed("state", state) | {self._language: [prompt]}
+        batches = {key: value[None] for key, value in video.items()}
+        vectors = {key: value[None] for key, value in state.items()}
+        if settings.dialect == "sim_wrapper":
+            flat = _prefixed("video", batches) | _prefixed("state", vectors) | {self._language: [prompt]}
+            return {"observation": flat, "options": None}
+        spoken = {self._language: [[prompt] * len(wanted.language.steps)]}
+        return {"observation": {"video": batches, "state": vectors, "language": spoken}, "options": None}
+
+    def rows(self, reply: object) -> Float32:
+        """Rows [H, W] in the robot's order of an answer to get_action; PolicyError where something is wrong in it."""
+        answer = self._answer(reply)
+        parts = {key: self._part(answer, key, dims) for key, dims in self._settings.actions.items()}
+        heights = {key: len(part) for key, part in parts.items()}
+        if len(set(heights.values())) != 1:
+            told = ", ".join(f"{key} {height}" for key, height in heights.items())
+            raise PolicyError(f"the parts of the answer have different numbers of rows: {told}")
+        made = np.empty((next(iter(heights.values())), self._row_width), np.float32)
+        for key, part in parts.items():
+            made[:, self._settings.actions[key]] = part
+        return made
+
+    def _answer(self, reply: object) -> Mapping[str, Any]:
+        early = self._settings.dialect == "n1.5"
+        answer = reply if early else reply[0] if isinstance(reply, list) and len(reply) == 2 else None
+        if not isinstance(answer, Mapping):
+            expected = "a map of actions" if early else "a list of two: actions and information"
+            raise PolicyError(
+                f"the answer is {_kind(reply)}; expected {expected} with policy.dialect = {self._settings.dialect!r}"
+            )
+        return answer
+
+    def _part(self, answer: Mapping[str, Any], key: str, dims: Sequence[int]) -> Float32:
+        name = key if key in answer else f"action.{key}"
+        if name not in answer:
+            raise PolicyError(f"the answer has no action {key!r}; it has {listed(map(str, answer))}")
+        given = answer[name]
+        if isinstance(given, Mapping):
+            raise PolicyError(
+                f"action {key!r} is a map of {listed(map(str, given))}; expected an array in NPY or MNP: "
+                "the server writes arrays in another dialect"
+            )
+        if isinstance(given, np.ndarray) and given.ndim == 1 and len(dims) == 1:
+            given = given[:, None]  # N1.5 leaves the last axis of single numbers away
+        return action_rows(f"action {key!r}", given, len(dims))
+
+    def _remember(self, moment: Moment) -> None:
+        while self._moments and self._moments[-1].step >= moment.step:
+            self._moments.pop()  # asked again, or control began anew
+        self._moments.append(moment)
+        wanted = self._wanted
+        assert wanted is not None
+        keeps = self._settings.history == "nearest"
+        earliest = (
+            moment.step + self._pace * min(*wanted.video.steps, *wanted.state.steps, 0)
+            if keeps
+            else moment.step
+        )
+        while len(self._moments) > 1 and self._moments[1].step <= earliest:
+            self._moments.popleft()
+
+    def _at(self, steps: Sequence[int]) -> list[Moment]:
+        now = self._moments[-1].step
+        return [
+            min(reversed(self._moments), key=lambda one, at=now + step * self._pace: abs(one.step - at))  # type: ignore[misc]
+            for step in steps
+        ]
+
+
+def _check_parts(parts: Mapping[str, Sequence[int]], width: int) -> None:
+    for key, dims in parts.items():
+        if max(dims) >= width:
+            raise ConfigurationError(
+                f"policy.state.{key} = {dims} leaves the state; allowed: 0 to {width - 1}"
+            )
+
+
+def _check_cover(parts: Mapping[str, Sequence[int]], width: int) -> None:
+    """A place that nobody fills would be a number out of nowhere, one that two fill is one's mistake."""
+    places = sorted(dim for dims in parts.values() for dim in dims)
+    if places == list(range(width)):
+        return
+    twice = sorted({dim for dim in places if places.count(dim) > 1})
+    missing = [dim for dim in range(width) if dim not in places]
+    beyond = [dim for dim in places if dim >= width]
+    said = [
+        f"{what} {dims}" for what, dims in (("not", missing), ("twice", twice), ("beyond", beyond)) if dims
+    ]
+    raise ConfigurationError(
+        f"policy.actions covers the {width} numbers of a row wrongly: {', '.join(said)}; "
+        f"allowed: each of 0 to {width - 1} once"
+    )
+
+
+def _same_keys(name: str, wanted: Modality, given: Iterable[str]) -> None:
+    """Servers refuse a request with a key too many or too few, and name neither."""
+    here = list(given)
+    if set(here) != set(wanted.keys):
+        raise ContradictionError(
+            f"the server's model has the {name} keys {listed(wanted.keys)}; policy.{name} has {listed(here)}; "
+            "correct policy." + name
+        )
+
+
+def _language_key(wanted: Modality, given: str | None) -> str:
+    if given is not None and wanted.keys and given not in wanted.keys:
+        raise ContradictionError(
+            f"the server's model has the language keys {listed(wanted.keys)}; policy.language_key = {given!r}"
+        )
+    if given is not None:
+        return given
+    if len(wanted.keys) != 1:
+        raise ContradictionError(
+            f"the server's model has the language keys {listed(wanted.keys)}; set policy.language_key to one of them"
+        )
+    return wanted.keys[0]
+
+
+def _check_steps(name: str, wanted: Modality, history: str) -> None:
+    if len(wanted.steps) > _MOST_STEPS or max(wanted.steps) > 0:
+        raise PolicyError(
+            f"the server's model wants {name} at the steps {listed(map(str, wanted.steps[:8]))}; "
+            f"allowed: at most {_MOST_STEPS}, none of them in the future"
+        )
+    if history == "none" and any(wanted.steps):
+        raise ContradictionError(
+            f"the server's model sees {name} at the steps {listed(map(str, wanted.steps))} before the newest, "
+            'policy.history = "none"; allowed: "repeat" or "nearest"'
+        )
+
+
+def _prefixed(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    return {f"{name}.{key}": value for key, value in values.items()}
+
+
+def _kind(value: object) -> str:
+    return f"a {type(value).__name__}" + (f" of {len(value)}" if isinstance(value, list) else "")

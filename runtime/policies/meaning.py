@@ -1,0 +1,68 @@
+"""What a deployment says of a policy's state and rows, where its server says neither: settings, and chunks of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal
+
+from runtime.formats import PoseFormat
+from runtime.policies.answers import AnswerSettings
+from runtime.policies.pictures import Resize
+from runtime.policies.request import RequestLayout, RequestSettings, Size, poses_of
+from runtime.types import ActionChunk, Float32, Space
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+
+class MeaningSettings(AnswerSettings):
+    """What the numbers of state and rows are, and how pictures are made."""
+
+    observation_space: Space = "joint"
+    """What the state is: joints, or poses."""
+    observation_pose: PoseFormat = PoseFormat()
+    """How poses are written in the state, where observation_space is "eef"."""
+    observation_eef: Literal["measured", "fk"] = "measured"
+    """Poses that the policy is shown and that its relative poses are relative to: as the robot measures them, where
+    it does; or as its joints have them in any case."""
+    image_size: Size | None = None
+    """Height and width that pictures are made to; as they are where it is not given."""
+    resize: Resize = "pad"
+    """With image_size: "pad" keeps the aspect on black, "stretch" does not."""
+
+    @property
+    def sees_poses(self) -> bool:
+        """Whether the answers depend on the poses of an observation."""
+        relative = self.action_space == "eef" and self.action_mode != "absolute"
+        return self.observation_space == "eef" or relative
+
+    def layout(self, robot: Robot, cameras: dict[str, str]) -> RequestLayout:
+        """Requests with the keys "state" float32 [W], "images" (by the names in `cameras`, HWC) and "prompt"."""
+        settings = RequestSettings(
+            observation_space=self.observation_space,
+            observation_pose=self.observation_pose,
+            observation_eef=self.observation_eef,
+            cameras=cameras,
+            image_size=self.image_size,
+            resize="none" if self.image_size is None else self.resize,
+            image_layout="hwc",
+        )
+        return RequestLayout(settings, robot)
+
+    def widths(self, robot: Robot) -> tuple[int, int]:
+        """How many numbers the state and a row have; ConfigurationError where a format does not fit the robot."""
+        state = poses_of(self.observation_space, self.observation_pose, robot, "observation_pose")
+        rows = poses_of(self.action_space, self.action_pose, robot, "action_pose")
+        return robot.dim if state is None else state.width, robot.dim if rows is None else rows.width
+
+    def chunk(self, rows: Float32, timing: Mapping[str, float]) -> ActionChunk:
+        """Rows [H, W] and what they mean."""
+        return ActionChunk(
+            actions=rows,
+            space=self.action_space,
+            rate=self.action_rate,
+            timing=timing,
+            mode=self.action_mode,
+            frame=self.relative_frame,
+            pose=self.action_pose,
+        )

@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.errors import PolicyError
+from runtime.policies.groot import arrays
+from runtime.policies.groot.modality import Modality, modalities
+
+N16 = bytes.fromhex(
+    "82a5766964656f82b85f5f4d6f64616c697479436f6e6669675f636c6173735f5fc3a761735f6a736f6e85ad64656c74615f696e6469636573"
+    "9100ad6d6f64616c6974795f6b65797391a865676f5f76696577b673696e5f636f735f656d62656464696e675f6b657973c0b76d65616e5f73"
+    "74645f656d62656464696e675f6b657973c0ae616374696f6e5f636f6e66696773c0a5737461746582b85f5f4d6f64616c697479436f6e6669"
+    "675f636c6173735f5fc3a761735f6a736f6e85ad64656c74615f696e64696365739100ad6d6f64616c6974795f6b65797391aa73696e676c65"
+    "5f61726db673696e5f636f735f656d62656464696e675f6b657973c0b76d65616e5f7374645f656d62656464696e675f6b657973c0ae616374"
+    "696f6e5f636f6e66696773c0"
+)
+N17 = bytes.fromhex(
+    "81a5766964656f82b25f5f4d6f64616c697479436f6e6669675f5fc3a761735f6a736f6e85ad64656c74615f696e64696365739100ad6d6f64"
+    "616c6974795f6b65797391a865676f5f76696577b673696e5f636f735f656d62656464696e675f6b657973c0b76d65616e5f7374645f656d62"
+    "656464696e675f6b657973c0ae616374696f6e5f636f6e66696773c0"
+)
+MARK = "__ModalityConfig_class__"
+
+
+def given_as(keys: Any, steps: Any) -> dict[str, object]:
+    return {MARK: True, "as_json": {"modality_keys": keys, "delta_indices": steps}}
+
+
+def test_the_answers_of_n16_and_n17_are_read() -> None:
+    found = modalities(arrays.unpack(N16, 1000))
+    assert found.video == Modality(("ego_view",), (0,))
+    assert found.state == Modality(("single_arm",), (0,))
+    assert found.action == Modality()
+    assert not found.early
+    assert modalities(arrays.unpack(N17, 1000)).video == Modality(("ego_view",), (0,))
+
+
+def test_n15_writes_json_as_text_and_keys_with_their_prefix() -> None:
+    text = '{"delta_indices": [-1, 0], "modality_keys": ["video.ego_view"]}'
+    found = modalities({"video": {MARK: True, "as_json": text}})
+    assert found.early
+    assert found.video == Modality(("ego_view",), (-1, 0))
+    assert found.plain()["video"] == {"keys": ["ego_view"], "steps": [-1, 0]}
+
+
+@pytest.mark.parametrize(
+    ("reply", "says"),
+    [
+        (None, "NoneType"),
+        ({"actions": 1}, "expected a map of video, state, action, language"),
+        ({"video": 3}, "modality 'video' is int"),
+        ({"video": {"as_json": {}}}, "modality 'video'"),
+        ({"video": {MARK: True, "as_json": 3}}, "expected a map"),
+        ({"video": {MARK: True, "as_json": "{"}}, "no JSON"),
+        ({"video": {MARK: True, "as_json": "[" * 100_000}}, "no JSON"),
+        ({"video": {MARK: True, "as_json": "3"}}, "expected a map"),
+        ({"state": given_as("names", [0])}, "modality_keys"),
+        ({"state": given_as([3], [0])}, "modality_keys"),
+        ({"state": given_as(["a"], [])}, "delta_indices"),
+        ({"state": given_as(["a"], ["0"])}, "delta_indices"),
+        ({"state": given_as(["a"], [True])}, "delta_indices"),
+    ],
+)
+def test_what_is_no_modality_configuration_is_named(reply: object, says: str) -> None:
+    with pytest.raises(PolicyError, match=says):
+        modalities(reply)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(
+            st.sampled_from(["video", "state", MARK, "as_json", "modality_keys", "delta_indices"]), inner
+        )
+    ),
+    max_leaves=20,
+)
+
+
+@given(JSON)
+def test_anything_else_is_an_error_and_no_crash(reply: object) -> None:
+    with contextlib.suppress(PolicyError):
+        modalities(reply)
