@@ -85,6 +85,7 @@ class Command(BaseCommand):
             seed.demo_checkpoint(name=name, description=description, policy={"url": served[name]})
         seed.demo_scene()
         assignments = [
+            f'robot="{robot}"',
             f'transport.sub_endpoint="{node["obs_endpoint"]}"',
             f'transport.pub_endpoint="{node["action_endpoint"]}"',
             f'policy.url="{served[_SKILLED]}"',
@@ -115,14 +116,11 @@ class Command(BaseCommand):
 
 
 def _deployment(robot: str) -> Path:
-    """The deployment of the tabletop with that robot; CommandError lists those that there are."""
-    found = {_ROBOT: _DEPLOYMENTS / "tabletop.toml"}
-    for name in robots.names():
-        if (path := _DEPLOYMENTS / f"tabletop_{name}.toml").is_file():
-            found[name] = path
-    if robot not in found:
-        raise CommandError(f"--robot {robot}: allowed: {', '.join(sorted(found))}")
-    return found[robot]
+    """The tabletop's deployment for that robot, else the one for any; CommandError lists the robots."""
+    if robot not in robots.names():
+        raise CommandError(f"--robot {robot}: allowed: {', '.join(robots.names())}")
+    own = _DEPLOYMENTS / f"tabletop_{robot}.toml"
+    return own if own.is_file() else _DEPLOYMENTS / "tabletop.toml"
 
 
 def _announce(path: Path, url: str, logins: list[Login], pids: Mapping[str, int]) -> None:
