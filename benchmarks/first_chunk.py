@@ -1,7 +1,6 @@
 """A process that imports everything, builds one robot's kinematics, solves one chunk, and tells what that took.
 
-`python -m benchmarks.first_chunk KIND ROBOT` prints JSON: `rss_mb` when the chunk is solved, `forward_mb` before
-anything is solved. The chunk is of home's own poses.
+`python -m benchmarks.first_chunk KIND ROBOT` prints JSON: `rss_mb` when the chunk, of home's own poses, is solved.
 """
 
 from __future__ import annotations
