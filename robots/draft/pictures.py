@@ -15,7 +15,7 @@ import numpy as np
 from robots import meshes, shapes
 from robots.errors import RobotError
 from robots.rotations import Float64
-from robots.urdf import Urdf
+from robots.urdf import Joint, Urdf
 
 _MESHES = "meshes"
 _STICK, _THICKEST, _THINNEST = 0.15, 0.04, 0.012  # of its length, m, m: the radius of a stand-in
@@ -140,7 +140,11 @@ class _Work:
 
     def _sticks(self, link: str) -> Iterator[ET.Element]:
         """Visuals from the link's origin to each joint on it; a knob where nothing more comes."""
-        behind = [joint for joint in self._tree.joints.values() if joint.parent == link]
+        behind = [
+            joint
+            for joint in self._tree.joints.values()
+            if joint.parent == link and not self._is_frame(joint)
+        ]
         above = next((joint for joint in self._tree.joints.values() if joint.child == link), None)
         ways = [joint.origin[:3, 3] for joint in behind]
         long = [way for way in ways if np.linalg.norm(way) >= _SHORTEST]
@@ -152,6 +156,12 @@ class _Work:
             pitch, yaw = math.acos(way[2] / length), math.atan2(way[1], way[0])
             stick = ET.Element("cylinder", radius=f"{radius:.4f}", length=f"{length:.4f}")
             yield _visual(way / 2, f"0 {pitch:.6f} {yaw:.6f}", stick)
+
+    def _is_frame(self, joint: Joint) -> bool:
+        """Whether it leads to a mere name of a place, as that between fingertips."""
+        link = next(link for link in self._robot.findall("link") if link.get("name") == joint.child)
+        leads_on = any(other.parent == joint.child for other in self._tree.joints.values())
+        return joint.kind == "fixed" and not leads_on and link.find("visual") is None
 
 
 def _visual(centre: Float64, rpy: str, shape: ET.Element) -> ET.Element:

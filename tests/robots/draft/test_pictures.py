@@ -87,6 +87,13 @@ def test_a_stand_in_leads_from_joint_to_joint(tmp_path: Path) -> None:
     np.testing.assert_allclose(ends, [[0, 0, 0], [0.1, -0.2, 0.2]], atol=1e-5)
 
 
+def test_no_stand_in_leads_to_a_mere_frame(tmp_path: Path) -> None:
+    tool = link("tcp") + joint("to_tcp", "link6", "tcp", kind="fixed", xyz="0 0 0.2")
+    body = link("base_link") + arm("base_link", visual=False) + tool
+    _, target = copied(write(tmp_path, body), tmp_path / "to")
+    assert {shape.link: shape.kind for shape in shapes.read(target)}["link6"] == "sphere"
+
+
 def test_a_urdf_that_shows_nothing_is_drawn_in_sticks(tmp_path: Path) -> None:
     pictures, target = copied(
         write(tmp_path, link("base_link") + arm("base_link", visual=False)), tmp_path / "to"
