@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import robots
@@ -34,8 +34,8 @@ def targets(workspace: dict[str, WorkspaceBox] | None = None) -> Targets:
     limits = Limits(
         robot.joint_names, robot.lower, robot.upper, robot.velocity, grippers, np.zeros(robot.dim, bool)
     )
-    settings = SimpleNamespace(safety=SafetySettings(workspace=workspace or {}))
-    plan: Any = SimpleNamespace(robot=robot, limits=limits, deployment=settings, dims=Dims())
+    chosen = SimpleNamespace(safety=SafetySettings(workspace=workspace or {}))
+    plan: Any = SimpleNamespace(robot=robot, limits=limits, deployment=chosen, dims=Dims())
     return Targets(plan, spaces, kinematics)
 
 
@@ -76,6 +76,7 @@ def test_a_wish_that_means_nothing_is_refused_with_what_is_allowed(asked: MoveRe
 
 
 @pytest.mark.parametrize("frame", ["base", "tool"])
+@settings(deadline=None)  # the first example builds the kinematics
 @given(shift=st.tuples(*[st.floats(-0.03, 0.03)] * 3), turn=st.tuples(*[st.floats(-0.2, 0.2)] * 3))
 def test_a_jog_moves_one_end_effector_by_what_was_asked_and_no_other_joint(
     frame: Any, shift: tuple[float, ...], turn: tuple[float, ...]
