@@ -7,16 +7,18 @@ configuration, so that the ALOHA, DROID and LIBERO layouts are settings and not 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from runtime import codecs
 from runtime.clock import Clock
-from runtime.errors import PolicyError
+from runtime.errors import ConfigurationError, PolicyError
 from runtime.policies.agreement import Declared, agreed
 from runtime.policies.answers import AnswerSettings
 from runtime.policies.base import PolicyInfo
+from runtime.policies.grip import Convention, Grip
 from runtime.policies.request import RequestLayout, RequestSettings, poses_of
 from runtime.policies.rows import action_rows
 from runtime.policies.rtc.async_rtc import AsyncRtc, Schedule
@@ -25,7 +27,7 @@ from runtime.policies.rtc.kai0 import Kai0
 from runtime.policies.rtc.openpi_rtc import EnvelopeKeys, OpenpiRtc, Rows
 from runtime.policies.rtc.prev_action import PrevAction
 from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
-from runtime.types import ActionChunk, Conditioning, Observation
+from runtime.types import ActionChunk, Conditioning, Float32, Observation
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -35,6 +37,11 @@ class Config(ServerSettings, RequestSettings, AnswerSettings):
     """A policy server that speaks the openpi websocket protocol."""
 
     kind: Literal["openpi"] = "openpi"
+    gripper: Convention = "robot"
+    """How state and answers count grippers: the robot's own numbers, or "droid": 0 is open and 1 closed."""
+    action_scale: Annotated[list[float], Field(min_length=1)] | None = None
+    """What each number of a row is multiplied with, in the order of the row: DROID's joint velocities are shares of
+    0.2 rad per row, so 0.2 for every joint and 1 for the gripper, with action_mode "delta"."""
     rtc: Literal["none", "prev_action", "openpi_rtc", "kai0", "async_rtc"] = "none"
     """How the server is told what the robot is committed to: flat keys, the envelope of openpi-rtc and its forks,
     kai0's flat keys, or the openpi-async-rtc envelope."""
@@ -66,6 +73,8 @@ class OpenpiPolicy(WebsocketPolicy):
         self._layout = RequestLayout(config, robot)
         poses = poses_of(config.action_space, config.action_pose, robot, "action_pose")
         self._width = robot.dim if poses is None else poses.width
+        self._grip = Grip(config.gripper, robot, poses)
+        self._scale = _scale(config.action_scale, self._width)
         self._declared = Declared(
             config,
             config.action_space,
@@ -100,7 +109,7 @@ class OpenpiPolicy(WebsocketPolicy):
 
     def request(self, observation: Observation) -> dict[str, object]:
         """The request map for an observation, in the declared layout, without what a dialect adds."""
-        return self._layout.of(observation)
+        return self._layout.of(self._grip.observed(observation))
 
     def _greeted(self, metadata: dict[str, Any]) -> PolicyInfo:
         space = agreed(metadata, self._declared, "metadata")
@@ -128,17 +137,34 @@ class OpenpiPolicy(WebsocketPolicy):
                 f"the answer has no 'actions'; it has {', '.join(map(str, reply)) or 'nothing'}"
             )
         agreed(reply, self._declared, "answer")
-        origin = reply.get("origin_actions") if self._dialect.continues_model_rows else None
+        given = action_rows("actions", reply["actions"], self._width)
         return ActionChunk(
-            actions=action_rows("actions", reply["actions"], self._width),
+            actions=self._grip.meant(given if self._scale is None else given * self._scale),
             space=self._config.action_space,
             rate=self._config.action_rate,
             mode=self._config.action_mode,
             frame=self._config.relative_frame,
             pose=self._config.action_pose,
-            model_actions=None if origin is None else action_rows("origin_actions", origin),
+            model_actions=self._model_rows(reply, given),
             timing=_timing(reply) | {"round_trip_ms": round_trip},
         )
+
+    def _model_rows(self, reply: Mapping[str, Any], given: Float32) -> Float32 | None:
+        """What is given back to be continued, where that is something else than the robot's rows."""
+        origin = reply.get("origin_actions") if self._dialect.continues_model_rows else None
+        if origin is not None:
+            return action_rows("origin_actions", origin)
+        converted = self._scale is not None or self._config.gripper != "robot"
+        # Rows that are relative to an observation that is over cannot be continued.
+        return given if converted and self._config.action_mode != "relative" else None
+
+
+def _scale(given: list[float] | None, width: int) -> Float32 | None:
+    if given is not None and len(given) != width:
+        raise ConfigurationError(
+            f"policy.action_scale has {len(given)} numbers; the rows of this robot have {width}"
+        )
+    return None if given is None else np.array(given, np.float32)
 
 
 def _dialect(config: Config) -> Dialect:

@@ -11,8 +11,8 @@ from pydantic import Field
 from runtime.errors import ConfigurationError, ContradictionError, PolicyError
 from runtime.formats import PoseFormat, PoseRows
 from runtime.policies.answers import Rate
-from runtime.policies.arena.grip import Convention, Grip
 from runtime.policies.arena.wants import ActionSpace, Wants
+from runtime.policies.grip import Convention, Grip
 from runtime.policies.rows import action_rows
 from runtime.section import Section
 from runtime.types import ActionChunk, Float32
@@ -54,17 +54,15 @@ class Meant:
 
     def __init__(self, settings: MeantSettings, convention: Convention, robot: Robot) -> None:
         self._settings = settings
-        self._grip = Grip(convention, robot)
         self.cartesian = settings.action_space.startswith("cartesian")
         self.velocity = settings.action_space.endswith("velocity")
         self._steps = _steps(settings) if self.velocity else VelocitySteps()
-        self._grippers = list(robot.gripper_dims)
         self._still = [dim for dim in range(robot.dim) if dim not in robot.gripper_dims]
         self._poses = PoseRows(settings.action_pose, robot, "policy.action_pose") if self.cartesian else None
+        self._grip = Grip(convention, robot, self._poses)
         self.width = robot.dim if self._poses is None else self._poses.width
         self._arms = len(robot.arms)
         self._each = 0 if self._poses is None else (self.width - len(self._poses.dims)) // self._arms
-        self._gripped = [arm for arm, group in enumerate(robot.arms) if group.gripper is not None]
         self._parts: tuple[str, ...] = tuple(settings.action_keys or ())
 
     def agree(self, wants: Wants) -> None:
@@ -85,7 +83,9 @@ class Meant:
     def chunk(self, reply: Any, timing: Mapping[str, float]) -> ActionChunk:
         """From an answer's value: an array, a map with `actions`, or a map of named parts."""
         rows = action_rows("actions", self._array(reply), self.width)
-        rows = self._joints(rows) if self._poses is None else self._cartesian(rows)
+        if self.velocity:
+            rows = self._steps_of_joints(rows) if self._poses is None else self._steps_of_poses(rows)
+        rows = self._grip.meant(rows)
         return ActionChunk(
             actions=rows,
             space="eef" if self.cartesian else "joint",
@@ -113,22 +113,16 @@ class Meant:
             raise PolicyError(f"the parts of the answer have different numbers of rows: {lengths}")
         return np.concatenate(parts, axis=1)
 
-    def _joints(self, rows: Float32) -> Float32:
-        if self.velocity:
-            rows[:, self._still] = np.clip(rows[:, self._still], -1.0, 1.0) * np.float32(self._steps.joint)
-        rows[:, self._grippers] = self._grip.meant(rows[:, self._grippers])
+    def _steps_of_joints(self, rows: Float32) -> Float32:
+        rows[:, self._still] = np.clip(rows[:, self._still], -1.0, 1.0) * np.float32(self._steps.joint)
         return rows
 
-    def _cartesian(self, rows: Float32) -> Float32:
-        pose = self._settings.action_pose
-        each = self._each
-        arms = rows[:, : each * self._arms].reshape(len(rows), self._arms, each)
-        if self.velocity:
-            arms[..., :3] = _bounded(arms[..., :3]) * np.float32(self._steps.linear)
-            arms[..., 3:6] = _bounded(arms[..., 3:6]) * np.float32(self._steps.angular)
-        if pose.gripper and self._gripped:
-            arms[:, self._gripped, -1] = self._grip.meant(arms[:, self._gripped, -1])
-        return np.concatenate([arms.reshape(len(rows), -1), rows[:, each * self._arms :]], axis=1)
+    def _steps_of_poses(self, rows: Float32) -> Float32:
+        posed = self._each * self._arms
+        arms = rows[:, :posed].reshape(len(rows), self._arms, self._each)
+        arms[..., :3] = _bounded(arms[..., :3]) * np.float32(self._steps.linear)
+        arms[..., 3:6] = _bounded(arms[..., 3:6]) * np.float32(self._steps.angular)
+        return np.concatenate([arms.reshape(len(rows), -1), rows[:, posed:]], axis=1)
 
 
 def _bounded(vectors: Float32) -> Float32:

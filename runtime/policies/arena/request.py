@@ -12,8 +12,8 @@ from pydantic import Field
 from runtime.errors import PolicyError
 from runtime.formats import PoseFormat, PoseRows
 from runtime.policies.arena.cameras import Cameras, Numbering, Slot
-from runtime.policies.arena.grip import Convention, Grip
 from runtime.policies.arena.wants import Wants
+from runtime.policies.grip import Convention, Grip
 from runtime.policies.pictures import fitted
 from runtime.policies.request import Size
 from runtime.section import Section

@@ -1,0 +1,77 @@
+"""Grippers as DROID counts them, 0 open and 1 closed, from and to a robot's own numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from runtime.formats import PoseRows
+from runtime.types import EEF_WIDTH, Float32, Float64, Observation
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+Convention = Literal["droid", "robot"]
+
+
+class Grip:
+    """The numbers of all grippers of a robot, [..., G]; the convention "robot" leaves them as they are.
+
+    `poses` are the rows of the answers where these are poses, None for joints.
+    """
+
+    def __init__(self, convention: Convention, robot: Robot, poses: PoseRows | None = None) -> None:
+        grippers = [group.gripper for group in robot.groups if group.gripper is not None]
+        self._converts = convention == "droid"
+        self._open = np.array([gripper.open for gripper in grippers], np.float64)
+        self._travel = np.array([gripper.close - gripper.open for gripper in grippers], np.float64)
+        self._dims = list(robot.gripper_dims)
+        self._columns = _columns(robot, poses)
+        arms = [(arm, group.gripper_dim) for arm, group in enumerate(robot.arms)]
+        self._gripped = [(EEF_WIDTH * arm + EEF_WIDTH - 1, dim) for arm, dim in arms if dim is not None]
+
+    def shown(self, numbers: Float64) -> Float64:
+        """As the policy is shown them; a gripper a little beyond its ends is at them."""
+        if not self._converts:
+            return numbers
+        return np.clip((numbers - self._open) / self._travel, 0.0, 1.0)
+
+    def observed(self, observation: Observation) -> Observation:
+        """The observation with the grippers of its joints and poses as the policy is shown them."""
+        if not self._converts:
+            return observation
+        qpos = observation.qpos.copy()
+        qpos[self._dims] = self.shown(qpos[self._dims].astype(np.float64))
+        eef = observation.eef
+        if eef is not None:
+            eef = eef.copy()
+            for place, dim in self._gripped:
+                eef[place] = qpos[dim]
+        return replace(observation, qpos=qpos, eef=eef)
+
+    def meant(self, rows: Float32) -> Float32:
+        """Rows of an answer [T, W] with the robot's numbers; beyond 0 and 1 there is nothing to close or open."""
+        if not self._converts:
+            return rows
+        made = rows.copy()
+        for column, gripper in self._columns:
+            share = np.clip(rows[:, column], 0.0, 1.0)
+            made[:, column] = self._open[gripper] + share * self._travel[gripper]
+        return made
+
+
+def _columns(robot: Robot, poses: PoseRows | None) -> list[tuple[int, int]]:
+    """Where in a row a gripper is, and which of the robot's it is."""
+    dims = list(robot.gripper_dims)
+    if poses is None:
+        return [(dim, gripper) for gripper, dim in enumerate(dims)]
+    appended = poses.width - len(poses.dims)
+    each = appended // len(robot.arms)
+    found = [(appended + n, dims.index(dim)) for n, dim in enumerate(poses.dims.tolist()) if dim in dims]
+    if poses.pose.gripper:
+        for arm, group in enumerate(robot.arms):
+            if group.gripper_dim is not None:
+                found.append((each * arm + each - 1, dims.index(group.gripper_dim)))
+    return found

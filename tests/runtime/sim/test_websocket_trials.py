@@ -1,0 +1,51 @@
+"""A trial at the tabletop over each wire on a websocket: node, bench, lockstep and stand-in are the product's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from runtime.session import State
+from runtime.sim.roboarena_server import Arena, RoboarenaServer
+from runtime.sim.script import Script
+from runtime.sim.starvla_server import Star, StarvlaServer
+from tests.runtime.sim.tabletop_station import HORIZON, TabletopPlan, pick_and_place
+
+ARENA = ['policy.kind="roboarena"', 'policy.cameras={cam_high="first", cam_wrist="wrist"}']
+SIZE = (240, 320)
+
+
+def arena_server(**arena: Any) -> Any:
+    def made(plan: TabletopPlan, script: Script) -> RoboarenaServer:
+        return RoboarenaServer(plan.robot, Arena(HORIZON, plan.rate, resolution=SIZE, **arena), 0, script)
+
+    return made
+
+
+def starvla_server(plan: TabletopPlan, script: Script) -> StarvlaServer:
+    views = ("cam_wrist", "cam_high")
+    return StarvlaServer(plan.robot, Star(HORIZON, plan.rate, size=SIZE, views=views), 0, script)
+
+
+TRIALS = {
+    "roboarena": (ARENA, arena_server(reply="dict")),
+    "velocities": (
+        [*ARENA, 'policy.action_space="joint_velocity"', "policy.velocity_steps={}"],
+        arena_server(reply="bare", space="joint_velocity"),
+    ),
+    "vllm": (
+        [*ARENA, 'policy.numbering="1-based"', 'policy.action_keys=["arm", "gripper"]'],
+        arena_server(variant="vllm", reply="parts", numbering=1),
+    ),
+    "starvla": (['policy.kind="starvla"', 'policy.cameras=["cam_wrist", "cam_high"]'], starvla_server),
+}
+
+
+@pytest.mark.parametrize("wire", TRIALS)
+def test_a_policy_on_this_wire_puts_the_block_on_the_plate(wire: str, tmp_path: Path) -> None:
+    assignments, serve = TRIALS[wire]
+    trial = pick_and_place("tabletop_ur5e", 0, tmp_path, assignments, serve)
+    assert trial.success, (trial.reason, trial.milestones, trial.events)
+    assert trial.state is State.RUNNING
