@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
+import ssl
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -175,6 +176,11 @@ class WebsocketLink:
             ) from error
         except InvalidStatus as error:
             raise self._refused(error.response.status_code) from error
+        except ssl.SSLError as error:
+            raise PolicyError(
+                f"{self._url}: no encrypted connection ({error}): correct its certificate, name the authority in "
+                "SSL_CERT_FILE, or use ws:// where the server has no TLS"
+            ) from error
         except (InvalidURI, ValueError) as error:  # what websockets raises where it is told to go elsewhere
             raise PolicyError(f"{self._url} points elsewhere ({error}): correct policy.url") from error
         except (WebSocketException, OSError, EOFError) as error:
