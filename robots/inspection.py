@@ -184,6 +184,7 @@ def _warnings(usual: Robot, whole: Robot, table: RobotTable, file: Path) -> Iter
         if touching.any():
             on = [joint for joint, at in zip(whole.joint_names, touching, strict=True) if at]
             yield f"poses.{name}: {', '.join(on)}: on a limit, where a robot at rest may be found beyond it"
+    yield from _low(whole)
     for entry in table.groups:
         group = whole.group(entry.name)
         yield from _group_warnings(whole, group, entry)
@@ -191,6 +192,18 @@ def _warnings(usual: Robot, whole: Robot, table: RobotTable, file: Path) -> Iter
         yield "no README.md beside it; it should say what was verified and what is a placeholder"
     if guesses := _guesses(file):
         yield f"{GUESS} stands in lines {', '.join(map(str, guesses))}: verify each, then delete the word"
+
+
+def _low(robot: Robot) -> Iterator[str]:
+    """Fingertips below the table, which the collision check lets pass: they reach down to it on purpose."""
+    body = Body(robot)
+    for name, q in robot.poses.items():
+        for arm in robot.arms:
+            end = body.poses(q)[body.link_of(arm.name, str(arm.eef_link))]
+            height = float((end if arm.tip is None else end @ arm.tip)[2, 3])
+            if height < 0:
+                deep = f"{-1000 * height:.0f} mm below the table"
+                yield f"poses.{name}: the fingertips of {arm.name} are {deep}; see stand"
 
 
 def _group_warnings(robot: Robot, group: Group, table: GroupTable) -> Iterator[str]:

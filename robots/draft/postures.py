@@ -15,6 +15,8 @@ from robots.urdf import Urdf
 CLEAR = 0.01  # m between links that a posture is to have
 _INSIDE = 0.05  # of a joint's range, from its ends
 _SAMPLES, _FEW, _ELITE, _ROUNDS = 256, 64, 24, 14  # of a search by the cross-entropy method
+_LOWEST = 0.05  # m over the table that fingertips stay
+_NONE: Float64 = np.empty(0)
 _STARTS = 4  # of a search
 _WAY = 24  # points between home and ready
 _LOOKED_AT = np.array([0.3, 0.6, 1.0])  # of them, while searching
@@ -104,8 +106,15 @@ class Postures:
         return tuple(sorted(found))
 
     def _touching(self, q: Float64) -> NDArray[np.intp]:
-        """How many pairs are too near [...]."""
-        return np.asarray((self._clearance.distances(q) < CLEAR).sum(axis=-1))
+        """How many pairs are too near, and how many arms too low [...]."""
+        near = (self._clearance.distances(q) < CLEAR).sum(axis=-1)
+        return np.asarray(near + (self._heights(q) < _LOWEST).sum(axis=-1))
+
+    def _heights(self, q: Float64) -> Float64:
+        """Of the fingertips over the table [..., arms]: they are no pair, because they reach down to it on purpose."""
+        return (
+            np.stack([self._tips(arm, q)[..., 2, 3] for arm in self._arms], axis=-1) if self._arms else _NONE
+        )
 
     def _apart(self, q: Float64) -> Float64:
         """The least distance [...] of the pairs that are looked at."""
@@ -117,7 +126,8 @@ class Postures:
 
     def _clear_way(self, home: Float64, ready: Float64) -> bool:
         way = home + np.linspace(0.0, 1.0, _WAY)[:, None] * (ready - home)
-        return bool(self._apart(way).min() >= min(MARGIN, float(self._apart(home))))
+        high = self._heights(way).min(axis=0) >= np.minimum(_LOWEST, self._heights(home))
+        return bool(self._apart(way).min() >= min(MARGIN, float(self._apart(home))) and high.all())
 
     def _search(self, arm: Group, start: Float64, home: Float64) -> Float64:
         """The best posture of one arm to which the straight way is clear; `start` where none is found.
@@ -163,9 +173,12 @@ class Postures:
         return np.asarray(away + 4 * upright + 4 * tight + turned)
 
     def _obstacles(self, q: Float64, home: Float64) -> Float64:
-        """How deep links would be in each other, at the posture or on the way to it."""
+        """How deep links would be in each other or fingertips too low, at the posture or on the way to it."""
         way = home + _LOOKED_AT[:, None, None] * (q - home)
-        return np.asarray(20 * np.maximum(2 * CLEAR - self._apart(way), 0.0).max(axis=0) / CLEAR)
+        deep = np.maximum(2 * CLEAR - self._apart(way), 0.0) + np.maximum(
+            _LOWEST - self._heights(way), 0.0
+        ).sum(axis=-1)
+        return np.asarray(20 * deep.max(axis=0) / CLEAR)
 
     def _tips(self, arm: Group, q: Float64) -> Float64:
         end = self._body.poses(q)[..., self._body.link_of(arm.name, str(arm.eef_link)), :, :]

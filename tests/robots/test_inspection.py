@@ -103,3 +103,12 @@ def test_a_mesh_that_is_missing_is_an_error(edited: Edit) -> None:
     file.write_text(text.replace(box, '<geometry><mesh filename="meshes/gone.stl"/>', 1))
     with pytest.raises(RobotError, match=r"'meshes/gone\.stl' is missing; looked for"):
         inspect(folder)
+
+
+def test_fingertips_below_the_table_are_a_warning(edited: Edit) -> None:
+    found = inspect(
+        edited(("[cameras]", "[stand]\nxyz = [0.0, 0.0, -0.3]\nwxyz = [1.0, 0.0, 0.0, 0.0]\n[cameras]"))
+    )
+    low = [warning for warning in found.warnings if "below the table; see stand" in warning]
+    assert "poses.home: the fingertips of left_arm are 75 mm below" in low[0]
+    assert len(low) == 4

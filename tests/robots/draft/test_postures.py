@@ -8,7 +8,7 @@ from robots import load, urdf
 from robots.clearance import MARGIN, Clearance
 from robots.draft import draft
 from robots.draft.postures import Postures, rest
-from tests.robots.draft.urdfs import arm, base, single, write
+from tests.robots.draft.urdfs import arm, base, jaws, single, write
 
 
 def test_rest_is_zero_or_as_near_as_limits_allow() -> None:
@@ -25,6 +25,21 @@ def test_a_home_in_which_links_touch_is_left_for_the_nearest_that_is_clear(tmp_p
     poses = [arm.pose(robot.poses["home"]) for arm in robot.arms]
     np.testing.assert_allclose(poses[0][:3] * [1, -1, 1], poses[1][:3], atol=1e-6)
     assert Clearance(robot).distances(robot.poses["home"]).min() >= MARGIN
+
+
+def test_fingertips_that_would_be_in_the_table_at_zero_are_lifted(tmp_path: Path) -> None:
+    """The arm lies down at zero: its gripper would be 5 cm deep in the table, which is no pair of links."""
+    lying = base() + arm("base_link", xyz="0 0 0.2").replace(
+        'rpy="0 0 0"/><axis xyz="0 1 0"', 'rpy="0 2.4 0"/><axis xyz="0 1 0"', 1
+    )
+    made = draft("mine", write(tmp_path, lying + jaws("link6")), tmp_path / "into")
+    robot = load(made.folder)
+    (only,) = robot.arms
+    assert only.tip is not None
+    assert (only.transform(np.zeros(robot.dim)) @ only.tip)[2, 3] < -0.05
+    for q in robot.poses.values():
+        assert (only.transform(q) @ only.tip)[2, 3] >= 0.05
+    assert not any("below the table" in warning for warning in made.inspection.warnings)
 
 
 def test_the_way_from_home_to_ready_is_clear(tmp_path: Path) -> None:
