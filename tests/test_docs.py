@@ -38,6 +38,7 @@ def test_there_is_a_document_for_every_reader():
         "api",
         "configuration",
         "episodes",
+        "robots",
         "contributing",
     ):
         assert f"(docs/{reader}.md)" in text("README.md"), reader
@@ -92,6 +93,14 @@ def test_every_module_that_a_document_runs_can_be_run():
         )
         assert runs.is_file(), module
         assert "__main__" in (runs.name + runs.read_text("utf-8")), module
+
+
+def test_every_robot_that_comes_along_is_pictured_and_told_of():
+    folders = sorted(file.parent.name for file in (ROOT / "robots").glob("*/robot.toml"))
+    assert len(folders) >= 6
+    for name in folders:
+        for shown in (f"(robots/{name}.png)", f"| `{name}`: ", f"(../robots/{name}/README.md)"):
+            assert shown in text("docs/robots.md"), shown
 
 
 def test_every_target_of_make_is_one():
