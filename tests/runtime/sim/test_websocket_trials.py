@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from runtime.session import State
+from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.roboarena_server import Arena, RoboarenaServer
 from runtime.sim.script import Script
 from runtime.sim.starvla_server import Star, StarvlaServer
@@ -29,7 +30,14 @@ def starvla_server(plan: TabletopPlan, script: Script) -> StarvlaServer:
     return StarvlaServer(plan.robot, Star(HORIZON, plan.rate, size=SIZE, views=views), 0, script)
 
 
-TRIALS = {
+def rtc_server(dialect: Any) -> Any:
+    def made(plan: TabletopPlan, script: Script) -> OpenpiServer:
+        return OpenpiServer(plan.robot, Behaviour(HORIZON, plan.rate, rtc=dialect), 0, script)
+
+    return made
+
+
+TRIALS: dict[str, tuple[list[str], Any]] = {
     "roboarena": (ARENA, arena_server(reply="dict")),
     "velocities": (
         [*ARENA, 'policy.action_space="joint_velocity"', "policy.velocity_steps={}"],
@@ -40,6 +48,15 @@ TRIALS = {
         arena_server(variant="vllm", reply="parts", numbering=1),
     ),
     "starvla": (['policy.kind="starvla"', 'policy.cameras=["cam_wrist", "cam_high"]'], starvla_server),
+}
+
+
+TRIALS |= {
+    dialect: (
+        ['strategy.kind="rtc"', f'policy.rtc="{dialect}"', "policy.rtc_envelope={server_shift=25}"],
+        rtc_server(dialect),
+    )
+    for dialect in ("prev_action", "openpi_rtc", "kai0", "async_rtc")
 }
 
 
