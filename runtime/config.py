@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
     TransportConfig = Variant
     PolicyConfig = Variant
+    CameraConfig = Variant
 
     class KinematicsConfig(KinematicsSettings):
         """Any backend's section."""
@@ -51,6 +52,7 @@ else:
     TransportConfig = _variants_of("runtime.transports")
     PolicyConfig = _variants_of("runtime.policies")
     StrategyConfig = _variants_of("runtime.strategies")
+    CameraConfig = _variants_of("runtime.cameras")
     KinematicsConfig = _variants_of("runtime.kinematics")
 
 
@@ -217,6 +219,8 @@ class Deployment(Section):
     data_dir: str | None = None
     """Where episodes and datasets lie; $EVA_DATA_DIR or ./data where it is not given."""
     transport: TransportConfig
+    cameras: dict[str, CameraConfig] = Field(default_factory=dict)
+    """By the camera's key in the robot's description, those that do not come from the transport."""
     policy: PolicyConfig
     kinematics: KinematicsConfig = Field(
         default_factory=lambda: variants("runtime.kinematics")["compiled"].Config()

@@ -67,7 +67,7 @@ class Director:
             asking, strategy_of(plan), page, self._orders, clock, patience, Commitment(plan.rate)
         )
         self.setup = SetUp(plan, self.inference, self._orders, page, clock, lambda: self.media_report)
-        self._watch = Watch(plan, page, self.lease, clock)
+        self._watch = Watch(plan, page, self.lease, clock, lambda: self.media_report)
         control = settings.control
         self._punctuality = Punctuality(
             page, plan.rate, control.realtime_priority, control.realtime == "auto"

@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import select
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 
@@ -16,6 +16,7 @@ import numpy as np
 import robots
 from robots import Robot
 from runtime import deployment, log
+from runtime.cameras.attaching import attached, check
 from runtime.clock import Clock
 from runtime.config import Deployment
 from runtime.deployment import Resolved
@@ -31,7 +32,7 @@ from runtime.publication import Publication
 from runtime.safety import Limits
 from runtime.spaces import Spaces
 from runtime.timeline import Dims
-from runtime.transports.base import Capabilities
+from runtime.transports.base import Capabilities, Source
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +89,29 @@ class Plan:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Keys of the cameras that this deployment has: the robot's, unless its transport names fewer."""
+        """Keys of the cameras that this deployment has: its own, and the robot's that its transport has."""
+        has = {*self._delivered, *self.deployment.cameras}
+        return tuple(camera.key for camera in self.robot.cameras if camera.key in has)
+
+    @property
+    def _delivered(self) -> tuple[str, ...]:
+        """Keys of the cameras that the transport delivers: the robot's, unless it names fewer."""
         named = getattr(self.transport, "cameras", None)
         if named is None:
             return tuple(camera.key for camera in self.robot.cameras)
         fewer: tuple[str, ...] = named(self.deployment.transport, self.robot)
         return fewer
+
+    def source(self, clock: Clock) -> Source:
+        """The observations, not yet connected: the transport's, with the cameras of the deployment's own.
+
+        The transport is told of a robot without these: it must not wait for them. What it leaves out itself stays.
+        """
+        settings, delivered = self.deployment, set(self._delivered)
+        own = settings.cameras.keys() & delivered
+        robot = replace(self.robot, cameras=tuple(c for c in self.robot.cameras if c.key not in own))
+        source: Source = self.transport.source(settings.transport, robot, clock)
+        return attached(source, settings.cameras, clock)
 
     @property
     def layout(self) -> PageLayout:
@@ -169,6 +187,7 @@ def plan(resolved: Resolved) -> Plan:
             f"recording.fps = {made.fps:g}: there would be more rows than ticks; "
             f"allowed: at most {made.rate:g}, the control rate"
         )
+    check(settings.cameras, robot)
     _check_publication(made)
     if settings.safety.report_only and made.capabilities.moves_robot:
         raise SetupError(

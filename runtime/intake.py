@@ -53,6 +53,11 @@ class Intake:
         """What the node last said of its drives; {} while it does not say."""
         return self._drives.newest
 
+    @property
+    def cameras(self) -> Mapping[str, Any]:
+        """How each camera of the deployment's own is."""
+        return self._source.camera_health()
+
     def pump(self, timeout: float) -> None:
         """Take one observation if there is one within `timeout` seconds."""
         observation = self._receive(timeout)
@@ -65,7 +70,9 @@ class Intake:
         self.pump(0.0)
 
     def faults(self) -> dict[str, int]:
-        """How often what went wrong; every count that has grown since the last call is an event."""
+        """How often what went wrong; every count that has grown since the last call is an event, and so is news."""
+        for event in self._source.news():
+            self._say(event)
         now, faults = self._clock.now(), {**self._source.faults(), **self._too_large}
         for name, count in faults.items():
             if count > self._faults.get(name, 0):

@@ -46,7 +46,7 @@ class Lockstep:
         self.page = Page(plan.layout, mmap.mmap(-1, Page.size(plan.layout)))
         settings = plan.deployment
         self.guard = Guard(self.page, Latch(settings.station_dir), self.clock, 1.0 / plan.rate)
-        self._source = plan.transport.source(settings.transport, plan.robot, self.clock)
+        self._source = plan.source(self.clock)
         self._sink = plan.transport.sink(settings.transport, plan.robot, self.clock)
         recorder = make_recorder(plan, self.clock.now, patient=True)
         self.media = Media(self.page, self._source, recorder, self.clock)

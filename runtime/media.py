@@ -184,7 +184,8 @@ class Media:
         faults, rates = intake.faults(), intake.rates()
         recording = recorder.recording or self._closing_uuid  # until it is on disk
         rows, repeated = recorder.rows, recorder.repeated
-        self._tell(MediaReport(now, rates, faults, rows, recording, repeated, intake.truth, intake.drives))
+        told = (intake.truth, intake.drives, intake.cameras)
+        self._tell(MediaReport(now, rates, faults, rows, recording, repeated, *told))
 
     def _say_truth(self) -> None:
         """How a simulated bench is left: what the episode is scored by."""
@@ -229,7 +230,7 @@ def main() -> None:
     page.beat("media", clock.now())
     exports = Exports(plan.deployment.data, plan.deployment.recording.export)
     start_repair(plan.deployment.episodes_dir, plan.deployment.station, exports.start)
-    source: Source = plan.transport.source(plan.deployment.transport, plan.robot, clock)
+    source = plan.source(clock)
     media = Media(
         page, source, make_recorder(plan, clock.now), clock, Previews(plan), in_background, exports.start
     )

@@ -12,6 +12,7 @@ import numpy as np
 
 from runtime.asking import Answered
 from runtime.bench_reset import BenchReset
+from runtime.cameras.telling import complaints
 from runtime.clock import Clock
 from runtime.errors import PolicyError, SetupError
 from runtime.family import Plan
@@ -179,6 +180,11 @@ class SetUp:
             faults = ", ".join(map(str, drives.get("faults", ()))) or "no fault named"
             raise DrivesDisabledError(f"the robot says that its drives are disabled ({faults}): enable them")
 
+    def _check_cameras(self) -> None:
+        found = complaints(self._media().cameras)
+        if found:
+            raise SetupError("; ".join(found))
+
     def _waited(self) -> float:
         return self._clock.now() - self._since
 
@@ -186,6 +192,7 @@ class SetUp:
         settings = self._plan.deployment.setup
         try:
             self._require_family()
+            self._check_cameras()
             self._inference.asking.observe()
             self._check_drives()
         except (PolicyError, SetupError) as error:

@@ -248,4 +248,9 @@ def _link(view: View) -> dict[str, Any]:
     for index, camera in enumerate(view.page.layout.cameras):
         seen = bool(record["picture_number"][index])
         ages[camera] = view.now - float(record["picture_captured"][index]) if seen else math.inf
-    return {"ages": ages, "rates": dict(view.media.rates), "faults": dict(view.media.faults)}
+    return {
+        "ages": ages,
+        "rates": dict(view.media.rates),
+        "faults": dict(view.media.faults),
+        "cameras": {key: dict(told) for key, told in view.media.cameras.items()},
+    }

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
+from runtime.cameras.telling import complaints
 from runtime.clock import Clock
 from runtime.family import Plan
 from runtime.latch import Latch
 from runtime.lease import Lease
+from runtime.messages import MediaReport
 from runtime.page import EStop, Page
 from runtime.run import Run
 from runtime.transitions import Happening, State
@@ -31,11 +33,14 @@ class Noticed(NamedTuple):
 class Watch:
     """Looks at page, lease and run once per pump; the session decides what follows."""
 
-    def __init__(self, plan: Plan, page: Page, lease: Lease, clock: Clock) -> None:
+    def __init__(
+        self, plan: Plan, page: Page, lease: Lease, clock: Clock, media: Callable[[], MediaReport]
+    ) -> None:
         self._plan = plan
         self._page = page
         self._lease = lease
         self._clock = clock
+        self._media = media  # what it last reported
         self._latch = Latch(plan.deployment.station_dir)
         self._generations = {name: page.generation(name) for name in SIBLINGS}
         self._lease_held = False
@@ -108,7 +113,8 @@ class Watch:
         if age < _CONNECTED_S and not missing:
             yield Noticed(Happening.CONNECTED, "observations arrive: set up")
         elif age < _CONNECTED_S:
-            yield Noticed(Happening.INCOMPLETE, f"no picture has arrived from {', '.join(missing)}")
+            why = "".join(f"; {sentence}" for sentence in complaints(self._media().cameras, missing))
+            yield Noticed(Happening.INCOMPLETE, f"no picture has arrived from {', '.join(missing)}{why}")
         elif age > _LINK_LOST_S and not record["last"]:
             yield Noticed(Happening.LINK_LOST, f"no observation for {age:.1f} s: {self._who_is_silent()}")
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from runtime.errors import TransportError
 from runtime.formats import PoseFormat
+from runtime.messages import Event
 from runtime.types import Observation, RobotCommand
 
 
@@ -54,6 +55,14 @@ class Source(ABC):
     def faults(self) -> dict[str, int]:
         """Counts by name of what went wrong since connect, e.g. {"clock_backwards": 1, "malformed": 3}."""
         return {}
+
+    def camera_health(self) -> dict[str, dict[str, Any]]:
+        """How each camera of the deployment's own is; {} where all pictures come from the transport."""
+        return {}
+
+    def news(self) -> list[Event]:
+        """What has happened since the last call that a person is told of."""
+        return []
 
 
 class Sink(ABC):

@@ -1,0 +1,109 @@
+"""A transport with cameras of the deployment's own: their pictures join each of its observations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+from runtime.cameras.base import Camera, Condition, Health
+from runtime.clock import Clock
+from runtime.messages import Event
+from runtime.transports.base import Source
+from runtime.types import Observation
+
+
+class Attached(Source):
+    """Another source, whose observations get the newest picture of each camera with its own time of capture.
+
+    A camera without a new picture repeats its last one, with that one's time: by this its age is told, refused and
+    recorded as of any other camera. One that has shown nothing yet is missing from the observation.
+    """
+
+    def __init__(self, source: Source, cameras: Sequence[Camera], clock: Clock) -> None:
+        self._source = source
+        self._cameras = tuple(cameras)
+        self._clock = clock
+        self._said: dict[str, Health] = {}
+
+    def connect(self) -> None:
+        """Start the cameras, which nobody waits for, and connect the source."""
+        for camera in self._cameras:
+            camera.start()
+        self._source.connect()
+
+    def receive(self, timeout: float) -> Observation | None:
+        observation = self._source.receive(timeout)
+        return None if observation is None else self._joined(observation)
+
+    def _joined(self, observation: Observation) -> Observation:
+        pictures, captured = dict(observation.pictures), dict(observation.captured)
+        for camera in self._cameras:
+            pictures.pop(camera.key, None)
+            captured.pop(camera.key, None)
+            shot = camera.newest()
+            if shot is not None:
+                pictures[camera.key], captured[camera.key] = shot.picture, shot.captured
+        return replace(observation, pictures=MappingProxyType(pictures), captured=MappingProxyType(captured))
+
+    def begin_run(self) -> None:
+        for camera in self._cameras:
+            camera.begin_run()
+        self._source.begin_run()
+
+    def faults(self) -> dict[str, int]:
+        """Those of the source, and of each camera."""
+        counts = dict(self._source.faults())
+        for camera in self._cameras:
+            counts |= camera.faults()
+        return counts
+
+    def camera_health(self) -> dict[str, dict[str, Any]]:
+        """How each camera is: kind, where, condition, since when, why, the age of its newest picture [s]."""
+        return {camera.key: self._told(camera) for camera in self._cameras}
+
+    def news(self) -> list[Event]:
+        """A camera that was lost, ended or came back since the last call, and why one cannot be opened."""
+        events = []
+        for camera in self._cameras:
+            health, before = camera.health(), self._said.get(camera.key)
+            if before is not None and (before.condition, before.why) == (health.condition, health.why):
+                continue
+            self._said[camera.key] = health
+            event = self._event(camera, health, before)
+            if event is not None:
+                events.append(event)
+        return events
+
+    def _event(self, camera: Camera, health: Health, before: Health | None) -> Event | None:
+        name = f"camera {camera.key} ({camera.shown})"
+        if health.condition is Condition.LIVE:
+            if before is None or before.condition is Condition.LIVE:
+                return None
+            away = health.since - before.since
+            kind, text = "camera_back", f"{name} gives pictures after {away:.1f} s"
+        elif health.condition is Condition.OPENING:
+            if not health.failed:
+                return None
+            kind, text = "camera_absent", f"{name}: {health.why}"
+        else:
+            kind, text = f"camera_{health.condition}", f"{name} is {health.condition}: {health.why}"
+        return Event(kind, text, self._clock.now(), data={"camera": camera.key, **self._told(camera)})
+
+    def _told(self, camera: Camera) -> dict[str, Any]:
+        health, shot = camera.health(), camera.newest()
+        return {
+            "kind": camera.kind,
+            "source": camera.shown,
+            "condition": str(health.condition),
+            "since": health.since,
+            "why": health.why,
+            "losses": health.losses,
+            "age": None if shot is None else self._clock.now() - shot.captured,
+        }
+
+    def close(self) -> None:
+        for camera in self._cameras:
+            camera.close()
+        self._source.close()

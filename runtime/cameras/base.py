@@ -1,0 +1,122 @@
+"""What a camera of our own is: its settings, where it is reached, its newest picture, how it is."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from runtime.errors import ConfigurationError, TransportError
+from runtime.section import Section
+from runtime.types import UInt8
+
+LARGEST = 1920 * 1080 * 3  # bytes of a picture as it is handed on
+
+Pixels = Annotated[int, Field(ge=8, le=4096)]
+Offset = Annotated[int, Field(ge=0, le=8192)]
+
+
+class CameraError(TransportError):
+    """A camera cannot be opened, is lost, or its pictures are unusable; says what was found there."""
+
+
+class CameraSettings(Section):
+    """What is done with the pictures of any camera, in this order: colours, crop, rotate, flip, size."""
+
+    colours: Literal["rgb", "bgr"] = "rgb"
+    """"bgr" for a camera that has red and blue in each other's place."""
+    crop: Annotated[list[Offset], Field(min_length=4, max_length=4)] | None = None
+    """The part that is used: left, top, width, height in the camera's own pixels; all of it where not given."""
+    rotate: Literal[0, 90, 180, 270] = 0
+    """By how much the picture is turned clockwise [degrees]."""
+    flip: Literal["none", "horizontal", "vertical"] = "none"
+    """"horizontal" exchanges left and right, "vertical" top and bottom, as it stands after turning."""
+    size: Annotated[list[Pixels], Field(min_length=2, max_length=2)] | None = None
+    """Width and height that it is scaled to; its own where not given."""
+    open_s: float = Field(default=5.0, gt=0, le=60)
+    """How long opening it may take until it has failed and is tried again [s]."""
+    read_s: float = Field(default=2.0, gt=0, le=60)
+    """How long it may send no picture until it is lost and opened anew [s]."""
+
+    @model_validator(mode="after")
+    def _crop_something(self) -> CameraSettings:
+        if self.crop is not None and min(self.crop[2:]) < 8:
+            raise ConfigurationError(
+                f"crop = {self.crop} leaves {self.crop[2]}x{self.crop[3]}; allowed: at least 8x8 pixels"
+            )
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """Where the pictures of a camera come from, as FFmpeg takes it."""
+
+    url: str = field(repr=False)  # may hold a password
+    shown: str  # for people
+    format: str | None = None
+    options: Mapping[str, str] = field(default_factory=dict)
+    stamped: bool = True  # the stream says when each picture was taken
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One picture uint8 [H, W, 3] RGB, when it was taken and when it was here, on our clock [s]."""
+
+    picture: UInt8
+    captured: float
+    arrived: float
+
+
+class Condition(StrEnum):
+    """How a camera is."""
+
+    OPENING = "opening"  # no picture yet
+    LIVE = "live"
+    LOST = "lost"  # it had pictures, and gives none now
+    ENDED = "ended"  # a file that is over
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """How a camera is, since when on our clock [s], and why."""
+
+    condition: Condition
+    since: float
+    why: str = ""
+    losses: int = 0  # how often it was lost
+    failed: bool = False  # it was tried, and could not be opened
+
+
+class Camera(ABC):
+    """One camera; whatever happens to it, nobody who asks it waits."""
+
+    key: str
+    kind: str
+    shown: str
+
+    @abstractmethod
+    def start(self) -> None:
+        """Begin to look; safe to call twice."""
+
+    @abstractmethod
+    def newest(self) -> Shot | None:
+        """The newest picture, the same one until there is another; None before the first."""
+
+    @abstractmethod
+    def health(self) -> Health:
+        """How it is now."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop looking; safe to call twice."""
+
+    def begin_run(self) -> None:  # noqa: B027  # a live camera has nothing to do
+        """A run starts: a file plays from its first picture."""
+
+    def faults(self) -> dict[str, int]:
+        """Counts by name of what went wrong since the start."""
+        return {}

@@ -1,0 +1,103 @@
+"""An open connection to one camera: pictures in RGB, one after the other, each within a deadline."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from runtime.cameras.base import Address, CameraError
+from runtime.cameras.finding import found
+from runtime.types import UInt8
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A picture uint8 [H, W, 3] RGB and the stream's own time of it [s], None where it has none."""
+
+    picture: UInt8
+    stamp: float | None
+
+
+class Feed:
+    """One stream opened by PyAV; used by one thread, which waits in FFmpeg without the interpreter's lock.
+
+    FFmpeg looks at the deadlines while it waits (PyAV's `timeout`); packets that never become a picture are bounded
+    here. Opening raises CameraError that says what was found.
+    """
+
+    def __init__(self, address: Address, open_s: float, read_s: float) -> None:
+        import av
+        import av.error
+
+        self._address = address
+        self._read_s = read_s
+        self._errors: Any = av.error
+        begun = time.monotonic()
+        try:
+            self._container: Any = av.open(
+                address.url,
+                format=address.format,
+                options={**_QUICK, **address.options} if address.format else dict(address.options),
+                timeout=(open_s, read_s),
+            )
+        except (av.error.FFmpegError, OSError, ValueError) as error:
+            raise CameraError(found(error, address, time.monotonic() - begun, open_s, True)) from None
+        videos = self._container.streams.video
+        if not videos:
+            others = ", ".join(sorted({stream.type for stream in self._container.streams})) or "nothing"
+            self._container.close()
+            raise CameraError(f"it has no video, but {others}")
+        self._stream = videos[0]
+        self._stream.codec_context.thread_count = 1  # frame threads hold pictures back
+        self._frames = self._decoded()
+
+    @property
+    def rate(self) -> float:
+        """Pictures per second as the stream says, 25 where it does not [Hz]."""
+        return float(self._stream.average_rate or self._stream.guessed_rate or 25.0)
+
+    def read(self) -> Frame | None:
+        """The next picture, None at the end of a file; CameraError where it does not come in time, or is lost."""
+        begun = time.monotonic()
+        try:
+            frame = next(self._frames, None)
+            picture = None if frame is None else self._rgb(frame)
+        except (self._errors.FFmpegError, OSError, ValueError) as error:
+            waited = time.monotonic() - begun
+            raise CameraError(found(error, self._address, waited, self._read_s, False)) from None
+        if frame is None or picture is None:
+            return None
+        stamp = frame.time if self._address.stamped else None
+        return Frame(picture, None if stamp is None else float(stamp))
+
+    def close(self) -> None:
+        """Let it go."""
+        self._container.close()
+
+    def _decoded(self) -> Iterator[Any]:
+        """Decoded frames; packets that cannot be decoded are skipped for as long as pictures may be awaited."""
+        since = time.monotonic()
+        for packet in self._container.demux(self._stream):
+            try:
+                frames = packet.decode()
+            except self._errors.InvalidDataError:
+                frames = []
+            for frame in frames:
+                yield frame
+                since = time.monotonic()
+            if time.monotonic() - since > self._read_s:
+                raise CameraError(f"what it sent for {self._read_s:g} s cannot be decoded")
+
+    def _rgb(self, frame: Any) -> UInt8:
+        try:
+            return np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+        except ValueError:
+            raise CameraError(f"its pixel format {frame.format.name} cannot be made RGB") from None
+
+
+# A live stream is not studied for long, and nothing is kept back for order's sake.
+_QUICK = {"fflags": "nobuffer", "flags": "low_delay", "analyzeduration": "1000000", "fpsprobesize": "0"}

@@ -1,0 +1,110 @@
+"""A camera that goes on by itself: a thread of its own opens it, reads it, and opens it again when it is lost."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+from runtime.back_off import BackOff
+from runtime.cameras.base import Address, Camera, CameraError, CameraSettings, Condition, Health, Shot
+from runtime.cameras.feed import Feed
+from runtime.cameras.shaping import Shaping
+from runtime.cameras.stamps import StreamTime
+from runtime.clock import Clock
+
+log = logging.getLogger(__name__)
+SETTLE_S = 0.3  # after opening: what was buffered until then is older than it looks
+_GRACE_S = 1.0  # beyond its own deadline, after which a thread is stuck where none reaches it
+_JOIN_S = 1.0
+
+
+class LiveCamera(Camera):
+    """Keeps the newest picture alone; a reader that is stuck in a driver is noticed by who asks."""
+
+    def __init__(self, key: str, kind: str, settings: CameraSettings, address: Address, clock: Clock) -> None:
+        self.key, self.kind, self.shown = key, kind, address.shown
+        self._settings, self._address, self._clock = settings, address, clock
+        self._shape = Shaping(settings)
+        self._time = StreamTime()
+        self._back_off = BackOff()
+        self._lock = threading.Lock()
+        self._newest: Shot | None = None
+        self._health = Health(Condition.OPENING, clock.now(), "it is being opened")
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._go_on, name=f"camera-{self.key}", daemon=True)
+            self._thread.start()
+
+    def newest(self) -> Shot | None:
+        with self._lock:
+            return self._newest
+
+    def health(self) -> Health:
+        with self._lock:
+            health, newest = self._health, self._newest
+        allowed = self._settings.read_s + _GRACE_S
+        if health.condition is Condition.LIVE and newest and self._clock.now() - newest.arrived > allowed:
+            why = f"no picture for over {allowed:g} s, and reading it does not return"
+            return Health(Condition.LOST, newest.arrived, why, health.losses + 1, failed=True)
+        return health
+
+    def faults(self) -> dict[str, int]:
+        """`camera_clock_jumped_KEY`: the stream's time broke."""
+        return {f"camera_clock_jumped_{self.key}": self._time.jumps} if self._time.jumps else {}
+
+    def close(self) -> None:
+        """It ends by itself within its deadline; nobody waits longer than a second for it."""
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join(_JOIN_S)
+            self._thread = None
+
+    def _go_on(self) -> None:
+        """The thread: nothing that happens in it may end it, because nobody else looks."""
+        while not self._ending.is_set():
+            try:
+                self._watch()
+            except CameraError as error:
+                self._lose(str(error))
+            except Exception as error:
+                log.exception("camera %s: reading failed", self.key)
+                self._lose(f"reading it failed: {type(error).__name__}: {error}")
+            self._ending.wait(self._back_off.waiting(self._clock.now()))
+
+    def _watch(self) -> None:
+        """Open it and read until it is lost; raises CameraError."""
+        feed = Feed(self._address, self._settings.open_s, self._settings.read_s)
+        try:
+            self._time.begin()
+            settled: float | None = None
+            while not self._ending.is_set():
+                frame = feed.read()
+                if frame is None:
+                    raise CameraError("it closed the connection")
+                arrived = self._clock.now()
+                settled = arrived + SETTLE_S if settled is None else settled
+                captured = self._time.captured(frame.stamp, arrived)
+                picture = self._shape(frame.picture)
+                if arrived >= settled:
+                    self._show(Shot(picture, captured, arrived))
+        finally:
+            feed.close()
+
+    def _show(self, shot: Shot) -> None:
+        self._back_off.forget()
+        with self._lock:
+            self._newest = shot
+            if self._health.condition is not Condition.LIVE:
+                self._health = Health(Condition.LIVE, shot.arrived, losses=self._health.losses)
+
+    def _lose(self, why: str) -> None:
+        now = self._clock.now()
+        self._back_off.failed(now)
+        with self._lock:
+            before, lost = self._health, Condition.LOST if self._newest else Condition.OPENING
+            since = before.since if before.condition is lost else now
+            losses = before.losses + (before.condition is Condition.LIVE)
+            self._health = Health(lost, since, why, losses, failed=True)

@@ -1,0 +1,34 @@
+"""A camera that sends JPEG pictures one after the other in one HTTP answer."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import field_validator
+
+from runtime.cameras.base import Address, CameraSettings
+from runtime.cameras.places import checked, with_password
+
+
+class Config(CameraSettings):
+    """A network camera over HTTP, multipart/x-mixed-replace ("MJPEG"); a picture counts as taken when it arrives."""
+
+    kind: Literal["mjpeg"] = "mjpeg"
+    url: str
+    """Where it is: http://HOST[:PORT]/PATH, without a password."""
+    user: str | None = None
+    """Name to log in with."""
+    password_env: str | None = None
+    """Environment variable that holds the password."""
+
+    @field_validator("url")
+    @classmethod
+    def _usable(cls, url: str) -> str:
+        return checked("url", url, ("http", "https"))
+
+
+def address(config: Config) -> Address:
+    """`rw_timeout` [us] bounds each read and write; these streams carry no time of their own."""
+    options = {"rw_timeout": str(int(max(config.open_s, config.read_s) * 1e6))}
+    url = with_password(config.url, config.user, config.password_env)
+    return Address(url, config.url, "mpjpeg", options, stamped=False)

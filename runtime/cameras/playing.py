@@ -1,0 +1,181 @@
+"""A video file as a camera: paced by our clock, by a thread of its own, or step by step on a virtual clock."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+
+from runtime.cameras import file
+from runtime.cameras.base import Camera, CameraError, Condition, Health, Shot
+from runtime.cameras.feed import Feed, Frame
+from runtime.cameras.shaping import Shaping
+from runtime.clock import Clock
+
+log = logging.getLogger(__name__)
+_EARLY_S = 1e-6  # due times are sums of floats
+_RETRY_S = 2.0
+_JOIN_S = 1.0
+
+
+class Player:
+    """Pictures of a file as they are due; the next one is decoded before that.
+
+    Until `begin` the first picture stands, as if taken again and again at the file's own rate.
+    """
+
+    def __init__(self, config: file.Config) -> None:
+        self._config = config
+        self._shape = Shaping(config)
+        self._feed: Feed | None = None
+        self._begun: float | None = None
+        self.over = False
+        self.due = -math.inf
+
+    def begin(self, now: float) -> None:
+        """Play from the first picture, which is due now."""
+        self._begun, self.over = now, False
+        self._rewind(now)
+
+    def at(self, now: float) -> Shot | None:
+        """The newest picture that is due and was not given yet; CameraError where the file cannot be read."""
+        if self._feed is None:
+            self._rewind(now)
+        shown = None
+        while not self.over and now + _EARLY_S >= self.due:
+            shown = Shot(self._shape(self._next.picture), min(self.due, now), now)
+            self._advance(now)
+        return shown
+
+    def close(self) -> None:
+        """Let the file go."""
+        if self._feed is not None:
+            self._feed.close()
+            self._feed = None
+
+    def _rewind(self, due: float) -> None:
+        """The first picture is next, due at `due`."""
+        self.close()
+        self._feed = Feed(file.address(self._config), self._config.open_s, self._config.read_s)
+        first = self._feed.read()
+        if first is None:
+            self.close()
+            raise CameraError("not a video: it has no picture")
+        self._next, self._first, self._since, self.due = first, first, due, due
+
+    def _advance(self, now: float) -> None:
+        assert self._feed is not None
+        period = 1 / self._feed.rate
+        if self._begun is None:
+            self.due = now + period
+            return
+        following = self._feed.read()
+        if following is not None:
+            self._next = following
+            self.due = max(self._since + self._offset(following, period), math.nextafter(self.due, math.inf))
+        elif self._config.at_end == "loop":
+            self._rewind(self.due + period)
+        else:
+            self.over, self.due = True, math.inf
+
+    def _offset(self, frame: Frame, period: float) -> float:
+        """When it is due after the first one [s]: by its stamp, a period after the one before where it has none."""
+        if frame.stamp is None or self._first.stamp is None:
+            return self.due - self._since + period
+        return frame.stamp - self._first.stamp
+
+
+class FileCamera(Camera):
+    """Plays a file. `threaded`: by a thread, so that nobody waits for its decoder; else whenever it is asked."""
+
+    kind = "file"
+
+    def __init__(self, key: str, config: file.Config, clock: Clock, threaded: bool) -> None:
+        self.key, self.shown = key, file.address(config).shown
+        self._clock = clock
+        self._player = Player(config)
+        self._threaded = threaded
+        self._lock = threading.Lock()
+        self._newest: Shot | None = None
+        self._health = Health(Condition.OPENING, clock.now(), "it is being opened")
+        self._wake = threading.Event()
+        self._ending = False
+        self._begin: float | None = None
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        if self._threaded and self._thread is None:
+            self._ending = False
+            self._thread = threading.Thread(target=self._go_on, name=f"camera-{self.key}", daemon=True)
+            self._thread.start()
+
+    def begin_run(self) -> None:
+        with self._lock:
+            self._begin = self._clock.now()
+        self._wake.set()
+
+    def newest(self) -> Shot | None:
+        if not self._threaded:
+            self._step()
+        with self._lock:
+            return self._newest
+
+    def health(self) -> Health:
+        with self._lock:
+            return self._health
+
+    def close(self) -> None:
+        self._ending = True
+        self._wake.set()
+        if self._thread is not None:
+            self._thread.join(_JOIN_S)
+            self._thread = None
+        if not self._threaded:
+            self._player.close()
+
+    def _go_on(self) -> None:
+        while not self._ending:
+            self._step()
+            due = self._player.due if self._healthy() else self._clock.now() + _RETRY_S
+            wait = due - self._clock.now()
+            if wait > 0:
+                self._wake.wait(min(wait, _RETRY_S))
+                self._wake.clear()
+        self._player.close()
+
+    def _healthy(self) -> bool:
+        return self.health().condition in (Condition.LIVE, Condition.ENDED)
+
+    def _step(self) -> None:
+        """Show what is due; what is wrong with the file is its health."""
+        with self._lock:
+            begin, self._begin = self._begin, None
+        try:
+            if begin is not None:
+                self._player.begin(begin)
+            shot = self._player.at(self._clock.now())
+        except CameraError as error:
+            self._fail(str(error))
+            return
+        except Exception as error:  # of a decoder: it must not end the thread, or media
+            log.exception("camera %s: playing %s failed", self.key, self.shown)
+            self._fail(f"playing it failed: {type(error).__name__}: {error}")
+            return
+        if shot is not None:
+            with self._lock:
+                self._newest = shot
+        if self._player.over:
+            self._tell(Condition.ENDED, "the file is over; a run begins it again")
+        elif shot is not None:
+            self._tell(Condition.LIVE)
+
+    def _fail(self, why: str) -> None:
+        self._player.close()
+        self._tell(Condition.LOST if self._newest else Condition.OPENING, why)
+
+    def _tell(self, condition: Condition, why: str = "") -> None:
+        with self._lock:
+            before = self._health
+            if (condition, why) != (before.condition, before.why):
+                losses = before.losses + (condition is Condition.LOST)
+                self._health = Health(condition, self._clock.now(), why, losses, failed=bool(why))

@@ -1,0 +1,18 @@
+"""What main says of cameras that give no pictures, from media's report of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from runtime.cameras.base import Condition
+
+
+def complaints(cameras: Mapping[str, Mapping[str, Any]], keys: Iterable[str] | None = None) -> list[str]:
+    """A sentence for each camera, or each of `keys`, that is not live: which, where, how, why."""
+    chosen = cameras if keys is None else [key for key in keys if key in cameras]
+    return [
+        f"camera {key} ({told['source']}) is {told['condition']}: {told['why']}"
+        for key in chosen
+        if (told := cameras[key])["condition"] != Condition.LIVE
+    ]

@@ -1,0 +1,110 @@
+"""What stand-in cameras on the network have in common: a port, pictures at a rate, faults on demand."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from runtime.types import UInt8
+
+FAULTS = {
+    "mute": "accepts and says nothing",
+    "garbage": "answers with bytes that are no video",
+    "not_found": "answers that there is nothing there",
+    "no_login": "answers that it wants a login",
+    "silent": "plays, and then sends nothing more",
+    "torn": "ends in the middle of a picture",
+    "nonsense": "goes on with pictures that nobody can decode",
+}
+
+
+def picture(number: int, width: int, height: int) -> UInt8:
+    """Red on the left, blue on the right, below a bar that is wider in every picture: [height, width, 3] RGB."""
+    made = np.zeros((height, width, 3), np.uint8)
+    made[:, : width // 2, 0] = 220
+    made[:, width // 2 :, 2] = 220
+    made[-height // 8 :, : (number * 8) % width + 1] = 255
+    return made
+
+
+class CameraServer(ABC):
+    """Serves one camera on loopback, each client by a thread; `size`, `rate` and `fault` may change meanwhile."""
+
+    scheme: str
+
+    def __init__(self, width: int = 160, height: int = 120, rate: float = 30.0) -> None:
+        self.size = (width, height)
+        self.rate = rate
+        self.fault = ""
+        self.sent = 0  # pictures, to all clients
+        self._port = 0
+        self._listening: socket.socket | None = None
+        self._clients: set[socket.socket] = set()
+        self._lock = threading.Lock()
+
+    @property
+    def url(self) -> str:
+        return f"{self.scheme}://127.0.0.1:{self._port}/camera"
+
+    def start(self) -> str:
+        """Listen, on the same port as before where there was one; returns where."""
+        self._listening = socket.create_server(("127.0.0.1", self._port))
+        self._port = self._listening.getsockname()[1]
+        threading.Thread(target=self._accept, args=(self._listening,), daemon=True).start()
+        return self.url
+
+    def close(self) -> None:
+        """Stop listening and hang up; `start` takes it up again."""
+        listening, self._listening = self._listening, None
+        if listening is not None:
+            with contextlib.suppress(OSError):  # wakes accept
+                listening.shutdown(socket.SHUT_RDWR)
+            listening.close()
+        self.hang_up()
+
+    def hang_up(self) -> None:
+        """Close every connection."""
+        with self._lock:
+            clients = list(self._clients)
+        for client in clients:
+            with contextlib.suppress(OSError):
+                client.shutdown(socket.SHUT_RDWR)
+
+    def _accept(self, listening: socket.socket) -> None:
+        while True:
+            try:
+                client, _ = listening.accept()
+            except OSError:
+                return
+            threading.Thread(target=self._serve, args=(client,), daemon=True).start()
+
+    def _serve(self, client: socket.socket) -> None:
+        with self._lock:
+            self._clients.add(client)
+        try:
+            if self.fault == "mute":
+                while client.recv(4096):
+                    pass
+            elif self.fault == "garbage":
+                client.sendall(b"SSH-2.0-OpenSSH_9.2\r\n" * 50)
+            else:
+                self._speak(client)
+        except OSError:
+            return  # the client is gone, or we hung up
+        finally:
+            with self._lock:
+                self._clients.discard(client)
+            client.close()
+
+    def _due(self, begun: float, number: int) -> float:
+        """Seconds until picture `number` of a client is due."""
+        return max(0.0, begun + number / self.rate - time.monotonic())
+
+    @abstractmethod
+    def _speak(self, client: socket.socket) -> None:
+        """Serve one client until one of both has enough; OSError where it is gone."""
