@@ -18,16 +18,14 @@ from pydantic import Field
 from runtime import codecs
 from runtime.clock import Clock
 from runtime.errors import ConfigurationError, ContradictionError, PolicyError
-from runtime.formats import PoseFormat
-from runtime.policies.answers import AnswerSettings
 from runtime.policies.base import PolicyInfo
 from runtime.policies.link import headline
-from runtime.policies.pictures import Resize
-from runtime.policies.request import RequestLayout, RequestSettings, Size, poses_of
+from runtime.policies.meaning import MeaningSettings
+from runtime.policies.request import RequestLayout, Size
 from runtime.policies.rows import action_rows
 from runtime.policies.statistics import Statistics
 from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
-from runtime.types import ActionChunk, Conditioning, Observation, Space
+from runtime.types import ActionChunk, Conditioning, Observation
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -36,7 +34,7 @@ log = logging.getLogger(__name__)
 _ENVIRONMENT = "starvla_policy_server"
 
 
-class Config(ServerSettings, AnswerSettings):
+class Config(ServerSettings, MeaningSettings):
     """A policy server of StarVLA."""
 
     kind: Literal["starvla"] = "starvla"
@@ -46,14 +44,8 @@ class Config(ServerSettings, AnswerSettings):
     """Observation keys of the views, in the order in which the policy was trained with them."""
     image_size: Size | None = None
     """Height and width of the views; without it what the server says it was trained with, else as they are."""
-    resize: Resize = "pad"
-    """"pad" keeps the aspect on black, "stretch" does not."""
-    state: Space | Literal["none"] = "joint"
-    """What is sent as state, [1, D]: joints, poses, or nothing, as to checkpoints that were trained without."""
-    observation_pose: PoseFormat = PoseFormat()
-    """How poses are written in the state, where state is "eef"."""
-    observation_eef: Literal["measured", "fk"] = "measured"
-    """Poses as the robot measures them, where it does; or as its joints have them in any case."""
+    state: bool = True
+    """Whether the state is sent, [1, D]; false for checkpoints that were trained without."""
     unnorm_key: str | None = None
     """Whose statistics the server brings actions back to the robot's numbers with; its own default without it."""
     statistics: Statistics | None = None
@@ -81,15 +73,12 @@ class StarvlaPolicy(WebsocketPolicy):
             )
         self._config = config
         self._robot = robot
-        poses = poses_of(config.action_space, config.action_pose, robot, "action_pose")
-        self._width = robot.dim if poses is None else poses.width
+        _, self._width = config.widths(robot)
         if config.statistics is not None:
             config.statistics.require_width(self._width)
         self._layout = self._layout_for(config.image_size)
         self.observation_eef = config.observation_eef
-        self.sees_poses = config.state == "eef" or (
-            config.action_space == "eef" and config.action_mode != "absolute"
-        )
+        self.sees_poses = config.sees_poses
         self._unnorm_key = config.unnorm_key
         self._number = 0
         self._spoken = time.monotonic()
@@ -139,23 +128,13 @@ class StarvlaPolicy(WebsocketPolicy):
         """One example, and whose statistics are meant."""
         shown = self._layout.of(observation)
         example: dict[str, Any] = {"image": list(shown["images"].values()), "lang": observation.prompt}
-        if self._config.state != "none":
+        if self._config.state:
             example["state"] = shown["state"][None]
         return {"examples": [example]} | ({"unnorm_key": self._unnorm_key} if self._unnorm_key else {})
 
     def _layout_for(self, size: list[int] | None) -> RequestLayout:
-        config = self._config
-        settings = RequestSettings(
-            observation_space="eef" if config.state == "eef" else "joint",
-            observation_pose=config.observation_pose,
-            cameras={key: key for key in config.cameras},
-            image_size=size,
-            resize=config.resize,
-            image_layout="hwc",
-            state_key="" if config.state == "none" else "state",
-            prompt_key="",
-        )
-        return RequestLayout(settings, self._robot)
+        sized = self._config.model_copy(update={"image_size": size})
+        return sized.layout(self._robot, {key: key for key in self._config.cameras})
 
     def _greeted(self, metadata: dict[str, Any]) -> PolicyInfo:
         said = metadata.get("env")
@@ -228,16 +207,7 @@ class StarvlaPolicy(WebsocketPolicy):
     def _chunk(self, data: Any, round_trip: float) -> ActionChunk:
         if not isinstance(data, Mapping):
             raise PolicyError(f"the answer has data that are a {type(data).__name__}; expected a map")
-        config = self._config
-        return ActionChunk(
-            actions=self._rows(data),
-            space=config.action_space,
-            rate=config.action_rate,
-            mode=config.action_mode,
-            frame=config.relative_frame,
-            pose=config.action_pose,
-            timing={"round_trip_ms": round_trip},
-        )
+        return self._config.chunk(self._rows(data), {"round_trip_ms": round_trip})
 
     def _rows(self, data: Mapping[str, Any]) -> np.ndarray[Any, np.dtype[np.float32]]:
         if "actions" in data:

@@ -78,6 +78,7 @@ class Shown:
         self._keys = self._cameras.of(wants)
         own = self._settings.image_size
         self._size = wants.resolution if own is None else (own[0], own[1])
+        self._seen.clear()  # another server's pictures may have been of another size
 
     def forget(self) -> None:
         """No picture was shown yet."""

@@ -172,8 +172,8 @@ def test_views_have_the_size_of_the_training(
 
 def test_the_state_may_be_poses_or_nothing() -> None:
     pose = PoseFormat(orientation="6d", gripper=False)
-    assert payload_of(state="eef", observation_pose=pose)["examples"][0]["state"].shape == (1, 9)
-    assert "state" not in payload_of(state="none")["examples"][0]
+    assert payload_of(observation_space="eef", observation_pose=pose)["examples"][0]["state"].shape == (1, 9)
+    assert "state" not in payload_of(state=False)["examples"][0]
 
 
 @pytest.mark.parametrize(
