@@ -29,7 +29,7 @@ export function labelled(joints, grippers) {
   return joints.map((one) => ({ ...one, label: grippers.includes(one.index) ? "gripper" : short.shift() }));
 }
 
-/** Options of value 0, 1, ... for full names, `grippers` among them; several groups are told apart by headings. */
+/** Options of value 0, 1, ... for full names, `grippers` among them; several groups stand in the names and as headings. */
 export function jointOptions(names, grippers = []) {
   const groups = new Map();
   names.forEach((full, index) => {
@@ -39,9 +39,9 @@ export function jointOptions(names, grippers = []) {
   });
   const only = groups.size < 2;
   const parts = [...groups].map(([group, joints]) => {
-    const options = labelled(joints, grippers).map(({ full, joint, label, index }) => {
-      const text = only ? joint : full;
-      const option = new Option(text.length > LONG ? `${only ? "" : `${group}.`}${label}` : text, String(index));
+    const options = labelled(joints, grippers).map(({ full, label, index }) => {
+      const text = full.length > LONG ? `${group}.${label}` : full;
+      const option = new Option(only ? label : text, String(index));
       option.title = full;
       return option;
     });

@@ -329,6 +329,7 @@ def test_how_poses_were_met_is_said_in_words() -> None:
             "worst_mm": 0.012,
             "worst_deg": 0.003,
         },
+        {"rows": 50, "over": 0, "worst_mm": 0.0, "worst_deg": 2e-5},
         {
             "rows": 50,
             "over": 3,
@@ -344,6 +345,7 @@ def test_how_poses_were_met_is_said_in_words() -> None:
     assert run("reach.js", "return given.map((ik) => m.reachWords(ik))", chunks) == [
         "",
         "50 poses reached, worst 0.012 mm and 0.003°",
+        "50 poses reached, worst 0.000 mm and below 0.001°",
         "3 of 50 poses not reached, worst 31.4 mm and 2.1°; 3 at a joint limit; 1 near singular",
         "1 of 50 poses not reached; 1 as fast as joints may",
     ]
