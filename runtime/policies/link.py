@@ -273,7 +273,7 @@ def headline(text: str) -> str:
     """A traceback's last line first, because that is the sentence, then the whole of it; of JSON what it says."""
     try:
         said = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         said = None
     if isinstance(said, dict):
         words = [str(said[key]) for key in ("error", "message", "code") if said.get(key)]

@@ -58,7 +58,7 @@ class RoboarenaPolicy(WebsocketPolicy):
         self._shown = Shown(config, robot)
         self._meant = Meant(config, config.gripper, robot)
         self.observation_eef = config.observation_eef
-        self.sees_poses = self._shown.sees_poses or self._meant.velocity
+        self.sees_poses = self._shown.sees_poses or (self._meant.cartesian and self._meant.velocity)
         self._wants: Wants | None = None
         self._session = _new_session()
         self._asked = False  # in this session

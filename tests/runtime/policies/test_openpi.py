@@ -21,7 +21,7 @@ from runtime.clock import MonotonicClock
 from runtime.errors import ConfigurationError, ContradictionError, PolicyError, PolicyLostError
 from runtime.formats import PoseFormat
 from runtime.policies import openpi
-from runtime.policies.link import PolicyGone, PolicyTimeout, WebsocketLink
+from runtime.policies.link import PolicyGone, PolicyTimeout, WebsocketLink, headline
 from runtime.policies.openpi import Config, OpenpiPolicy
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.in_poses import InPoses
@@ -701,6 +701,21 @@ def test_a_text_frame_at_any_time_is_the_servers_error() -> None:
         policy.connect()
         with pytest.raises(PolicyError, match="reports an error: KeyError: 'state'\nTraceback"):
             policy.infer(observation())
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ('{"error": "no model", "code": "unsupported"}', "no model, unsupported"),
+        ('{"message": "busy"}', "busy"),
+        ('{"status": 1}', '{"status": 1}'),
+        ("[" * 100_000, "[" * 100_000),
+        ("Traceback\n  x\nKeyError: 1", "KeyError: 1\nTraceback\n  x\nKeyError: 1"),
+        ("", "(an empty text)"),
+    ],
+)
+def test_of_what_a_server_says_the_sentence_comes_first(text: str, line: str) -> None:
+    assert headline(text) == line
 
 
 # What happens to the connection
