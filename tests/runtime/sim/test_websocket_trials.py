@@ -8,11 +8,12 @@ from typing import Any
 import pytest
 
 from runtime.session import State
+from runtime.sim.faults import Fault
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.roboarena_server import Arena, RoboarenaServer
 from runtime.sim.script import Script
 from runtime.sim.starvla_server import Star, StarvlaServer
-from tests.runtime.sim.tabletop_station import HORIZON, TabletopPlan, pick_and_place
+from tests.runtime.sim.tabletop_station import HORIZON, TabletopPlan, pick_and_place, served
 
 ARENA = ['policy.kind="roboarena"', 'policy.cameras={cam_high="first", cam_wrist="wrist"}']
 SIZE = (240, 320)
@@ -66,3 +67,22 @@ def test_a_policy_on_this_wire_puts_the_block_on_the_plate(wire: str, tmp_path: 
     trial = pick_and_place("tabletop_ur5e", 0, tmp_path, assignments, serve)
     assert trial.success, (trial.reason, trial.milestones, trial.events)
     assert trial.state is State.RUNNING
+
+
+def test_a_reset_that_the_server_does_not_acknowledge_holds_the_robot_with_what_it_said(
+    tmp_path: Path,
+) -> None:
+    """The warm-up of set-up was a session; a run that went on in it would be of no worth."""
+    refusing = arena_server(fault=Fault("reset_text"))
+    with served("tabletop_ur5e", 0, tmp_path, ARENA, refusing) as (_, station):
+        session = station.main.session
+        station.connect()
+        station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
+        station.command("setup")
+        station.until(lambda: session.state is not State.SETTING_UP, 60.0, "set-up")
+        assert session.state is State.READY, session.reason
+        station.command("run")
+        station.until(lambda: session.state is not State.RUNNING, 60.0, "the end of patience")
+        assert session.state is State.HOLDING
+        assert "the policy server at ws://127.0.0.1" in session.reason
+        assert "reports an error: done" in session.reason
