@@ -13,7 +13,7 @@ import argparse
 import contextlib
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -36,9 +36,16 @@ if TYPE_CHECKING:
     from robots import Robot
     from runtime.sim.surroundings import Surroundings
 
-_LONGEST_STEP = 0.2  # s; a node that was stopped does not make up for it in one leap
+LONGEST_STEP = 0.2  # s; a node that was stopped does not make up for it in one leap
 _GARBAGE = b"\x85\xa1t"  # a map of five that ends after half an entry
 _NO_LEADER = "the simulated node has no leader arm"
+
+
+class Ticking(Protocol):
+    """What `run` runs."""
+
+    def tick(self, seconds: float) -> None:
+        """Let `seconds` pass."""
 
 
 class Node:
@@ -57,7 +64,7 @@ class Node:
         self._robot = robot
         self._options = options
         self._clock = clock
-        self._plant = Plant(robot, start=_start(robot, options.start_pose))
+        self._plant = Plant(robot, start=start_pose(robot, options.start_pose))
         self._drives = Drives(not options.drives_disabled, options.drive_fault)
         self._gate = Gate(robot, options.deadline, bench=options.bench != "none")
         self._surroundings = around or surroundings.surroundings(robot, options)
@@ -178,7 +185,7 @@ class Node:
         return pictures
 
 
-def run(node: Node, clock: Clock, rate: float, told: Event) -> None:
+def run(node: Ticking, clock: Clock, rate: float, told: Event) -> None:
     """Tick on absolute deadlines until told to end; missed ticks are skipped, not made up for.
 
     One that is late by less than half a period is done at once: the next one is on time again.
@@ -188,7 +195,7 @@ def run(node: Node, clock: Clock, rate: float, told: Event) -> None:
     while not told.is_set():
         clock.sleep_until(due)
         now = clock.now()
-        node.tick(min(now - last, _LONGEST_STEP))
+        node.tick(min(now - last, LONGEST_STEP))
         last = now
         due += period * max(1, int((clock.now() - due) / period + 0.5))
 
@@ -205,11 +212,11 @@ def parser() -> argparse.ArgumentParser:
     line.add_argument("--obs-endpoint", default="tcp://127.0.0.1:5555", help="port 0 takes a free one")
     line.add_argument("--action-endpoint", default="tcp://127.0.0.1:5556", help="port 0 takes a free one")
     line.add_argument("--insecure-link", action="store_true", help="allow addresses beyond this machine")
-    line.add_argument("--rate", type=_positive, default=30.0, help="observations per second")
+    line.add_argument("--rate", type=positive, default=30.0, help="observations per second")
     line.add_argument("--width", type=int, default=640)
     line.add_argument("--height", type=int, default=480)
     line.add_argument(
-        "--deadline", type=_positive, default=0.3, help="seconds without a command until it holds"
+        "--deadline", type=positive, default=0.3, help="seconds without a command until it holds"
     )
     line.add_argument(
         "--seed", type=int, default=0, help="grain of the pictures, gestures of the leader, first layout"
@@ -260,13 +267,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _start(robot: Robot, name: str) -> Float64:
+def start_pose(robot: Robot, name: str) -> Float64:
+    """The joints [D] of a pose; SetupError lists the poses where there is none of that name."""
     if name not in robot.poses:
         raise SetupError(f"{robot.name} has no pose {name!r}; it has {', '.join(robot.poses)}")
     return robot.poses[name]
 
 
-def _positive(text: str) -> float:
+def positive(text: str) -> float:
+    """A number above zero, of a command line."""
     number = float(text)
     if not 0 < number < 1e6:
         raise argparse.ArgumentTypeError(f"{text} is not above zero")

@@ -1,0 +1,1 @@
+"""What both ROS transports share: which topics, what is read of messages, alignment, commands."""

@@ -1,0 +1,282 @@
+"""ROS 2's topics over DDS without a ROS installation; needs the package cyclonedds.
+
+Names, types and quality of service as ROS 2's own middlewares have them (design.ros2.org, "Topic and Service name
+mapping to DDS"): topic /a/b is rt/a/b, its type sensor_msgs::msg::dds_::JointState_, its bytes XCDR1, its type hash
+part of the user data.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Mapping
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+from runtime.errors import SetupError, TransportError
+from runtime.transports.ros.messages import PACKAGES
+from runtime.transports.ros.middleware import (
+    COMMAND_LIFE_S,
+    Deliver,
+    Match,
+    Middleware,
+    Publish,
+    Topic,
+    incompatible,
+)
+
+log = logging.getLogger(__name__)
+LOOPBACK, ENVIRONMENT = "loopback", "environment"
+_WAKE_NS = 100_000_000  # how soon the reader notices that it is to end
+_TAKEN = 64
+_MOST_ENDPOINTS = 2000
+_POLICIES = {
+    2: "durability", 4: "deadline", 5: "latency_budget", 6: "ownership", 8: "liveliness", 10: "partition",
+    11: "reliability", 12: "destination_order", 23: "data_representation", 24: "type_consistency",
+}  # fmt: skip
+
+
+def configuration(network: str, peers: tuple[str, ...] = ()) -> str | None:
+    """Cyclone's configuration for a network interface by name or address; None: that of $CYCLONEDDS_URI.
+
+    On loopback there is no multicast: participants look for each other by address, at the first 30 ports of the
+    domain. That finds nodes of Cyclone DDS 0.10 (Jazzy) and 11 so configured, and Fast DDS.
+    """
+    if network == ENVIRONMENT:
+        return None
+    local = network == LOOPBACK
+    interface = 'name="lo" multicast="false"' if local else _interface(network)
+    found = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in (("127.0.0.1",) if local else peers))
+    return (
+        "<CycloneDDS><Domain><General>"
+        f"<Interfaces><NetworkInterface {interface}/></Interfaces>"
+        + ("<AllowMulticast>false</AllowMulticast>" if local else "")
+        + "</General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
+        "<MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>"
+        + (f"<Peers>{found}</Peers>" if found else "")
+        + "</Discovery></Domain></CycloneDDS>"
+    )
+
+
+def _interface(network: str) -> str:
+    kind = "address" if network.replace(".", "").isdigit() or ":" in network else "name"
+    return f"{kind}={quoteattr(network)}"
+
+
+class _Domains:
+    """The DDS domains of this process: each has one configuration, and lives while somebody uses it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: dict[int, tuple[Any, str | None, int]] = {}
+
+    def enter(self, number: int, configured: str | None) -> None:
+        from cyclonedds.domain import Domain
+
+        with self._lock:
+            domain, before, users = self._open.get(number, (None, configured, 0))
+            if before != configured:
+                raise TransportError(f"DDS domain {number} is in use in this process over another network")
+            if users == 0 and configured is not None:
+                domain = Domain(number, configured)
+            self._open[number] = (domain, configured, users + 1)
+
+    def leave(self, number: int) -> None:
+        with self._lock:
+            domain, configured, users = self._open.pop(number)
+            if users > 1:
+                self._open[number] = (domain, configured, users - 1)
+
+
+_domains = _Domains()
+
+
+class DdsMiddleware(Middleware):
+    """One participant; one thread waits for all of its readers."""
+
+    def __init__(self, domain: int, network: str, peers: tuple[str, ...] = ()) -> None:
+        """Join the domain; SetupError without the package, TransportError where the network cannot be used."""
+        require()
+        from cyclonedds.core import DDSException, WaitSet
+        from cyclonedds.domain import DomainParticipant
+        from cyclonedds.qos import Policy, Qos
+
+        self._domain = domain
+        self._entered = False
+        try:
+            _domains.enter(domain, configuration(network, peers))
+            self._entered = True
+            self._participant: Any = DomainParticipant(domain, Qos(Policy.Userdata(b"enclave=/;")))
+            self._waitset: Any = WaitSet(self._participant)
+        except DDSException as error:
+            self._leave()
+            raise TransportError(
+                f"DDS domain {domain} cannot be joined over {network!r}: {error}; is there such an interface "
+                "(transport.network), and has the domain less than 30 participants on this machine?"
+            ) from error
+        self._readers: list[tuple[Topic, Any, Deliver]] = []
+        self._writers: list[tuple[Topic, Any]] = []
+        self._lock = threading.Lock()
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def subscribe(self, topic: Topic, deliver: Deliver) -> None:
+        """Hear the topic from the middleware's one thread."""
+        from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
+        from cyclonedds.sub import DataReader
+
+        reader = self._made(DataReader, topic, life=False)
+        condition = ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any)
+        with self._lock:
+            self._readers.append((topic, reader, deliver))
+        self._waitset.attach(condition)
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._read, name="dds", daemon=True)
+            self._thread.start()
+
+    def advertise(self, topic: Topic) -> Publish:
+        """A writer that drops a message rather than wait for a slow reader."""
+        from cyclonedds.core import DDSException
+        from cyclonedds.pub import DataWriter
+
+        from runtime.transports.ros.idl import TYPES
+
+        writer = self._made(DataWriter, topic, life=True)
+        kind = TYPES[topic.message]
+        self._writers.append((topic, writer))
+
+        def publish(payload: bytes) -> None:
+            try:
+                writer.write(kind(payload))
+            except DDSException as error:
+                if (
+                    error.code != DDSException.DDS_RETCODE_TIMEOUT
+                ):  # of a reader that is behind: the next one comes
+                    raise TransportError(f"{topic.name} cannot be published: {error}") from error
+
+        return publish
+
+    def matches(self) -> Mapping[str, Match]:
+        """Read off the statuses of readers and writers, and, where nobody matches, off what others announce."""
+        with self._lock:
+            readers = [(topic, reader) for topic, reader, _ in self._readers]
+        found: dict[str, Match] = {}
+        for topic, reader in readers:
+            peers = len(reader.get_matched_publications())
+            status = reader.get_requested_incompatible_qos_status()
+            found[topic.name] = Match(peers, self._refused(topic, status, peers, publishes=False))
+        for topic, writer in self._writers:
+            peers = len(writer.get_matched_subscriptions())
+            status = writer.get_offered_incompatible_qos_status()
+            found[topic.name] = Match(peers, self._refused(topic, status, peers, publishes=True))
+        return found
+
+    def close(self) -> None:
+        """End the thread, then the participant and all that it has."""
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        for entity in (*(r for _, r, _ in self._readers), *(w for _, w in self._writers), self._participant):
+            if entity is not None:
+                entity.__del__()  # now, whoever still holds it; doing it again is harmless
+        self._readers, self._writers = [], []
+        self._waitset = self._participant = None
+        self._leave()
+
+    def _leave(self) -> None:
+        if self._entered:
+            self._entered = False
+            _domains.leave(self._domain)
+
+    def _made(self, kind: Any, topic: Topic, life: bool) -> Any:
+        """A reader or a writer of the topic."""
+        from cyclonedds.core import DDSException
+        from cyclonedds.topic import Topic as DdsTopic
+
+        from runtime.transports.ros.idl import TYPES
+
+        try:
+            channel = DdsTopic(self._participant, f"rt{topic.name}", TYPES[topic.message])
+            return kind(self._participant, channel, _quality(topic, life))
+        except DDSException as error:
+            raise TransportError(f"{topic.name} cannot be opened: {error}") from error
+
+    def _read(self) -> None:
+        """The thread: hands over what has come; what goes wrong with one message does not end it."""
+        while not self._ending.is_set():
+            try:
+                self._waitset.wait(_WAKE_NS)
+                with self._lock:
+                    readers = list(self._readers)
+                for topic, reader, deliver in readers:
+                    self._hand_over(topic, reader, deliver)
+            except Exception:
+                log.exception("reading from DDS failed")
+                self._ending.wait(0.1)
+
+    def _hand_over(self, topic: Topic, reader: Any, deliver: Deliver) -> None:
+        for sample in reader.take(_TAKEN):
+            payload = getattr(sample, "payload", None)  # absent where a publisher says that it has gone
+            if payload is not None and sample.sample_info.valid_data:
+                deliver(payload)
+
+    def _refused(self, topic: Topic, status: Any, peers: int, publishes: bool) -> str:
+        if status.total_count:
+            policy = _POLICIES.get(status.last_policy_id, f"policy {status.last_policy_id}")
+            return incompatible(topic, policy, publishes)
+        return "" if peers or publishes else self._otherwise_published(topic)
+
+    def _otherwise_published(self, topic: Topic) -> str:
+        """Whether somebody publishes another type on that topic, which DDS says to nobody."""
+        from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+
+        wanted = _type_name(topic)
+        announced = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication).read(_MOST_ENDPOINTS)
+        for endpoint in announced:
+            name, kind = getattr(endpoint, "topic_name", None), getattr(endpoint, "type_name", "")
+            if name == f"rt{topic.name}" and kind != wanted:
+                return f"{topic.name} is published as {_ros_name(kind)}; expected {_ros_name(wanted)}"
+        return ""
+
+
+def require() -> None:
+    """SetupError with what to install where the package is absent or not the one that is needed."""
+    try:
+        from runtime.transports.ros import idl
+    except ImportError as error:
+        raise SetupError(
+            f'transport.middleware = "dds" needs the package cyclonedds ({error}); '
+            'install it: pip install "eva-web[ros2]"'
+        ) from error
+    assert idl.TYPES
+
+
+def _type_name(topic: Topic) -> str:
+    return f"{PACKAGES[topic.message]}::msg::dds_::{topic.message}_"
+
+
+def _ros_name(kind: str) -> str:
+    return kind.replace("::dds_::", "::").removesuffix("_").replace("::", "/")
+
+
+def _quality(topic: Topic, life: bool) -> Any:
+    from cyclonedds.qos import Policy, Qos
+    from cyclonedds.util import duration
+
+    from runtime.transports.ros.idl import HASHES
+
+    asked = topic.quality
+    reliable = asked.reliability == "reliable"
+    policies = [
+        Policy.Reliability.Reliable(duration(milliseconds=1)) if reliable else Policy.Reliability.BestEffort,
+        Policy.History.KeepLast(asked.depth),
+        Policy.Durability.TransientLocal
+        if asked.durability == "transient_local"
+        else Policy.Durability.Volatile,
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.Userdata(f"typehash={HASHES[topic.message]};".encode()),
+    ]
+    if life:
+        policies.append(Policy.Lifespan(duration(seconds=COMMAND_LIFE_S)))
+    return Qos(*policies)

@@ -1,0 +1,86 @@
+"""The ROS messages that a robot's arms and cameras speak, free of any middleware."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, TypeAlias
+
+import numpy as np
+
+from runtime.types import Float64, UInt8
+
+MessageName = Literal["JointState", "Image", "CompressedImage", "PoseStamped"]
+
+
+def _none() -> Float64:
+    return np.zeros(0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointState:
+    """sensor_msgs/JointState: numbers by joint, `stamp` in ROS time [ns]; velocity and effort may be empty."""
+
+    stamp: int
+    frame: str
+    names: tuple[str, ...]
+    position: Float64
+    velocity: Float64 = field(default_factory=_none)
+    effort: Float64 = field(default_factory=_none)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Image:
+    """sensor_msgs/Image: `data` uint8 [N], rows of `step` bytes, in `encoding`."""
+
+    stamp: int
+    frame: str
+    height: int
+    width: int
+    encoding: str
+    step: int
+    data: UInt8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CompressedImage:
+    """sensor_msgs/CompressedImage: a file of `format`, such as "jpeg" or "bgr8; png compressed bgr8"."""
+
+    stamp: int
+    frame: str
+    format: str
+    data: UInt8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseStamped:
+    """geometry_msgs/PoseStamped: `pose` float64 [7] as on the wire, x, y, z [m], quaternion x, y, z, w."""
+
+    stamp: int
+    frame: str
+    pose: Float64
+
+
+Message: TypeAlias = JointState | Image | CompressedImage | PoseStamped
+MESSAGES: dict[MessageName, type[Message]] = {
+    "JointState": JointState,
+    "Image": Image,
+    "CompressedImage": CompressedImage,
+    "PoseStamped": PoseStamped,
+}
+PACKAGES: dict[MessageName, str] = {
+    "JointState": "sensor_msgs",
+    "Image": "sensor_msgs",
+    "CompressedImage": "sensor_msgs",
+    "PoseStamped": "geometry_msgs",
+}
+
+
+class Wire(Protocol):
+    """How messages are bytes on one generation of ROS: the functions of a codec module.
+
+    `decode` raises CodecError. Arrays of bytes that it returns are views into what was given.
+    """
+
+    def decode(self, name: MessageName, payload: bytes) -> Message: ...
+
+    def encode(self, message: Message) -> bytes: ...

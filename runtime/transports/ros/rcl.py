@@ -1,0 +1,153 @@
+"""ROS 2's topics through rclpy, where a ROS 2 installation comes with it for this Python.
+
+Messages pass as bytes both ways, as over plain DDS, so that nothing is converted field by field in Python.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+from runtime.errors import SetupError, TransportError
+from runtime.transports.ros.messages import PACKAGES
+from runtime.transports.ros.middleware import (
+    Deliver,
+    Match,
+    Middleware,
+    Publish,
+    Topic,
+    incompatible,
+)
+
+
+def require() -> None:
+    """SetupError with what to do where rclpy cannot be imported by this Python."""
+    try:
+        for name in ("rclpy", *(f"{package}.msg" for package in set(PACKAGES.values()))):
+            importlib.import_module(name)
+    except ImportError as error:
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+        raise SetupError(
+            f'transport.middleware = "rclpy" needs a ROS 2 installation for Python {version} ({error}); source its '
+            'setup.bash, or use middleware = "dds", which needs none'
+        ) from error
+
+
+class RclMiddleware(Middleware):
+    """One node in a context of its own, so that other nodes of the process are not disturbed; one thread spins it."""
+
+    def __init__(self, domain: int, name: str) -> None:
+        """Join the domain; SetupError without rclpy, TransportError where it cannot start."""
+        require()
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        self._context: Any = rclpy.Context()
+        try:
+            rclpy.init(args=[], context=self._context, domain_id=domain)
+            self._node: Any = rclpy.create_node(name, context=self._context, use_global_arguments=False)
+        except Exception as error:  # rclpy raises its own, of its C layer
+            self._context.try_shutdown()
+            raise TransportError(f"ROS domain {domain} cannot be joined: {error}") from error
+        self._executor: Any = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._subscribed: dict[str, Topic] = {}
+        self._advertised: dict[str, tuple[Topic, Any]] = {}
+        self._refused: dict[str, str] = {}
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = threading.Thread(target=self._spin, name="rclpy", daemon=True)
+        self._thread.start()
+
+    def subscribe(self, topic: Topic, deliver: Deliver) -> None:
+        """Hear the topic from the executor's thread, undecoded."""
+        events, _ = _events()
+        callbacks = events(incompatible_qos=lambda event: self._note(topic, event, publishes=False))
+        self._node.create_subscription(
+            _kind(topic), topic.name, deliver, _quality(topic, False), raw=True, event_callbacks=callbacks
+        )
+        self._subscribed[topic.name] = topic
+
+    def advertise(self, topic: Topic) -> Publish:
+        """A publisher of bytes."""
+        _, events = _events()
+        callbacks = events(incompatible_qos=lambda event: self._note(topic, event, publishes=True))
+        publisher = self._node.create_publisher(
+            _kind(topic), topic.name, _quality(topic, True), event_callbacks=callbacks
+        )
+        self._advertised[topic.name] = (topic, publisher)
+
+        def publish(payload: bytes) -> None:
+            try:
+                publisher.publish(payload)
+            except Exception as error:
+                raise TransportError(f"{topic.name} cannot be published: {error}") from error
+
+        return publish
+
+    def matches(self) -> Mapping[str, Match]:
+        """Publishers are counted as the graph has them; those of another type are named."""
+        found = {}
+        for name, topic in self._subscribed.items():
+            wanted = f"{PACKAGES[topic.message]}/msg/{topic.message}"
+            kinds = [one.topic_type for one in self._node.get_publishers_info_by_topic(name)]
+            others = [kind for kind in kinds if kind != wanted]
+            refused = self._refused.get(name, "")
+            if others and wanted not in kinds:
+                refused = refused or f"{name} is published as {others[0]}; expected {wanted}"
+            found[name] = Match(kinds.count(wanted), refused)
+        for name, (_, publisher) in self._advertised.items():
+            found[name] = Match(publisher.get_subscription_count(), self._refused.get(name, ""))
+        return found
+
+    def close(self) -> None:
+        """End the thread, the node and its context."""
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+            self._executor.shutdown()
+            self._node.destroy_node()
+            self._context.try_shutdown()
+
+    def _spin(self) -> None:
+        while not self._ending.is_set() and self._context.ok():
+            self._executor.spin_once(timeout_sec=0.1)
+
+    def _note(self, topic: Topic, event: Any, publishes: bool) -> None:
+        policy = str(getattr(event.last_policy_kind, "name", event.last_policy_kind)).lower()
+        self._refused[topic.name] = incompatible(topic, policy, publishes)
+
+
+def _kind(topic: Topic) -> Any:
+    return getattr(importlib.import_module(f"{PACKAGES[topic.message]}.msg"), topic.message)
+
+
+def _events() -> tuple[Any, Any]:
+    """The classes of callbacks for subscriptions and publishers; Humble has them elsewhere."""
+    try:
+        module = importlib.import_module("rclpy.event_handler")
+    except ImportError:
+        module = importlib.import_module("rclpy.qos_event")
+    return module.SubscriptionEventCallbacks, module.PublisherEventCallbacks
+
+
+def _quality(topic: Topic, publishes: bool) -> Any:
+    from rclpy.duration import Duration
+    from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+    from runtime.transports.ros.middleware import COMMAND_LIFE_S
+
+    asked = topic.quality
+    reliable, kept = asked.reliability == "reliable", asked.durability == "transient_local"
+    made = QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=asked.depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
+    )
+    if publishes:
+        made.lifespan = Duration(seconds=COMMAND_LIFE_S)
+    return made

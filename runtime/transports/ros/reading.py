@@ -1,0 +1,201 @@
+"""What is read of a robot's messages: joints by name, pictures by encoding; anything doubtful is refused."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from runtime.errors import CodecError
+from runtime.transports.ros.messages import CompressedImage, Image, JointState, PoseStamped
+from runtime.transports.ros.topics import Part
+from runtime.types import Float32, Float64, UInt8
+
+Names = Literal["check", "ignore"]
+_CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "rgba8": 4, "bgra8": 4}
+_JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+PIXELS_LIMIT = 16 * 1024 * 1024
+
+
+class Unusable(CodecError):
+    """A message that cannot be used; `fault` is the name under which it is counted."""
+
+    def __init__(self, fault: str, text: str) -> None:
+        super().__init__(text)
+        self.fault = fault
+
+
+class JointOrder:
+    """Puts the numbers of a message into the order of `part.joints`.
+
+    Messages with names may have more joints and any order. Those without names need exactly as many numbers. With
+    names = "ignore" the first numbers count as they come.
+    """
+
+    def __init__(self, part: Part, names: Names) -> None:
+        self._part = part
+        self._check = names == "check"
+        self._seen: tuple[str, ...] | None = None
+        self._order: list[int] = []
+
+    def read(self, message: JointState) -> tuple[Float64, Float64 | None, Float64 | None]:
+        """Position, and velocity and effort where the message has them: float64 [joints]."""
+        order = self._places(message)
+        position = message.position[order]
+        if not np.isfinite(position).all():
+            raise Unusable("not_finite", f"positions are {position.tolist()}; expected finite numbers")
+        return position, _also(message.velocity, message, order), _also(message.effort, message, order)
+
+    def _places(self, message: JointState) -> list[int]:
+        wanted, size = self._part.joints, len(message.position)
+        if not self._check or not message.names:
+            enough = size >= len(wanted) if not self._check else size == len(wanted)
+            if not enough:
+                raise Unusable(
+                    "wrong_dimension",
+                    f"{size} positions {'without names' if not message.names else ''} came; "
+                    f"expected {len(wanted)}: {', '.join(wanted)}",
+                )
+            return list(range(len(wanted)))
+        if len(message.names) != size:
+            raise Unusable("wrong_dimension", f"{len(message.names)} names came with {size} positions")
+        if message.names != self._seen:
+            self._order = self._ordered(message.names)
+            self._seen = message.names
+        return self._order
+
+    def _ordered(self, names: tuple[str, ...]) -> list[int]:
+        wanted = self._part.joints
+        missing = [name for name in wanted if name not in names]
+        twice = [name for name in wanted if names.count(name) > 1]
+        if missing or twice:
+            wrong = f"lack {', '.join(missing)}" if missing else f"have {', '.join(twice)} more than once"
+            raise Unusable(
+                "joint_names",
+                f"the joints {', '.join(names)} {wrong}; expected {', '.join(wanted)} "
+                f"(transport.topics.groups.{self._part.of}.joints says what messages call them)",
+            )
+        return [names.index(name) for name in wanted]
+
+
+def _also(numbers: Float64, message: JointState, order: list[int]) -> Float64 | None:
+    """Velocity or effort: drivers leave them empty, or shorter, where they do not know them."""
+    if len(numbers) != len(message.position):
+        return None
+    chosen = numbers[order]
+    return chosen if np.isfinite(chosen).all() else None
+
+
+def pose(message: PoseStamped, frame: str) -> Float32:
+    """x, y, z [m], quaternion w, x, y, z: float32 [7] in `frame`."""
+    given = message.frame.lstrip("/")
+    if frame and given and given != frame:
+        raise Unusable("wrong_frame", f"a pose is given in {given}; expected {frame}")
+    numbers = message.pose
+    length = float(np.linalg.norm(numbers[3:]))
+    if not np.isfinite(numbers).all() or abs(length - 1.0) > 0.05:
+        raise Unusable(
+            "bad_pose", f"a pose is {numbers.tolist()}; expected a finite one, its quaternion unit"
+        )
+    return np.concatenate([numbers[:3], numbers[[6, 3, 4, 5]] / length]).astype(np.float32)
+
+
+def check_picture(message: Image | CompressedImage) -> None:
+    """Refuse, without decoding, what `picture` could not use."""
+    if isinstance(message, Image):
+        _check_raw(message)
+    elif _kind_of(message) is None:
+        raise Unusable(
+            "wrong_encoding",
+            f"a picture of format {message.format!r} begins with {bytes(message.data[:4]).hex() or 'nothing'}; "
+            "allowed: jpeg, png (not compressedDepth)",
+        )
+
+
+def picture(message: Image | CompressedImage) -> UInt8:
+    """RGB uint8 [H, W, 3], read-only; Unusable where it cannot be decoded."""
+    rgb = _raw(message) if isinstance(message, Image) else _decompressed(message)
+    rgb.flags.writeable = False
+    return rgb
+
+
+def _check_raw(message: Image) -> None:
+    channels = _CHANNELS.get(message.encoding)
+    if channels is None:
+        raise Unusable(
+            "wrong_encoding", f"a picture is {message.encoding!r}; allowed: {', '.join(sorted(_CHANNELS))}"
+        )
+    _check_size(message.height, message.width)
+    needed = message.step * message.height
+    if message.step < message.width * channels or len(message.data) < needed:
+        raise Unusable(
+            "wrong_dimension",
+            f"a picture of {message.width} x {message.height} {message.encoding} has rows of {message.step} bytes "
+            f"and {len(message.data)} bytes; expected at least {message.width * channels} and {needed}",
+        )
+
+
+def _check_size(height: int, width: int) -> None:
+    if not 0 < height * width <= PIXELS_LIMIT:
+        raise Unusable(
+            "wrong_dimension", f"a picture has {width} x {height} pixels; allowed: 1 to {PIXELS_LIMIT}"
+        )
+
+
+def _raw(message: Image) -> UInt8:
+    import cv2  # imported here, as control locks all that it imports
+
+    _check_raw(message)
+    channels, size = _CHANNELS[message.encoding], message.step * message.height
+    rows = message.data[:size].reshape(message.height, message.step)[:, : message.width * channels]
+    given = rows.reshape(message.height, message.width, channels)
+    if message.encoding == "rgb8":
+        return given.copy()
+    code = {
+        "bgr8": cv2.COLOR_BGR2RGB,
+        "mono8": cv2.COLOR_GRAY2RGB,
+        "rgba8": cv2.COLOR_RGBA2RGB,
+        "bgra8": cv2.COLOR_BGRA2RGB,
+    }[message.encoding]
+    return np.asarray(cv2.cvtColor(given, code), np.uint8)
+
+
+def _kind_of(message: CompressedImage) -> Literal["jpeg", "png"] | None:
+    """What the first bytes say; `format` differs from driver to driver."""
+    if "compressedDepth" in message.format:
+        return None
+    start = bytes(message.data[:8])
+    return "jpeg" if start.startswith(_JPEG) else "png" if start == _PNG else None
+
+
+def _decompressed(message: CompressedImage) -> UInt8:
+    check_picture(message)
+    try:
+        decoded = _jpeg(message) if _kind_of(message) == "jpeg" else _png(message)
+    except (ValueError, OSError, SyntaxError) as error:  # SyntaxError: what Pillow calls a broken PNG
+        raise Unusable(
+            "broken_picture", f"a {message.format!r} picture cannot be decoded: {error}"
+        ) from error
+    # image_transport hands its files to OpenCV, which takes red for blue unless it swaps, as "compressed bgr8" says.
+    return np.ascontiguousarray(decoded[..., ::-1]) if "compressed rgb" in message.format else decoded
+
+
+def _jpeg(message: CompressedImage) -> UInt8:
+    import simplejpeg
+
+    data = message.data.tobytes()
+    height, width, _, _ = simplejpeg.decode_jpeg_header(data)
+    _check_size(height, width)
+    return np.asarray(simplejpeg.decode_jpeg(data, "RGB"), np.uint8)
+
+
+def _png(message: CompressedImage) -> UInt8:
+    import io
+
+    from PIL import Image as Pillow
+
+    with Pillow.open(io.BytesIO(message.data.tobytes()), formats=["PNG"]) as opened:
+        _check_size(opened.height, opened.width)
+        if opened.mode not in ("1", "L", "LA", "P", "RGB", "RGBA"):
+            raise Unusable("wrong_encoding", f"a PNG of mode {opened.mode} came; allowed: 8 bits per channel")
+        return np.array(opened.convert("RGB"), np.uint8)

@@ -1,0 +1,100 @@
+"""Commands to a robot's topics: one message per group, all with the same stamp."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from runtime.clock import Clock
+from runtime.errors import TransportError
+from runtime.transports.base import Sink
+from runtime.transports.ros.messages import JointState, Message, PoseStamped, Wire
+from runtime.transports.ros.middleware import Middleware, Publish, Topic
+from runtime.transports.ros.topics import Outlet
+from runtime.types import EEF_WIDTH, Float32, RobotCommand
+
+if TYPE_CHECKING:
+    from robots import Robot
+    from runtime.transports.ros.middleware import Quality
+
+
+class RosSink(Sink):
+    """Publishes every command on all its topics, those of the simulation first; nothing waits for a subscriber.
+
+    `stamp` of a message is when the command was made, in ROS time, which is this machine's wall clock.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        outlets: tuple[Outlet, ...],
+        quality: Callable[[str], Quality],
+        clock: Clock,
+        wire: Wire,
+        open_middleware: Callable[[], Middleware],
+        wall: Callable[[], float] = time.time,
+    ) -> None:
+        self._robot, self._outlets, self._quality = robot, outlets, quality
+        self._clock, self._wire, self._open, self._wall = clock, wire, open_middleware, wall
+        self._posed = any(outlet.message == "PoseStamped" for outlet in outlets)
+        self._middleware: Middleware | None = None
+        self._publish: list[tuple[Outlet, Publish]] = []
+
+    def connect(self) -> None:
+        """Advertise every topic; subscribers that are not there yet are found by themselves when they come."""
+        self.close()
+        self._middleware = middleware = self._open()
+        self._publish = [
+            (one, middleware.advertise(Topic(one.topic, one.message, self._quality(one.topic))))
+            for one in self._outlets
+        ]
+
+    def send(self, command: RobotCommand) -> None:
+        """Hand over one absolute target; TransportError for a vector that no robot may be given."""
+        if self._middleware is None:
+            raise TransportError("the command topics are not advertised; connect before sending")
+        action = _finite(command.action, self._robot.dim, "a command").astype(np.float64)
+        eef = None
+        if self._posed:
+            if command.eef is None:
+                raise TransportError(
+                    'transport.eef_commands = true, but the command has no poses; needed: publication.space = "eef"'
+                )
+            width = EEF_WIDTH * len(self._robot.arms)
+            eef = _finite(command.eef, width, "a command's poses").astype(np.float64).reshape(-1, EEF_WIDTH)
+        stamp = int((self._wall() - (self._clock.now() - command.time)) * 1e9)
+        # All are made before the first is sent: a command reaches every group or none.
+        messages = [self._wire.encode(self._message(one, stamp, action, eef)) for one, _ in self._publish]
+        for (_, publish), payload in zip(self._publish, messages, strict=True):
+            publish(payload)
+
+    def unheard(self) -> dict[str, str]:
+        """The command topics to which nobody listens, and why not where that is known, or ""."""
+        matches = {} if self._middleware is None else self._middleware.matches()
+        return {topic: match.refused for topic, match in matches.items() if not match.peers or match.refused}
+
+    def close(self) -> None:
+        """Withdraw the topics."""
+        self._publish = []
+        if self._middleware is not None:
+            self._middleware.close()
+            self._middleware = None
+
+    def _message(self, outlet: Outlet, stamp: int, action: np.ndarray, eef: np.ndarray | None) -> Message:
+        if outlet.message == "JointState":
+            return JointState(stamp, "", outlet.joints, action[list(outlet.dims)])
+        assert eef is not None
+        return PoseStamped(stamp, outlet.frame, eef[outlet.arm, [0, 1, 2, 4, 5, 6, 3]])
+
+
+def _finite(numbers: Float32, width: int, what: str) -> Float32:
+    given = np.asarray(numbers, np.float32)
+    if given.shape != (width,) or not np.isfinite(given).all():
+        raise TransportError(
+            f"{what} of shape {list(given.shape)} {given.tolist()} was to be sent; "
+            f"allowed: {width} finite numbers"
+        )
+    return given

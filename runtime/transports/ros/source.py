@@ -1,0 +1,299 @@
+"""A robot's topics as a source of observations: aligned in time, checked, its silences named."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from runtime.clock import Clock
+from runtime.errors import CodecError, ConfigurationError, TransportError
+from runtime.transports.base import Source
+from runtime.transports.freshness import FROZEN_S
+from runtime.transports.ros.alignment import Alignment, Sample
+from runtime.transports.ros.clock import RosClock
+from runtime.transports.ros.frames import Assembly, Readers, Received
+from runtime.transports.ros.messages import Message, Wire
+from runtime.transports.ros.middleware import Match, Middleware, Quality, Topic
+from runtime.transports.ros.reading import Names, Unusable
+from runtime.transports.ros.topics import Part
+from runtime.types import Observation
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+log = logging.getLogger(__name__)
+_PICTURES_DEPTH = 32  # of a camera; a second of them at 30 Hz
+_HISTORY_S = 1.0
+_GRACE_S = 1.0  # for publishers and us to find each other
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A subscription: its topic, and the parts of a frame that its messages have."""
+
+    topic: Topic
+    parts: tuple[Part, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """How messages are taken."""
+
+    skew: float  # s, window of the alignment
+    stalled: float  # s, after which a stream counts as stalled
+    names: Names
+    stamped: bool  # by their senders; else by their arrival here
+    detect_frozen: bool
+
+
+class RosSource(Source):
+    """Delivers the newest frame of aligned messages; waits where streams do not belong together.
+
+    Messages are checked as they come, on the middleware's thread, and counted by what is wrong with them. Reading
+    takes nothing away: this source is one reader of `alignment`, with a cursor of its own. What is wrong for as
+    long as no frame comes is raised once as TransportError: a stream that is silent, with its age, and who is at the
+    other side of its topic.
+    """
+
+    _cursor: float  # the moment of the frame delivered last, in the senders' clock
+    _count: int
+
+    def __init__(
+        self,
+        robot: Robot,
+        heard: tuple[Heard, ...],
+        terms: Terms,
+        clock: Clock,
+        wire: Wire,
+        open_middleware: Callable[[], Middleware],
+    ) -> None:
+        self._robot, self._heard, self._terms, self._clock = robot, heard, terms, clock
+        self._wire, self._open = wire, open_middleware
+        self._parts = tuple(part for one in heard for part in one.parts)
+        self._topics = {part.name: one.topic for one in heard for part in one.parts}
+        self._middleware: Middleware | None = None
+        self._changed = threading.Condition()
+        self._forget()
+
+    def connect(self) -> None:
+        """Subscribe to everything; publishers that are not there yet are found by themselves when they come."""
+        self.close()
+        self._forget()
+        self._began = self._framed_at = self._clock.now()
+        self._middleware = self._open()
+        for one in self._heard:
+            self._middleware.subscribe(one.topic, self._taker(one))
+
+    def receive(self, timeout: float) -> Observation | None:
+        """The newest frame not yet delivered, as RGB; None after `timeout` seconds without one.
+
+        Raises TransportError with what keeps frames from coming, once for each such sentence.
+        """
+        if self._middleware is None:
+            raise TransportError("the ROS topics are not subscribed; connect before receiving")
+        with self._changed:
+            self._changed.wait_for(lambda: self.alignment.frame(self._cursor) is not None, timeout)
+            aligned = self.alignment.frame(self._cursor)
+            if aligned is not None:
+                self._cursor = aligned.time
+        if aligned is None:
+            self._complain()
+            return None
+        self._count += 1
+        self._framed_at = self._clock.now()
+        try:
+            made = self._assembly.observation(self._count, aligned)
+        except Unusable as error:
+            self._blame(error.fault, str(error))
+            return None
+        for camera in self._assembly.newly_frozen(self._clock.now()):
+            self._blame(f"frozen_{camera}", f"{camera} shows the same picture for over {FROZEN_S:g} s")
+        self._told.clear()
+        return made
+
+    def close(self) -> None:
+        """Stop listening."""
+        if self._middleware is not None:
+            self._middleware.close()
+            self._middleware = None
+
+    def faults(self) -> dict[str, int]:
+        """Refused messages by reason, `stalled_<stream>`, `frozen_<camera>`, jumps of the senders' clock."""
+        with self._changed:
+            self._notice_stalls()
+            counts = dict(self._faults)
+            jumps = {"clock_backwards": self._ros.backwards, "clock_forwards": self._ros.forwards}
+        return counts | {name: count for name, count in jumps.items() if count}
+
+    @property
+    def last_fault(self) -> str:
+        """The sentence of the newest fault; empty where there was none."""
+        return self._last_fault
+
+    def stalled(self) -> dict[str, float]:
+        """The streams without a usable message for too long, with the age of their newest, or of the link [s]."""
+        now, began = self._clock.now(), self._began
+        ages = {part.name: now - self._heard_at.get(part.name, began + _GRACE_S) for part in self._parts}
+        return {
+            name: age if name in self._heard_at else age + _GRACE_S
+            for name, age in ages.items()
+            if age > self._terms.stalled
+        }
+
+    def _forget(self) -> None:
+        self._ros = RosClock()
+        names = [part.name for part in self._parts]
+        self.alignment: Alignment[Received] = Alignment(
+            names,
+            self._terms.skew,
+            max(_HISTORY_S, 2 * self._terms.skew),
+            {part.name: _PICTURES_DEPTH for part in self._parts if part.kind == "camera"},
+        )
+        self._readers = Readers(self._robot, self._parts, self._terms.names)
+        self._assembly = Assembly(self._robot, self._parts, self._terms.detect_frozen)
+        self._faults: Counter[str] = Counter()
+        self._last_fault = ""
+        self._refusals: dict[str, tuple[str, str]] = {}  # by stream: why its newest message is unusable
+        self._heard_at: dict[str, float] = {}
+        self._stalled: set[str] = set()
+        self._told: set[str] = set()
+        self._cursor = float("-inf")
+        self._count = 0
+        self._began = self._framed_at = 0.0
+
+    def _taker(self, one: Heard) -> Callable[[bytes], None]:
+        def take(payload: bytes) -> None:
+            arrived = self._clock.now()
+            try:
+                message = self._wire.decode(one.topic.message, payload)
+            except CodecError as error:
+                self._blame("malformed", f"{one.topic.name}: {error}")
+                return
+            for part in one.parts:
+                self._take(part, message, arrived)
+
+        return take
+
+    def _take(self, part: Part, message: Message, arrived: float) -> None:
+        """Keep one message; whatever is wrong with it is counted and ends nothing."""
+        try:
+            value = self._readers.read(part, message)
+            stamp = self._stamp(message, arrived)
+        except Unusable as error:
+            self._blame(error.fault, f"{part.topic}: {error}", part.name)
+            return
+        except Exception as error:
+            log.exception("reading %s failed", part.topic)
+            self._blame("reader_failed", f"{part.topic}: {type(error).__name__}: {error}", part.name)
+            return
+        with self._changed:
+            before = self._ros.backwards
+            ours = self._ros.see(part.name, stamp, arrived)
+            if self._ros.backwards > before:
+                self.alignment.clear()
+                self._cursor = float("-inf")
+            if self.alignment.add(part.name, Sample(stamp, arrived, Received(value, ours))):
+                self._heard_at[part.name] = arrived
+                self._refusals.pop(part.name, None)
+                self._changed.notify_all()
+            else:
+                self._faults["not_newer"] += 1
+                self._refusals[part.name] = ("not_newer", "its stamps do not advance")
+
+    def _stamp(self, message: Message, arrived: float) -> float:
+        if not self._terms.stamped:
+            return arrived
+        if message.stamp <= 0:
+            raise Unusable(
+                "unstamped",
+                'its header has no stamp; let the driver set it, or say transport.stamps = "arrival"',
+            )
+        return message.stamp * 1e-9
+
+    def _notice_stalls(self) -> None:
+        """Count each stream that has just stalled."""
+        now = self.stalled()
+        for name in now.keys() - self._stalled:
+            self._faults[f"stalled_{name.replace(' ', '_')}"] += 1
+            self._last_fault = self._silence(name, now[name], Match(1))
+        self._stalled = set(now)
+
+    def _complain(self) -> None:
+        """Raise why no frame comes, once per reason; says nothing while streams are merely on their way."""
+        with self._changed:
+            stalled = self.stalled()
+            fresh = {self._reason(name): name for name in stalled}
+            apart = [] if stalled or self._waited() <= self._terms.stalled else self.alignment.apart()
+        fresh = {reason: name for reason, name in fresh.items() if reason not in self._told}
+        if apart and "apart" not in self._told:
+            self._told.add("apart")
+            self._last_fault = self._distance(apart)
+            raise TransportError(self._last_fault)
+        if not fresh:
+            return
+        assert self._middleware is not None
+        matches = self._middleware.matches()
+        self._told |= fresh.keys()
+        sentences = [
+            self._silence(name, stalled[name], matches.get(self._topics[name].name, Match(0)))
+            for name in fresh.values()
+        ]
+        self._last_fault = "; ".join(sentences)
+        raise TransportError(self._last_fault)
+
+    def _waited(self) -> float:
+        return self._clock.now() - self._framed_at
+
+    def _reason(self, name: str) -> str:
+        """What is said once: a stream's silence, or what is wrong with its messages."""
+        return f"{name}: {self._refusals.get(name, ('', ''))[0]}"
+
+    def _silence(self, name: str, age: float, match: Match) -> str:
+        topic = self._topics[name].name
+        refusal = self._refusals.get(name)
+        why = match.refused or ("" if match.peers else "nobody publishes it")
+        if refusal is not None:
+            why = refusal[1]
+        since = "nothing" if refusal is None else "nothing usable"
+        return f"waiting for {name} ({topic}): {since} for {age:.1f} s" + (f": {why}" if why else "")
+
+    def _distance(self, apart: list[str]) -> str:
+        newest = {part.name: self.alignment.newest(part.name) for part in self._parts}
+        stamps = {name: sample.stamp for name, sample in newest.items() if sample is not None}
+        slowest = min(stamps, key=lambda name: stamps[name])
+        behind = max(stamps.values()) - stamps[slowest]
+        return (
+            f"no message of {', '.join(apart)} is within {self._terms.skew:g} s of the newest of {slowest}, whose "
+            f"stamps are {behind:.2f} s behind the others': have the robot's computers one clock? "
+            "(transport.max_skew_s)"
+        )
+
+    def _blame(self, fault: str, text: str, stream: str = "") -> None:
+        with self._changed:
+            self._faults[fault] += 1
+            self._last_fault = text
+            if stream:
+                self._refusals[stream] = (fault, text)
+
+
+def subscriptions(parts: tuple[Part, ...], quality: Callable[[str], Quality]) -> tuple[Heard, ...]:
+    """One per topic: several groups may be on the same one, as on /joint_states."""
+    by_topic: dict[str, list[Part]] = defaultdict(list)
+    for part in parts:
+        by_topic[part.topic].append(part)
+    for topic, found in by_topic.items():
+        kinds = sorted({part.message for part in found})
+        if len(kinds) > 1:
+            names = ", ".join(part.name for part in found)
+            raise ConfigurationError(
+                f"transport: {topic} is the topic of {names}, which are {' and '.join(kinds)}; "
+                "allowed: one type of message per topic"
+            )
+    return tuple(
+        Heard(Topic(topic, found[0].message, quality(topic)), tuple(found))
+        for topic, found in by_topic.items()
+    )

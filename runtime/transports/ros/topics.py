@@ -1,0 +1,217 @@
+"""Which topics a deployment listens to and speaks on: the robot's own, unless the deployment names others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field
+
+from runtime.errors import ConfigurationError
+from runtime.section import Section
+from runtime.transports.ros.messages import MessageName
+
+if TYPE_CHECKING:
+    from robots import Camera, Group, Robot
+
+TopicName = Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$|^$")]
+Target = Literal["robot", "simulation"]
+
+
+class GroupTopics(Section):
+    """Topics of one group where they are not those of the robot's description; "" for one that there is none of."""
+
+    state: TopicName | None = None
+    """sensor_msgs/JointState: where the group is."""
+    command: TopicName | None = None
+    """sensor_msgs/JointState: where it is told to go."""
+    eef: TopicName | None = None
+    """geometry_msgs/PoseStamped: where its end effector is, in the group's own frame."""
+    eef_command: TopicName | None = None
+    """geometry_msgs/PoseStamped: where its end effector is told to go."""
+    gripper_state: TopicName | None = None
+    """sensor_msgs/JointState: its gripper, where that is not among the numbers of `state`."""
+    gripper_command: TopicName | None = None
+    """sensor_msgs/JointState: its gripper, where that is not among the numbers of `command`."""
+    simulation: TopicName | None = None
+    """sensor_msgs/JointState: the same command for a simulation that runs beside the robot."""
+    joints: list[str] | None = None
+    """What the messages call the group's joints, in its order, where that is not what the robot's description does."""
+
+
+class Topics(Section):
+    """Topics that are not those of the robot's description."""
+
+    cameras: dict[str, TopicName] = Field(default_factory=dict)
+    """By the logical name of the camera."""
+    groups: dict[str, GroupTopics] = Field(default_factory=dict)
+    """By the name of the group."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One stream of a frame: what kind it is, of which group or camera (key), on which topic.
+
+    `joints` are the names in the message of the numbers that are wanted, in the group's order.
+    """
+
+    kind: Literal["joints", "gripper", "eef", "camera"]
+    of: str
+    topic: str
+    message: MessageName
+    joints: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The stream's name: a camera's key, or "left_arm joints"."""
+        return self.of if self.kind == "camera" else f"{self.of} {self.kind}"
+
+
+@dataclass(frozen=True, slots=True)
+class Outlet:
+    """One topic of commands: the places in the robot's vector that go there, under these joint names.
+
+    For a pose, `arm` is the arm's place among the robot's arms, and `frame` what the pose is expressed in.
+    """
+
+    topic: str
+    message: MessageName
+    dims: tuple[int, ...] = ()
+    joints: tuple[str, ...] = ()
+    arm: int = -1
+    frame: str = ""
+
+
+class TopicPlan:
+    """The topics for one robot; ConfigurationError names what is missing or not the robot's."""
+
+    def __init__(self, robot: Robot, version: Literal[1, 2], given: Topics, disabled: list[str]) -> None:
+        self._robot, self._given = robot, given
+        self._own = robot.ros if robot.ros is not None and robot.ros.version == version else None
+        _known("topics.cameras", given.cameras, [camera.name for camera in robot.cameras], robot)
+        _known("topics.groups", given.groups, [group.name for group in robot.groups], robot)
+        _known("disabled_cameras", disabled, [camera.key for camera in robot.cameras], robot)
+        self.cameras = tuple(camera for camera in robot.cameras if camera.key not in disabled)
+        for group in robot.groups:
+            self._check_joints(group)
+
+    def parts(self, eef: bool) -> tuple[Part, ...]:
+        """Everything that a frame consists of, with poses where `eef`."""
+        made = [self._camera(camera) for camera in self.cameras]
+        for group in self._robot.groups:
+            made += self._state(group)
+            if eef and group.chain is not None:
+                topic = self._required(group, "eef", "eef = true needs the poses of every arm")
+                made.append(Part("eef", group.name, topic, "PoseStamped"))
+        return tuple(made)
+
+    def outlets(self, targets: Sequence[Target], eef: bool) -> tuple[Outlet, ...]:
+        """Where commands go, in the order of the targets, with poses where `eef`; one message per topic."""
+        merged: dict[str, Outlet] = {}
+        for target in targets:
+            for group in self._robot.groups:
+                for outlet in self._commands(group, target, eef):
+                    merged[outlet.topic] = _merged(merged.get(outlet.topic), outlet)
+        return tuple(merged.values())
+
+    def _camera(self, camera: Camera) -> Part:
+        topic = self._given.cameras.get(camera.name)
+        if topic is None and self._own is not None:
+            topic = self._own.cameras.get(camera.name)
+        if not topic:
+            raise ConfigurationError(
+                f"transport: no topic of camera {camera.name} ({camera.key}) is known; needed: "
+                f'transport.topics.cameras.{camera.name}, or "{camera.key}" among transport.disabled_cameras'
+            )
+        compressed = topic.endswith("/compressed")
+        return Part("camera", camera.key, topic, "CompressedImage" if compressed else "Image")
+
+    def _state(self, group: Group) -> Iterator[Part]:
+        names = self._names(group)
+        topic = self._required(group, "state", "every group says where it is")
+        apart = self._topic(group, "gripper_state")
+        index = None if group.gripper is None else group.gripper.index
+        if not apart or index is None:
+            yield Part("joints", group.name, topic, "JointState", names)
+            return
+        yield Part("joints", group.name, topic, "JointState", names[:index] + names[index + 1 :])
+        yield Part("gripper", group.name, apart, "JointState", (names[index],))
+
+    def _commands(self, group: Group, target: Target, eef: bool) -> Iterator[Outlet]:
+        names, dims = self._names(group), tuple(range(group.slice.start, group.slice.stop))
+        if target == "simulation":
+            topic = self._required(group, "simulation", 'commands_to has "simulation"')
+            yield Outlet(topic, "JointState", dims, names)
+            return
+        if eef and group.chain is not None:
+            topic = self._required(group, "eef_command", "eef_commands = true needs one for every arm")
+            place = [arm.name for arm in self._robot.arms].index(group.name)
+            yield Outlet(topic, "PoseStamped", arm=place, frame=group.frame or "")
+            yield from self._joint_commands(group, names, dims, posed=True)
+        else:
+            yield from self._joint_commands(group, names, dims, posed=False)
+
+    def _joint_commands(
+        self, group: Group, names: tuple[str, ...], dims: tuple[int, ...], posed: bool
+    ) -> Iterator[Outlet]:
+        """The group's joints, its gripper by itself where it has a topic; a posed arm needs the latter alone."""
+        apart = self._topic(group, "gripper_command")
+        index = None if group.gripper is None else group.gripper.index
+        topic = self._topic(group, "command")
+        if not topic and not (posed and (apart or index is None)):
+            self._required(group, "command", "every number of the robot has to be told")
+        if apart and index is not None:
+            yield Outlet(apart, "JointState", dims[index : index + 1], names[index : index + 1])
+            names, dims = names[:index] + names[index + 1 :], dims[:index] + dims[index + 1 :]
+        if topic:
+            yield Outlet(topic, "JointState", dims, names)
+
+    def _names(self, group: Group) -> tuple[str, ...]:
+        given = self._given.groups.get(group.name)
+        return group.joints if given is None or given.joints is None else tuple(given.joints)
+
+    def _check_joints(self, group: Group) -> None:
+        names = self._names(group)
+        if len(names) != group.dof or len(set(names)) != len(names):
+            raise ConfigurationError(
+                f"transport.topics.groups.{group.name}.joints = {list(names)}; "
+                f"allowed: {group.dof} different names, in the order of {', '.join(group.joints)}"
+            )
+
+    def _topic(self, group: Group, field: str) -> str:
+        """The topic, "" where there is none."""
+        given = getattr(self._given.groups.get(group.name), field, None)
+        if given is None and self._own is not None:
+            given = getattr(self._own.groups.get(group.name), field, None)
+        return str(given or "")
+
+    def _required(self, group: Group, field: str, why: str) -> str:
+        topic = self._topic(group, field)
+        if not topic:
+            raise ConfigurationError(
+                f"transport: no {field} topic of group {group.name} is known; needed: "
+                f"transport.topics.groups.{group.name}.{field} ({why})"
+            )
+        return topic
+
+
+def _merged(before: Outlet | None, outlet: Outlet) -> Outlet:
+    """One message of both: groups may share a topic of commands where their joints have names of their own."""
+    if before is None:
+        return outlet
+    joints = before.joints + outlet.joints
+    if {before.message, outlet.message} != {"JointState"} or len(set(joints)) != len(joints):
+        raise ConfigurationError(
+            f"transport: several commands go to {outlet.topic}; allowed: one per topic, or joints alone whose names "
+            f"are all different, not {', '.join(joints)}"
+        )
+    return replace(before, dims=before.dims + outlet.dims, joints=joints)
+
+
+def _known(key: str, given: Mapping[str, object] | list[str], allowed: list[str], robot: Robot) -> None:
+    unknown = [name for name in given if name not in allowed]
+    if unknown:
+        raise ConfigurationError(
+            f"transport.{key}: {', '.join(unknown)} not of {robot.name}; allowed: {', '.join(allowed)}"
+        )
