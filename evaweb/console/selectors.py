@@ -93,6 +93,7 @@ def robot_facts(*, robot: str) -> dict[str, Any]:
     return {
         "names": found["joint_names"],
         "units": found["units"],
+        "grippers": found["gripper_dims"],
         "cameras": found["cameras"],
         "title": found["title"],
         "error": found.get("error", ""),

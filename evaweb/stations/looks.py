@@ -72,13 +72,14 @@ class Looks:
         return units_of(self.robot)
 
     def facts(self) -> dict[str, Any]:
-        """Groups, names and units of the numbers, names of the cameras, and the robot's title."""
+        """Groups, names and units of the numbers, which are grippers, names of the cameras, and the robot's title."""
         return {
             "robot": self.robot.name,
             "title": self.robot.title,
             "groups": [group.name for group in self.robot.groups],
             "joint_names": list(self.robot.joint_names),
             "units": list(self.units),
+            "gripper_dims": list(self.robot.gripper_dims),
             "cameras": [camera.key for camera in self.robot.cameras],
             "rate": self.robot.control_rate,
         }
@@ -123,5 +124,7 @@ def facts_of(robot: str) -> dict[str, Any]:
     try:
         return looks_of(robot).facts()
     except NotFound as error:
-        nothing: dict[str, Any] = {"groups": [], "joint_names": [], "units": [], "cameras": []}
+        nothing: dict[str, Any] = {
+            key: [] for key in ("groups", "joint_names", "units", "gripper_dims", "cameras")
+        }
         return {"robot": robot, "title": robot, **nothing, "error": str(error)}

@@ -25,7 +25,7 @@ export async function curvePane(store) {
   const legend = new Legend(document.getElementById("curves-legend"), (name, shown) => curves.reveal(name, shown));
   const markLegend = new MarkLegend(document.getElementById("curves-marks"));
   const curves = new Curves({ element: document.getElementById("curves"), library, legend, markLegend, names: config.joints });
-  const select = joints(curves, config.joints, config.units);
+  const select = joints(curves, config.joints, config.units, config.grippers);
   document.getElementById("joint-next").addEventListener("click", () => {
     select.selectedIndex = (select.selectedIndex + 1) % Math.max(1, select.options.length);
     select.dispatchEvent(new Event("change"));
@@ -45,7 +45,7 @@ export async function curvePane(store) {
   };
 }
 
-function joints(curves, names, units, grippers = []) {
+function joints(curves, names, units, grippers) {
   const select = document.getElementById("joint");
   select.replaceChildren(...jointOptions(names, grippers));
   const wanted = names.indexOf(localStorage.getItem(KEY));

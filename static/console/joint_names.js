@@ -1,6 +1,6 @@
 // Names of joints, "group.joint": in groups, and as short as still tells one from the other.
 
-const LONG = 22; // letters that a list has room for
+const LONG = 18; // letters that a list has room for
 
 /** {group, joint} of a full name. */
 export function parted(full) {

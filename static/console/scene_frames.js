@@ -11,7 +11,7 @@ const LENGTH = { end: 0.075, reference: 0.13 }; // m
 const THICK = 0.0026; // m, radius
 const LABEL = 0.023; // height of a name, where 1 is about the view's
 const BELOW = [0.5, 1.6]; // where the frame is in its name's box, from 0 to 1
-const BEHIND = [1.12, 0.9];
+const ABOVE = [1.05, -0.5];
 
 export class Frames {
   #frames; // [{part, pose}] of the server
@@ -63,7 +63,7 @@ function triad({ name, kind, part }) {
     arm.rotation.set(...turn);
     group.add(arm);
   }
-  group.add(label(name, part === null ? BEHIND : BELOW));
+  group.add(label(name, part === null ? ABOVE : BELOW));
   return group;
 }
 

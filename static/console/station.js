@@ -84,7 +84,7 @@ async function start() {
   document.body.addEventListener("htmx:afterSettle", () => steps(store));
   steps(store);
   setInterval(() => store.tell("second"), 500);
-  const joints = ({ joint_names: names, units, gripper_dims: grippers }) => names?.length && panes.curves.joints(names, units ?? config.units, grippers);
+  const joints = ({ joint_names: names, units, gripper_dims: grippers }) => names?.length && panes.curves.joints(names, units ?? config.units, grippers ?? config.grippers);
   store.on("snapshot", ({ facts }) => facts && joints(facts));
   store.on("snapshot", (snapshot) => snapshot.truth && panes.scene.bench(snapshot.truth));
   scenePane(store).then((pane) => Object.assign(panes, { scene: pane }));

@@ -227,6 +227,7 @@ def test_the_page_knows_its_addresses_joints_and_units(browser: Client, station:
     assert config["role"] == "operator"
     assert config["joints"][0] == "left_arm.joint0"
     assert (config["units"][0], config["units"][6]) == ("rad", "m")
+    assert config["grippers"] == [6, 13]
     assert config["cameras"] == ["cam_high", "cam_left_wrist", "cam_right_wrist"]
 
 
