@@ -16,6 +16,7 @@ MARGIN = 0.005  # [m] within which links count as touching, unless somebody says
 _POSTURES = 256  # at which is looked whether two links ever part
 _NEARLY_ALWAYS = 0.95  # of them
 _LEVEL = 1e-3  # [m] by which the height of what only turns about the vertical changes
+_DIP = 0.01  # [m] that the middle of a finger may be below the table: a mount is no truer, and fingers press
 _REACHING = ("arm", "hand")  # kinds of groups that come down to the table
 _BLOCK = 16  # postures at once: what lies in between then fits the caches
 
@@ -25,7 +26,8 @@ _Indices = NDArray[np.intp]
 class Clearance:
     """Distances of the `pairs` that are looked at, by the names of parts ("left_arm/link5") or "table".
 
-    A pair of links is there once for each pair of their capsules.
+    A pair of links is there once for each pair of their capsules. Fingers reach down to the table on purpose: over it
+    they count as the lines in the middle of their capsules, and may dip in a little (`least`).
 
     Looked at are links of different arms, links of one body, and links over the table (the plane z = 0 of the
     scene). Left out, for they say nothing:
@@ -33,8 +35,7 @@ class Clearance:
     * links with at most one of the robot's joints between them (grippers do not count, nor joints that no group
       moves); of two arms that each stand for themselves, links that nothing moves;
     * pairs that touch at nearly every posture (95 %), as in a wrist, in this arm and in others like it;
-    * the table under what no arm or hand moves (a torso stands beside it) or what only turns about the vertical, and
-      under fingers: they reach down to it on purpose;
+    * the table under what no arm or hand moves (a torso stands beside it) or what only turns about the vertical;
     * what robot.toml says under collision.ignore and collision.without.
     """
 
@@ -54,6 +55,7 @@ class Clearance:
         self._ends = np.ones((len(found), 4, 2))  # in the link, homogeneous
         for ends, (_, capsule) in zip(self._ends, found, strict=True):
             ends[:3, 0], ends[:3, 1] = capsule.start, capsule.end
+        self._fingers = np.asarray(body.moved()[self._parts][:, list(robot.gripper_dims)].any(axis=1))
         self._look_at(*_candidates(robot, body, self._parts))
         self._look_at(*self._telling(robot))
 
@@ -79,10 +81,17 @@ class Clearance:
         lowest = ends[..., self._over, 2, :].min(axis=-1)
         return np.asarray(np.concatenate([apart, lowest], axis=-1) - self._thick)
 
+    def least(self, margin: float) -> Float64:
+        """Distances [K] under which pairs count as touching: `margin`, and for fingers over the table less than 0."""
+        least = np.full(len(self.pairs), margin)
+        least[len(self._first) :][self._fingers[self._over]] = -_DIP
+        return least
+
     def _look_at(self, first: _Indices, second: _Indices, over: _Indices) -> None:
         """The pairs from now on: capsules `first` and `second`, and those `over` the table."""
         self._first, self._second, self._over = first, second, over
-        self._thick = np.concatenate([self._radii[first] + self._radii[second], self._radii[over]])
+        standing = np.where(self._fingers[over], 0.0, self._radii[over])
+        self._thick = np.concatenate([self._radii[first] + self._radii[second], standing])
         names = self._names
         self.pairs = (
             *((names[one], names[other]) for one, other in zip(first, second, strict=True)),
@@ -123,7 +132,6 @@ def _candidates(robot: Robot, body: Body, parts: _Indices) -> tuple[_Indices, _I
     for group in robot.groups:
         reaching[group.slice] = group.kind in _REACHING
     carried = moved[:, reaching & ~grippers].any(axis=1)
-    fingers = moved[:, grippers].any(axis=1)
     moved = moved[:, ~grippers]
     roots = np.array([_root(body, part) for part in parts])
     between = (moved[:, None] ^ moved[None]).sum(axis=-1)
@@ -143,7 +151,7 @@ def _candidates(robot: Robot, body: Body, parts: _Indices) -> tuple[_Indices, _I
     over = np.array(
         [
             index
-            for index in np.flatnonzero(carried & ~fingers)
+            for index in np.flatnonzero(carried)
             if not ignored & {frozenset((links[index], TABLE)), frozenset((names[index], TABLE))}
         ],
         dtype=np.intp,
@@ -160,6 +168,7 @@ def _root(body: Body, part: np.intp) -> int:
 def problems(robot: Robot, margin: float = MARGIN) -> list[str]:
     """What is wrong with [collision] of the robot, in sentences: pairs that touch at a named pose, or no pairs."""
     clearance = Clearance(robot)
+    least = dict(zip(clearance.pairs, clearance.least(margin).tolist(), strict=True))
     if not clearance.pairs:
         return ["collision: no two links are looked at; links need shapes, or capsules in robot.toml"]
     found: dict[tuple[str, str, str], float] = {}
@@ -167,8 +176,8 @@ def problems(robot: Robot, margin: float = MARGIN) -> list[str]:
         for (one, other), apart in zip(clearance.pairs, clearance.distances(pose).tolist(), strict=True):
             found[name, one, other] = min(apart, found.get((name, one, other), apart))
     return [
-        f"poses.{name}: {one} and {other} are {1000 * apart:.0f} mm apart, needed: {1000 * margin:g}; correct the "
-        "pose or the capsules, or name the pair in collision.ignore"
+        f"poses.{name}: {one} and {other} are {1000 * apart:.0f} mm apart, needed: {1000 * least[one, other]:g}; "
+        "correct the pose or the capsules, or name the pair in collision.ignore"
         for (name, one, other), apart in found.items()
-        if apart < margin
+        if apart < least[one, other]
     ]

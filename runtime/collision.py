@@ -41,18 +41,18 @@ class Collisions:
 
     def __init__(self, robot: Robot, margin: float) -> None:
         self._clearance = Clearance(robot)
-        self._margin = margin
+        self._least = self._clearance.least(margin)
         self._grippers = np.array(robot.gripper_dims, dtype=np.intp)
 
     def nearest(self, q: Float64) -> Collision | None:
         """The nearest pair within the margin; None where there is none."""
         apart = self._clearance.distances(q)
-        return self._worst(apart, apart < self._margin)
+        return self._worst(apart, apart < self._least)
 
     def approached(self, q: Float64, before: Float64) -> Collision | None:
         """The nearest pair that touches at `q` and came nearer since `before`; None where nothing does."""
         apart = self._clearance.distances(q)
-        touching = apart < self._margin
+        touching = apart < self._least
         if not touching.any():
             return None
         return self._worst(
@@ -74,7 +74,7 @@ class Collisions:
     def _hit(self, way: Float64) -> tuple[Collision, int] | None:
         apart = self._clearance.distances(way)  # [T, K]
         farthest = np.maximum.accumulate(apart, axis=0)
-        wrong = (apart < self._margin) & (apart < farthest - _NEARER)
+        wrong = (apart < self._least) & (apart < farthest - _NEARER)
         if not wrong.any():
             return None
         at = int(wrong.any(axis=1).argmax())

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import robots
+from robots import Robot
 from robots.body import Body
 from robots.capsules import Capsule, capsules
 from robots.clearance import MARGIN, Clearance, problems
@@ -38,6 +39,13 @@ def balls(capsule: Capsule, pose: Float64, count: int = 300) -> Float64:
     return np.asarray(along @ pose[:3, :3].T + pose[:3, 3])
 
 
+def fingers(robot: Robot) -> set[str]:
+    """What grippers move, with what is fixed to it."""
+    body = Body(robot)
+    moved = body.moved()[:, list(robot.gripper_dims)].any(axis=1)
+    return {part for part, moves in zip(body.parts, moved, strict=True) if moves}
+
+
 def sampled(name: str, one: str, other: str, q: Float64) -> float:
     """The distance of two links, or of a link and the table, from many points along their capsules."""
     robot = robots.load(name)
@@ -49,7 +57,8 @@ def sampled(name: str, one: str, other: str, q: Float64) -> float:
         return [(balls(capsule, poses[body.part(part)]), capsule.radius) for capsule in made[link]]
 
     if other == TABLE:
-        return min(float(points[:, 2].min()) - radius for points, radius in dense(one))
+        finger = one in fingers(robot)
+        return min(float(points[:, 2].min()) - (0.0 if finger else radius) for points, radius in dense(one))
     return min(
         float(np.linalg.norm(a[:, None] - b[None], axis=-1).min()) - r - s
         for a, r in dense(one)
@@ -101,7 +110,18 @@ def test_the_table_is_looked_at_under_what_can_come_down_to_it() -> None:
     assert between("left_arm/link3", TABLE)
     assert not between("left_arm/base_link", TABLE)  # stands on it
     assert not between("left_arm/link1", TABLE)  # only turns about the vertical
-    assert not between("left_arm/link7", TABLE)  # a finger, which grasps what lies there
+    assert between("left_arm/link7", TABLE)  # a finger
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_fingers_may_touch_the_table_and_dip_in_a_little_but_no_more(name: str) -> None:
+    robot, looked = robots.load(name), clearance(name)
+    jaws = fingers(robot)
+    over = {one for one, other in looked.pairs if other == TABLE}
+    assert jaws
+    assert jaws & {part for pair in looked.pairs for part in pair} <= over
+    for (one, other), least in zip(looked.pairs, looked.least(0.02), strict=True):
+        assert least == (-0.01 if other == TABLE and one in jaws else 0.02)
 
 
 def test_what_touches_at_nearly_every_posture_is_left_out_alike_in_both_arms() -> None:

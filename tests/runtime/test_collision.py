@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runtime.collision import Collision
+import robots
+from robots import Body, Robot
+from robots.rotations import quaternion_of_matrix
+from runtime.collision import Collision, Collisions
+from runtime.kinematics.compiled import CompiledKinematics
+from runtime.types import Float64
 from tests.runtime.collision_samples import MARGIN, collisions, robot, turned, way
 
 FREE, NEAR, DEEP = turned(0.5), turned(1.2), turned(1.4)
@@ -26,7 +31,39 @@ def test_the_table_is_one_of_them() -> None:
     low[1] = 2.15
     found = collisions().nearest(low)
     assert found is not None
-    assert (found.one, found.other) == ("left_arm/gripper_base", "table")
+    assert found.one in ("left_arm/link7", "left_arm/link8")  # fingers
+    assert found.other == "table"
+
+
+def fingers_down(robot: Robot, height: float) -> Float64:
+    """The first arm's fingertips at that height over the table, pointing down, from its pose `ready` on."""
+    arm, q = robot.arms[0], robot.poses["ready"]
+    kinematics = CompiledKinematics(robot)
+    body = Body(robot)
+    frame = body.poses(q)[body.link_of(arm.name, str(arm.frame))]
+    assert arm.tip is not None
+    tip = frame @ arm.transform(q) @ arm.tip
+    down = tip.copy()
+    down[:3, 2], down[:3, 1] = (0, 0, -1), (*tip[:2, 1] / np.linalg.norm(tip[:2, 1]), 0)
+    down[:3, 0] = np.cross(down[:3, 1], down[:3, 2])
+    down[2, 3] = height
+    wanted = np.linalg.inv(frame) @ down @ np.linalg.inv(arm.tip)
+    targets = kinematics.forward(q)[None]
+    targets[0, 0] = [*wanted[:3, 3], *quaternion_of_matrix(wanted[:3, :3])]
+    solved = kinematics.solve(targets, q)
+    assert solved.position_error[0, 0] < 1e-4
+    return np.asarray(solved.q[0])
+
+
+@pytest.mark.parametrize("name", robots.names())
+def test_fingers_come_down_to_the_table_and_are_not_driven_into_it(name: str) -> None:
+    made = robots.load(name)
+    judged, lowest = Collisions(made, MARGIN), fingers_down(made, 0.002)
+    assert judged.nearest(lowest) is None
+    found = judged.nearest(fingers_down(made, -0.06))
+    assert found is not None
+    assert found.other == "table"
+    assert found.distance < -0.01
 
 
 def test_a_margin_is_how_near_counts_as_touching() -> None:

@@ -82,7 +82,7 @@ def test_a_motion_by_hand_into_the_other_arm_is_refused_before_anything_moves(tm
 def entangled() -> Float64:
     """The left arm is turned over the right one's side: on their straight ways home they meet."""
     q = turned(0.0)
-    q[[0, 1, 2]], q[[7, 8, 9]] = (-1.9, 1.9, -1.3), (0.8, 1.9, -0.8)
+    q[[0, 1, 2]], q[[7, 8, 9]] = (-1.9, 1.9, -1.3), (0.8, 1.8, -0.8)
     assert collisions().nearest(q) is None
     return q
 
