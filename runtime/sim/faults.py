@@ -36,6 +36,12 @@ NAMES = {
     "two_frames": "gr00t: answers with two frames",
     "missing_key": "gr00t: answers without one of its action keys",
     "uneven": "gr00t: one action key has a row less than the others",
+    "load_fails": "lerobot: cannot load what it is told to",
+    "foreign_name": "lerobot: a pickle that would run a command",
+    "other_step": "lerobot: rows for steps that nobody asked for",
+    "shuffled": "lerobot: rows in another order than that of their steps",
+    "other_rate": "lerobot: rows at twice the rate",
+    "no_name": "lerobot: has its classes where version 0.3 had them",
 }
 
 

@@ -170,9 +170,18 @@ def _starvla(robot: Robot, rate: float, script: Script, options: argparse.Namesp
     return StarvlaServer(robot, star, options.port, script)
 
 
+def _lerobot(robot: Robot, rate: float, script: Script, options: argparse.Namespace) -> StandInServer:
+    from runtime.sim.lerobot_server import LerobotBehaviour, LerobotServer
+
+    latency = options.latency_ms / 1e3
+    behaviour = LerobotBehaviour(options.horizon, rate, latency, options.fault, options.seed)
+    return LerobotServer(robot, behaviour, options.port, script)
+
+
 _PROTOCOLS: dict[str, Callable[[Robot, float, Script, argparse.Namespace], StandInServer]] = {
     "openpi": _openpi,
     "gr00t": _gr00t,
+    "lerobot": _lerobot,
     "roboarena": _roboarena,
     "vllm": _roboarena,
     "starvla": _starvla,

@@ -1,0 +1,167 @@
+"""A gRPC channel to LeRobot's policy server: every call has a deadline, and can be given up from another thread."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from runtime.errors import ConfigurationError, PolicyError, PolicyLostError
+from runtime.policies.link import PolicyGone, PolicyTimeout, headline
+from runtime.policies.reach import reach
+
+if TYPE_CHECKING:
+    import grpc
+
+_LARGEST_MESSAGE = 4 * 1024 * 1024  # bytes that the server takes in one message
+
+
+class Channel:
+    """One channel that can be opened again until it is aborted; for one thread at a time, except for `abort`.
+
+    Answers of more than `limit` bytes are refused. ConfigurationError where gRPC is not installed.
+    """
+
+    def __init__(self, url: str, connect_deadline: float, limit: int) -> None:
+        _grpc()
+        self._url = url
+        self._connect_deadline = connect_deadline
+        self._limit = limit
+        self._channel: grpc.Channel | None = None
+        self._call: Any = None  # the one under way
+        self._turning = threading.Lock()  # of that: held for a moment
+        self._aborted = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a channel is held; the peer may have gone since."""
+        return self._channel is not None
+
+    def open(self) -> float:
+        """Make sure that somebody listens, and make a channel; what is left of the connect deadline [s]."""
+        self.drop()
+        deadline = time.monotonic() + self._connect_deadline
+        place = urlsplit(self._url)
+        host, port = place.hostname or "", place.port or 0
+        try:
+            reach(host, port, deadline, self._require_not_aborted).close()
+        except ConnectionRefusedError as error:
+            raise PolicyLostError(
+                f"no policy server listens at {self._url}: start it, or correct policy.url"
+            ) from error
+        except socket.gaierror as error:
+            raise PolicyLostError(
+                f"the host of {self._url} is not known: correct policy.url ({error})"
+            ) from error
+        except TimeoutError as error:
+            raise PolicyTimeout(
+                f"{self._url} was not reached within {self._connect_deadline:g} s: the host is unreachable"
+            ) from error
+        except OSError as error:
+            raise PolicyLostError(f"the connection to {self._url} failed ({error})") from error
+        self._channel = _grpc().insecure_channel(
+            f"[{host}]:{port}" if ":" in host else f"{host}:{port}",
+            options=[
+                ("grpc.max_receive_message_length", self._limit),
+                ("grpc.max_send_message_length", _LARGEST_MESSAGE),
+                ("grpc.enable_http_proxy", 0),
+                ("grpc.enable_retries", 0),  # an observation that is sent twice is two
+                ("grpc.use_local_subchannel_pool", 1),  # a dropped connection is never used again
+            ],
+        )
+        return max(0.0, deadline - time.monotonic())
+
+    def call(self, method: str, request: bytes | Iterable[bytes], seconds: float) -> bytes:
+        """The answer to one message, or to several, as bytes; PolicyTimeout after `seconds`, PolicyGone, or its error.
+
+        After any of these but an error of the server's own the channel is dropped.
+        """
+        channel = self._channel
+        if channel is None:
+            raise PolicyError(f"there is no connection to {self._url}; connect first")
+        started: Any
+        if isinstance(request, bytes):
+            started = channel.unary_unary(method).future
+        else:
+            started, request = channel.stream_unary(method).future, iter(request)
+        with self._turning:
+            self._require_not_aborted()
+            self._call = started(request, timeout=seconds)
+        try:
+            answer: bytes = self._call.result()
+        except _grpc().FutureCancelledError as error:
+            self.drop()
+            raise PolicyError(f"the connection to {self._url} was closed from our side") from error
+        except _grpc().RpcError as error:
+            raise self._told(error, method, seconds) from error
+        finally:
+            self._call = None
+        return answer
+
+    def abort(self) -> None:
+        """From another thread: whoever waits here raises PolicyError, now and later."""
+        with self._turning:
+            self._aborted = True
+            if self._call is not None:
+                self._call.cancel()
+
+    def drop(self) -> None:
+        """End the channel and whatever is under way on it; safe to call twice."""
+        channel, self._channel = self._channel, None
+        if channel is not None:
+            channel.close()
+
+    def _require_not_aborted(self) -> None:
+        if self._aborted:
+            raise PolicyError(f"the connection to {self._url} was closed from our side")
+
+    def _told(self, error: Any, method: str, seconds: float) -> PolicyError:
+        """An error of gRPC as ours."""
+        code, details = error.code(), str(error.details())
+        codes, name = _grpc().StatusCode, method.rpartition("/")[2]
+        if code is codes.UNKNOWN:  # the server's own code failed: it goes on serving
+            said = details.removeprefix("Exception calling application: ")
+            return PolicyError(
+                f"the policy server at {self._url} reports an error in {name}: {headline(said)}"
+            )
+        self.drop()
+        if self._aborted:
+            return PolicyError(f"the connection to {self._url} was closed from our side")
+        if code is codes.DEADLINE_EXCEEDED:
+            return PolicyTimeout(
+                f"{self._url} did not answer {name} within {seconds:g} s; the connection is dropped"
+            )
+        if code is codes.UNIMPLEMENTED:
+            return PolicyError(
+                f"{self._url} is a gRPC server without LeRobot's {name} ({details}): check host, port and policy.kind"
+            )
+        if code is codes.RESOURCE_EXHAUSTED:
+            return PolicyError(f"{self._url} and a message that is too large for {name}: {details}")
+        if code is codes.UNAVAILABLE and _is_foreign(details):
+            return PolicyError(
+                f"what listens at {self._url} does not speak gRPC ({details}): check host, port and policy.kind"
+            )
+        if code is codes.UNAVAILABLE:
+            return PolicyGone(
+                f"the policy server at {self._url} closed the connection ({details}): see that it runs, and speaks gRPC"
+            )
+        return PolicyError(f"the policy server at {self._url} refuses {name}: {code.name}, {details}")
+
+
+def _is_foreign(details: str) -> bool:
+    """Whether gRPC was answered in another protocol."""
+    return "Failed parsing HTTP/2" in details or "http1.x" in details
+
+
+def _grpc() -> Any:
+    try:
+        import grpc
+    except ImportError as error:
+        raise ConfigurationError(
+            'policy.kind = "lerobot" needs the package grpcio, which is not installed: '
+            "pip install 'eva-web[lerobot-grpc]'"
+        ) from error
+    return grpc

@@ -1,0 +1,201 @@
+"""Pickles as LeRobot's policy server exchanges them, without LeRobot and without running anything of the peer's.
+
+Written are instances of its classes, by name alone. Read are lists of its TimedAction: of the pickle machine only the
+instructions that these need exist here, a name stands for nothing but what a table of ours says, and every other name
+is refused. Source: lerobot.async_inference.helpers; in 0.3 the module was lerobot.scripts.server.helpers.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from runtime.errors import CodecError
+from runtime.policies.async_inference.tensors import Tensors
+
+MODULES = {"0.4": "lerobot.async_inference.helpers", "0.3": "lerobot.scripts.server.helpers"}
+_PROTOCOL = 4
+
+
+@dataclass(frozen=True)
+class RemotePolicyConfig:
+    """What a server is to load. The order of the fields is that on the wire."""
+
+    policy_type: str
+    pretrained_name_or_path: str
+    lerobot_features: Mapping[str, Any]
+    actions_per_chunk: int
+    device: str = "cpu"
+    rename_map: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class TimedObservation:
+    """What the robot shows: motors as floats, pictures uint8 [H, W, 3], the task. `timestamp` is wall clock [s]."""
+
+    timestamp: float
+    timestep: int
+    observation: Mapping[str, Any]
+    must_go: bool
+
+
+@dataclass(frozen=True, slots=True)
+class TimedAction:
+    """One row of an answer."""
+
+    timestamp: float
+    timestep: int
+    action: np.ndarray[Any, Any]
+
+
+def written(value: RemotePolicyConfig | TimedObservation, module: str) -> bytes:
+    """`value` as the server's own class of the same name in `module` would be pickled."""
+    file = io.BytesIO()
+    _Writer(file, module).dump(value)
+    return file.getvalue()
+
+
+def read_actions(data: bytes, limit: int) -> list[TimedAction]:
+    """The actions in their order on the wire; CodecError names what is wrong or refused."""
+    if len(data) > limit:
+        raise CodecError(f"actions of {len(data)} bytes exceed the limit of {limit}")
+    try:
+        given = _Reader(io.BytesIO(data)).load()
+    except CodecError:
+        raise
+    except Exception as error:  # a broken pickle may raise anything, and has run nothing
+        raise CodecError(
+            f"{len(data)} bytes are no pickle of actions: {type(error).__name__}: {error}"
+        ) from error
+    if not isinstance(given, list):
+        raise CodecError(f"the actions are {type(given).__name__}; expected a list of TimedAction")
+    return [_timed_action(one) for one in given]
+
+
+class _Writer(pickle._Pickler):
+    """Python's own, which finds a class by what it is; ours go by their names in the server's module."""
+
+    save: Callable[[Any], None]  # of Python's own, as the two below are
+    write: Callable[[bytes], None]
+    memoize: Callable[[Any], None]
+
+    def __init__(self, file: io.BytesIO, module: str) -> None:
+        super().__init__(file, _PROTOCOL)
+        self._module = module
+
+    def save_global(self, obj: Any, name: str | None = None) -> None:
+        if obj is not RemotePolicyConfig and obj is not TimedObservation:
+            super().save_global(obj, name)  # type: ignore[misc]
+            return
+        self.save(self._module)
+        self.save(obj.__name__)
+        self.write(pickle.STACK_GLOBAL)
+        self.memoize(obj)
+
+
+class _Record:
+    """An instance of a class of the peer: the fields that it was given, and nothing that could act."""
+
+    __slots__ = ("fields",)
+
+    def __init__(self) -> None:
+        self.fields: dict[str, Any] = {}
+
+
+class _Name:
+    """Stands for a name of the peer's code; what is made of it is made here. Nothing can be set on it."""
+
+    __slots__ = ("make", "what")
+    what: str
+    make: Callable[..., Any] | None
+
+    def __init__(self, what: str, make: Callable[..., Any] | None) -> None:
+        object.__setattr__(self, "what", what)
+        object.__setattr__(self, "make", make)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise CodecError(f"an instruction to change {self.what} is refused")
+
+
+_NEEDED = (
+    "PROTO", "FRAME", "STOP", "MARK", "MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT", "GET", "BINGET", "LONG_BINGET",
+    "EMPTY_LIST", "APPEND", "APPENDS", "EMPTY_DICT", "SETITEM", "SETITEMS", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2",
+    "TUPLE3", "NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE",
+    "SHORT_BINUNICODE", "BINBYTES", "SHORT_BINBYTES", "GLOBAL", "STACK_GLOBAL", "BINPERSID",
+)  # fmt: skip
+
+
+class Reader(pickle._Unpickler):
+    """A pickle machine that knows no instruction but those for plain data, and no name at all."""
+
+    dispatch: ClassVar[dict[int, Callable[..., None]]] = {
+        code: pickle._Unpickler.dispatch[code] for code in (getattr(pickle, name)[0] for name in _NEEDED)
+    }
+
+    def find_class(self, module: str, name: str) -> Any:
+        raise CodecError(f"a pickle that names {module}.{name} is refused")
+
+
+class _Reader(Reader):
+    """Reads lists of TimedAction; its names live as long as one message."""
+
+    dispatch: ClassVar[dict[int, Callable[..., None]]] = dict(Reader.dispatch)
+    stack: list[Any]  # of the machine, as the two below are
+    append: Callable[[Any], None]
+
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file)
+        tensors = Tensors(Reader)
+        known: dict[tuple[str, str], Callable[..., Any] | None] = {
+            ("torch._utils", "_rebuild_tensor_v2"): tensors.tensor,
+            ("torch.storage", "_load_from_bytes"): tensors.storage,
+            ("collections", "OrderedDict"): dict,
+            **{(module, "TimedAction"): None for module in MODULES.values()},
+        }
+        self._names = {key: _Name(".".join(key), make) for key, make in known.items()}
+
+    def find_class(self, module: str, name: str) -> Any:
+        found = self._names.get((module, name))
+        if found is None:
+            allowed = ", ".join(sorted(one.what for one in self._names.values()))
+            raise CodecError(f"a pickle that names {module}.{name} is refused; allowed: {allowed}")
+        return found
+
+    def _reduce(self) -> None:
+        arguments = self.stack.pop()
+        name = self.stack[-1]
+        if not isinstance(name, _Name) or name.make is None or type(arguments) is not tuple:
+            raise CodecError(f"a pickle that calls {type(name).__name__} is refused")
+        self.stack[-1] = name.make(*arguments)
+
+    def _new(self) -> None:
+        arguments = self.stack.pop()
+        name = self.stack.pop()
+        if not isinstance(name, _Name) or name.make is not None or arguments != ():
+            raise CodecError(f"a pickle that makes {type(name).__name__} is refused")
+        self.append(_Record())
+
+    def _build(self) -> None:
+        state = self.stack.pop()
+        made = self.stack[-1]
+        if not isinstance(made, _Record) or type(state) is not dict:
+            raise CodecError(f"a pickle that changes {type(made).__name__} is refused")
+        made.fields = state
+
+    dispatch[pickle.REDUCE[0]] = _reduce
+    dispatch[pickle.NEWOBJ[0]] = _new
+    dispatch[pickle.BUILD[0]] = _build
+
+
+def _timed_action(given: object) -> TimedAction:
+    fields = given.fields if isinstance(given, _Record) else {}
+    timestamp, timestep, action = (fields.get(name) for name in ("timestamp", "timestep", "action"))
+    if type(timestamp) is not float or type(timestep) is not int or not isinstance(action, np.ndarray):
+        found = {str(name): type(value).__name__ for name, value in fields.items()} or type(given).__name__
+        raise CodecError(f"an action is {found}; expected timestamp float, timestep int, action tensor")
+    return TimedAction(timestamp, timestep, action)

@@ -1,0 +1,167 @@
+"""An observation as LeRobot's policy server takes it, what it is told to load, and its answer as rows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from runtime.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.policies.async_inference.pickles import (
+    MODULES,
+    RemotePolicyConfig,
+    TimedAction,
+    TimedObservation,
+    written,
+)
+from runtime.policies.meaning import MeaningSettings
+from runtime.policies.request import Dims, poses_of
+from runtime.policies.rows import action_rows
+from runtime.types import Float32, Observation
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+_RATE_TOLERANCE = 0.02  # of the rate: timestamps are wall clock in double precision
+_NATIVE = (480, 640)  # what a picture is declared as where its size is not; the server resizes whatever comes
+
+
+class RequestSettings(MeaningSettings):
+    """What the server is to load, and what its model calls what it is shown."""
+
+    policy_type: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
+    """LeRobot's name of the model's kind: act, smolvla, diffusion, tdmpc, vqbet, pi0, pi05, groot."""
+    checkpoint: Annotated[str, Field(min_length=1)]
+    """What the server loads: a folder on its machine, or a name on the hub."""
+    device: str = "cuda"
+    """Where the server runs it."""
+    actions_per_chunk: Annotated[int, Field(ge=1, le=1000)] = 50
+    """Rows of an answer at most; a model that has fewer gives fewer."""
+    images: dict[str, str]
+    """The model's name of a picture, what follows "observation.images.", = observation key of a camera."""
+    state: Dims | None = None
+    """Places of our state vector that the model's state has, in its order; all in ours where it is not given."""
+    state_names: list[str] | None = None
+    """Names of these numbers; the server needs none in particular. Names of the joints where they are not given."""
+    actions: Dims | None = None
+    """Places of our row that the numbers of the model's row take, in its order; all in ours where it is not given."""
+    rename: dict[str, str] = Field(default_factory=dict)
+    """LeRobot's rename_map: keys of observations on the server that its model has under other names."""
+    server_version: Literal["0.4", "0.3"] = "0.4"
+    """Of LeRobot on the server: 0.3 has its classes in another place. Newer ones are as 0.4."""
+
+
+class AsyncRequest:
+    """Builds what goes out, and checks what comes back; ConfigurationError where maps do not fit the robot."""
+
+    def __init__(self, settings: RequestSettings, robot: Robot, control_rate: float) -> None:
+        self._settings = settings
+        self._module = MODULES[settings.server_version]
+        self._rate = settings.action_rate or control_rate
+        width, self._row_width = settings.widths(robot)
+        self._places = _places("state", settings.state, width)
+        self._actions = _places("actions", settings.actions, self._row_width)
+        if sorted(self._actions) != list(range(self._row_width)):
+            raise ConfigurationError(
+                f"policy.actions = {self._actions}; allowed: each of 0 to {self._row_width - 1} once"
+            )
+        poses = poses_of(settings.observation_space, settings.observation_pose, robot, "observation_pose")
+        ours = robot.joint_names if poses is None else poses.names
+        self._names = _names(settings.state_names, [f"{ours[place]}.pos" for place in self._places])
+        self._layout = settings.layout(robot, {camera: camera for camera in settings.images.values()})
+
+    def instructions(self) -> bytes:
+        """The pickle of what to load and of what each observation will have."""
+        settings = self._settings
+        height, width = settings.image_size or _NATIVE
+        picture = {"dtype": "image", "shape": (height, width, 3), "names": ["height", "width", "channels"]}
+        features: dict[str, Any] = {
+            "observation.state": {
+                "dtype": "float32",
+                "shape": (len(self._names),),
+                "names": list(self._names),
+            }
+        }
+        features |= {f"observation.images.{name}": dict(picture) for name in settings.images}
+        config = RemotePolicyConfig(
+            settings.policy_type,
+            settings.checkpoint,
+            features,
+            settings.actions_per_chunk,
+            settings.device,
+            dict(settings.rename),
+        )
+        return written(config, self._module)
+
+    def of(self, observation: Observation, timestep: int) -> bytes:
+        """The pickle of an observation that has to be answered; PolicyError where something is missing in it."""
+        shown = self._layout.of(observation)
+        values: dict[str, Any] = {
+            name: float(shown["state"][place]) for name, place in zip(self._names, self._places, strict=True)
+        }
+        values |= {name: shown["images"][camera] for name, camera in self._settings.images.items()}
+        values["task"] = observation.prompt
+        return written(TimedObservation(time.time(), timestep, values, must_go=True), self._module)
+
+    def rows(self, given: Sequence[TimedAction], timestep: int) -> Float32:
+        """Rows [H, W] in the robot's order of the actions that answer the observation `timestep`.
+
+        PolicyError for an answer to another one, gaps, and numbers that are no rows; ContradictionError where they are
+        meant for another rate.
+        """
+        actions = sorted(given, key=lambda one: one.timestep)
+        steps = [one.timestep for one in actions]
+        if not actions:
+            raise PolicyError("the answer has no actions")
+        if steps != list(range(timestep, timestep + len(steps))):
+            raise PolicyError(
+                f"the answer has actions for the steps {_short(steps)}; expected {timestep} and those after it, as it "
+                "answers the observation of that step: another client uses the same server?"
+            )
+        self._agree([one.timestamp for one in actions])
+        for one in actions:
+            if one.action.ndim != 1 or one.action.shape != actions[0].action.shape:
+                raise PolicyError(
+                    f"the action for step {one.timestep} has shape {list(one.action.shape)}, the first "
+                    f"{list(actions[0].action.shape)}; expected [{self._row_width}] each"
+                )
+        rows = action_rows("the answer", np.stack([one.action for one in actions]), self._row_width)
+        made = np.empty_like(rows)
+        made[:, self._actions] = rows
+        return made
+
+    def _agree(self, times: Sequence[float]) -> None:
+        """The server says when each row is for, by the rate that it was started with."""
+        if len(times) < 2:
+            return
+        apart = (times[-1] - times[0]) / (len(times) - 1)
+        if not abs(apart * self._rate - 1.0) <= _RATE_TOLERANCE:
+            said = f"{1.0 / apart:.4g} Hz" if apart > 0 else f"{apart:g} s apart"
+            raise ContradictionError(
+                f"the server's rows are at {said}, policy.action_rate (without it the control rate) is {self._rate:g} "
+                "Hz; start it with --fps of that rate, or correct policy.action_rate"
+            )
+
+
+def _places(name: str, given: Sequence[int] | None, width: int) -> list[int]:
+    places = list(range(width)) if given is None else list(given)
+    if max(places) >= width:
+        raise ConfigurationError(f"policy.{name} = {places} leaves the vector; allowed: 0 to {width - 1}")
+    return places
+
+
+def _names(given: Sequence[str] | None, ours: list[str]) -> list[str]:
+    names = ours if given is None else list(given)
+    if len(names) != len(ours) or len(set(names)) != len(names):
+        raise ConfigurationError(
+            f"policy.state_names has {len(names)} names, {len(set(names))} different ones; the state has {len(ours)}"
+        )
+    return names
+
+
+def _short(steps: Sequence[int]) -> str:
+    shown = ", ".join(map(str, steps[:4]))
+    return f"{shown}, ... {steps[-1]}" if len(steps) > 4 else shown

@@ -1,0 +1,110 @@
+"""Tensors out of the bytes in which torch pickles their storage, with numpy alone.
+
+A storage is a torch file of the old form: five pickles one after the other (magic number, version, machine, what it
+is, its keys), the number of elements as int64, the elements. A tensor is a view of one: offset, sizes, strides.
+Several tensors may show different rows of the same storage, as those of LeRobot's server do.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+from typing import Any
+
+import numpy as np
+
+from runtime.errors import CodecError
+
+_MAGIC, _VERSION = 0x1950A86A20F9469CFC6C, 1001
+_MOST_ELEMENTS = (
+    10_000_000  # of all tensors of a message: strides of 0 would make any number of them out of one
+)
+_MOST_DIMENSIONS = 32
+_KINDS = {
+    "FloatStorage": "<f4",
+    "DoubleStorage": "<f8",
+    "HalfStorage": "<f2",
+    "BFloat16Storage": "<u2",
+    "LongStorage": "<i8",
+    "IntStorage": "<i4",
+    "ShortStorage": "<i2",
+    "CharStorage": "|i1",
+    "ByteStorage": "|u1",
+    "BoolStorage": "|b1",
+}
+Array = np.ndarray[Any, Any]
+
+
+class Tensors:
+    """The tensors of one message, and their storages by their bytes: a server sends the same one with each row.
+
+    `reader` is a machine for plain pickles.
+    """
+
+    def __init__(self, reader: type[Any]) -> None:
+        class Reader(reader):  # type: ignore[misc]
+            """Names of storages, and what a storage says of itself."""
+
+            def find_class(self, module: str, name: str) -> Any:
+                if module != "torch" or name not in _KINDS:
+                    raise CodecError(
+                        f"a storage that names {module}.{name} is refused; allowed: torch.{', '.join(_KINDS)}"
+                    )
+                return name
+
+            def persistent_load(self, pid: Any) -> Any:
+                return pid
+
+        self._reader = Reader
+        self._known: dict[bytes, Array] = {}
+        self._left = _MOST_ELEMENTS
+
+    def storage(self, data: object) -> Array:
+        """The elements [n]; CodecError where the bytes are no storage."""
+        if not isinstance(data, bytes):
+            raise CodecError(f"a storage is {type(data).__name__}; expected bytes")
+        if data not in self._known:
+            self._known[data] = self._read(data)
+        return self._known[data]
+
+    def _read(self, data: bytes) -> Array:
+        file = io.BytesIO(data)
+        magic, version, machine, said, keys = (self._reader(file).load() for _ in range(5))
+        if (magic, version) != (_MAGIC, _VERSION) or not isinstance(machine, dict):
+            raise CodecError("a storage does not begin as torch's do")
+        if machine.get("little_endian") is not True:
+            raise CodecError("a storage was written by a big-endian machine")
+        if type(said) is not tuple or len(said) != 6 or said[0] != "storage" or said[1] not in _KINDS:
+            raise CodecError(f"a storage says that it is {str(said)[:80]}")
+        kind, key, count, view = said[1], said[2], said[4], said[5]
+        counted, raw = file.read(8), file.read()
+        dtype = np.dtype(_KINDS[kind])
+        whole = len(counted) == 8 and type(count) is int and struct.unpack("<q", counted)[0] == count
+        if not whole or view is not None or keys != [key] or len(raw) != count * dtype.itemsize:
+            raise CodecError(f"a storage of {count} elements of {kind} has {len(raw)} bytes of data")
+        if kind == "BFloat16Storage":
+            return (np.frombuffer(raw, dtype).astype(np.uint32) << 16).view(np.float32)
+        return np.frombuffer(raw, dtype)
+
+    def tensor(self, storage: object, offset: object, size: object, stride: object, *_: object) -> Array:
+        """The elements [*size] that begin at `offset` and are `stride` elements apart, copied; CodecError for others.
+
+        What follows (whether it wants a gradient, its hooks) has no meaning here.
+        """
+        if not isinstance(storage, np.ndarray) or type(size) is not tuple or type(stride) is not tuple:
+            raise CodecError("a tensor is not made of a storage, sizes and strides")
+        numbers = (offset, *size, *stride)
+        if len(size) != len(stride) or not all(type(number) is int and number >= 0 for number in numbers):
+            raise CodecError(f"a tensor has offset {offset}, sizes {size} and strides {stride}")
+        start = int(numbers[0])
+        reach = sum((count - 1) * step for count, step in zip(size, stride, strict=True)) if all(size) else -1
+        if start + reach >= len(storage) or start > len(storage) or len(size) > _MOST_DIMENSIONS:
+            raise CodecError(
+                f"a tensor of sizes {size}, strides {stride} from {start} on does not fit {len(storage)} elements"
+            )
+        self._left -= math.prod(size)
+        if self._left < 0:
+            raise CodecError(f"the tensors of a message have more than {_MOST_ELEMENTS} elements")
+        steps = [step * storage.itemsize for step in stride]
+        return np.lib.stride_tricks.as_strided(storage[start:], size, steps).copy()

@@ -1,0 +1,235 @@
+"""LeRobot's asynchronous inference over gRPC, without LeRobot and without torch.
+
+Its messages are pickles both ways: whoever reaches the server's port runs code there, so this is for servers on this
+machine or behind a tunnel, and has to be allowed for each checkpoint. What comes from it is read by a machine of our
+own that runs nothing. The server answers with nothing where it has no observation, and where its inference
+failed: it says neither. Source: lerobot.async_inference of LeRobot 0.4.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import threading
+import time
+from typing import TYPE_CHECKING, Annotated, Literal
+from urllib.parse import urlsplit
+
+from pydantic import Field
+
+from runtime.clock import Clock
+from runtime.errors import CodecError, ConfigurationError, PolicyError
+from runtime.policies.async_inference import messages
+from runtime.policies.async_inference.link import Channel
+from runtime.policies.async_inference.pickles import MODULES, TimedAction, read_actions
+from runtime.policies.async_inference.request import AsyncRequest, RequestSettings
+from runtime.policies.base import Policy, PolicyInfo
+from runtime.policies.link import PolicyGone, PolicyTimeout
+from runtime.types import ActionChunk, Conditioning, Observation
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+ANSWER_LIMIT = 16 * 1024 * 1024  # bytes; every row carries the whole chunk: 100 rows of 32 numbers are 1.3 MB
+_PAUSES = (0.05, 0.5)  # s between questions that were answered with nothing: the first, and the longest
+
+
+class Config(RequestSettings):
+    """LeRobot's policy server, which loads the checkpoint that it is told to."""
+
+    kind: Literal["lerobot"] = "lerobot"
+    url: Annotated[str, Field(pattern=r"^grpc://[^/:]+:\d{1,5}$|^grpc://\[[0-9a-fA-F:]+\]:\d{1,5}$")] = (
+        "grpc://127.0.0.1:8080"
+    )
+    """Where the server listens; beyond this machine only with insecure_link."""
+    accept_pickle: bool = False
+    """Has to be true: a server of this kind runs whatever reaches its port. Ours runs nothing of what it answers."""
+    insecure_link: bool = False
+    """Allow a server beyond this machine although anybody on the way can run code on it and move the robot; an SSH
+    tunnel needs no such thing."""
+    connect_deadline: Positive = 5.0
+    """For the connection [s]; for a reset too."""
+    load_deadline: Positive = 300.0
+    """For the server to load the checkpoint [s], also when it came back without it."""
+    first_inference_deadline: Positive = 120.0
+    """For the first answer after set-up [s]."""
+    inference_deadline: Positive = 5.0
+    """For every later answer [s]. The server waits two for an observation that it has missed."""
+
+
+def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> LerobotPolicy:
+    """The policy, not yet connected; ConfigurationError where it is not allowed, not installed, or does not fit."""
+    if not config.accept_pickle:
+        raise ConfigurationError(
+            'policy.kind = "lerobot" exchanges pickles: whoever reaches the server\'s port can run code there; '
+            "allowed: policy.accept_pickle = true, for a server that only this machine reaches"
+        )
+    host = urlsplit(config.url).hostname or ""
+    if not config.insecure_link and not _is_loopback(host):
+        raise ConfigurationError(
+            f"policy.url = {config.url!r} leaves this machine over a plain link; allowed: a loopback address, such as "
+            "the end of an SSH tunnel, or policy.insecure_link = true on a network you trust"
+        )
+    return LerobotPolicy(config, robot, control_rate)
+
+
+class LerobotPolicy(Policy):
+    """One channel; after a timeout or a lost answer it is dropped, and the next `infer` makes another.
+
+    Every observation is one that must go: the server would skip one in which the joints have hardly moved. Deadlines
+    are real seconds whatever the clock. The long first deadline holds once after `connect`.
+    """
+
+    def __init__(self, config: Config, robot: Robot, control_rate: float) -> None:
+        self._config = config
+        self._request = AsyncRequest(config, robot, control_rate)
+        self.observation_eef = config.observation_eef
+        self.sees_poses = config.sees_poses
+        self._link = self._new_link()
+        self._lock = threading.Lock()  # of the wire: held through every wait
+        self._turning = threading.Lock()  # between open and closed: held for a moment
+        self._ended = threading.Event()
+        self._loaded = False  # by the server, as far as we know
+        self._warm = False
+        self._asked = False  # since the last reset
+        self._timestep = 0
+
+    def connect(self) -> PolicyInfo:
+        """Reach the server and let it load the checkpoint; an open connection is replaced."""
+        with self._lock:
+            self._warm = self._loaded = False
+            self._link.drop()
+            with self._turning:
+                self._ended.clear()
+                self._link = self._new_link()
+            self._open()
+        config = self._config
+        return PolicyInfo(
+            name=config.checkpoint,
+            horizon=config.actions_per_chunk,
+            rate=config.action_rate,
+            metadata={"policy_type": config.policy_type, "checkpoint": config.checkpoint},
+        )
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        """The chunk; `timing` has our `round_trip_ms`.
+
+        PolicyLostError where the server is not there or does not answer: the next call opens another connection, and
+        has the server load the checkpoint again where that was lost. PolicyError where it answers with nothing only.
+        """
+        if conditioning is not None:
+            raise PolicyError(
+                "LeRobot's asynchronous inference has no real-time chunking; choose another strategy"
+            )
+        with self._lock:
+            if self._ended.is_set():
+                raise PolicyError(f"the policy at {self._config.url} is closed; connect first")
+            self._timestep += 1
+            shown = self._request.of(observation, self._timestep)
+            if not self._link.is_open:
+                self._open()
+            seconds = self._config.inference_deadline if self._warm else self._config.first_inference_deadline
+            self._warm = self._asked = True
+            started = time.monotonic()
+            try:
+                answer = self._answer(shown, seconds)
+            except PolicyGone:
+                self._loaded = False
+                raise
+            round_trip = 1e3 * (time.monotonic() - started)
+            rows = self._request.rows(self._read(answer), self._timestep)
+        return self._config.chunk(rows, {"round_trip_ms": round_trip})
+
+    def reset(self) -> None:
+        """Let the server forget its observation; nothing is sent where nothing was asked."""
+        with self._lock:
+            if self._asked and self._link.is_open:  # a connection that is yet to be opened begins so anyway
+                self._link.call(messages.READY, messages.EMPTY, self._config.connect_deadline)
+            self._asked = False
+
+    def close(self) -> None:
+        """Cut the connection and return at once; a call that waits in another thread raises PolicyError."""
+        with self._turning:
+            self._ended.set()
+            self._link.abort()
+        if self._lock.acquire(blocking=False):  # else whoever waits drops it
+            try:
+                self._link.drop()
+            finally:
+                self._lock.release()
+
+    def _new_link(self) -> Channel:
+        return Channel(self._config.url, self._config.connect_deadline, ANSWER_LIMIT)
+
+    def _open(self) -> None:
+        left = self._link.open()
+        try:
+            self._link.call(messages.READY, messages.EMPTY, left)
+            if not self._loaded:
+                told = messages.setup(self._request.instructions())
+                self._link.call(messages.INSTRUCT, told, self._config.load_deadline)
+                self._loaded = True
+        except PolicyError as error:
+            self._link.drop()
+            if "No module named 'lerobot" not in str(error):
+                raise
+            raise PolicyError(
+                f"{error}\nThe server's LeRobot has its classes in another place: policy.server_version is "
+                f"{self._config.server_version!r}, allowed: {', '.join(MODULES)}"
+            ) from error
+
+    def _answer(self, shown: bytes, seconds: float) -> bytes:
+        """The pickle of the actions for an observation, which is sent again where nothing comes back.
+
+        Nothing comes back too where a call of ours that was given up took the observation off the server's queue.
+        """
+        deadline, pause, asked = time.monotonic() + seconds, _PAUSES[0], 0
+        while True:
+            self._link.call(messages.OBSERVE, messages.observations(shown), self._left(deadline))
+            answer = self._link.call(messages.ACT, messages.EMPTY, self._left(deadline))
+            asked += 1
+            data = self._data(answer)
+            if data:
+                return data
+            if time.monotonic() + pause >= deadline:
+                self._loaded = False  # perhaps it came back without it
+                self._link.drop()
+                raise PolicyError(
+                    f"{self._config.url} answered with nothing, {asked} times within {seconds:g} s: its inference "
+                    "fails, which it tells its own log alone. What fails most: the model has other images, another "
+                    "number of states, or another kind than policy.images, policy.state and policy.policy_type say"
+                )
+            if self._ended.wait(pause):
+                raise PolicyError(f"the connection to {self._config.url} was closed from our side")
+            pause = min(2 * pause, _PAUSES[1])
+
+    def _left(self, deadline: float) -> float:
+        left = deadline - time.monotonic()
+        if left <= 0:
+            self._link.drop()
+            raise PolicyTimeout(
+                f"{self._config.url} did not answer within the deadline; the connection is dropped"
+            )
+        return left
+
+    def _data(self, answer: bytes) -> bytes:
+        try:
+            return messages.actions(answer)
+        except CodecError as error:
+            self._link.drop()
+            raise PolicyError(f"{self._config.url} sent an answer that is not LeRobot's: {error}") from error
+
+    def _read(self, data: bytes) -> list[TimedAction]:
+        try:
+            return read_actions(data, ANSWER_LIMIT)
+        except CodecError as error:
+            self._link.drop()
+            raise PolicyError(f"{self._config.url} sent an answer that is not LeRobot's: {error}") from error
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
