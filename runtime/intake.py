@@ -69,6 +69,10 @@ class Intake:
         self._source.begin_run()
         self.pump(0.0)
 
+    def end_run(self) -> None:
+        """Tell the source that the run is over."""
+        self._source.end_run()
+
     def faults(self) -> dict[str, int]:
         """How often what went wrong; every count that has grown since the last call is an event, and so is news."""
         for event in self._source.news():

@@ -134,6 +134,7 @@ class Media:
             self._drain("ticks")  # those that control did before main decided to end
             self._say_truth()
             self.end(message.status, message.reason, message.details)
+            self._intake.end_run()
 
     def _begin(self, message: BeginEpisode) -> None:
         identity, path, error = "", Path(), ""

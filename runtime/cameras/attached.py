@@ -52,6 +52,11 @@ class Attached(Source):
             camera.begin_run()
         self._source.begin_run()
 
+    def end_run(self) -> None:
+        for camera in self._cameras:
+            camera.end_run()
+        self._source.end_run()
+
     def faults(self) -> dict[str, int]:
         """Those of the source, and of each camera."""
         counts = dict(self._source.faults())

@@ -117,6 +117,9 @@ class Camera(ABC):
     def begin_run(self) -> None:  # noqa: B027  # a live camera has nothing to do
         """A run starts: a file plays from its first picture."""
 
+    def end_run(self) -> None:  # noqa: B027
+        """The run is over: a file shows its first picture again."""
+
     def faults(self) -> dict[str, int]:
         """Counts by name of what went wrong since the start."""
         return {}

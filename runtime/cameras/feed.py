@@ -34,7 +34,8 @@ class Feed:
         import av.error
 
         self._address = address
-        self._read_s = read_s
+        self._open_s, self._read_s = open_s, read_s
+        self._seen = False  # a picture
         self._errors: Any = av.error
         begun = time.monotonic()
         try:
@@ -68,9 +69,10 @@ class Feed:
             picture = None if frame is None else self._rgb(frame)
         except (self._errors.FFmpegError, OSError, ValueError) as error:
             waited = time.monotonic() - begun
-            raise CameraError(found(error, self._address, waited, self._read_s, False)) from None
+            raise CameraError(found(error, self._address, waited, self._read_s, not self._seen)) from None
         if frame is None or picture is None:
             return None
+        self._seen = True
         stamp = frame.time if self._address.stamped else None
         return Frame(picture, None if stamp is None else float(stamp))
 
@@ -79,7 +81,10 @@ class Feed:
         self._container.close()
 
     def _decoded(self) -> Iterator[Any]:
-        """Decoded frames; packets that cannot be decoded are skipped for as long as pictures may be awaited."""
+        """Decoded frames; packets that cannot be decoded are skipped for as long as pictures may be awaited.
+
+        The first picture may take as long as opening: many cameras send one that stands for itself every few seconds.
+        """
         since = time.monotonic()
         for packet in self._container.demux(self._stream):
             try:
@@ -89,8 +94,9 @@ class Feed:
             for frame in frames:
                 yield frame
                 since = time.monotonic()
-            if time.monotonic() - since > self._read_s:
-                raise CameraError(f"what it sent for {self._read_s:g} s cannot be decoded")
+            allowed = self._read_s if self._seen else max(self._open_s, self._read_s)
+            if time.monotonic() - since > allowed:
+                raise CameraError(f"what it sent for {allowed:g} s cannot be decoded")
 
     def _rgb(self, frame: Any) -> UInt8:
         try:
@@ -100,4 +106,4 @@ class Feed:
 
 
 # A live stream is not studied for long, and nothing is kept back for order's sake.
-_QUICK = {"fflags": "nobuffer", "flags": "low_delay", "analyzeduration": "1000000", "fpsprobesize": "0"}
+_QUICK = {"fflags": "nobuffer", "flags": "low_delay", "analyzeduration": "500000", "fpsprobesize": "0"}

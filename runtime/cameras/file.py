@@ -9,13 +9,13 @@ from runtime.cameras.base import Address, CameraSettings
 
 
 class Config(CameraSettings):
-    """A video that is played at its own pace: its first picture stands until a run begins."""
+    """A video that every run plays from its first picture, at its own pace; between runs that picture stands."""
 
     kind: Literal["file"] = "file"
     path: str
     """The file: whatever FFmpeg reads."""
     at_end: Literal["loop", "stop"] = "loop"
-    """"loop" goes on with its first picture; "stop" gives no more, until the next run begins."""
+    """"loop" goes on with its first picture; "stop" gives no more until the run is over."""
 
 
 def address(config: Config) -> Address:

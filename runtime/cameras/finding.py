@@ -42,6 +42,8 @@ def found(error: Exception, address: Address, waited: float, allowed: float, ope
         return "there is no such file"
     if isinstance(error, PermissionError):
         return "this user may not read it"
+    if not opening and address.format == "mpjpeg":
+        return "it closed the connection, or sent what is no picture"
     if not opening:
         return f"the stream broke: {getattr(error, 'strerror', '') or type(error).__name__}"
     return _no_video(error, address)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
+from collections.abc import Callable
 
 from runtime.cameras import file
 from runtime.cameras.base import Camera, CameraError, Condition, Health, Shot
@@ -21,7 +22,7 @@ _JOIN_S = 1.0
 class Player:
     """Pictures of a file as they are due; the next one is decoded before that.
 
-    Until `begin` the first picture stands, as if taken again and again at the file's own rate.
+    Until `begin`, and from `stand` on, the first picture stands, as if taken again and again at the file's own rate.
     """
 
     def __init__(self, config: file.Config) -> None:
@@ -35,6 +36,11 @@ class Player:
     def begin(self, now: float) -> None:
         """Play from the first picture, which is due now."""
         self._begun, self.over = now, False
+        self._rewind(now)
+
+    def stand(self, now: float) -> None:
+        """Show the first picture from now on."""
+        self._begun, self.over = None, False
         self._rewind(now)
 
     def at(self, now: float) -> Shot | None:
@@ -100,7 +106,7 @@ class FileCamera(Camera):
         self._health = Health(Condition.OPENING, clock.now(), "it is being opened")
         self._wake = threading.Event()
         self._ending = False
-        self._begin: float | None = None
+        self._asked: Callable[[float], None] | None = None  # what the player is to do first
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -110,8 +116,14 @@ class FileCamera(Camera):
             self._thread.start()
 
     def begin_run(self) -> None:
+        self._ask(self._player.begin)
+
+    def end_run(self) -> None:
+        self._ask(self._player.stand)
+
+    def _ask(self, what: Callable[[float], None]) -> None:
         with self._lock:
-            self._begin = self._clock.now()
+            self._asked = what
         self._wake.set()
 
     def newest(self) -> Shot | None:
@@ -147,13 +159,20 @@ class FileCamera(Camera):
         return self.health().condition in (Condition.LIVE, Condition.ENDED)
 
     def _step(self) -> None:
-        """Show what is due; what is wrong with the file is its health."""
+        """Show what is due; what is wrong with the file is its health.
+
+        A file that breaks while it plays stays lost until a run begins or ends: it would begin again unasked.
+        """
         with self._lock:
-            begin, self._begin = self._begin, None
+            asked, self._asked = self._asked, None
+            broken = self._health.condition is Condition.LOST
+        if broken and asked is None:
+            return
         try:
-            if begin is not None:
-                self._player.begin(begin)
-            shot = self._player.at(self._clock.now())
+            now = self._clock.now()
+            if asked is not None:
+                asked(now)
+            shot = self._player.at(now)
         except CameraError as error:
             self._fail(str(error))
             return
@@ -165,7 +184,7 @@ class FileCamera(Camera):
             with self._lock:
                 self._newest = shot
         if self._player.over:
-            self._tell(Condition.ENDED, "the file is over; a run begins it again")
+            self._tell(Condition.ENDED, "the file is over")
         elif shot is not None:
             self._tell(Condition.LIVE)
 

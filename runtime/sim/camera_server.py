@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
-import time
 from abc import ABC, abstractmethod
 
 import numpy as np
@@ -100,10 +99,6 @@ class CameraServer(ABC):
             with self._lock:
                 self._clients.discard(client)
             client.close()
-
-    def _due(self, begun: float, number: int) -> float:
-        """Seconds until picture `number` of a client is due."""
-        return max(0.0, begun + number / self.rate - time.monotonic())
 
     @abstractmethod
     def _speak(self, client: socket.socket) -> None:

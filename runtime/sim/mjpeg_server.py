@@ -36,9 +36,9 @@ class MjpegServer(CameraServer):
             self._play(client)
 
     def _play(self, client: socket.socket) -> None:
-        begun, number = time.monotonic(), 0
+        due, number = time.monotonic(), 0
         while True:
-            time.sleep(self._due(begun, number))
+            time.sleep(max(0.0, due - time.monotonic()))
             if self.fault == "silent":
                 client.recv(1)  # until it gives up
                 return
@@ -50,5 +50,5 @@ class MjpegServer(CameraServer):
                 client.sendall(part + jpeg[: len(jpeg) // 2])
                 return
             client.sendall(part + jpeg + b"\r\n")
-            number += 1
+            number, due = number + 1, due + 1 / self.rate
             self.sent += 1

@@ -61,13 +61,14 @@ class RtspServer(CameraServer):
         return method if status == "200 OK" else ""
 
     def _play(self, client: socket.socket) -> None:
-        begun, number, packets = time.monotonic(), 0, 0
+        begun = due = time.monotonic()
+        number, packets = 0, 0
         encoder: Any = None
         while True:
-            readable, _, _ = select.select([client], [], [], self._due(begun, number))
+            readable, _, _ = select.select([client], [], [], max(0.0, due - time.monotonic()))
             if readable and not self._still_wanted(client):
                 return
-            if self._due(begun, number):
+            if time.monotonic() < due:
                 continue
             if self.fault == "silent":
                 if not client.recv(4096):
@@ -75,14 +76,14 @@ class RtspServer(CameraServer):
                 continue
             if encoder is None or (encoder.width, encoder.height) != self.size:
                 encoder = self._encoder()
-            stamp = int((number / self.rate + self.stamp_offset) * _CLOCK)
+            stamp = int((due - begun + self.stamp_offset) * _CLOCK)
             for unit, last in self._units(encoder, number):
                 for payload, marked in _payloads(unit, last):
                     packets += 1
                     self._send(client, payload, marked, packets, stamp)
                     if self.fault == "torn":
                         return
-            number += 1
+            number, due = number + 1, due + 1 / self.rate
             self.sent += 1
 
     def _still_wanted(self, client: socket.socket) -> bool:

@@ -52,6 +52,9 @@ class Source(ABC):
     def begin_run(self) -> None:  # noqa: B027  # a live robot has nothing to do
         """A run starts: a recording plays from its first frame."""
 
+    def end_run(self) -> None:  # noqa: B027
+        """The run is over: a video shows its first picture again."""
+
     def faults(self) -> dict[str, int]:
         """Counts by name of what went wrong since connect, e.g. {"clock_backwards": 1, "malformed": 3}."""
         return {}
