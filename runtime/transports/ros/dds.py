@@ -157,18 +157,21 @@ class DdsMiddleware(Middleware):
         return publish
 
     def matches(self) -> Mapping[str, Match]:
-        """Read off the statuses of readers and writers, and, where nobody matches, off what others announce."""
+        """Read off the statuses of readers and writers, and, where nobody matches, off what others announce.
+
+        A refusal is told for as long as the middleware lives: DDS counts those there have been.
+        """
         with self._lock:
             readers = [(topic, reader) for topic, reader, _ in self._readers]
         found: dict[str, Match] = {}
         for topic, reader in readers:
             peers = len(reader.get_matched_publications())
             status = reader.get_requested_incompatible_qos_status()
-            found[topic.name] = Match(peers, self._refused(topic, status, peers, publishes=False))
+            found[topic.name] = Match(peers, self._refused(topic, status, peers, False))
         for topic, writer in self._writers:
             peers = len(writer.get_matched_subscriptions())
             status = writer.get_offered_incompatible_qos_status()
-            found[topic.name] = Match(peers, self._refused(topic, status, peers, publishes=True))
+            found[topic.name] = Match(peers, self._refused(topic, status, peers, True))
         return found
 
     def close(self) -> None:
@@ -222,21 +225,29 @@ class DdsMiddleware(Middleware):
                 deliver(payload)
 
     def _refused(self, topic: Topic, status: Any, peers: int, publishes: bool) -> str:
-        if status.total_count:
-            policy = _POLICIES.get(status.last_policy_id, f"policy {status.last_policy_id}")
-            return incompatible(topic, policy, publishes)
-        return "" if peers or publishes else self._otherwise_published(topic)
+        """Why somebody at the other side is none of our peers; "" where nobody is refused."""
+        other = "" if peers else self._otherwise_typed(topic, publishes)
+        if other or not status.total_count:
+            return other
+        return incompatible(
+            topic, _POLICIES.get(status.last_policy_id, f"policy {status.last_policy_id}"), publishes
+        )
 
-    def _otherwise_published(self, topic: Topic) -> str:
-        """Whether somebody publishes another type on that topic, which DDS says to nobody."""
-        from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+    def _otherwise_typed(self, topic: Topic, publishes: bool) -> str:
+        """Whether the other side has another type on that topic, which DDS says to nobody."""
+        from cyclonedds.builtin import (
+            BuiltinDataReader,
+            BuiltinTopicDcpsPublication,
+            BuiltinTopicDcpsSubscription,
+        )
 
+        others = BuiltinTopicDcpsSubscription if publishes else BuiltinTopicDcpsPublication
         wanted = _type_name(topic)
-        announced = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication).read(_MOST_ENDPOINTS)
-        for endpoint in announced:
-            name, kind = getattr(endpoint, "topic_name", None), getattr(endpoint, "type_name", "")
-            if name == f"rt{topic.name}" and kind != wanted:
-                return f"{topic.name} is published as {_ros_name(kind)}; expected {_ros_name(wanted)}"
+        for endpoint in BuiltinDataReader(self._participant, others).read(_MOST_ENDPOINTS):
+            kind = getattr(endpoint, "type_name", wanted)  # absent where an endpoint has gone
+            if kind != wanted and endpoint.topic_name == f"rt{topic.name}":
+                verb = "subscribed to" if publishes else "published"
+                return f"{topic.name} is {verb} as {_ros_name(kind)}; expected {_ros_name(wanted)}"
         return ""
 
 

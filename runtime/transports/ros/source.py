@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from runtime.clock import Clock
 from runtime.errors import CodecError, ConfigurationError, TransportError
+from runtime.messages import Event
 from runtime.transports.base import Source
 from runtime.transports.freshness import FROZEN_S
 from runtime.transports.ros.alignment import Alignment, Sample
@@ -54,13 +55,13 @@ class RosSource(Source):
     """Delivers the newest frame of aligned messages; waits where streams do not belong together.
 
     Messages are checked as they come, on the middleware's thread, and counted by what is wrong with them. Reading
-    takes nothing away: this source is one reader of `alignment`, with a cursor of its own. What is wrong for as
-    long as no frame comes is raised once as TransportError: a stream that is silent, with its age, and who is at the
-    other side of its topic.
+    takes nothing away: this source is one reader of `alignment`, with a cursor of its own. What keeps frames from
+    coming is news, once for each reason.
     """
 
     _cursor: float  # the moment of the frame delivered last, in the senders' clock
     _count: int
+    _news: list[Event]
 
     def __init__(
         self,
@@ -89,10 +90,7 @@ class RosSource(Source):
             self._middleware.subscribe(one.topic, self._taker(one))
 
     def receive(self, timeout: float) -> Observation | None:
-        """The newest frame not yet delivered, as RGB; None after `timeout` seconds without one.
-
-        Raises TransportError with what keeps frames from coming, once for each such sentence.
-        """
+        """The newest frame not yet delivered, as RGB; None after `timeout` seconds without one."""
         if self._middleware is None:
             raise TransportError("the ROS topics are not subscribed; connect before receiving")
         with self._changed:
@@ -129,6 +127,11 @@ class RosSource(Source):
             jumps = {"clock_backwards": self._ros.backwards, "clock_forwards": self._ros.forwards}
         return counts | {name: count for name, count in jumps.items() if count}
 
+    def news(self) -> list[Event]:
+        """Why no frame comes: a stream that is silent, with its age, and who is at the other side of its topic."""
+        told, self._news = self._news, []
+        return told
+
     @property
     def last_fault(self) -> str:
         """The sentence of the newest fault; empty where there was none."""
@@ -161,6 +164,7 @@ class RosSource(Source):
         self._heard_at: dict[str, float] = {}
         self._stalled: set[str] = set()
         self._told: set[str] = set()
+        self._news = []
         self._cursor = float("-inf")
         self._count = 0
         self._began = self._framed_at = 0.0
@@ -223,7 +227,7 @@ class RosSource(Source):
         self._stalled = set(now)
 
     def _complain(self) -> None:
-        """Raise why no frame comes, once per reason; says nothing while streams are merely on their way."""
+        """Tell why no frame comes, once per reason; says nothing while streams are merely on their way."""
         with self._changed:
             stalled = self.stalled()
             fresh = {self._reason(name): name for name in stalled}
@@ -231,8 +235,7 @@ class RosSource(Source):
         fresh = {reason: name for reason, name in fresh.items() if reason not in self._told}
         if apart and "apart" not in self._told:
             self._told.add("apart")
-            self._last_fault = self._distance(apart)
-            raise TransportError(self._last_fault)
+            self._tell(self._distance(apart))
         if not fresh:
             return
         assert self._middleware is not None
@@ -242,8 +245,11 @@ class RosSource(Source):
             self._silence(name, stalled[name], matches.get(self._topics[name].name, Match(0)))
             for name in fresh.values()
         ]
-        self._last_fault = "; ".join(sentences)
-        raise TransportError(self._last_fault)
+        self._tell("; ".join(sentences))
+
+    def _tell(self, sentence: str) -> None:
+        self._last_fault = sentence
+        self._news.append(Event("source_waiting", sentence, self._clock.now()))
 
     def _waited(self) -> float:
         return self._clock.now() - self._framed_at
