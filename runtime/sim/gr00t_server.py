@@ -1,12 +1,8 @@
-"""A stand-in for a GR00T policy server: the wire of three versions, a script for a policy, faults on demand.
-
-Its arrays are numpy's own files and maps made by hand; nothing of the client's code is used.
-"""
+"""A stand-in for a GR00T policy server: the wire of three versions, a script for a policy, faults on demand."""
 
 from __future__ import annotations
 
 import hmac
-import io
 import json
 import os
 import threading
@@ -15,11 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-import msgpack  # type: ignore[import-untyped]
 import numpy as np
 import zmq
 
 from runtime.errors import SetupError
+from runtime.sim import gr00t_wire as wire
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.script import Answer, Script, Waving
 from runtime.types import Float32, Float64, UInt8
@@ -123,7 +119,7 @@ class Gr00tServer:
         """The frames that answer; None where the connection is to end without."""
         fault = self._behaviour.fault
         try:
-            message = msgpack.unpackb(payload, object_hook=_decoded)
+            message = wire.unpacked(payload)
             endpoint, reply = str(message.get("endpoint", "get_action")), self._result(message)
         except Exception as error:  # a policy's errors are told to the client, as GR00T does it
             self.failures.append(str(error))
@@ -135,8 +131,7 @@ class Gr00tServer:
             spoilt = self._spoilt_frames()
             if spoilt is not _RIGHT:
                 return spoilt
-        packed: bytes = msgpack.packb(reply, default=self._encoded)
-        return [packed]
+        return [wire.packed(reply, self._behaviour.version == "n1.7", fault.name == "bad_array_dialect")]
 
     def _spoilt_frames(self) -> list[bytes] | None:
         """What the fault sends in place of an answer; `_RIGHT` where the answer itself is right."""
@@ -256,66 +251,18 @@ class Gr00tServer:
         elif fault == "wrong_dim":
             parts[first] = parts[first][:, :-1]
         elif fault == "object_array":
-            parts[first] = _Pickled()
+            parts[first] = wire.Pickled()
         elif fault == "uneven":
             parts[first] = parts[first][:-1]
         return {key: part[:0] for key, part in parts.items()} if fault == "empty" else parts
 
     def _batched(self, part: Any) -> Any:
-        if isinstance(part, _Pickled):
+        if isinstance(part, wire.Pickled):
             return part
         return np.stack([part, part]) if self._behaviour.fault.name == "two_batches" else part[None]
 
-    def _encoded(self, value: object) -> object:
-        """As the version writes arrays: numpy's files, or the package msgpack_numpy's maps."""
-        modern = self._behaviour.version == "n1.7"
-        if isinstance(value, _Pickled):
-            pickled = {
-                b"nd": True,
-                b"type": "|O",
-                b"kind": b"O",
-                b"shape": [1],
-                b"data": b"\x80\x04]\x94N\x61.",
-            }
-            return pickled if modern else {"__ndarray_class__": True, "as_npy": _file(np.array([None]), True)}
-        assert isinstance(value, np.ndarray)
-        if self._behaviour.fault.name == "bad_array_dialect":
-            return {
-                b"__ndarray__": True,
-                b"data": value.tobytes(),
-                b"dtype": value.dtype.str,
-                b"shape": value.shape,
-            }
-        if modern:
-            return {
-                b"nd": True,
-                b"type": value.dtype.str,
-                b"kind": b"",
-                b"shape": value.shape,
-                b"data": value.tobytes(),
-            }
-        return {"__ndarray_class__": True, "as_npy": _file(value)}
-
-
-class _Pickled:
-    """Stands for an array of pickled objects."""
-
 
 _RIGHT: list[bytes] = []
-
-
-def _decoded(fields: dict[Any, Any]) -> object:
-    if "__ndarray_class__" in fields:
-        return np.load(io.BytesIO(fields["as_npy"]), allow_pickle=False)
-    if fields.get(b"nd") is True and fields[b"kind"] == b"":
-        return np.ndarray(fields[b"shape"], fields[b"type"], buffer=fields[b"data"])
-    return fields
-
-
-def _file(array: np.ndarray[Any, Any], pickled: bool = False) -> bytes:
-    file = io.BytesIO()
-    np.save(file, array, allow_pickle=pickled)
-    return file.getvalue()
 
 
 def _value(observation: Mapping[str, Any], name: str, key: str, flat: bool) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from runtime.errors import PolicyError
@@ -15,11 +15,23 @@ _MARKS = ("__ModalityConfig__", "__ModalityConfig_class__")
 
 
 @dataclass(frozen=True, slots=True)
+class Written:
+    """How N1.6 and newer write an action."""
+
+    representation: str  # "ABSOLUTE", "DELTA", "RELATIVE", which it answers as absolute
+    format: str  # "DEFAULT", "XYZ_ROT6D", "XYZ_ROTVEC"
+
+
+@dataclass(frozen=True, slots=True)
 class Modality:
-    """Keys without their prefix, and the steps that each stands for, relative to the newest observation."""
+    """Keys without their prefix, and the steps that each stands for, relative to the newest observation.
+
+    `written` says of actions how they are, by key, as far as the server does.
+    """
 
     keys: tuple[str, ...] = ()
     steps: tuple[int, ...] = (0,)
+    written: Mapping[str, Written] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +86,24 @@ def _modality(given: Mapping[str, Any], name: Name) -> Modality:
         raise PolicyError(
             f"the server's modality {name!r} has delta_indices {_short(steps)}; expected integers"
         )
-    return Modality(tuple(key.removeprefix(f"{name}.") for key in keys), tuple(steps))
+    bare = tuple(key.removeprefix(f"{name}.") for key in keys)
+    return Modality(bare, tuple(steps), _written(bare, fields.get("action_configs")))
+
+
+def _written(keys: tuple[str, ...], configs: object) -> dict[str, Written]:
+    """By key; nothing where there is not one for each, which some servers get wrong without harm."""
+    if not isinstance(configs, list) or len(configs) != len(keys):
+        return {}
+    return {
+        key: Written(_word(config.get("rep")), _word(config.get("format")))
+        for key, config in zip(keys, configs, strict=True)
+        if isinstance(config, Mapping)
+    }
+
+
+def _word(given: object) -> str:
+    """An enumeration's name, of its name or of its value."""
+    return str(given).upper().replace("+", "_")
 
 
 def listed(names: Iterable[str]) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from runtime.errors import ConfigurationError, ContradictionError, PolicyError
-from runtime.policies.groot.modality import Modalities, Modality, listed
+from runtime.policies.groot.modality import Modalities, Modality, Written, listed
 from runtime.policies.meaning import MeaningSettings
 from runtime.policies.request import Dims
 from runtime.policies.rows import action_rows
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from robots import Robot
 
 Parts = Annotated[dict[str, Dims], Field(min_length=1)]
+_ORIENTATIONS = {"XYZ_ROT6D": "6d", "XYZ_ROTVEC": "rotation_vector"}
 _MOST_STEPS = 64  # of a modality; more pictures than that in one request are a mistake
 
 
@@ -83,6 +84,8 @@ class Gr00tRequest:
         _same_keys("state", wanted.state, settings.state)
         if wanted.action.keys:
             _same_keys("actions", wanted.action, [*settings.actions, *settings.ignored_actions])
+        for key in settings.actions:
+            _check_written(key, wanted.action.written.get(key), settings)
         self._language = _language_key(wanted.language, settings.language_key)
         for name, one in (("video", wanted.video), ("state", wanted.state)):
             _check_steps(name, one, settings.history)
@@ -243,6 +246,24 @@ def _check_steps(name: str, wanted: Modality, history: str) -> None:
         raise ContradictionError(
             f"the server's model sees {name} at the steps {listed(map(str, wanted.steps))} before the newest, "
             'policy.history = "none"; allowed: "repeat" or "nearest"'
+        )
+
+
+def _check_written(key: str, written: Written | None, settings: RequestSettings) -> None:
+    """Rows of poses, or of changes, must not be taken for joints, or for targets."""
+    if written is None:
+        return
+    orientation, mine = _ORIENTATIONS.get(written.format), settings.action_pose.orientation
+    if orientation is not None and (settings.action_space != "eef" or mine != orientation):
+        raise ContradictionError(
+            f"the server's model writes action {key!r} as {written.format}; policy.action_space = "
+            f'{settings.action_space!r}, policy.action_pose.orientation = {mine!r}; allowed: "eef" '
+            f"and {orientation!r}, or the key in policy.ignored_actions"
+        )
+    if written.representation == "DELTA" and settings.action_mode == "absolute":
+        raise ContradictionError(
+            f"the server's model answers with changes for the action {key!r} (DELTA); policy.action_mode = 'absolute'; "
+            'allowed: "delta" or "relative"'
         )
 
 

@@ -7,7 +7,8 @@ import pytest
 
 import robots
 from runtime.errors import ConfigurationError, ContradictionError, PolicyError
-from runtime.policies.groot.modality import Modalities, Modality
+from runtime.formats import PoseFormat
+from runtime.policies.groot.modality import Modalities, Modality, Written
 from runtime.policies.groot.request import Gr00tRequest, RequestSettings
 from runtime.types import Float32, Observation
 
@@ -163,6 +164,40 @@ def test_what_contradicts_the_server_names_both_sides(
 ) -> None:
     with pytest.raises(ContradictionError, match=says):
         request(wanted(**changes), **settings)
+
+
+EEF = {"action_space": "eef", "actions": {"eef": [*range(3), *range(3, 9)], "other": [*range(9, 20)]}}
+
+
+@pytest.mark.parametrize(
+    ("written", "settings", "says"),
+    [
+        (Written("RELATIVE", "XYZ_ROT6D"), {}, "'left' as XYZ_ROT6D; policy.action_space = 'joint'.*'6d'"),
+        (Written("RELATIVE", "XYZ_ROTVEC"), {}, "allowed: .eef. and 'rotation_vector'"),
+        (Written("DELTA", "DEFAULT"), {}, "answers with changes for the action 'left'"),
+    ],
+)
+def test_rows_of_poses_or_changes_are_not_taken_for_joints_or_targets(
+    written: Written, settings: dict[str, Any], says: str
+) -> None:
+    action = Modality(("left", "right"), (0,), {"left": written})
+    with pytest.raises(ContradictionError, match=says):
+        request(wanted(action=action), **settings)
+
+
+def test_what_is_written_as_declared_is_no_contradiction() -> None:
+    fine = {"left": Written("RELATIVE", "DEFAULT"), "right": Written("DELTA", "DEFAULT")}
+    request(wanted(action=Modality(("left", "right"), (0,), fine)), action_mode="delta")
+    poses = {"eef": Written("RELATIVE", "XYZ_ROT6D"), "other": Written("ABSOLUTE", "XYZ_ROT6D")}
+    action = Modality(("eef", "other", "joints"), (0,), {**poses, "joints": Written("DELTA", "XYZ_ROTVEC")})
+    pose = PoseFormat(orientation="6d")
+    request(wanted(action=action), action_pose=pose, ignored_actions=["joints"], **EEF)
+    with pytest.raises(ContradictionError, match="orientation = 'wxyz'"):
+        request(
+            wanted(action=action),
+            ignored_actions=["joints"],
+            **{**EEF, "actions": {"eef": [*range(8)], "other": [*range(8, 16)]}},
+        )
 
 
 @pytest.mark.parametrize("steps", [(0, 1), tuple(range(-100, 1))])

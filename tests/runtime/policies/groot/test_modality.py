@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from runtime.errors import PolicyError
 from runtime.policies.groot import arrays
-from runtime.policies.groot.modality import Modality, modalities
+from runtime.policies.groot.modality import Modality, Written, modalities
 
 N16 = bytes.fromhex(
     "82a5766964656f82b85f5f4d6f64616c697479436f6e6669675f636c6173735f5fc3a761735f6a736f6e85ad64656c74615f696e6469636573"
@@ -69,6 +69,19 @@ def test_n15_writes_json_as_text_and_keys_with_their_prefix() -> None:
 def test_what_is_no_modality_configuration_is_named(reply: object, says: str) -> None:
     with pytest.raises(PolicyError, match=says):
         modalities(reply)
+
+
+def test_how_actions_are_written_is_read_where_there_is_one_word_for_each() -> None:
+    configs = [
+        {"rep": "RELATIVE", "type": "EEF", "format": "xyz+rot6d"},
+        {"rep": "absolute", "format": "DEFAULT"},
+    ]
+    fields = {"modality_keys": ["eef", "gripper"], "delta_indices": [0], "action_configs": configs}
+    found = modalities({"action": {MARK: True, "as_json": fields}}).action.written
+    assert found == {"eef": Written("RELATIVE", "XYZ_ROT6D"), "gripper": Written("ABSOLUTE", "DEFAULT")}
+    for strange in (configs[:1], None, 3, [1, 2]):
+        given = {MARK: True, "as_json": {**fields, "action_configs": strange}}
+        assert modalities({"action": given}).action.written == {}
 
 
 JSON = st.recursive(
