@@ -29,7 +29,7 @@ class Capsule:
 
 
 def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
-    """Capsules by link of the URDF: the one that robot.toml declares, else those about the link's shapes.
+    """Capsules by link of the URDF: those that robot.toml declares, else those about the link's shapes.
 
     Links without shapes, and those that robot.toml leaves out, have none.
     """
@@ -37,7 +37,7 @@ def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
     for shape in shapes.read(robot.urdf):
         by_link.setdefault(shape.link, []).append(shape)
     found = {link: about(shown) for link, shown in by_link.items()}
-    found |= {link: (_declared(table),) for link, table in robot.collision.capsules.items()}
+    found |= {link: tuple(map(_declared, tables)) for link, tables in robot.collision.capsules.items()}
     return {link: made for link, made in found.items() if link not in robot.collision.without}
 
 

@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from robots.errors import RobotError
@@ -91,11 +91,18 @@ class CapsuleTable(Table):
     radius: Positive
 
 
-class CollisionTable(Table):
-    """What the coarse collision check looks at; without it, a capsule per link from its shapes."""
+def _several(given: Any) -> Any:
+    return [given] if isinstance(given, dict) else given
 
-    capsules: dict[str, CapsuleTable] = {}
-    """Links with a capsule of their own instead of the one that their shapes give."""
+
+Capsules = Annotated[list[CapsuleTable], BeforeValidator(_several), Field(min_length=1)]
+
+
+class CollisionTable(Table):
+    """What the coarse collision check looks at; without it, capsules from the shapes of each link."""
+
+    capsules: dict[str, Capsules] = {}
+    """Links with a capsule of their own, or a list of some, instead of those that their shapes give."""
     without: list[str] = []
     """Links that are left out: fingers that touch each other, covers, cameras."""
     ignore: list[Annotated[list[str], Field(min_length=2, max_length=2)]] = []

@@ -14,6 +14,7 @@ from robots import RobotError
 from robots.capsules import PIECES, Capsule, about, around, capsules
 from robots.rotations import Float64, matrix_of_rpy
 from robots.shapes import PLAIN, Shape
+from robots.shapes import read as drawn
 from tests.robots.conftest import Edit
 
 length = st.floats(0.01, 0.4)
@@ -100,6 +101,17 @@ ignore = ["""
     assert set(made) == set(capsules(robots.load("agilex_piper"))) - {"link5"}
 
 
+@pytest.mark.parametrize(("name", "link"), [("r1_lite", "torso_link3"), ("agibot_g2", "body_link5")])
+def test_capsules_that_are_declared_of_a_trunk_cover_its_shapes(name: str, link: str) -> None:
+    robot = robots.load(name)
+    made = capsules(robot)[link]
+    assert len(made) > PIECES
+    for shape in drawn(robot.urdf):
+        if shape.link == link:
+            inside = np.max([depth(surface(shape, 4000), capsule) for capsule in made], axis=0)
+            assert inside.min() > 0, shape
+
+
 @pytest.mark.parametrize(
     ("table", "said"),
     [
@@ -115,7 +127,11 @@ ignore = ["""
         ('ignore = [["link2"]]', "collision.ignore"),
         (
             "capsules.link1 = { start = [0.0, 0.0, 0.0], end = [0.0, 0.0, 0.0], radius = 0.0 }",
-            "collision.capsules.link1.radius = 0.0",
+            "collision.capsules.link1.0.radius = 0.0",
+        ),
+        (
+            "capsules.link1 = []",
+            "collision.capsules.link1 = []: Value should have at least 1 item",
         ),
     ],
 )

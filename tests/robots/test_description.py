@@ -129,7 +129,7 @@ Edit = Callable[..., Path]
         (
             "[collision]",
             "[collision]\ncapsules = { link2 = { start = [0.0, 0.0, 0.0], end = [0.0, 0.0, 0.1], radius = -1.0 } }",
-            "collision.capsules.link2.radius = -1.0: Input should be greater than 0",
+            "collision.capsules.link2.0.radius = -1.0: Input should be greater than 0",
         ),
         (
             "left_arm = [0.0, 0.0",
