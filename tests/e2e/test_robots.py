@@ -59,7 +59,9 @@ def test_body_and_head_are_moved_drawn_recorded_and_played_back(browser, demo):
     bench.stop()
 
     episode = bench.snapshot()["last_run"]["uuid"]
-    bench.open(f"/replay/{episode}/")
+    address = f"/replay/{episode}/"
+    eventually(lambda: page.request.get(demo.url + address).ok, 60, "the lab knows the episode")
+    bench.open(address)
     played = page.locator(".replay-scene")
     eventually(lambda: played.count() == 1, 60, "the episode can be played")
     page.locator("#scene-note").wait_for(state="hidden")
