@@ -110,5 +110,7 @@ class Attached(Source):
 
     def close(self) -> None:
         for camera in self._cameras:
+            camera.leave()
+        for camera in self._cameras:
             camera.close()
         self._source.close()

@@ -111,8 +111,12 @@ class Camera(ABC):
         """How it is now."""
 
     @abstractmethod
+    def leave(self) -> None:
+        """Stop looking, as soon as that is possible; nobody waits."""
+
+    @abstractmethod
     def close(self) -> None:
-        """Stop looking; safe to call twice."""
+        """Stop looking, and wait a moment for that; safe to call twice."""
 
     def begin_run(self) -> None:  # noqa: B027  # a live camera has nothing to do
         """A run starts: a file plays from its first picture."""

@@ -49,9 +49,9 @@ class Feed:
             raise CameraError(found(error, address, time.monotonic() - begun, open_s, True)) from None
         videos = self._container.streams.video
         if not videos:
-            others = ", ".join(sorted({stream.type for stream in self._container.streams})) or "nothing"
+            others = "".join(f", but {kind}" for kind in sorted({s.type for s in self._container.streams}))
             self._container.close()
-            raise CameraError(f"it has no video, but {others}")
+            raise CameraError(f"it has no video{others}")
         self._stream = videos[0]
         self._stream.codec_context.thread_count = 1  # frame threads hold pictures back
         self._frames = self._decoded()

@@ -15,7 +15,7 @@ from runtime.clock import Clock
 log = logging.getLogger(__name__)
 SETTLE_S = 0.3  # after opening: what was buffered until then is older than it looks
 _GRACE_S = 1.0  # beyond its own deadline, after which a thread is stuck where none reaches it
-_JOIN_S = 1.0
+_JOIN_S = 0.3
 
 
 class LiveCamera(Camera):
@@ -55,9 +55,12 @@ class LiveCamera(Camera):
         """`camera_clock_jumped_KEY`: the stream's time broke."""
         return {f"camera_clock_jumped_{self.key}": self._time.jumps} if self._time.jumps else {}
 
-    def close(self) -> None:
-        """It ends by itself within its deadline; nobody waits longer than a second for it."""
+    def leave(self) -> None:
         self._ending.set()
+
+    def close(self) -> None:
+        """A thread that waits for a mute camera ends by itself within its deadline; nobody waits for that."""
+        self.leave()
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None

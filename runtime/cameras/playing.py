@@ -16,7 +16,7 @@ from runtime.clock import Clock
 log = logging.getLogger(__name__)
 _EARLY_S = 1e-6  # due times are sums of floats
 _RETRY_S = 2.0
-_JOIN_S = 1.0
+_JOIN_S = 0.3
 
 
 class Player:
@@ -136,9 +136,12 @@ class FileCamera(Camera):
         with self._lock:
             return self._health
 
-    def close(self) -> None:
+    def leave(self) -> None:
         self._ending = True
         self._wake.set()
+
+    def close(self) -> None:
+        self.leave()
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None

@@ -5,18 +5,21 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+import time
 from abc import ABC, abstractmethod
 
 import numpy as np
 
 from runtime.types import UInt8
 
+_TRICKLE_S = 0.02
 FAULTS = {
     "mute": "accepts and says nothing",
     "garbage": "answers with bytes that are no video",
     "not_found": "answers that there is nothing there",
     "no_login": "answers that it wants a login",
     "silent": "plays, and then sends nothing more",
+    "trickle": "plays one byte at a time",
     "torn": "ends in the middle of a picture",
     "nonsense": "goes on with pictures that nobody can decode",
 }
@@ -99,6 +102,15 @@ class CameraServer(ABC):
             with self._lock:
                 self._clients.discard(client)
             client.close()
+
+    def _send_picture(self, client: socket.socket, data: bytes) -> None:
+        """All of it, or byte by byte."""
+        if self.fault != "trickle":
+            client.sendall(data)
+            return
+        for byte in data:
+            client.sendall(bytes([byte]))
+            time.sleep(_TRICKLE_S)
 
     @abstractmethod
     def _speak(self, client: socket.socket) -> None:

@@ -49,6 +49,6 @@ class MjpegServer(CameraServer):
             if self.fault == "torn":
                 client.sendall(part + jpeg[: len(jpeg) // 2])
                 return
-            client.sendall(part + jpeg + b"\r\n")
+            self._send_picture(client, part + jpeg + b"\r\n")
             number, due = number + 1, due + 1 / self.rate
             self.sent += 1

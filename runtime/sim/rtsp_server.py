@@ -122,7 +122,7 @@ class RtspServer(CameraServer):
         )
         packet = head + payload
         framed = b"$\0" + struct.pack(">H", len(packet)) + packet
-        client.sendall(framed[: len(framed) // 2] if self.fault == "torn" else framed)
+        self._send_picture(client, framed[: len(framed) // 2] if self.fault == "torn" else framed)
 
 
 def _payloads(unit: bytes, last: bool) -> Iterator[tuple[bytes, bool]]:

@@ -63,6 +63,9 @@ class Hand(Camera):
     def health(self) -> Health:
         return self.how
 
+    def leave(self) -> None:
+        self.heard.append("leave")
+
     def close(self) -> None:
         self.heard.append("close")
 
@@ -129,7 +132,7 @@ def test_both_hear_of_connection_runs_and_end(bench: Bench) -> None:
     for call in ("connect", "begin_run", "end_run", "close"):
         getattr(bench.source, call)()
     assert bench.robot.heard == ["connect", "begin_run", "end_run", "close"]
-    assert bench.camera.heard == ["start", "begin_run", "end_run", "close"]
+    assert bench.camera.heard == ["start", "begin_run", "end_run", "leave", "close"]
     assert bench.source.faults() == {"malformed": 1, "camera_clock_jumped_wrist": 2}
 
 

@@ -83,15 +83,17 @@ def test_settings_shape_its_pictures(kind: str) -> None:
 
 
 ABSENT = [
-    ("rtsp", "mute", "mute: it sent no picture within 0.4 s"),
+    ("rtsp", "mute", "mute: it sent no picture within 0.5 s"),
     ("rtsp", "garbage", "what answers there is no RTSP server with a video"),
     ("rtsp", "not_found", "404: there is nothing at that path"),
     ("rtsp", "no_login", "it wants a login: set user and password_env, or correct them"),
     ("rtsp", "torn", "it closed the connection"),
     ("rtsp", "nonsense", "what it sent for 0.5 s cannot be decoded"),
+    ("rtsp", "trickle", "mute: it sent no picture within 0.5 s"),
+    ("mjpeg", "trickle", "mute: it sent no picture within 0.5 s"),
     ("rtsp", "silent", "mute: it sent no picture within 0.5 s"),
-    ("mjpeg", "silent", "mute: it sent no picture within 0.4 s"),
-    ("mjpeg", "mute", "mute: it sent no picture within 0.4 s"),
+    ("mjpeg", "silent", "mute: it sent no picture within 0.5 s"),
+    ("mjpeg", "mute", "mute: it sent no picture within 0.5 s"),
     ("mjpeg", "garbage", "no MJPEG stream: it answers with something else, not multipart/x-mixed-replace"),
     ("mjpeg", "not_found", "404: there is nothing at that path"),
     ("mjpeg", "no_login", "it wants a login: set user and password_env, or correct them"),
@@ -103,7 +105,7 @@ ABSENT = [
 
 @pytest.mark.parametrize(("kind", "fault", "why"), ABSENT)
 def test_what_was_found_in_its_place_is_said(kind: str, fault: str, why: str) -> None:
-    with watched(kind, fault, open_s=0.4) as (_, camera):
+    with watched(kind, fault, open_s=0.5) as (_, camera):
         until(lambda: camera.health().failed)
         assert (camera.health().condition, camera.health().why) == (Condition.OPENING, why)
         assert camera.newest() is None
