@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from runtime import deployment, headless, lockstep, log
+from runtime.clock import MonotonicClock
 from runtime.deployment import Resolved
 from runtime.errors import ConfigurationError, RuntimeFault
 from runtime.family import Lifeline, Plan, plan
@@ -26,6 +27,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     log.start("supervisor")
     try:
         made = plan(_resolved(given))
+        made.new_policy(
+            MonotonicClock()
+        ).close()  # what does not fit it is said here, not by a main that dies
         if given.headless:
             headless.check(made)
     except RuntimeFault as fault:
