@@ -186,23 +186,38 @@ class LerobotPolicy(Policy):
         """
         deadline, pause, asked = time.monotonic() + seconds, _PAUSES[0], 0
         while True:
-            self._link.call(messages.OBSERVE, messages.observations(shown), self._left(deadline))
-            answer = self._link.call(messages.ACT, messages.EMPTY, self._left(deadline))
-            asked += 1
-            data = self._data(answer)
+            try:
+                data = self._asked_once(shown, deadline)
+            except PolicyTimeout as error:
+                if not asked:
+                    raise
+                raise self._nothing(asked, seconds) from error
             if data:
                 return data
+            asked += 1
             if time.monotonic() + pause >= deadline:
-                self._loaded = False  # perhaps it came back without it
-                self._link.drop()
-                raise PolicyError(
-                    f"{self._config.url} answered with nothing, {asked} times within {seconds:g} s: its inference "
-                    "fails, which it tells its own log alone. What fails most: the model has other images, another "
-                    "number of states, or another kind than policy.images, policy.state and policy.policy_type say"
-                )
+                raise self._nothing(asked, seconds)
             if self._ended.wait(pause):
                 raise PolicyError(f"the connection to {self._config.url} was closed from our side")
             pause = min(2 * pause, _PAUSES[1])
+
+    def _asked_once(self, shown: bytes, deadline: float) -> bytes:
+        self._link.call(messages.OBSERVE, messages.observations(shown), self._left(deadline))
+        answer = self._link.call(messages.ACT, messages.EMPTY, self._left(deadline))
+        try:
+            return messages.actions(answer)
+        except CodecError as error:
+            self._link.drop()
+            raise PolicyError(f"{self._config.url} sent an answer that is not LeRobot's: {error}") from error
+
+    def _nothing(self, asked: int, seconds: float) -> PolicyError:
+        self._loaded = False  # perhaps it came back without it
+        self._link.drop()
+        return PolicyError(
+            f"{self._config.url} answered with nothing, {asked} times within {seconds:g} s: its inference fails, which "
+            "it tells its own log alone. What fails most: the model has other images, another number of states, or "
+            "another kind than policy.images, policy.state and policy.policy_type say"
+        )
 
     def _left(self, deadline: float) -> float:
         left = deadline - time.monotonic()
@@ -212,13 +227,6 @@ class LerobotPolicy(Policy):
                 f"{self._config.url} did not answer within the deadline; the connection is dropped"
             )
         return left
-
-    def _data(self, answer: bytes) -> bytes:
-        try:
-            return messages.actions(answer)
-        except CodecError as error:
-            self._link.drop()
-            raise PolicyError(f"{self._config.url} sent an answer that is not LeRobot's: {error}") from error
 
     def _read(self, data: bytes) -> list[TimedAction]:
         try:

@@ -171,8 +171,12 @@ def _starvla(robot: Robot, rate: float, script: Script, options: argparse.Namesp
 
 
 def _lerobot(robot: Robot, rate: float, script: Script, options: argparse.Namespace) -> StandInServer:
-    from runtime.sim.lerobot_server import LerobotBehaviour, LerobotServer
-
+    try:
+        from runtime.sim.lerobot_server import LerobotBehaviour, LerobotServer
+    except ImportError as error:
+        raise SetupError(
+            f"lerobot needs grpcio and protobuf: pip install 'eva-web[lerobot-grpc]' ({error})"
+        ) from error
     latency = options.latency_ms / 1e3
     behaviour = LerobotBehaviour(options.horizon, rate, latency, options.fault, options.seed)
     return LerobotServer(robot, behaviour, options.port, script)

@@ -20,7 +20,9 @@ from runtime.types import Observation
 
 ROBOT = robots.load("agilex_piper")
 PARTS = {group.name: list(range(group.slice.start, group.slice.stop)) for group in ROBOT.groups}
-DEADLINE = 0.4
+WAITING = ("mute_on_connect", "mute_on_infer", "late_reply")  # faults that only a deadline ends
+DEADLINE = 0.4  # s, for these; others are noticed at once, also by a busy machine
+PATIENCE = 30.0
 FAULTS: list[tuple[str, type[PolicyError], str]] = [
     ("mute_on_connect", PolicyLostError, "did not send an answer to get_modality_config within"),
     ("mute_on_infer:0", PolicyLostError, "did not send an answer to get_action within 0.4 s"),
@@ -57,6 +59,7 @@ def test_a_fault_is_one_helpful_sentence_in_time(
     version: Any, fault: str, error: type[PolicyError], says: str, observation: Observation
 ) -> None:
     name, _, argument = fault.partition(":")
+    deadline = DEADLINE if name in WAITING else PATIENCE
     if version == "n1.5" and name in UNBATCHED:
         pytest.skip("N1.5 answers without a batch axis: there are no two batches")
     threads = threading.active_count()
@@ -68,9 +71,9 @@ def test_a_fault_is_one_helpful_sentence_in_time(
             video={camera.key: camera.key for camera in ROBOT.cameras},
             state=PARTS,
             actions=PARTS,
-            connect_deadline=DEADLINE,
-            first_inference_deadline=DEADLINE,
-            inference_deadline=DEADLINE,
+            connect_deadline=deadline,
+            first_inference_deadline=deadline,
+            inference_deadline=deadline,
         )
         with contextlib.closing(gr00t.build(settings, ROBOT, MonotonicClock(), 30.0)) as policy:
             told: list[PolicyError] = []
@@ -80,7 +83,7 @@ def test_a_fault_is_one_helpful_sentence_in_time(
                     policy.infer(observation)
                 except PolicyError as failure:
                     told.append(failure)
-                assert time.monotonic() - started < 30.0, "it hung"
+                assert time.monotonic() - started < PATIENCE, "it hung"
     assert told, "the fault was not noticed"
     assert isinstance(told[0], error)
     assert (error is PolicyLostError) == isinstance(told[0], PolicyLostError)
