@@ -40,7 +40,7 @@ class RosSink(Sink):
         clock: Clock,
         wire: Wire,
         open_middleware: Callable[[], Middleware],
-        wall: Callable[[], float] = time.time,
+        wall: Callable[[], int] = time.time_ns,
     ) -> None:
         self._robot, self._outlets, self._quality = robot, outlets, quality
         self._clock, self._wire, self._open, self._wall = clock, wire, open_middleware, wall
@@ -73,7 +73,7 @@ class RosSink(Sink):
                 )
             width = EEF_WIDTH * len(self._robot.arms)
             eef = _finite(command.eef, width, "a command's poses").astype(np.float64).reshape(-1, EEF_WIDTH)
-        stamp = int((self._wall() - (self._clock.now() - command.time)) * 1e9)
+        stamp = self._wall() - round((self._clock.now() - command.time) * 1e9)
         # All are made before the first is sent: a command reaches every group or none.
         messages = [self._wire.encode(self._message(one, stamp, action, eef)) for one, _ in self._publish]
         for (_, publish), payload in zip(self._publish, messages, strict=True):

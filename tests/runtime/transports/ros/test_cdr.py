@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -48,11 +48,13 @@ def same(one: Message, other: Message) -> bool:
     return all(np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b for a, b in pairs)
 
 
+@settings(deadline=None)
 @given(ANY)
 def test_what_was_written_is_read_again(message: Message) -> None:
     assert same(cdr.decode(name_of(message), cdr.encode(message)), message)
 
 
+@settings(deadline=None)
 @given(ANY)
 def test_every_truncation_is_refused(message: Message) -> None:
     payload = cdr.encode(message)
@@ -61,6 +63,7 @@ def test_every_truncation_is_refused(message: Message) -> None:
             cdr.decode(name_of(message), payload[:size])
 
 
+@settings(deadline=None)
 @given(st.sampled_from(NAMES), st.binary(max_size=120), st.booleans())
 def test_random_bytes_are_a_message_or_refused(name: MessageName, garbage: bytes, headed: bool) -> None:
     payload = b"\x00\x01\x00\x00" + garbage if headed else garbage
@@ -90,6 +93,7 @@ def test_big_endian_is_read() -> None:
     assert same(message, PoseStamped(1_000_000_002, "a", np.arange(7.0)))
 
 
+@settings(deadline=None)
 @given(ANY)
 def test_rosbags_writes_the_same_bytes_and_reads_ours(message: Message) -> None:
     store = typestore()
