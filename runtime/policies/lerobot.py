@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
-ANSWER_LIMIT = 16 * 1024 * 1024  # bytes; every row carries the whole chunk: 100 rows of 32 numbers are 1.3 MB
+ANSWER_LIMIT = 8 * 1024 * 1024  # bytes; every row carries the whole chunk: 100 rows of 32 numbers are 1.3 MB
 _PAUSES = (0.05, 0.5)  # s between questions that were answered with nothing: the first, and the longest
 
 

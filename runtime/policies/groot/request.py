@@ -87,7 +87,7 @@ class Gr00tRequest:
         for key in settings.actions:
             _check_written(key, wanted.action.written.get(key), settings)
         self._language = _language_key(wanted.language, settings.language_key)
-        for name, one in (("video", wanted.video), ("state", wanted.state)):
+        for name, one in (("video", wanted.video), ("state", wanted.state), ("language", wanted.language)):
             _check_steps(name, one, settings.history)
         self._wanted = wanted
 

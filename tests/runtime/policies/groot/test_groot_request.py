@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays_of
 
 import robots
 from runtime.errors import ConfigurationError, ContradictionError, PolicyError
@@ -127,6 +131,27 @@ def test_flat_answers_and_single_numbers_without_axis_are_read() -> None:
 def test_an_answer_that_cannot_be_rows_is_named(reply: object, says: str) -> None:
     with pytest.raises(PolicyError, match=says):
         request().rows(reply)
+
+
+NUMBERS = arrays_of.arrays(
+    st.sampled_from(["<f4", "<f8", "|u1", "|b1", "<i8"]),
+    arrays_of.array_shapes(min_dims=0, max_dims=3, min_side=0),
+)
+REPLIES = st.recursive(
+    st.none() | st.integers() | st.text(max_size=3) | NUMBERS,
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.sampled_from(["left", "right", "action.left", "other"]), inner)
+    ),
+    max_leaves=8,
+)
+
+
+@given(REPLIES)
+def test_whatever_is_decoded_is_rows_or_an_error(reply: object) -> None:
+    for dialect in ("nested", "n1.5"):
+        with contextlib.suppress(PolicyError):
+            assert request(wanted(early=dialect == "n1.5"), dialect=dialect).rows(reply).shape[1] == 14
 
 
 @pytest.mark.parametrize(
