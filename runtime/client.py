@@ -57,6 +57,10 @@ class StationClient:
 
     def query(self, kind: str, **arguments: Any) -> Ack:
         """Ask what changes nothing and needs no lease; raises Refused, or TransportError."""
+        return self.ask(kind, arguments)
+
+    def ask(self, kind: str, arguments: Mapping[str, Any]) -> Ack:
+        """`query` with arguments of any name."""
         return _accepted(self._send(Command(str(uuid.uuid4()), kind, arguments, user=self.holder), 2.0))
 
     def claim(self, epoch: int = 0) -> None:
@@ -82,6 +86,13 @@ class StationClient:
         """
         self.claim()
         self.status()
+        return self.give(kind, arguments, identity, timeout)
+
+    def give(self, kind: str, arguments: Mapping[str, Any], identity: str = "", timeout: float = 2.0) -> Ack:
+        """Give one command under the lease that was claimed, decided by the status that was seen last.
+
+        Raises Refused, or TransportError: outcome unknown.
+        """
         return self._command(kind, timeout, self._epoch, identity, arguments)
 
     def estop(self, why: str) -> Ack:

@@ -179,6 +179,22 @@ class BusSettings(Section):
     """Height of a preview [pixels]."""
 
 
+class ControlChannelSettings(Section):
+    """JSON commands over ZMQ for existing scripts, on this machine alone: docs/control-channel.md."""
+
+    enabled: bool = False
+    """Whether the station listens for scripts."""
+    port: int = Field(default=5757, ge=0, le=65535)
+    """Where, on 127.0.0.1; 0 for a free port, which is left in the station's folder."""
+    operator: str = Field(default="", max_length=100)
+    """Who the scripts command for, in lease and events; user and machine where it is not given."""
+    silence_s: float = Field(default=10.0, gt=0, le=3600)
+    """Silence of a script after which its lease ends and the robot holds [s]."""
+    scripts: Literal["apart", "together"] = "apart"
+    """"apart": each connection (or name that a script gives itself) is a holder of its own; "together": all that
+    give no name are one, and whatever any of them says keeps their lease."""
+
+
 class LockstepSettings(Section):
     """One process on a virtual clock."""
 
@@ -236,6 +252,7 @@ class Deployment(Section):
     publication: PublicationSettings = PublicationSettings()
     lease: LeaseSettings = LeaseSettings()
     bus: BusSettings = BusSettings()
+    control_channel: ControlChannelSettings = ControlChannelSettings()
     lockstep: LockstepSettings = LockstepSettings()
 
     @property

@@ -17,6 +17,7 @@ from types import FrameType
 from typing import IO
 
 from runtime.bus import Endpoints
+from runtime.companion import Companion
 from runtime.errors import SetupError
 from runtime.family import Lifeline, Plan
 from runtime.page import PROCESSES, Page
@@ -40,6 +41,7 @@ class Supervisor:
         self._environment = dict(os.environ)
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._driver: subprocess.Popen[bytes] | None = None
+        self._channel: Companion | None = None
         self._restarts: deque[float] = deque()
         self._ending = False
         self.boot = str(uuid.uuid4())
@@ -65,6 +67,8 @@ class Supervisor:
                 self._environment.setdefault("EVA_LOG_LEVEL", "WARNING")
             for process in _START_ORDER:
                 self._start(process)
+            if self._plan.deployment.control_channel.enabled:
+                self._channel = Companion("channel", self._spawn_channel)
             if headless:
                 self._driver = self._spawn("headless")
             return self._watch()
@@ -111,6 +115,16 @@ class Supervisor:
             start_new_session=True,  # Ctrl-C reaches the supervisor alone, which ends them in order
         )
 
+    def _spawn_channel(self) -> subprocess.Popen[bytes]:
+        """The control channel: a client like any other, without a part in the page."""
+        station, data = self._plan.deployment.station, str(self._plan.deployment.data)
+        return subprocess.Popen(
+            [sys.executable, "-m", "runtime.channel", station, "--data-dir", data, "--lifeline"],
+            stdin=self._lifeline_out,
+            env=self._environment,
+            start_new_session=True,
+        )
+
     def _watch(self) -> int:
         while not self._ending and not (self._lifeline and self._lifeline.cut):
             if self._driver is not None and self._driver.poll() is not None:
@@ -119,6 +133,8 @@ class Supervisor:
                 code = self._children[process].poll()
                 if code is not None and not self._restart(process, code):
                     return 1
+            if self._channel is not None:
+                self._channel.look()
             time.sleep(_POLL_S)
         return 130
 
@@ -153,6 +169,8 @@ class Supervisor:
         deadline = time.monotonic() + _PATIENCE_S
         for process, child in self._children.items():
             self._await(process, child, max(0.1, deadline - time.monotonic()))
+        if self._channel is not None:
+            self._await("channel", self._channel.process, _DRIVER_PATIENCE_S)
         os.close(self._lifeline_out)
         os.close(self._page_fd)
         self._endpoints.clear()

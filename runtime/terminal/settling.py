@@ -10,7 +10,7 @@ from typing import Any
 from runtime.client import StationClient
 
 _BUSY = ("asking", "executing", "moving", "approaching", "starved")
-_CALM_TICKS = 3  # an order reaches control, and its answer us, within that many
+CALM_TICKS = 3  # an order reaches control, and its answer us, within that many
 _LOOK_S = 0.02
 _FAILURES = ("chunk_dropped", "policy_failed", "policy_lost")
 
@@ -51,14 +51,14 @@ def settle(client: StationClient, before: dict[str, Any], tell: Callable[[dict[s
                 events.append(event)
                 tell(event)
         step = status["control"]["step"]
-        if _busy(status) or calm_since is None:
+        if busy(status) or calm_since is None:
             calm_since = step
-        if status["state"] != began or step - calm_since >= _CALM_TICKS:
+        if status["state"] != began or step - calm_since >= CALM_TICKS:
             return Settled(began, status, events)
         client.renew()
         time.sleep(_LOOK_S)
 
 
-def _busy(status: dict[str, Any]) -> bool:
+def busy(status: dict[str, Any]) -> bool:
     """Whether something goes on; a gripper moves also where no run is open."""
     return status["phase"] in _BUSY or status["control"]["behaviour"] == "motion"

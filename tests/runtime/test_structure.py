@@ -13,7 +13,7 @@ GROUND_FLOOR = {"types", "clock", "messages", "codecs", "errors", "section", "me
 # By these alone the web comes in; to read a deployment file belongs to the configuration.
 DOORS = {"messages", "bus", "config", "deployment", "kinematics", "recording", "datasets"}
 FAMILY = {"control", "main", "media", "guard", "headless"}
-ROOF = FAMILY | {"lockstep", "supervisor", "ctl", "terminal", "__main__"}
+ROOF = FAMILY | {"lockstep", "supervisor", "ctl", "terminal", "channel", "__main__"}
 
 
 SOURCES = Sources("runtime", "robots")

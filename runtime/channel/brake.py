@@ -1,0 +1,99 @@
+"""Stops, which wait for nothing: `stop` and `halt` by main, the e-stop by the guard."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable
+from typing import Any
+
+from runtime.channel import answers
+from runtime.channel.message import Message
+from runtime.channel.outcomes import Outcome, Outcomes
+from runtime.channel.scripts import Lives
+from runtime.channel.verbs import stops
+from runtime.client import Refused, StationClient
+from runtime.errors import RuntimeFault, TransportError
+
+_ANYBODY = 'anybody may {"command": "estop"}'
+_LONGEST = 200  # characters of a reason
+
+
+def is_stop(message: Message) -> bool:
+    """Whether it ends whatever goes on, under a lease."""
+    if message.form == "command":
+        return message.name in ("stop", "halt")
+    return message.form == "cmd" and stops(message.name, message.argument)
+
+
+def is_estop(message: Message) -> bool:
+    """Whether it presses the e-stop, which needs no lease."""
+    return message.form != "query" and message.name == "estop"
+
+
+class Brake:
+    """Stops at main: also what another script of this channel has begun, whose lease it then uses."""
+
+    def __init__(self, open_client: Callable[[str], StationClient], lives: Lives, outcomes: Outcomes) -> None:
+        self._open, self._lives, self._outcomes = open_client, lives, outcomes
+
+    def answer(self, holder: str, message: Message) -> dict[str, Any]:
+        """The answer to `stop` or `halt`; whatever comes with it is not looked at."""
+        kind = "halt" if message.name == "halt" else "stop"
+        outcome = Outcome(message.id or str(uuid.uuid4()), message.name, kind, "done")
+        state = None
+        try:
+            state = self._stop(holder, kind)
+        except TransportError as fault:
+            outcome.result, outcome.reason = "unknown", f"{fault}; {_ANYBODY}"
+        except Refused as refusal:
+            outcome.result, outcome.reason = "refused", f"{refusal}; {_ANYBODY}"
+        self._outcomes.keep(outcome)
+        return answers.told(message, outcome, {}, state)
+
+    def _stop(self, holder: str, kind: str) -> str:
+        """Under the lease that a script of the channel holds, else under one of the asker's own."""
+        client = self._open(holder)
+        try:
+            held = client.status()["lease"]["holder"]
+            if held != holder and self._lives.knows(held):
+                client.close()
+                client = self._open(held)
+            client.claim()
+            client.status()
+            client.give(kind, {})
+            return str(client.status()["state"])
+        finally:
+            client.close()
+
+    def close(self) -> None:
+        """Nothing is kept open."""
+
+
+class EStop:
+    """Presses the e-stop at the guard."""
+
+    def __init__(self, open_client: Callable[[str], StationClient], outcomes: Outcomes) -> None:
+        self._open, self._outcomes = open_client, outcomes
+
+    def answer(self, holder: str, message: Message) -> dict[str, Any]:
+        """What the guard says; never refused for an argument."""
+        given = message.arguments.get("why") or message.argument or "over the control channel"
+        outcome = Outcome(message.id or str(uuid.uuid4()), message.name, "estop", "done")
+        client = self._open(holder)
+        try:
+            ack = client.estop(_readable(given))
+            outcome.result, outcome.reason = "done" if ack.status == "done" else "failed", ack.reason
+        except RuntimeFault as fault:
+            outcome.result, outcome.reason = "unknown", str(fault)
+        finally:
+            client.close()
+        self._outcomes.keep(outcome)
+        return answers.told(message, outcome, {}, None)
+
+    def close(self) -> None:
+        """Nothing is kept open."""
+
+
+def _readable(given: object) -> str:
+    """A reason of any kind as text that every wire takes."""
+    return str(given)[:_LONGEST].encode(errors="replace").decode()

@@ -1,0 +1,239 @@
+"""Carries out what scripts ask for, one after the other, and says what came of it."""
+
+from __future__ import annotations
+
+import logging
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from runtime.channel import answers
+from runtime.channel import status as older
+from runtime.channel.deed import NotOurs, Scene
+from runtime.channel.message import Message
+from runtime.channel.outcomes import Outcome, Outcomes, lasts
+from runtime.channel.scripts import Lives, Script, Scripts
+from runtime.channel.verbs import VERBS, deed
+from runtime.client import Refused, StationClient
+from runtime.errors import RuntimeFault, TransportError
+from runtime.transitions import COMMANDS
+
+log = logging.getLogger(__name__)
+OWN = (*COMMANDS, "aim", "estop", "claim", "give_up")
+QUERIES = ("status", "config", "frame", "station", "events", "result", "commands")
+_APART = (
+    '; a script that connects anew for every message is one only where it says who it is ("client": NAME), or '
+    'the deployment says control_channel.scripts = "together"'
+)
+_FRAME_S = 0.5
+_LOOK_S = 0.1
+
+
+class Desk:
+    """The channel's one way to main, but for stops; used by one thread."""
+
+    def __init__(
+        self,
+        open_client: Callable[[str], StationClient],
+        lives: Lives,
+        outcomes: Outcomes,
+        silence_s: float,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._scripts = Scripts(open_client, lives, silence_s)
+        self._outcomes = outcomes
+        self._now, self._looked = now, 0.0
+        self._newest = ""  # why the newest command that was refused or failed was
+
+    def answer(self, holder: str, message: Message) -> dict[str, Any]:
+        """The answer to one message; every fault is a sentence in it."""
+        script = self._scripts.of(holder)
+        if message.form == "query":
+            return self._asked(script, message)
+        outcome = Outcome(message.id or str(uuid.uuid4()), message.name, "", "done")
+        known = self._outcomes.get(outcome.id)
+        if known is not None and known.result != "unknown":
+            return self._repeated(message, known, script)
+        data: Mapping[str, Any] = {}
+        try:
+            data = (self._verb if message.form == "cmd" else self._own)(script, message, outcome)
+        except RuntimeFault as fault:
+            outcome.result = "unknown" if isinstance(fault, TransportError) else "refused"
+            outcome.reason = self._newest = str(fault)
+        self._outcomes.keep(outcome)
+        if message.name == "select_collect_task" and outcome.result == "done":
+            return {"ok": True, **data}  # as it always was
+        special = dict(data) if message.name == "tab_switch" else {}
+        return answers.told(message, outcome, data, self._state(script, outcome)) | special
+
+    def _repeated(self, message: Message, known: Outcome, script: Script) -> dict[str, Any]:
+        """What came of it the first time, as far as it has come now."""
+        if known.said != message.name:
+            other = Outcome(known.id, message.name, "", "refused")
+            other.reason = f"its id was given to {known.said!r} before"
+            return answers.told(message, other, {}, None)
+        return answers.told(message, known, {}, self._state(script, known))
+
+    def _state(self, script: Script, outcome: Outcome) -> str | None:
+        """After a command; None where the station has just gone, and the answer is still worth having."""
+        if outcome.result in ("refused", "unknown"):
+            return None
+        try:
+            return str(script.client.status()["state"])
+        except TransportError:
+            return None
+
+    def keep(self) -> None:
+        """What is due beside messages: leases, and what became of commands that go on."""
+        for sentence in self._scripts.keep():
+            log.warning("%s", sentence)
+        if self._now() - self._looked >= _LOOK_S:
+            self._looked = self._now()
+            self._look()
+
+    def _look(self) -> None:
+        going_on = self._outcomes.open
+        if not going_on:
+            return
+        client = self._scripts.of("channel").client  # of no script: it asks, and holds nothing
+        try:
+            status = client.status()
+            for outcome in going_on:
+                outcome.look(status, client.events_since)
+                self._newest = outcome.reason if outcome.result == "failed" else self._newest
+        except TransportError as fault:
+            log.warning("what became of commands is not known: %s", fault)
+
+    # --- commands ------------------------------------------------------------------------------------------
+
+    def _verb(self, script: Script, message: Message, outcome: Outcome) -> Mapping[str, Any]:
+        """Do what a verb of the older channel comes to; returns the data of the answer."""
+        if message.name not in VERBS:
+            raise NotOurs(
+                f"command not allowed: {str(message.fields['cmd'])!r:.80}; known: {', '.join(VERBS)}"
+            )
+        client = script.client
+        with _nothing_given():
+            scene = Scene(message, client.status(), script.selection, lambda: _commanded(client))
+            made = deed(scene)
+        told: Mapping[str, Any] = made.told
+        for number, (kind, arguments) in enumerate(made.steps, start=1):
+            last = number == len(made.steps)
+            told = self._give(script, kind, arguments, outcome if last else None) or told
+        script.selection.choose(**made.chosen)
+        outcome.reason = made.note
+        return told
+
+    def _own(self, script: Script, message: Message, outcome: Outcome) -> Mapping[str, Any]:
+        """Do a command of ours; returns the data of the answer."""
+        kind, arguments = message.name, message.arguments
+        if kind not in OWN:
+            raise NotOurs(f"unknown command {kind!r:.80}; known: {', '.join(OWN)}")
+        if kind == "aim":
+            return script.client.ask("aim", arguments).data
+        if kind not in ("claim", "give_up"):
+            return self._give(script, kind, arguments, outcome)
+        if arguments:
+            raise NotOurs(f"{kind} takes no arguments; given: {', '.join(map(str, arguments)):.200}")
+        if kind == "claim":
+            self._claim(script)
+        elif script.holds:
+            script.holds = False
+            script.client.give_up()
+        return {}
+
+    def _give(
+        self, script: Script, kind: str, arguments: Mapping[str, Any], outcome: Outcome | None
+    ) -> Mapping[str, Any]:
+        """Give one command under the script's lease; raises Refused, or TransportError: outcome unknown."""
+        with _nothing_given():
+            self._claim(script)
+            before = script.client.status()
+        ack = script.client.give(kind, arguments, outcome.id if outcome else "")
+        if outcome is not None:
+            outcome.kind, outcome.result = kind, "accepted" if lasts(kind) else "done"
+            outcome.before = before if lasts(kind) else {}
+        return {key: value for key, value in ack.data.items() if key not in ("epoch", "holder")}
+
+    def _claim(self, script: Script) -> None:
+        try:
+            script.client.claim()
+        except Refused as refusal:
+            script.holds = False
+            raise Refused(f"{refusal}{_APART if 'channel:' in str(refusal) else ''}") from None
+        script.holds = True
+
+    # --- questions -----------------------------------------------------------------------------------------
+
+    def _asked(self, script: Script, message: Message) -> dict[str, Any]:
+        if message.name not in QUERIES:
+            return {
+                "ok": False,
+                "error": f"unknown query: {message.name!r:.80}; known: {', '.join(QUERIES)}",
+            }
+        try:
+            return {"ok": True, "data": getattr(self, f"_{message.name}")(script, message.fields)}
+        except TransportError as fault:
+            return {"ok": False, "error": f"console context not ready: {fault}"}
+        except RuntimeFault as fault:
+            return {"ok": False, "error": str(fault)}
+
+    def _status(self, script: Script, fields: Mapping[str, Any]) -> dict[str, Any]:
+        return older.status(script.client.status(), script.selection, self._newest)
+
+    def _config(self, script: Script, fields: Mapping[str, Any]) -> dict[str, Any]:
+        status = script.client.status()
+        kinds = {"robot_type": status["robot"], "transport_type": status["transport"]}
+        return {
+            **kinds,
+            "station": status["station"],
+            "policy_type": status["policy"]["kind"],
+            **status["facts"],
+        }
+
+    def _frame(self, script: Script, fields: Mapping[str, Any]) -> dict[str, Any]:
+        cameras = script.client.status()["facts"]["cameras"]
+        stream = script.client.subscribe("joints")
+        try:
+            joints = stream.receive(_FRAME_S).get("joints", {})
+        finally:
+            stream.close()
+        return {"qpos": joints.get("measured"), "cameras": cameras}
+
+    def _station(self, script: Script, fields: Mapping[str, Any]) -> dict[str, Any]:
+        return script.client.status()
+
+    def _events(self, script: Script, fields: Mapping[str, Any]) -> list[dict[str, Any]]:
+        since = fields.get("since", 0)
+        if isinstance(since, bool) or not isinstance(since, int) or not 0 <= since < 2**53:
+            raise NotOurs(f"since = {since!r:.80}: must be a whole number, the newest event you have")
+        return script.client.events_since(since)
+
+    def _result(self, script: Script, fields: Mapping[str, Any]) -> dict[str, Any]:
+        given = fields.get("id")
+        self._look()
+        found = self._outcomes.get(given) if isinstance(given, str) else None
+        if found is None:
+            raise NotOurs(f"id = {given!r:.80}: no command of that id is remembered")
+        return found.told
+
+    def _commands(self, script: Script, fields: Mapping[str, Any]) -> dict[str, Any]:
+        return {"cmd": {f"web:{verb}": what.ours for verb, what in VERBS.items()}, "command": list(OWN)}
+
+    def close(self) -> None:
+        self._scripts.close()
+
+
+def _commanded(client: StationClient) -> list[float]:
+    return list(client.query("aim").data["joints"])
+
+
+@contextmanager
+def _nothing_given() -> Iterator[None]:
+    """A station that does not answer before anything was given to it has refused: nothing is unknown."""
+    try:
+        yield
+    except TransportError as fault:
+        raise RuntimeFault(f"console context not ready: {fault}") from None

@@ -1,0 +1,152 @@
+"""The channel's socket: takes messages from any number of scripts, hands them to lanes, sends the answers."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Literal
+
+import zmq
+
+from runtime.channel import answers, strict
+from runtime.channel.brake import Brake, EStop, is_estop, is_stop
+from runtime.channel.desk import Desk
+from runtime.channel.lane import Job, Lane
+from runtime.channel.message import LARGEST, Malformed, Message, read
+from runtime.channel.outcomes import Outcomes
+from runtime.channel.scripts import Lives
+from runtime.client import StationClient
+from runtime.errors import TransportError
+
+HOST = "127.0.0.1"
+_CONNECTIONS = 1000  # whose numbers are remembered
+_REPLIES = "inproc://channel-replies-{}"
+_NUMBERS = itertools.count()
+_END_S = 1.0
+
+
+class Names:
+    """Who a message is of: a script that names itself, a connection, or all scripts together."""
+
+    def __init__(self, operator: str, scripts: Literal["apart", "together"]) -> None:
+        self._base, self._apart = f"channel:{operator}", scripts == "apart"
+        self._numbers: dict[bytes, int] = {}
+        self._next = itertools.count(1)
+
+    def holder(self, connection: bytes, client: str) -> str:
+        """The name under which it holds a lease; no script can give itself one outside the channel's."""
+        if client:
+            return f"{self._base}/{client}"
+        if not self._apart:
+            return self._base
+        number = self._numbers.pop(connection, None) or next(self._next)
+        self._numbers[connection] = number
+        if len(self._numbers) > _CONNECTIONS:
+            del self._numbers[next(iter(self._numbers))]
+        return f"{self._base}#{number}"
+
+
+class Door:
+    """Listens on loopback alone; what has to stop a robot has lanes of its own, which nothing else delays."""
+
+    def __init__(
+        self,
+        context: zmq.Context[Any],
+        port: int,
+        names: Names,
+        silence_s: float,
+        open_client: Callable[[str], StationClient],
+    ) -> None:
+        self._names, self._lives, self._stops = names, Lives(time.monotonic), 0
+        self._socket, self.endpoint = _listening(context, port)
+        self._context, self._inbox = context, _REPLIES.format(next(_NUMBERS))
+        self._replies = context.socket(zmq.PULL)
+        self._replies.linger = 0
+        self._replies.bind(self._inbox)
+        self._local = threading.local()
+        outcomes = Outcomes()
+        desk = Desk(open_client, self._lives, outcomes, silence_s)
+        self._desk = self._lane("desk", desk, desk.keep)
+        self._brake = self._lane("brake", Brake(open_client, self._lives, outcomes))
+        self._estop = self._lane("estop", EStop(open_client, outcomes))
+
+    def _lane(self, name: str, clerk: Any, keep: Callable[[], None] | None = None) -> Lane:
+        return Lane(f"channel-{name}", clerk, self._reply, lambda: self._stops, keep)
+
+    def _reply(self, address: list[bytes], answer: dict[str, Any]) -> None:
+        """Hand an answer over, from a lane's thread by a socket of that thread."""
+        if not hasattr(self._local, "socket"):
+            self._local.socket = self._context.socket(zmq.PUSH)
+            self._local.socket.linger = 0
+            self._local.socket.connect(self._inbox)
+        self._local.socket.send_multipart([*address, strict.dumps(answer)])
+
+    def serve(self, timeout: float) -> None:
+        """Wait up to `timeout` seconds for messages and answers; pass on all there are."""
+        poller = zmq.Poller()
+        poller.register(self._socket, zmq.POLLIN)
+        poller.register(self._replies, zmq.POLLIN)
+        poller.poll(int(timeout * 1000))
+        while (frames := _next(self._replies)) is not None:
+            self._send(frames)
+        while (frames := _next(self._socket)) is not None:
+            self._take(frames)
+
+    def _take(self, frames: list[bytes]) -> None:
+        """Hand a message to its lane; what cannot be read, or finds no room, is answered at once."""
+        end = frames.index(b"", 1) + 1 if b"" in frames[1:] else 1
+        address, body = frames[:end], frames[end:]
+        try:
+            message = read(body)
+        except Malformed as fault:
+            self._send([*address, strict.dumps(answers.error(str(fault)))])
+            return
+        holder = self._names.holder(address[0], message.client)
+        self._lives.heard(holder)
+        lane = self._lane_of(message)
+        if not lane.put(Job(address, holder, message, time.monotonic(), self._stops)):
+            why = "too many commands wait: not carried out"
+            self._send([*address, strict.dumps(answers.error(why) | message.echo)])
+
+    def _lane_of(self, message: Message) -> Lane:
+        if not is_estop(message) and not is_stop(message):
+            return self._desk
+        self._stops += 1  # void is what waits
+        return self._estop if is_estop(message) else self._brake
+
+    def _send(self, frames: list[bytes]) -> None:
+        """A script that is gone loses its answer."""
+        self._socket.send_multipart(frames, zmq.NOBLOCK)
+
+    def close(self) -> None:
+        """End the lanes and close the socket; leases that are held end by themselves."""
+        for lane in (self._desk, self._brake, self._estop):
+            lane.end(_END_S)
+        self._socket.close()
+        self._replies.close()
+
+
+def _next(socket: Any) -> list[bytes] | None:
+    try:
+        frames: list[bytes] = socket.recv_multipart(zmq.NOBLOCK)
+    except zmq.Again:
+        return None
+    return frames
+
+
+def _listening(context: zmq.Context[Any], port: int) -> tuple[Any, str]:
+    """A bound socket and its endpoint; raises TransportError where the port is taken."""
+    socket = context.socket(zmq.ROUTER)
+    socket.linger = 0
+    socket.set(zmq.MAXMSGSIZE, 16 * LARGEST)  # what is merely too large is told so
+    try:
+        socket.bind(f"tcp://{HOST}:{port or '*'}")
+    except zmq.ZMQError as error:
+        socket.close()
+        raise TransportError(
+            f"the control channel cannot listen on {HOST}:{port}: {error.strerror}; "
+            "name another port with control_channel.port"
+        ) from None
+    return socket, socket.last_endpoint.decode()

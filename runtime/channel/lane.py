@@ -1,0 +1,120 @@
+"""A thread with an inbox: what comes in is answered one after the other, however long one takes."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from queue import Empty, Full, Queue
+from typing import Any, Protocol
+
+from runtime.channel import answers
+from runtime.channel.message import Message
+
+log = logging.getLogger(__name__)
+WAITING = 64  # messages in one inbox
+LATE_S = 4.0  # the older channel's scripts wait 5 s for an answer
+_PERIOD_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A message to be answered at `address`; `stops` counts the stops that had come before it."""
+
+    address: list[bytes]
+    holder: str
+    message: Message
+    came: float
+    stops: int
+
+
+class Clerk(Protocol):
+    """Who answers in a lane."""
+
+    def answer(self, holder: str, message: Message) -> dict[str, Any]: ...
+    def close(self) -> None: ...
+
+
+Reply = Callable[[list[bytes], dict[str, Any]], None]
+
+
+class Lane:
+    """Jobs for one clerk, who is made, used and closed in the lane's own thread.
+
+    `keep` is done about ten times a second. A command is answered without being carried out where it has waited
+    too long for who asked to be waiting still, or a stop has come after it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        clerk: Clerk,
+        reply: Reply,
+        stops: Callable[[], int],
+        keep: Callable[[], None] | None = None,
+    ) -> None:
+        self._clerk, self._reply, self._stops, self._keep = clerk, reply, stops, keep
+        self._jobs: Queue[Job | None] = Queue(WAITING)
+        self._kept = 0.0
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
+        self._thread.start()
+
+    def put(self, job: Job) -> bool:
+        """Whether there was room for it."""
+        try:
+            self._jobs.put_nowait(job)
+        except Full:
+            return False
+        return True
+
+    def end(self, patience: float) -> None:
+        """Let it finish what it is about and close its clerk; waits so long at most [s]."""
+        try:
+            self._jobs.put(None, timeout=patience)
+        except Full:
+            log.error("%s is still busy: left as it is", self._thread.name)
+            return
+        self._thread.join(patience)
+
+    def _work(self) -> None:
+        while True:
+            try:
+                job = self._jobs.get(timeout=_PERIOD_S)
+            except Empty:
+                self._tend()
+                continue
+            if job is None:
+                self._clerk.close()
+                return
+            self._reply(job.address, self._answer(job))
+            self._tend()
+
+    def _answer(self, job: Job) -> dict[str, Any]:
+        why = self._void(job)
+        if why:
+            return answers.error(why) | job.message.echo | {"result": "refused"}
+        try:
+            return self._clerk.answer(job.holder, job.message)
+        except Exception as error:  # whatever a message meets, the channel goes on
+            log.exception("%s cannot be answered", job.message.name)
+            return answers.error(f"handler error: {type(error).__name__}: {error}") | job.message.echo
+
+    def _void(self, job: Job) -> str:
+        """Why a command is not carried out any more, "" where it is."""
+        if self._keep is None or job.message.form == "query":  # stops are always carried out
+            return ""
+        waited = time.monotonic() - job.came
+        if job.stops != self._stops():
+            return "a stop came after it: not carried out"
+        return f"it waited {waited:.1f} s behind others: not carried out" if waited > LATE_S else ""
+
+    def _tend(self) -> None:
+        if self._keep is None or time.monotonic() - self._kept < _PERIOD_S:
+            return
+        self._kept = time.monotonic()
+        try:
+            self._keep()
+        except Exception:  # a lease that is not renewed ends, and the robot holds
+            log.exception("what is due beside messages was not done")

@@ -1,0 +1,122 @@
+"""What a script says: one frame of JSON, checked for its form before anything is done about it."""
+
+from __future__ import annotations
+
+import json
+import re
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NoReturn
+
+from runtime.errors import RuntimeFault
+
+LARGEST = 64 * 1024  # bytes of one message
+_PREFIX = "web:"
+_CLIENT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
+_OWN_KEYS = ("command", "arguments", "client", "id")
+
+
+class Malformed(RuntimeFault):
+    """A message that cannot be read; the sentence goes back to the script."""
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One request: a query, a `cmd` of the older channel (`name` is its verb), or a `command` of ours.
+
+    `argument` is what stands after the verb's colon, None where no colon does. `client` is how the script names
+    itself, "" where it does not. `fields` is the message as it came.
+    """
+
+    form: Literal["query", "cmd", "command"]
+    name: str
+    fields: Mapping[str, Any]
+    argument: str | None = None
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    client: str = ""
+    id: str = ""
+
+    @property
+    def echo(self) -> dict[str, Any]:
+        """What an answer repeats of it."""
+        return {} if self.form == "query" else {self.form: self.fields[self.form]}
+
+
+def read(frames: list[bytes]) -> Message:
+    """The message in the frames behind the address; raises Malformed."""
+    fields = _object(frames)
+    client, identity = _client(fields), _identity(fields)
+    if "query" in fields:
+        return Message("query", _word(fields, "query"), fields, client=client, id=identity)
+    if "cmd" in fields:
+        verb, argument = _verb(fields["cmd"])
+        return Message("cmd", verb, fields, argument, client=client, id=identity)
+    if "command" in fields:
+        arguments = _arguments(fields)
+        return Message(
+            "command", _word(fields, "command"), fields, arguments=arguments, client=client, id=identity
+        )
+    raise Malformed("message must carry 'cmd' or 'query' (or 'command')")
+
+
+def _object(frames: list[bytes]) -> dict[str, Any]:
+    if len(frames) != 1:
+        raise Malformed(f"recv failed: a message is one frame of JSON, and {len(frames)} came")
+    if len(frames[0]) > LARGEST:
+        raise Malformed(f"recv failed: {len(frames[0])} bytes; allowed: at most {LARGEST}")
+    try:
+        found = json.loads(frames[0].decode("utf-8"), parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:  # JSON and UTF-8 alike
+        raise Malformed(f"recv failed: not JSON in UTF-8: {error}") from None
+    if not isinstance(found, dict):
+        raise Malformed("message must be a JSON object")
+    return found
+
+
+def _no_number(word: str) -> NoReturn:
+    raise ValueError(f"{word} is no number of JSON")
+
+
+def _word(fields: Mapping[str, Any], key: str) -> str:
+    word: object = fields[key]
+    if not isinstance(word, str):
+        raise Malformed(f"unknown {key}: {word!r:.80}; it is a word")
+    return word
+
+
+def _verb(said: object) -> tuple[str, str | None]:
+    if not isinstance(said, str) or not said.startswith(_PREFIX):
+        raise Malformed(f"command must start with 'web:', got {said!r:.80}")
+    verb, colon, argument = said.removeprefix(_PREFIX).partition(":")
+    return verb, argument if colon else None
+
+
+def _arguments(fields: Mapping[str, Any]) -> dict[str, Any]:
+    unknown = [key for key in fields if key not in _OWN_KEYS]
+    if unknown:
+        raise Malformed(f"{unknown[0]!r:.80} is no key of a command; allowed: {', '.join(_OWN_KEYS)}")
+    arguments = fields.get("arguments", {})
+    if not isinstance(arguments, dict):
+        raise Malformed(f"arguments = {arguments!r:.80}: must be a JSON object")
+    return arguments
+
+
+def _client(fields: Mapping[str, Any]) -> str:
+    client: object = fields.get("client", "")
+    if isinstance(client, str) and (not client or _CLIENT.fullmatch(client)):
+        return client
+    raise Malformed(
+        f"client = {client!r:.80}: must be a name of at most 63 letters, digits, dots, dashes, underscores"
+    )
+
+
+def _identity(fields: Mapping[str, Any]) -> str:
+    """The uuid under which a repetition gets the first answer again; another name might come again tomorrow."""
+    given = fields.get("id", "")
+    if given == "":
+        return ""
+    try:
+        return str(uuid.UUID(given))
+    except (ValueError, TypeError, AttributeError):
+        raise Malformed(f"id = {given!r:.80}: must be a UUID, or absent") from None

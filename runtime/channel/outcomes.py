@@ -1,0 +1,109 @@
+"""What became of commands that go on after they were accepted: looked at until they are over."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from runtime.terminal.settling import CALM_TICKS, Settled, busy
+
+KEPT = 1000
+# The state in which each goes on; the rest goes on within the state it was given in.
+_WHILE = {"setup": "setting_up", "home": "setting_up", "run": "running", "resume": "running"}
+_WITHIN = {
+    "step": "",
+    "commit": "",
+    "cancel": "",
+    "gripper": "",
+    "move": "motion_done",
+}  # and the event they want
+Events = Callable[[int], list[dict[str, Any]]]
+
+
+def lasts(kind: str) -> bool:
+    """Whether a command goes on after it was accepted."""
+    return kind in _WHILE or kind in _WITHIN or kind == "approach"
+
+
+@dataclass(slots=True)
+class Outcome:
+    """One command: "accepted", "refused" or "unknown", and from "accepted" on "done" or "failed".
+
+    `said` is the word of the script, `kind` the command of ours that it came to.
+    """
+
+    id: str
+    said: str
+    kind: str
+    result: str
+    reason: str = ""
+    before: Mapping[str, Any] = field(default_factory=dict)  # the status when it was given
+    events: list[dict[str, Any]] = field(default_factory=list)  # since then
+    calm_since: int | None = None
+
+    @property
+    def told(self) -> dict[str, Any]:
+        return {"id": self.id, "said": self.said, "result": self.result, "reason": self.reason}
+
+    def look(self, status: dict[str, Any], events_since: Events) -> None:
+        """See whether it is over."""
+        if status["boot"] != self.before["boot"]:
+            self._end("unknown", "the station was restarted")
+            return
+        during = _WHILE.get(self.kind)
+        if self.kind == "approach" and self.before["state"] == "ready":
+            during = "setting_up"
+        if during is None:
+            self._settle(status, events_since)
+        elif status["state"] == "ready":
+            self._end("done", status["reason"])
+        elif status["state"] != during:
+            self._end("failed", f"{status['state']}: {status['reason']}")
+
+    def _settle(self, status: dict[str, Any], events_since: Events) -> None:
+        self._hear(status, events_since)
+        step = status["control"]["step"]
+        if busy(status) or self.calm_since is None:
+            self.calm_since = step
+        if status["state"] == self.before["state"] and step - self.calm_since < CALM_TICKS:
+            return
+        wants = "motion_done" if self.kind == "approach" else _WITHIN[self.kind]
+        failure = Settled(self.before["state"], status, self.events).failure(wants)
+        self._end("failed" if failure else "done", failure)
+
+    def _hear(self, status: dict[str, Any], events_since: Events) -> None:
+        heard = self.events[-1]["number"] if self.events else self.before["newest_event"]
+        if status["newest_event"] > heard:
+            self.events.extend(events_since(heard))
+
+    def _end(self, result: str, reason: str) -> None:
+        self.result, self.reason, self.before, self.events = result, reason, {}, []
+
+
+class Outcomes:
+    """The newest outcomes by id; of several threads."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, Outcome] = {}
+        self._lock = threading.Lock()
+
+    def keep(self, outcome: Outcome) -> None:
+        """Remember it; what is known of an id is not replaced."""
+        with self._lock:
+            first = self._kept.get(outcome.id)
+            if first is None or first.result == "unknown":
+                self._kept[outcome.id] = outcome
+            if len(self._kept) > KEPT:
+                del self._kept[next(iter(self._kept))]
+
+    def get(self, identity: str) -> Outcome | None:
+        with self._lock:
+            return self._kept.get(identity)
+
+    @property
+    def open(self) -> list[Outcome]:
+        """Those that go on."""
+        with self._lock:
+            return [outcome for outcome in self._kept.values() if outcome.result == "accepted"]

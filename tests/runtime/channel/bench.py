@@ -1,0 +1,133 @@
+"""A whole station in lockstep behind real sockets, its control channel, and scripts that speak to it as they do."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from typing import Any
+
+import zmq
+
+from runtime.bus import CommandServer, Endpoints
+from runtime.channel.door import Door, Names
+from runtime.client import StationClient
+from runtime.main import Service
+from runtime.messages import Ack
+from tests.processes import eventually
+from tests.runtime.station import Station, plan
+
+ANSWER_MS = 5000  # as the older channel's own script waits
+_TICK_S = 0.003  # ten times as fast as life
+
+
+class Bench:
+    """Ticks in a thread; `channel` is its door's endpoint."""
+
+    def __init__(self, folder, silence_s=60.0, scripts="apart", **settings):
+        self.context = zmq.Context()
+        self.lock, self._ended, self.frozen = threading.Lock(), threading.Event(), False
+        self.station = Station(plan(folder, lease={"ttl_s": 60.0}, **settings))
+        self.folder = self.station.plan.deployment.station_dir
+        self._service = Service(self.station.main, self.context)
+        self._guard = CommandServer(self.context, "127.0.0.1", 0)
+        Endpoints(self.folder).write("guard", {"estop": self._guard.endpoint})
+        self._open: list[Any] = []
+        self.door = Door(
+            self.context, 0, Names("lab", scripts), silence_s, lambda name: StationClient(self.folder, name)
+        )
+        self.channel = self.door.endpoint
+        self._threads = [threading.Thread(target=run) for run in (self._tick, self._press, self._listen)]
+        for thread in self._threads:
+            thread.start()
+
+    def _tick(self):
+        while not self._ended.is_set():
+            if not self.frozen:
+                with self.lock:
+                    self.station.tick()
+                    self._service.serve(0.0)
+            time.sleep(_TICK_S)
+
+    def _press(self):
+        while not self._ended.is_set():
+            self._guard.socket.poll(10)
+            if (received := self._guard.receive()) is not None:
+                address, command = received
+                guard = self.station.guard
+                guard.press(command.user, command.args["why"])
+                self._guard.answer(
+                    address, Ack(command.uuid, "done", "every tick now sends the measured position")
+                )
+
+    def _listen(self):
+        while not self._ended.is_set():
+            self.door.serve(0.01)
+        self.door.close()
+
+    def script(self, **common):
+        """A script with a connection of its own; `common` goes into each of its messages."""
+        made = Script(self.channel, common)
+        self._open.append(made)
+        return made
+
+    def reach(self, state, seconds=20.0):
+        eventually(lambda: self.station.state == state, seconds, f"{state}, not {self.station.state}")
+
+    def close(self):
+        self._ended.set()
+        for thread in self._threads:
+            thread.join(10)
+        for script in self._open:
+            script.close()
+        self._service.close()
+        self._guard.close()
+        self.station.close()
+        self.context.term()
+
+
+class Script:
+    """A REQ socket and JSON, and nothing of ours: as existing scripts do it."""
+
+    def __init__(self, endpoint, common):
+        self.context = zmq.Context()
+        self.socket = self.context.socket(zmq.REQ)
+        self.socket.linger = 0
+        self.socket.connect(endpoint)
+        self.common = common
+
+    def send(self, **message):
+        return self.raw(json.dumps(message | self.common).encode())
+
+    def raw(self, *frames):
+        self.socket.send_multipart(frames)
+        assert self.socket.poll(ANSWER_MS), f"no answer to {frames!r:.200}"
+        (answer,) = self.socket.recv_multipart()
+        return json.loads(answer, parse_constant=_no_number)
+
+    def cmd(self, verb, **more):
+        return self.send(cmd=f"web:{verb}", **more)
+
+    def command(self, kind, **arguments):
+        return self.send(command=kind, arguments=arguments)
+
+    def query(self, name, **more):
+        answer = self.send(query=name, **more)
+        assert answer["ok"], answer
+        return answer["data"]
+
+    def result(self, answer, seconds=20.0):
+        """What became of a command that was accepted."""
+        return eventually(lambda: self._over(answer["id"]), seconds, f"the end of {answer}")
+
+    def _over(self, identity):
+        found = self.query("result", id=identity)
+        return found if found["result"] != "accepted" else None
+
+    def close(self):
+        self.socket.close()
+        self.context.term()
+
+
+def _no_number(word):
+    raise AssertionError(f"{word} is not JSON")
