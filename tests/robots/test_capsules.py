@@ -101,8 +101,11 @@ ignore = ["""
     assert set(made) == set(capsules(robots.load("agilex_piper"))) - {"link5"}
 
 
-@pytest.mark.parametrize(("name", "link"), [("r1_lite", "torso_link3"), ("agibot_g2", "body_link5")])
-def test_capsules_that_are_declared_of_a_trunk_cover_its_shapes(name: str, link: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "link"),
+    [("r1_lite", "torso_link3"), ("agibot_g2", "body_link5"), ("dual_franka", "panda_link5")],
+)
+def test_capsules_that_are_declared_of_a_link_cover_its_shapes(name: str, link: str) -> None:
     robot = robots.load(name)
     made = capsules(robot)[link]
     assert len(made) > PIECES
