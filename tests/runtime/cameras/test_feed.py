@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from runtime.cameras.base import Address, CameraError
+from runtime.cameras.feed import Feed
+from runtime.sim.mjpeg_server import MjpegServer
+from tests.runtime.cameras.movies import movie, number_of
+
+
+def opened(path: Path) -> Feed:
+    return Feed(Address(f"file:{path}", str(path)), 2.0, 2.0)
+
+
+def test_a_file_is_read_to_its_end_with_the_stamp_of_each_picture(tmp_path: Path) -> None:
+    feed = opened(movie(tmp_path / "film.mp4", pictures=5, rate=10))
+    assert feed.rate == 10.0
+    frames = [feed.read() for _ in range(6)]
+    assert frames.pop() is None
+    assert [number_of(frame.picture) for frame in frames if frame] == [0, 1, 2, 3, 4]
+    np.testing.assert_allclose([frame.stamp for frame in frames if frame], [0.0, 0.1, 0.2, 0.3, 0.4])
+    feed.close()
+
+
+def test_a_stream_without_a_time_of_its_own_has_no_stamps() -> None:
+    server = MjpegServer()
+    url = server.start()
+    feed = Feed(Address(url, url, "mpjpeg", stamped=False), 2.0, 2.0)
+    frame = feed.read()
+    assert frame is not None
+    assert frame.stamp is None
+    feed.close()
+    server.close()
+
+
+def test_a_file_with_sound_alone_says_what_it_has(tmp_path: Path) -> None:
+    path = tmp_path / "sound.wav"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
+        sound = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+        sound.sample_rate = 8000
+        container.mux(stream.encode(sound))
+    with pytest.raises(CameraError, match="it has no video, but audio"):
+        opened(path)
+
+
+@pytest.mark.parametrize("size", [0, 1, 100, 1000])
+def test_a_file_that_is_cut_off_is_no_video(tmp_path: Path, size: int) -> None:
+    path = movie(tmp_path / "film.mp4", pictures=12)
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(CameraError, match="not a video"):
+        opened(path)
