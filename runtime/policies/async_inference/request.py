@@ -17,6 +17,7 @@ from runtime.policies.async_inference.pickles import (
     TimedObservation,
     written,
 )
+from runtime.policies.grip import Convention, Grip
 from runtime.policies.meaning import MeaningSettings
 from runtime.policies.request import Dims, poses_of
 from runtime.policies.rows import action_rows
@@ -48,6 +49,8 @@ class RequestSettings(MeaningSettings):
     """Names of these numbers; the server needs none in particular. Names of the joints where they are not given."""
     actions: Dims | None = None
     """Places of our row that the numbers of the model's row take, in its order; all in ours where it is not given."""
+    gripper: Convention = "robot"
+    """How state and answers count grippers: the robot's own numbers, or "droid": 0 is open and 1 closed."""
     rename: dict[str, str] = Field(default_factory=dict)
     """LeRobot's rename_map: keys of observations on the server that its model has under other names."""
     server_version: Literal["0.4", "0.3"] = "0.4"
@@ -68,6 +71,8 @@ class AsyncRequest:
             raise ConfigurationError(
                 f"policy.actions = {self._actions}; allowed: each of 0 to {self._row_width - 1} once"
             )
+        posed = poses_of(settings.action_space, settings.action_pose, robot, "action_pose")
+        self._grip = Grip(settings.gripper, robot, posed)
         poses = poses_of(settings.observation_space, settings.observation_pose, robot, "observation_pose")
         ours = robot.joint_names if poses is None else poses.names
         self._names = _names(settings.state_names, [f"{ours[place]}.pos" for place in self._places])
@@ -98,7 +103,7 @@ class AsyncRequest:
 
     def of(self, observation: Observation, timestep: int) -> bytes:
         """The pickle of an observation that has to be answered; PolicyError where something is missing in it."""
-        shown = self._layout.of(observation)
+        shown = self._layout.of(self._grip.observed(observation))
         values: dict[str, Any] = {
             name: float(shown["state"][place]) for name, place in zip(self._names, self._places, strict=True)
         }
@@ -131,7 +136,7 @@ class AsyncRequest:
         rows = action_rows("the answer", np.stack([one.action for one in actions]), self._row_width)
         made = np.empty_like(rows)
         made[:, self._actions] = rows
-        return made
+        return self._grip.meant(made)
 
     def _agree(self, times: Sequence[float]) -> None:
         """The server says when each row is for, by the rate that it was started with."""

@@ -11,9 +11,10 @@ import numpy as np
 from pydantic import Field
 
 from runtime.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.policies.grip import Convention, Grip
 from runtime.policies.groot.modality import Modalities, Modality, Written, listed
 from runtime.policies.meaning import MeaningSettings
-from runtime.policies.request import Dims
+from runtime.policies.request import Dims, poses_of
 from runtime.policies.rows import action_rows
 from runtime.types import Float32, Observation, UInt8
 
@@ -39,6 +40,8 @@ class RequestSettings(MeaningSettings):
     """The model's action key = places of the row that its numbers take, in their order; together every place once."""
     ignored_actions: list[str] = Field(default_factory=list)
     """Action keys of the model that this robot has no use for."""
+    gripper: Convention = "robot"
+    """How state and answers count grippers: the robot's own numbers, or "droid": 0 is open and 1 closed."""
     language_key: str | None = None
     """The model's language key; the only one that it has where it is not given."""
     history: Literal["none", "repeat", "nearest"] = "none"
@@ -63,6 +66,8 @@ class Gr00tRequest:
         width, self._row_width = settings.widths(robot)
         _check_parts(settings.state, width)
         _check_cover(settings.actions, self._row_width)
+        poses = poses_of(settings.action_space, settings.action_pose, robot, "action_pose")
+        self._grip = Grip(settings.gripper, robot, poses)
         cameras = {camera: camera for camera in settings.video.values()}
         self._layout = settings.layout(robot, cameras)
         self._pace = control_rate / (
@@ -103,7 +108,7 @@ class Gr00tRequest:
 
     def moment(self, observation: Observation) -> Moment:
         """What the observation shows; PolicyError where something is missing."""
-        shown = self._layout.of(observation)
+        shown = self._layout.of(self._grip.observed(observation))
         pictures = {key: shown["images"][camera] for key, camera in self._settings.video.items()}
         return Moment(observation.step, pictures, shown["state"])
 
@@ -138,7 +143,7 @@ class Gr00tRequest:
         made = np.empty((next(iter(heights.values())), self._row_width), np.float32)
         for key, part in parts.items():
             made[:, self._settings.actions[key]] = part
-        return made
+        return self._grip.meant(made)
 
     def _answer(self, reply: object) -> Mapping[str, Any]:
         early = self._settings.dialect == "n1.5"

@@ -64,6 +64,15 @@ def test_the_state_takes_its_places_and_names() -> None:
     assert told(made).lerobot_features["observation.state"]["names"] == ["x", "y"]
 
 
+def test_grippers_are_counted_as_the_model_does() -> None:
+    made = request(gripper="droid")
+    rows = made.rows(actions(np.ones((1, 14))), 5)
+    closed = [group.gripper.close for group in ROBOT.groups if group.gripper is not None]
+    np.testing.assert_allclose(rows[0, list(ROBOT.gripper_dims)], closed)
+    shown = sent(made).observation  # the gripper of the second arm is far beyond open
+    assert shown["right_arm.joint6.pos"] == 0.0
+
+
 def test_rows_go_by_their_steps_to_their_places() -> None:
     rows = np.arange(28, dtype=np.float32).reshape(2, 14)
     assert (request().rows(actions(rows)[::-1], 5) == rows).all()

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -99,6 +100,17 @@ def test_action_parts_go_to_their_places_in_the_robots_order() -> None:
     np.testing.assert_array_equal(rows[:, 7:], whole[:, :7])
     np.testing.assert_array_equal(rows[:, :7], whole[:, 13:6:-1])
     assert rows.dtype == np.float32
+
+
+def test_grippers_are_counted_as_the_model_does() -> None:
+    made = request(gripper="droid")
+    grippers = list(ROBOT.gripper_dims)
+    qpos = np.zeros(14, np.float32)
+    qpos[grippers] = [group.gripper.open for group in ROBOT.groups if group.gripper is not None]
+    state = made.moment(replace(observation(), qpos=qpos)).state
+    np.testing.assert_array_equal(state, np.zeros(14))
+    rows = made.rows([{key: np.zeros_like(part) for key, part in answer().items()}, {}])
+    np.testing.assert_array_equal(rows[0], qpos)
 
 
 def test_flat_answers_and_single_numbers_without_axis_are_read() -> None:
