@@ -15,7 +15,7 @@ class Config(CameraSettings):
 
     kind: Literal["mjpeg"] = "mjpeg"
     url: str
-    """Where it is: http://HOST[:PORT]/PATH, without a password."""
+    """Where it is: http://host[:PORT]/PATH, without a password."""
     user: str | None = None
     """Name to log in with."""
     password_env: str | None = None

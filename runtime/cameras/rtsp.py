@@ -15,7 +15,7 @@ class Config(CameraSettings):
 
     kind: Literal["rtsp"] = "rtsp"
     url: str
-    """Where it is: rtsp://HOST[:PORT]/PATH, without a password."""
+    """Where it is: rtsp://host[:PORT]/PATH, without a password."""
     user: str | None = None
     """Name to log in with."""
     password_env: str | None = None

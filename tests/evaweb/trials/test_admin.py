@@ -93,7 +93,7 @@ def test_a_scene_that_cannot_be_is_refused_with_a_sentence(admin, given, sentenc
     ("policy", "sentence"),
     [
         ('{"url": ', "This is not JSON: Expecting value in line 1, column 9"),
-        ('{"kind": "gpt"}', "allowed: mock, openpi"),
+        ('{"kind": "gpt"}', "allowed: gr00t, lerobot, mock, openpi"),
         ('["ws://x"]', "allowed: a table such as"),
     ],
 )

@@ -17,7 +17,7 @@ def test_policies_that_a_deployment_could_have_pass(policy):
     [
         ([], "allowed: a table such as"),
         ("ws://10.0.0.1", "allowed: a table such as"),
-        ({"kind": "gpt"}, "kind = 'gpt'; allowed: mock, openpi"),
+        ({"kind": "gpt"}, "kind = 'gpt'; allowed: gr00t, lerobot, mock, openpi"),
         ({"kind": "openpi", "urll": "x"}, "urll: unknown key for kind 'openpi'; allowed: "),
         ({"kind": "openpi", "url": "http://x"}, "url = 'http://x': "),
         ({"nonsense": 1}, "nonsense: unknown key"),
