@@ -1,4 +1,4 @@
-"""`python -m benchmarks NAME [--json FILE]`: measure, print a table, write JSON."""
+"""`python -m benchmarks NAME [--json [FILE]]`: measure, print a table, write JSON, or print that alone."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ def main() -> int:
     """Exit code 0 where every wanted figure holds, 1 where one does not."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("name", choices=_BENCHMARKS)
-    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument(
+        "--json", nargs="?", const="-", metavar="FILE", help="without FILE: print it in place of the table"
+    )
     parser.add_argument("--seconds", type=float, help="of measurement per case")
     parser.add_argument(
         "--set",
@@ -32,9 +34,9 @@ def main() -> int:
     module = importlib.import_module(f"benchmarks.{given.name}")
     seconds = given.seconds or getattr(module, "SECONDS", _SECONDS)
     report = module.measure(seconds, *([given.assignments] if given.assignments else []))
-    print(report.table())
-    if given.json:
-        report.write(given.json)
+    print(report.json() if given.json == "-" else report.table())
+    if given.json not in (None, "-"):
+        report.write(Path(given.json))
     return 0 if all(figure.holds is not False for figure in report.figures) else 1
 
 

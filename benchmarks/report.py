@@ -49,10 +49,14 @@ class Report:
         )
 
     def write(self, path: Path) -> None:
+        """The report as JSON, in a file."""
+        path.write_text(self.json(), "utf-8")
+
+    def json(self) -> str:
         """The report as JSON."""
         figures = [asdict(figure) | {"holds": figure.holds} for figure in self.figures]
         content = {"name": self.name, "machine": machine(), "figures": figures, "rows": list(self.rows)}
-        path.write_text(json.dumps(content, indent=1, default=str), "utf-8")
+        return json.dumps(content, indent=1, default=str)
 
 
 def machine() -> dict[str, object]:
