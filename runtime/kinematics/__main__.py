@@ -1,4 +1,4 @@
-"""python -m runtime.kinematics: compiles what the solvers of robots need, so that no start and no command waits for it."""
+"""python -m runtime.kinematics: compiles what solvers of robots need, so that no start and no command waits for it."""
 
 from __future__ import annotations
 
