@@ -81,7 +81,7 @@ def test_every_option_of_the_lab_that_a_document_names_is_one():
 
 
 def test_every_module_that_a_document_runs_can_be_run():
-    named = {found for _, found in everywhere(r"python -m ([a-z_.]+[a-z_])")} - {"pip"}
+    named = {found for _, found in everywhere(r"python -m ([a-z0-9_.]+[a-z0-9_])")} - {"pip"}
     assert {"runtime", "runtime.ctl", "runtime.datasets", "robots", "benchmarks"} < named
     for module in sorted(named):
         found = importlib.util.find_spec(module)
