@@ -76,6 +76,8 @@ class Attached(Source):
             if before is not None and (before.condition, before.why) == (health.condition, health.why):
                 continue
             self._said[camera.key] = health
+            if before is None and camera.kind == "file":
+                events.append(self._warning(camera))
             event = self._event(camera, health, before)
             if event is not None:
                 events.append(event)
@@ -95,6 +97,11 @@ class Attached(Source):
         else:
             kind, text = f"camera_{health.condition}", f"{name} is {health.condition}: {health.why}"
         return Event(kind, text, self._clock.now(), data={"camera": camera.key, **self._told(camera)})
+
+    def _warning(self, camera: Camera) -> Event:
+        """A policy that moves a robot by a video acts on what is not there: whoever stands beside it is told."""
+        text = f"camera {camera.key} plays the video {camera.shown}: it does not show what is there"
+        return Event("camera_is_a_video", text, self._clock.now(), data={"camera": camera.key})
 
     def _told(self, camera: Camera) -> dict[str, Any]:
         health, shot = camera.health(), camera.newest()

@@ -39,12 +39,12 @@ class CameraServer(ABC):
 
     scheme: str
 
-    def __init__(self, width: int = 160, height: int = 120, rate: float = 30.0) -> None:
+    def __init__(self, width: int = 160, height: int = 120, rate: float = 30.0, port: int = 0) -> None:
         self.size = (width, height)
         self.rate = rate
         self.fault = ""
         self.sent = 0  # pictures, to all clients
-        self._port = 0
+        self._port = port
         self._listening: socket.socket | None = None
         self._clients: set[socket.socket] = set()
         self._lock = threading.Lock()

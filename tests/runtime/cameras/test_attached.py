@@ -136,6 +136,14 @@ def test_both_hear_of_connection_runs_and_end(bench: Bench) -> None:
     assert bench.source.faults() == {"malformed": 1, "camera_clock_jumped_wrist": 2}
 
 
+def test_that_a_camera_is_a_video_is_said_once(bench: Bench) -> None:
+    bench.camera.kind, bench.camera.shown = "file", "a.mp4"
+    text = "camera wrist plays the video a.mp4: it does not show what is there"
+    assert bench.told() == [("camera_is_a_video", text)]
+    bench.camera.how = Health(Condition.LIVE, 101.0)
+    assert [kind for kind, _ in bench.told()] == ["camera_back"]
+
+
 def test_what_happens_to_a_camera_is_said_once_with_which_why_and_since_when(bench: Bench) -> None:
     camera = bench.camera
     assert bench.told() == [], "it is being opened"
