@@ -162,17 +162,22 @@ class DdsMiddleware(Middleware):
 
         A refusal is told for as long as the middleware lives: DDS counts those there have been.
         """
+        from cyclonedds.core import DDSException
+
         with self._lock:
             readers = [(topic, reader) for topic, reader, _ in self._readers]
         found: dict[str, Match] = {}
-        for topic, reader in readers:
-            peers = len(reader.get_matched_publications())
-            status = reader.get_requested_incompatible_qos_status()
-            found[topic.name] = Match(peers, self._refused(topic, status, peers, False))
-        for topic, writer in self._writers:
-            peers = len(writer.get_matched_subscriptions())
-            status = writer.get_offered_incompatible_qos_status()
-            found[topic.name] = Match(peers, self._refused(topic, status, peers, True))
+        try:
+            for topic, reader in readers:
+                peers = len(reader.get_matched_publications())
+                status = reader.get_requested_incompatible_qos_status()
+                found[topic.name] = Match(peers, self._refused(topic, status, peers, False))
+            for topic, writer in self._writers:
+                peers = len(writer.get_matched_subscriptions())
+                status = writer.get_offered_incompatible_qos_status()
+                found[topic.name] = Match(peers, self._refused(topic, status, peers, True))
+        except DDSException as error:
+            raise TransportError(f"DDS does not say who is at the other side: {error}") from error
         return found
 
     def close(self) -> None:

@@ -91,7 +91,11 @@ class RosSink(Sink):
         if now < self._look_at:
             return
         self._look_at = now + _LOOK_S
-        unheard = self.unheard()
+        try:
+            unheard = self.unheard()
+        except TransportError as error:  # commands go out all the same
+            log.warning("%s", error)
+            return
         for topic in unheard.keys() - self._unheard.keys():
             log.warning("%s", unheard[topic] or f"nobody listens to {topic}")
         for topic in self._unheard.keys() - unheard.keys():

@@ -239,10 +239,14 @@ class RosSource(Source):
         if not fresh:
             return
         assert self._middleware is not None
-        matches = self._middleware.matches()
+        try:
+            matches = self._middleware.matches()
+        except TransportError as error:
+            log.warning("%s", error)
+            matches = {}
         self._told |= fresh.keys()
         sentences = [
-            self._silence(name, stalled[name], matches.get(self._topics[name].name, Match(0)))
+            self._silence(name, stalled[name], matches.get(self._topics[name].name, Match(1)))
             for name in fresh.values()
         ]
         self._tell("; ".join(sentences))

@@ -145,6 +145,21 @@ def test_a_sink_that_is_not_connected_says_so(monkeypatch: pytest.MonkeyPatch) -
         sink.tell("scene_reset", {})
 
 
+def test_a_middleware_that_cannot_say_who_hears_ends_no_command(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    sink, wall, clock = connected(monkeypatch)
+
+    def fail() -> Mapping[str, Match]:
+        raise TransportError("nobody can say")
+
+    monkeypatch.setattr(wall, "matches", fail)
+    clock.advance(3.0)
+    sink.send(command(time=clock.now()))
+    assert len(wall.sent) == 4
+    assert [record.message for record in caplog.records] == ["nobody can say"]
+
+
 def test_who_does_not_hear_is_said_when_it_changes(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
