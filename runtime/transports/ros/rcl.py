@@ -6,6 +6,7 @@ Messages pass as bytes both ways, as over plain DDS, so that nothing is converte
 from __future__ import annotations
 
 import importlib
+import logging
 import sys
 import threading
 from collections.abc import Mapping
@@ -21,6 +22,8 @@ from runtime.transports.ros.middleware import (
     Topic,
     incompatible,
 )
+
+log = logging.getLogger(__name__)
 
 
 def require() -> None:
@@ -114,10 +117,16 @@ class RclMiddleware(Middleware):
 
     def _spin(self) -> None:
         while not self._ending.is_set() and self._context.ok():
-            self._executor.spin_once(timeout_sec=0.1)
+            try:
+                self._executor.spin_once(timeout_sec=0.1)
+            except Exception:  # of one message: nobody else would hear the next
+                log.exception("reading from rclpy failed")
+                self._ending.wait(0.1)
 
     def _note(self, topic: Topic, event: Any, publishes: bool) -> None:
-        policy = str(getattr(event.last_policy_kind, "name", event.last_policy_kind)).lower()
+        from rclpy.qos import qos_policy_name_from_kind
+
+        policy = str(qos_policy_name_from_kind(event.last_policy_kind)).lower().removesuffix("_qos_policy")
         self._refused[topic.name] = incompatible(topic, policy, publishes)
 
 
