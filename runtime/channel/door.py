@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -146,7 +147,7 @@ def _listening(context: zmq.Context[Any], port: int) -> tuple[Any, str]:
     except zmq.ZMQError as error:
         socket.close()
         raise TransportError(
-            f"the control channel cannot listen on {HOST}:{port}: {error.strerror}; "
+            f"the control channel cannot listen on {HOST}:{port}: {os.strerror(error.errno)}; "
             "name another port with control_channel.port"
         ) from None
     return socket, socket.last_endpoint.decode()

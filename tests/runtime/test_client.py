@@ -100,6 +100,19 @@ def test_a_command_is_given_under_the_lease_and_by_the_newest_status(client, sta
     assert station.session.state is State.RUNNING
 
 
+def test_arguments_may_have_the_words_of_the_clients_own(client, station):
+    client.claim()
+    client.status()
+    with pytest.raises(Refused, match="timeout"):
+        client.give("run", {"timeout": 5, "kind": "x", "identity": "y"})
+    with pytest.raises(Refused, match="no such arm"):
+        client.ask("aim", {"kind": 1, "timeout": 2})
+    assert [dict(command.args) for command in station.received if command.args] == [
+        {"timeout": 5, "kind": "x", "identity": "y"},
+        {"kind": 1, "timeout": 2},
+    ]
+
+
 def test_each_command_has_a_uuid_of_its_own(client, station):
     client.command("run")
     client.command("stop")

@@ -24,7 +24,7 @@ def started(monkeypatch):
     real = subprocess.Popen
 
     class Started(real):
-        commands = dict.fromkeys(("guard", "media", "control", "main", "headless"), WAITS)
+        commands = dict.fromkeys(("guard", "media", "control", "main", "headless", "channel"), WAITS)
 
         def __init__(self, arguments, **options):
             self.process = arguments[2].removeprefix("runtime.")
@@ -65,6 +65,18 @@ def test_a_family_that_gives_up_takes_its_driver_with_it(station, started):
     commands["control"] = DIES
     assert station.run(headless=True) == 1
     assert [child.process for child in made].count("control") == 6
+    assert all_ended(made)
+
+
+def test_a_control_channel_that_dies_does_not_end_the_family_and_ends_with_it(tmp_path, started):
+    made, commands = started
+    sets = [f'data_dir="{tmp_path}"', "control_channel.enabled=true"]
+    commands["channel"], commands["headless"] = DIES, ["sh", "-c", "sleep 0.3; exit 4"]
+    assert Supervisor(plan(load(DEMO, sets))).run(headless=True) == 4
+    names = [child.process for child in made]
+    assert names == ["guard", "media", "control", "main", "channel", "headless"]
+    commands["channel"] = WAITS
+    assert Supervisor(plan(load(DEMO, sets))).run(headless=True) == 4
     assert all_ended(made)
 
 
