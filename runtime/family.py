@@ -22,7 +22,7 @@ from runtime.config import Deployment
 from runtime.deployment import Resolved
 from runtime.end_effectors import EndEffectors
 from runtime.errors import ConfigurationError, RuntimeFault, SetupError
-from runtime.formats import PoseRows
+from runtime.formats import PoseRows, refuse_format
 from runtime.kinematics.base import Kinematics
 from runtime.kinematics.forward import ChainForward
 from runtime.page import Page, PageLayout
@@ -207,6 +207,7 @@ def _check_publication(made: Plan) -> None:
             f"allowed: {', '.join(sorted(capabilities.spaces))}"
         )
     if wanted.space == "joint":
+        refuse_format(wanted.pose, "publication.pose")
         return
     PoseRows(wanted.pose, made.robot, "publication.pose")
     if capabilities.poses and wanted.pose not in capabilities.poses:

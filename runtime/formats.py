@@ -97,6 +97,15 @@ class PoseFormat(Section):
 CANONICAL = PoseFormat()
 
 
+def refuse_format(pose: PoseFormat, key: str) -> None:
+    """ConfigurationError where a format is declared for a space that is joints: it would mean nothing."""
+    given = pose.model_dump(exclude_defaults=True)
+    if given:
+        raise ConfigurationError(
+            f'{key} = {given}, but the space it is for is "joint"; allowed: no format, or the space "eef"'
+        )
+
+
 class PoseRows:
     """Rows of poses for one robot in one format: their `width`, the `names` of their numbers, and the way both ways.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Literal
 
@@ -17,6 +18,7 @@ _WRONG = {  # by what runtime.kinematics.kernels.chunks says
     1: "a target, the seed or the anchor holds a number that is not finite",
     2: "a target's quaternion has length zero; allowed: any other",
 }
+_log = logging.getLogger(__name__)
 
 
 class Config(KinematicsSettings):
@@ -37,7 +39,7 @@ class CompiledKinematics(Kinematics):
 
     def __init__(self, robot: Robot, config: Config | None = None) -> None:
         try:
-            from runtime.kinematics.kernels import chains, chunks, frames
+            from runtime.kinematics.kernels import chains, chunks, compiling, frames
         except ImportError as error:
             raise SetupError(str(error)) from error
         config = config or Config()
@@ -45,6 +47,7 @@ class CompiledKinematics(Kinematics):
         own = [(group, chain) for group in robot.arms if (chain := group.chain) is not None]
         self._whole = chains_of([_whole(group, chain) for group, chain in own])
         self._arms = _arms_of(robot, own, config.velocity_scale)
+        self._is_kept, self._forget = compiling.is_kept, compiling.forget
         self._poses_of, self._solve_chunk = chains.poses_of, chunks.solve_chunk
         self._reach_type = chains.reach_type(self._whole["drive"].shape[1])
         self._scratch_type = chunks.scratch_type(*_lengths(self._arms))
@@ -56,7 +59,25 @@ class CompiledKinematics(Kinematics):
         )
 
     def warm_up(self) -> None:
-        """Compiles what is not on disk yet and loads the rest, so that nothing of it is left for a command."""
+        """Compiles what is not on disk yet and loads the rest, so that nothing of it is left for a command.
+
+        What is kept on disk and cannot be read, after a full disk or a loss of power, is compiled again.
+        """
+        if not self._is_kept():
+            _log.info("compiling the kinematics for this processor, once; this takes some seconds")
+        try:
+            self._solve_once()
+        except Exception as error:
+            if not self._forget():
+                raise
+            _log.warning(
+                "compiled kinematics cannot be used as they are kept (%s: %s); compiling them again",
+                type(error).__name__,
+                error,
+            )
+            self._solve_once()
+
+    def _solve_once(self) -> None:
         seed = np.zeros(self._dim)
         self.solve(self.forward(seed)[None], seed)
 

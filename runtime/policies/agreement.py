@@ -15,16 +15,17 @@ from runtime.types import ActionMode, RelativeFrame, Space
 
 _SPACES: dict[str, Space] = {"joint": "joint", "qpos": "joint", "eef": "eef"}
 _MODES = ("absolute", "relative", "delta")
-_ORIENTATIONS = {  # words that are in use for what PoseFormat calls otherwise
-    "quat": "wxyz",
-    "quaternion": "wxyz",
-    "quat_wxyz": "wxyz",
-    "quat_xyzw": "xyzw",
-    "rpy": "euler",
-    "axis_angle": "rotation_vector",
-    "rotvec": "rotation_vector",
-    "rot6d": "6d",
-    "rotation_6d": "6d",
+_QUATERNIONS = ("wxyz", "xyzw")  # a word that leaves their order open contradicts neither
+_ORIENTATIONS: dict[str, tuple[str, ...]] = {  # words that are in use for what PoseFormat calls otherwise
+    "quat": _QUATERNIONS,
+    "quaternion": _QUATERNIONS,
+    "quat_wxyz": ("wxyz",),
+    "quat_xyzw": ("xyzw",),
+    "rpy": ("euler",),
+    "axis_angle": ("rotation_vector",),
+    "rotvec": ("rotation_vector",),
+    "rot6d": ("6d",),
+    "rotation_6d": ("6d",),
 }
 _SIZES = ("image_size", "image_resolution", "training_obs_image_size")
 
@@ -83,12 +84,19 @@ def _pose_pairs(said: Mapping[str, Any], side: str, pose: PoseFormat) -> Iterato
     for key in words:
         if said.get(key) is not None:
             here = f"{side}_pose.orientation"
-            yield key, _ORIENTATIONS.get(str(said[key]).lower(), said[key]), here, pose.orientation
+            yield key, _orientation(said[key], pose.orientation), here, pose.orientation
     given = said.get(f"{side}_pose")
     if isinstance(given, Mapping):
         for key, value in pose.model_dump().items():
             if key in given:
-                yield f"{side}_pose.{key}", given[key], f"{side}_pose.{key}", value
+                theirs = _orientation(given[key], value) if key == "orientation" else given[key]
+                yield f"{side}_pose.{key}", theirs, f"{side}_pose.{key}", value
+
+
+def _orientation(said: object, here: str) -> object:
+    """What a server calls an orientation, in our words; ours where its word leaves that open."""
+    meant = _ORIENTATIONS.get(str(said).lower(), (said,))
+    return here if here in meant else meant[0]
 
 
 def _space(said: Mapping[str, Any], declared: Declared, where: str) -> Space | None:

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from runtime.errors import ConfigurationError, PolicyError
-from runtime.formats import PoseFormat, PoseRows
+from runtime.formats import PoseFormat, PoseRows, refuse_format
 from runtime.policies.pictures import Layout, Resize, fitted, laid_out
 from runtime.section import Section
 from runtime.types import EEF_WIDTH, Float32, Observation, Space
@@ -110,7 +110,10 @@ class RequestLayout:
 
 def poses_of(space: Space, pose: PoseFormat, robot: Robot, key: str) -> PoseRows | None:
     """The rows of a space that is poses, None for joints; ConfigurationError where the format does not fit."""
-    return None if space == "joint" else PoseRows(pose, robot, f"policy.{key}")
+    if space == "eef":
+        return PoseRows(pose, robot, f"policy.{key}")
+    refuse_format(pose, f"policy.{key}")
+    return None
 
 
 def _cameras(settings: RequestSettings, robot: Robot) -> dict[str, str] | None:

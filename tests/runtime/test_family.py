@@ -144,3 +144,7 @@ def test_a_format_of_published_poses_that_does_not_fit_the_robot_is_refused(reso
 
 def test_joints_alone_are_published_where_nothing_is_said(resolved):
     assert plan(resolved).publication() is None
+    with pytest.raises(
+        ConfigurationError, match=r"publication\.pose = \{'orientation': 'xyzw'\}, but the space"
+    ):
+        plan(publishing(resolved, pose={"orientation": "xyzw"}))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from robots import Robot, load
 from runtime.deployment import load as load_deployment
 from runtime.errors import ConfigurationError, PolicyError
-from runtime.formats import CANONICAL, PoseFormat, PoseRows
+from runtime.formats import CANONICAL, PoseFormat, PoseRows, refuse_format
 from tests.runtime.odd_robot import odd_robot
 from tests.runtime.test_frames import joints, some_vectors
 from tests.runtime.test_orientations import ORDERS
@@ -196,3 +196,11 @@ def test_a_format_reads_itself_back_from_what_it_resolved_to() -> None:
     )
     assert PoseFormat.model_validate(made.model_dump(mode="json")) == made
     assert str(made) == "euler XYX in degrees in base_link with head"
+
+
+def test_a_format_for_a_space_of_joints_is_refused_with_what_was_given():
+    refuse_format(PoseFormat(), "policy.action_pose")
+    with pytest.raises(
+        ConfigurationError, match=r"policy\.action_pose = \{'gripper': False\}.*no format, or.*\"eef\""
+    ):
+        refuse_format(PoseFormat(gripper=False), "policy.action_pose")

@@ -63,6 +63,19 @@ def _cache() -> Path | None:
     return None
 
 
+def is_kept() -> bool:
+    """Whether something compiled is on disk; what is not has to be compiled, for seconds."""
+    return CACHE is not None and any(CACHE.rglob("*.nbi"))
+
+
+def forget() -> bool:
+    """Remove what is kept on disk, so that it is compiled again; False where nothing is."""
+    kept = [] if CACHE is None else [file for file in CACHE.rglob("*") if file.is_file()]
+    for file in kept:
+        file.unlink(missing_ok=True)
+    return bool(kept)
+
+
 CACHE = _cache()
 if CACHE is not None:
     numba.config.CACHE_DIR = str(CACHE)  # type: ignore[attr-defined]

@@ -468,3 +468,26 @@ def test_kernels_are_kept_in_the_folder_that_is_named(tmp_path: Path) -> None:
     """
     python(code, NUMBA_CACHE_DIR=str(tmp_path))
     assert [path.suffix for path in sorted(tmp_path.glob("kernels-*/*/*"))] == [".nbc", ".nbi"]
+
+
+@pytest.mark.slow
+def test_what_is_kept_on_disk_and_broken_is_compiled_again(tmp_path: Path) -> None:
+    build = (
+        "import logging, robots; logging.basicConfig(level='INFO'); from runtime.kinematics import compiled; "
+        "compiled.build(compiled.Config(), robots.load('ur5e'))"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+
+    def started() -> str:
+        done = subprocess.run(
+            [sys.executable, "-c", build], env=environment, capture_output=True, text=True, check=True
+        )
+        return done.stderr
+
+    assert "compiling the kinematics for this processor" in started()
+    kept = sorted(tmp_path.rglob("*.nbc"))
+    assert kept
+    for file in kept:
+        file.write_bytes(file.read_bytes()[:100])
+    assert "cannot be used as they are kept" in started()
+    assert started() == ""

@@ -516,6 +516,7 @@ def test_metadata_that_agree_are_reported() -> None:
 
 
 SIX = {"action_space": "eef", "action_pose": PoseFormat(orientation="6d", gripper=False)}
+XYZW = {"action_space": "eef", "action_pose": PoseFormat(orientation="xyzw")}
 
 
 @pytest.mark.parametrize(
@@ -529,6 +530,11 @@ SIX = {"action_space": "eef", "action_pose": PoseFormat(orientation="6d", grippe
         ({"action_rate": 15.0}, {"action_rate": 30}, "action_rate = 30, policy.action_rate = 15.0"),
         (SIX, {"orientation": "xyzw"}, "orientation = 'xyzw', policy.action_pose.orientation = '6d'"),
         (SIX, {"action_orientation": "rpy"}, "= 'euler', policy.action_pose.orientation = '6d'"),
+        (
+            XYZW,
+            {"action_pose": {"orientation": "quat_wxyz"}},
+            "= 'wxyz', policy.action_pose.orientation = 'xyzw'",
+        ),
         (SIX, {"action_pose": {"sixd": "rows"}}, "sixd = 'rows', policy.action_pose.sixd = 'columns'"),
         (
             {"observation_space": "eef"},
@@ -561,6 +567,7 @@ def test_metadata_that_contradict_the_configuration_are_an_error_with_both_sides
         ({}, {"action_dim": 14, "action_rate": 30, "image_size": [24, 32, 3], "orientation": "rpy"}),
         ({}, {"training_obs_image_size": np.array([3, 24, 32]), "action_mode": "absolute"}),
         (SIX, {"action_dim": 18, "orientation": "ROT6D", "action_pose": {"frame": "", "gripper": False}}),
+        (XYZW, {"orientation": "quat", "action_pose": {"orientation": "quaternion"}}),
         ({"resize": "none"}, {"image_size": [480, 640]}),
     ],
 )
