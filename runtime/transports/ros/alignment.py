@@ -79,13 +79,15 @@ class Alignment(Generic[Value]):
             return None
         return min(kept[-1].stamp for kept in self._samples.values())
 
-    def frame(self, after: float = float("-inf")) -> Aligned[Value] | None:
-        """The newest frame if its moment is later than `after`, which is the reader's own cursor."""
+    def frame(self, after: Aligned[Value] | None = None) -> Aligned[Value] | None:
+        """The newest frame if it is later than `after`, the reader's last one, and has a sample that is not in that."""
         time = self.reached()
-        if time is None or time <= after:
+        if time is None or (after is not None and time <= after.time):
             return None
         chosen = {name: _nearest(kept, time) for name, kept in self._samples.items()}
         if any(abs(sample.stamp - time) > self._window for sample in chosen.values()):
+            return None
+        if after is not None and all(sample is after.samples[name] for name, sample in chosen.items()):
             return None
         return Aligned(time, chosen)
 

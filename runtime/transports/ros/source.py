@@ -14,7 +14,7 @@ from runtime.errors import CodecError, ConfigurationError, TransportError
 from runtime.messages import Event
 from runtime.transports.base import Source
 from runtime.transports.freshness import FROZEN_S
-from runtime.transports.ros.alignment import Alignment, Sample
+from runtime.transports.ros.alignment import Aligned, Alignment, Sample
 from runtime.transports.ros.clock import RosClock
 from runtime.transports.ros.frames import Assembly, Readers, Received
 from runtime.transports.ros.messages import Message, Wire
@@ -59,7 +59,7 @@ class RosSource(Source):
     coming is news, once for each reason.
     """
 
-    _cursor: float  # the moment of the frame delivered last, in the senders' clock
+    _cursor: Aligned[Received] | None  # the frame delivered last
     _count: int
     _news: list[Event]
 
@@ -97,7 +97,7 @@ class RosSource(Source):
             self._changed.wait_for(lambda: self.alignment.frame(self._cursor) is not None, timeout)
             aligned = self.alignment.frame(self._cursor)
             if aligned is not None:
-                self._cursor = aligned.time
+                self._cursor = aligned
         if aligned is None:
             self._complain()
             return None
@@ -165,7 +165,7 @@ class RosSource(Source):
         self._stalled: set[str] = set()
         self._told: set[str] = set()
         self._news = []
-        self._cursor = float("-inf")
+        self._cursor = None
         self._count = 0
         self._began = self._framed_at = 0.0
 
@@ -199,7 +199,7 @@ class RosSource(Source):
             ours = self._ros.see(part.name, stamp, arrived)
             if self._ros.backwards > before:
                 self.alignment.clear()
-                self._cursor = float("-inf")
+                self._cursor = None
             if self.alignment.add(part.name, Sample(stamp, arrived, Received(value, ours))):
                 self._heard_at[part.name] = arrived
                 self._refusals.pop(part.name, None)

@@ -54,12 +54,24 @@ def test_readers_take_nothing_from_each_other() -> None:
     first = made.frame()
     assert first is not None
     assert made.frame() == first
-    assert made.frame(after=first.time) is None
+    assert made.frame(after=first) is None
     made.add("joints", Sample(1.05, 1.05, 0.0))
-    assert made.frame(after=first.time) is None  # the camera has not reached it
+    assert made.frame(after=first) is None  # the camera has not reached it
     made.add("camera", Sample(1.06, 1.06, 0.0))
-    assert stamps(made.frame(after=first.time)) == {"joints": 1.05, "camera": 1.06}
-    assert stamps(made.frame(after=0.0)) == {"joints": 1.05, "camera": 1.06}
+    assert stamps(made.frame(after=first)) == {"joints": 1.05, "camera": 1.06}
+    assert stamps(made.frame()) == {"joints": 1.05, "camera": 1.06}
+
+
+def test_the_same_samples_are_no_new_frame_at_a_later_moment() -> None:
+    made = filled(joints=[1.0], camera=[1.02])
+    first = made.frame()
+    made.add(
+        "joints", Sample(1.05, 1.05, 0.0)
+    )  # all have reached 1.02 now, and the joints of 1.0 are nearest
+    assert stamps(made.frame()) == {"joints": 1.0, "camera": 1.02}
+    assert made.frame(after=first) is None
+    made.add("camera", Sample(1.06, 1.06, 0.0))
+    assert stamps(made.frame(after=first)) == {"joints": 1.05, "camera": 1.06}
 
 
 def test_a_sample_that_is_not_newer_is_left_out() -> None:
