@@ -1,6 +1,7 @@
 """The whole channel: scripts with sockets of their own against a station in lockstep."""
 
 import json
+import re
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -16,7 +17,9 @@ from runtime.transitions import State
 from tests.processes import eventually
 from tests.runtime.channel.bench import Bench
 from tests.runtime.station import STANDS
+from tests.sources import ROOT
 
+HERE = "tcp://127.0.0.1:5757"
 FAR = [STANDS[0] + 0.05, *STANDS[1:]]
 
 
@@ -137,6 +140,20 @@ def test_more_than_one_frame_is_an_error_and_not_two_messages(start):
     script = start().script()
     assert "one frame of JSON, and 2 came" in script.raw(b'{"cmd": "web:setup"}', b"{}")["error"]
     assert script.query("status")["state"] == "idle"
+
+
+def test_the_script_of_the_document_sets_up_and_runs(start):
+    bench = start()
+    document = (ROOT / "docs/control-channel.md").read_text("utf-8")
+    (script,) = re.findall(r"```python\n(.*?)```", document, re.DOTALL)
+    assert HERE in script
+    names = {}
+    try:
+        exec(script.replace(HERE, bench.channel).replace("duration_s=20", "duration_s=2"), names)
+    finally:
+        names["socket"].close()
+    assert bench.station.reason == "the run's 2 s are over"
+    assert bench.station.main.lease.current(bench.station.clock.now()) is None
 
 
 # --- results -------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from runtime.channel.message import read
 from runtime.channel.selection import Selection
 from runtime.channel.verbs import VERBS, deed, stops
 from tests.runtime.terminal_station import status
+from tests.sources import ROOT
 
 # As the older channel's allow-list has them, with `setup` and `select_task`, which it documented and refused.
 THEIRS = [
@@ -256,3 +257,9 @@ def test_what_was_recorded_is_told_when_it_is_to_be_saved():
 )
 def test_stops_are_told_from_the_rest_before_anything_waits(verb, argument, told):
     assert stops(verb, argument) is told
+
+
+def test_the_document_says_of_every_verb_what_it_comes_to():
+    document = (ROOT / "docs/control-channel.md").read_text("utf-8").splitlines()
+    rows = [f"| `web:{verb}` | {what.ours} |" for verb, what in VERBS.items()]
+    assert [line for line in document if line.startswith("| `web:")] == rows
