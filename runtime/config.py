@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
-from runtime.formats import PoseFormat
 from runtime.kinematics.base import KinematicsSettings
 from runtime.messages import Mode
 from runtime.plugins import variants
+from runtime.pose_format import PoseFormat
 from runtime.recording.settings import RecordingSettings
 from runtime.safety import SafetySettings
 from runtime.section import Section

@@ -22,12 +22,13 @@ from runtime.config import Deployment
 from runtime.deployment import Resolved
 from runtime.end_effectors import EndEffectors
 from runtime.errors import ConfigurationError, RuntimeFault, SetupError
-from runtime.formats import PoseRows, refuse_format
+from runtime.formats import PoseRows
 from runtime.kinematics.base import Kinematics
 from runtime.kinematics.forward import ChainForward
 from runtime.page import Page, PageLayout
 from runtime.plugins import variants
 from runtime.policies.base import Policy
+from runtime.pose_format import refuse_format
 from runtime.publication import Publication
 from runtime.safety import Limits
 from runtime.spaces import Spaces

@@ -1,4 +1,4 @@
-"""How poses are written in a row of numbers: declared in a deployment, converted at the borders alone.
+"""Rows of poses as a deployment declares them, converted at the borders alone.
 
 Inside, an arm's vector is x, y, z [m], unit quaternion w, x, y, z, gripper, in the arm's own frame; vectors are
 float64 [T, arms, 8].
@@ -6,11 +6,10 @@ float64 [T, arms, 8].
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
 
 from runtime.errors import ConfigurationError, PolicyError
 from runtime.frames import Frame
@@ -22,88 +21,24 @@ from runtime.orientations import (
     SixNumbers,
     continuous_signs,
 )
-from runtime.section import Section
+from runtime.pose_format import PoseFormat
 from runtime.types import EEF_WIDTH, Float64
 
 if TYPE_CHECKING:
     from robots import Robot
 
 _POSITION, _QUATERNION, _GRIPPER = slice(0, 3), slice(3, 7), EEF_WIDTH - 1
-_ORDERS = (
-    r"^(xyz|xzy|yxz|yzx|zxy|zyx|xyx|xzx|yxy|yzy|zxz|zyz|XYZ|XZY|YXZ|YZX|ZXY|ZYX|XYX|XZX|YXY|YZY|ZXZ|ZYZ)$"
-)
-OrientationName = Literal["wxyz", "xyzw", "euler", "rotation_vector", "6d"]
 
 
-class PoseFormat(Section):
-    """How the pose of an end effector is written: per arm x, y, z [m], an orientation, and its gripper."""
-
-    orientation: OrientationName = "wxyz"
-    """Quaternion with the scalar first or last, Euler angles, axis times angle, or six numbers of the matrix."""
-    euler_order: Annotated[str, Field(pattern=_ORDERS)] = "xyz"
-    """Axes of Euler angles: "xyz" turns about fixed axes one after the other (extrinsic), "XYZ" about axes that
-    turn along (intrinsic)."""
-    degrees: bool = False
-    """Angles of Euler angles and rotation vectors in degrees; else radians."""
-    sixd: Literal["columns", "rows"] = "columns"
-    """Of the rotation matrix, the first two columns one after the other, or the first two rows."""
-    gripper: bool = True
-    """Whether the gripper's number follows each pose (0 for an arm without one); else grippers stay as commanded."""
-    frame: str = ""
-    """What poses are expressed in: "" for each arm's own frame, the robot's mount frame, or a link of its URDF."""
-    groups: list[str] = Field(default_factory=list)
-    """Groups without end effector (a head, a torso) whose joints follow the poses; all others are held."""
-
-    @model_validator(mode="after")
-    def _mean_something(self) -> PoseFormat:
-        """A key that this orientation has no use for is a mistake, and would be none to notice."""
-        chosen = self.orientation
-        strange = {
-            "euler_order": self.euler_order != "xyz" and chosen != "euler",
-            "degrees": self.degrees and chosen not in ("euler", "rotation_vector"),
-            "sixd": self.sixd != "columns" and chosen != "6d",
-        }
-        for key, wrong in strange.items():
-            if wrong:
-                needed = {"euler_order": '"euler"', "degrees": '"euler" or "rotation_vector"', "sixd": '"6d"'}
-                raise ValueError(
-                    f"{key} = {getattr(self, key)!r} beside orientation = {chosen!r}, which has no such thing; "
-                    f"allowed: with orientation = {needed[key]}, or without {key}"
-                )
-        return self
-
-    @property
-    def numbers(self) -> Orientation:
-        """The orientation's codec."""
-        if self.orientation == "euler":
-            return EulerAngles(self.euler_order, self.degrees)
-        if self.orientation == "rotation_vector":
-            return RotationVector(self.degrees)
-        if self.orientation == "6d":
-            return SixNumbers(self.sixd == "columns")
-        return QuaternionNumbers(self.orientation == "wxyz")
-
-    def __str__(self) -> str:
-        words: list[str] = [self.orientation]
-        words += [self.euler_order] if self.orientation == "euler" else []
-        words += [f"of {self.sixd}"] if self.orientation == "6d" else []
-        words += ["in degrees"] if self.degrees else []
-        words += [] if self.gripper else ["without gripper"]
-        words += [f"in {self.frame}"] if self.frame else []
-        words += [f"with {', '.join(self.groups)}"] if self.groups else []
-        return " ".join(words)
-
-
-CANONICAL = PoseFormat()
-
-
-def refuse_format(pose: PoseFormat, key: str) -> None:
-    """ConfigurationError where a format is declared for a space that is joints: it would mean nothing."""
-    given = pose.model_dump(exclude_defaults=True)
-    if given:
-        raise ConfigurationError(
-            f'{key} = {given}, but the space it is for is "joint"; allowed: no format, or the space "eef"'
-        )
+def orientation_of(pose: PoseFormat) -> Orientation:
+    """The codec of the format's orientation."""
+    if pose.orientation == "euler":
+        return EulerAngles(pose.euler_order, pose.degrees)
+    if pose.orientation == "rotation_vector":
+        return RotationVector(pose.degrees)
+    if pose.orientation == "6d":
+        return SixNumbers(pose.sixd == "columns")
+    return QuaternionNumbers(pose.orientation == "wxyz")
 
 
 class PoseRows:
@@ -121,7 +56,7 @@ class PoseRows:
         self.dims = _dims(pose, robot, key)
         self._arms = [arm.name for arm in robot.arms]
         self._gripped = np.array([arm.gripper is not None for arm in robot.arms])
-        self._numbers = pose.numbers
+        self._numbers = orientation_of(pose)
         self._turning = slice(3, 3 + len(self._numbers.fields))
         fields = ("x", "y", "z", *self._numbers.fields, *(("gripper",) if pose.gripper else ()))
         self._each = len(fields)

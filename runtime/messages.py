@@ -206,7 +206,9 @@ class MediaReport:
     drives: Mapping[str, Any] = field(
         default_factory=dict
     )  # {"enabled": bool, "faults": [str]}, {} where unsaid
-    cameras: Mapping[str, Any] = field(default_factory=dict)  # of the deployment's own, as by Source.camera_health
+    cameras: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # of the deployment's own, as by Source.camera_health
 
 
 # --- clients <-> runtime -----------------------------------------------------------------------------------

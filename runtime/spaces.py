@@ -11,8 +11,9 @@ from robots import Robot
 from robots.rotations import quaternion_of_matrix, transform_of
 from runtime.end_effectors import EndEffectors
 from runtime.errors import PolicyError, SetupError
-from runtime.formats import CANONICAL, PoseFormat, PoseRows, continuous
+from runtime.formats import PoseRows, continuous
 from runtime.kinematics.base import IkResult, Kinematics
+from runtime.pose_format import CANONICAL, PoseFormat
 from runtime.poses import absolute
 from runtime.resampling import resample
 from runtime.types import EEF_WIDTH, ActionChunk, Float64, Observation

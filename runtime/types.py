@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from runtime.formats import PoseFormat
+    from runtime.pose_format import PoseFormat
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from runtime.errors import ContradictionError
-from runtime.formats import PoseFormat
 from runtime.policies.request import RequestSettings
+from runtime.pose_format import PoseFormat
 from runtime.types import ActionMode, RelativeFrame, Space
 
 _SPACES: dict[str, Space] = {"joint": "joint", "qpos": "joint", "eef": "eef"}

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from runtime.formats import PoseFormat
+from runtime.pose_format import PoseFormat
 from runtime.section import Section
 from runtime.types import ActionMode, RelativeFrame, Space
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Literal
 
-from runtime.formats import PoseFormat
 from runtime.policies.answers import AnswerSettings
 from runtime.policies.pictures import Resize
 from runtime.policies.request import RequestLayout, RequestSettings, Size, poses_of
+from runtime.pose_format import PoseFormat
 from runtime.types import ActionChunk, Float32, Space
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ from pydantic import Field
 from runtime.clock import Clock
 from runtime.datasets.mapping import ColumnMapping
 from runtime.errors import PolicyError, RecordingError
-from runtime.formats import PoseFormat
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.request import poses_of
+from runtime.pose_format import PoseFormat
 from runtime.section import Section
 from runtime.types import ActionChunk, Conditioning, Float32, Observation, Space
 

@@ -8,8 +8,9 @@ import numpy as np
 from pydantic import Field
 
 from runtime.errors import ConfigurationError, PolicyError
-from runtime.formats import PoseFormat, PoseRows, refuse_format
+from runtime.formats import PoseRows
 from runtime.policies.pictures import Layout, Resize, fitted, laid_out
+from runtime.pose_format import PoseFormat, refuse_format
 from runtime.section import Section
 from runtime.types import EEF_WIDTH, Float32, Observation, Space
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 

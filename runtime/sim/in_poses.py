@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import ValidationError
 
 from runtime.errors import RuntimeFault, SetupError
-from runtime.formats import PoseFormat, PoseRows
+from runtime.formats import PoseRows
+from runtime.pose_format import PoseFormat
 from runtime.sim.script import Answer, Script
 from runtime.types import EEF_WIDTH, Float32, Float64, UInt8
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from runtime.errors import TransportError
-from runtime.formats import PoseFormat
 from runtime.messages import Event
+from runtime.pose_format import PoseFormat
 from runtime.types import Observation, RobotCommand
 
 

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from runtime.clock import Clock
 from runtime.errors import ConfigurationError
-from runtime.formats import PoseFormat
+from runtime.pose_format import PoseFormat
 from runtime.section import Section
 from runtime.transports.base import Capabilities
 from runtime.transports.ros import cdr, dds, rcl

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from runtime import deployment
-from runtime.formats import PoseFormat, PoseRows
+from runtime.formats import PoseRows
 from runtime.kinematics.base import IkFlag
+from runtime.pose_format import PoseFormat
 from runtime.poses import absolute
 from runtime.spaces import Spaces
 from runtime.transitions import State

@@ -10,8 +10,8 @@ from runtime import family
 from runtime.deployment import changed, load
 from runtime.errors import ConfigurationError, SetupError
 from runtime.family import Lifeline, plan
-from runtime.formats import PoseFormat
 from runtime.page import Page
+from runtime.pose_format import PoseFormat
 from runtime.timeline import Dims
 from runtime.transports import zmq
 from runtime.transports.base import Capabilities

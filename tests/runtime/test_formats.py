@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from robots import Robot, load
 from runtime.deployment import load as load_deployment
 from runtime.errors import ConfigurationError, PolicyError
-from runtime.formats import CANONICAL, PoseFormat, PoseRows, refuse_format
+from runtime.formats import PoseRows
+from runtime.pose_format import CANONICAL, PoseFormat, refuse_format
 from tests.runtime.odd_robot import odd_robot
 from tests.runtime.test_frames import joints, some_vectors
 from tests.runtime.test_orientations import ORDERS

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from robots import Robot, load
 from runtime.errors import PolicyError, SetupError
-from runtime.formats import PoseFormat, PoseRows
+from runtime.formats import PoseRows
 from runtime.kinematics.base import IkFlag
 from runtime.kinematics.compiled import CompiledKinematics
+from runtime.pose_format import PoseFormat
 from runtime.spaces import CommandRows, Onset, Spaces
 from runtime.types import ActionChunk, Observation
 from tests.runtime.odd_robot import odd_robot

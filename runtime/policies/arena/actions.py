@@ -9,11 +9,12 @@ import numpy as np
 from pydantic import Field
 
 from runtime.errors import ConfigurationError, ContradictionError, PolicyError
-from runtime.formats import PoseFormat, PoseRows
+from runtime.formats import PoseRows
 from runtime.policies.answers import Rate
 from runtime.policies.arena.wants import ActionSpace, Wants
 from runtime.policies.grip import Convention, Grip
 from runtime.policies.rows import action_rows
+from runtime.pose_format import PoseFormat
 from runtime.section import Section
 from runtime.types import ActionChunk, Float32
 

@@ -10,12 +10,13 @@ import numpy as np
 from pydantic import Field
 
 from runtime.errors import PolicyError
-from runtime.formats import PoseFormat, PoseRows
+from runtime.formats import PoseRows
 from runtime.policies.arena.cameras import Cameras, Numbering, Slot
 from runtime.policies.arena.wants import Wants
 from runtime.policies.grip import Convention, Grip
 from runtime.policies.pictures import fitted
 from runtime.policies.request import Size
+from runtime.pose_format import PoseFormat
 from runtime.section import Section
 from runtime.types import EEF_WIDTH, Float32, Observation, UInt8
 

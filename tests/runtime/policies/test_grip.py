@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runtime.formats import PoseFormat, PoseRows
+from runtime.formats import PoseRows
 from runtime.policies.grip import Grip
+from runtime.pose_format import PoseFormat
 from tests.runtime.policies.peers import FRANKA, PIPER, seen
 
 

@@ -19,10 +19,10 @@ import robots
 from runtime import codecs
 from runtime.clock import MonotonicClock
 from runtime.errors import ConfigurationError, ContradictionError, PolicyError, PolicyLostError
-from runtime.formats import PoseFormat
 from runtime.policies import openpi
 from runtime.policies.link import PolicyGone, PolicyTimeout, WebsocketLink, headline
 from runtime.policies.openpi import Config, OpenpiPolicy
+from runtime.pose_format import PoseFormat
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.in_poses import InPoses
 from runtime.sim.openpi_server import Behaviour, OpenpiServer

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from runtime.clock import VirtualClock
 from runtime.datasets.mapping import ColumnMapping
 from runtime.errors import PolicyError
-from runtime.formats import PoseFormat
 from runtime.policies import replay
 from runtime.policies.replay import Config, ReplayPolicy
+from runtime.pose_format import PoseFormat
 from runtime.types import Observation
 from tests.runtime.datasets.small import robot, write_dataset
 

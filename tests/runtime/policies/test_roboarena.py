@@ -14,10 +14,10 @@ from websockets.sync.server import ServerConnection
 from runtime import codecs
 from runtime.clock import MonotonicClock
 from runtime.errors import ConfigurationError, ContradictionError, PolicyError, PolicyLostError
-from runtime.formats import PoseFormat
 from runtime.policies import roboarena
 from runtime.policies.link import PolicyGone, PolicyTimeout
 from runtime.policies.roboarena import Config, RoboarenaPolicy
+from runtime.pose_format import PoseFormat
 from runtime.sim.faults import Fault
 from runtime.sim.roboarena_server import Arena, RoboarenaServer
 from runtime.types import Conditioning, Observation

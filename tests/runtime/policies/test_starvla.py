@@ -13,9 +13,9 @@ from websockets.sync.server import ServerConnection
 from runtime import codecs
 from runtime.clock import MonotonicClock
 from runtime.errors import ConfigurationError, ContradictionError, PolicyError, PolicyLostError
-from runtime.formats import PoseFormat
 from runtime.policies import starvla
 from runtime.policies.starvla import Config, StarvlaPolicy
+from runtime.pose_format import PoseFormat
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.starvla_server import Star, StarvlaServer
 from runtime.types import Conditioning, Observation

@@ -7,7 +7,8 @@ import pytest
 
 import robots
 from runtime.errors import SetupError
-from runtime.formats import PoseFormat, PoseRows
+from runtime.formats import PoseRows
+from runtime.pose_format import PoseFormat
 from runtime.sim.in_poses import InPoses, pose_format
 from runtime.sim.script import Waving
 

@@ -12,9 +12,9 @@ from hypothesis.extra import numpy as arrays_of
 
 import robots
 from runtime.errors import ConfigurationError, ContradictionError, PolicyError
-from runtime.formats import PoseFormat
 from runtime.policies.groot.modality import Modalities, Modality, Written
 from runtime.policies.groot.request import Gr00tRequest, RequestSettings
+from runtime.pose_format import PoseFormat
 from runtime.types import Float32, Observation
 
 ROBOT = robots.load("agilex_piper")
