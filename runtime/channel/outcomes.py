@@ -41,6 +41,7 @@ class Outcome:
     reason: str = ""
     before: Mapping[str, Any] = field(default_factory=dict)  # the status when it was given
     events: list[dict[str, Any]] = field(default_factory=list)  # since then
+    looked_since: int | None = None  # the step of the first look
     calm_since: int | None = None
 
     @property
@@ -64,14 +65,25 @@ class Outcome:
 
     def _settle(self, status: dict[str, Any], events_since: Events) -> None:
         self._hear(status, events_since)
-        step = status["control"]["step"]
-        if busy(status) or self.calm_since is None:
-            self.calm_since = step
-        if status["state"] == self.before["state"] and step - self.calm_since < CALM_TICKS:
+        if status["state"] == self.before["state"] and not self._calm(status):
             return
         wants = "motion_done" if self.kind == "approach" else _WITHIN[self.kind]
         failure = Settled(self.before["state"], status, self.events).failure(wants)
         self._end("failed" if failure else "done", failure)
+
+    def _calm(self, status: dict[str, Any]) -> bool:
+        """Whether it was seen to stand twice, so far apart that what there is to tell of it was told.
+
+        What is seen in the first ticks says nothing: it may not have begun.
+        """
+        step = status["control"]["step"]
+        if self.looked_since is None:
+            self.looked_since = step
+        if busy(status) or step - self.looked_since < CALM_TICKS:
+            self.calm_since = None
+        elif self.calm_since is None:
+            self.calm_since = step
+        return self.calm_since is not None and step - self.calm_since >= CALM_TICKS
 
     def _hear(self, status: dict[str, Any], events_since: Events) -> None:
         heard = self.events[-1]["number"] if self.events else self.before["newest_event"]
