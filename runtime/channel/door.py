@@ -147,7 +147,7 @@ def _listening(context: zmq.Context[Any], port: int) -> tuple[Any, str]:
     except zmq.ZMQError as error:
         socket.close()
         raise TransportError(
-            f"the control channel cannot listen on {HOST}:{port}: {os.strerror(error.errno)}; "
+            f"the control channel cannot listen on {HOST}:{port}: {os.strerror(error.errno or 0)}; "
             "name another port with control_channel.port"
         ) from None
     return socket, socket.last_endpoint.decode()
