@@ -51,9 +51,12 @@ def settle(client: StationClient, before: dict[str, Any], tell: Callable[[dict[s
                 events.append(event)
                 tell(event)
         step = status["control"]["step"]
-        if busy(status) or calm_since is None:
+        if busy(status):
+            calm_since = None
+        elif calm_since is None:
             calm_since = step
-        if status["state"] != began or step - calm_since >= CALM_TICKS:
+        calm = calm_since is not None and step - calm_since >= CALM_TICKS
+        if status["state"] != began or calm:
             return Settled(began, status, events)
         client.renew()
         time.sleep(_LOOK_S)

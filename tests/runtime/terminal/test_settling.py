@@ -27,12 +27,24 @@ def test_it_is_over_when_the_run_has_waited_for_a_few_ticks():
         running("executing", 12),
         running("waiting", 13),
         running("waiting", 14),
-        running("waiting", 15),
+        running("waiting", 16),
     )
-    assert found.status["control"]["step"] == 15
+    assert found.status["control"]["step"] == 16
     assert found.failure() == ""
     assert "renew" in script.given
     assert told == []
+
+
+def test_a_pause_between_two_looks_that_are_many_ticks_apart_is_not_the_end():
+    """At 200 Hz four ticks pass between two looks: a motion may be over without its end being told yet."""
+    told = event(1, "motion_done")
+    found, _, _ = settled(
+        running("moving", 10),
+        running("waiting", 14),
+        running("waiting", 18, newest_event=1),
+        events=[told],
+    )
+    assert found.failure("motion_done") == ""
 
 
 def test_what_was_over_at_once_is_over_after_a_few_ticks():
@@ -41,7 +53,7 @@ def test_what_was_over_at_once_is_over_after_a_few_ticks():
 
 
 def test_a_chunk_that_is_shown_is_the_end_of_a_step():
-    found, _, _ = settled(running("asking", 10), running("proposed", 11), running("proposed", 13))
+    found, _, _ = settled(running("asking", 10), running("proposed", 11), running("proposed", 14))
     assert found.status["phase"] == "proposed"
 
 
@@ -76,7 +88,7 @@ def test_a_gripper_is_waited_for_where_no_run_is_open():
         running("", 11, "ready", "motion"),
         running("", 14, "ready", "motion"),
         running("", 15, "ready", "hold"),
-        running("", 17, "ready", "hold"),
+        running("", 18, "ready", "hold"),
     )
-    assert found.status["control"]["step"] == 17
+    assert found.status["control"]["step"] == 18
     assert found.failure() == ""
