@@ -156,13 +156,14 @@ def test_a_script_waits_for_the_end_of_what_it_asked_for(run, capsys):
     ],
 )
 def test_what_went_wrong_meanwhile_is_no_success(run, capsys, words, last, says):
-    assert run(Script([running(step=1), running("asking", 2), last]), *words, "--wait") == 1
+    before = [running(step=1), running("asking", 2), running("waiting", 3)]
+    assert run(Script([*before, last]), *words, "--wait") == 1
     assert says in capsys.readouterr().err
 
 
 def test_an_approach_within_a_run_waits_for_its_arrival(run):
-    arrived = running("proposed", 9, newest_event=1)
-    script = Script([running("proposed", 1), running("proposed", 1), running("approaching", 2), arrived])
+    before = [running("proposed", 1), running("proposed", 1), running("approaching", 2), running("proposed", 3)]
+    script = Script([*before, running("proposed", 9, newest_event=1)])
     script.events = [event(1, "motion_done", "arrived")]
     assert run(script, "approach", "--wait") == 0
     assert script.given[0] == "approach"
