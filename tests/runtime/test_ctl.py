@@ -162,7 +162,12 @@ def test_what_went_wrong_meanwhile_is_no_success(run, capsys, words, last, says)
 
 
 def test_an_approach_within_a_run_waits_for_its_arrival(run):
-    before = [running("proposed", 1), running("proposed", 1), running("approaching", 2), running("proposed", 3)]
+    before = [
+        running("proposed", 1),
+        running("proposed", 1),
+        running("approaching", 2),
+        running("proposed", 3),
+    ]
     script = Script([*before, running("proposed", 9, newest_event=1)])
     script.events = [event(1, "motion_done", "arrived")]
     assert run(script, "approach", "--wait") == 0
