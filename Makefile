@@ -38,12 +38,12 @@ demo: setup ## a small lab on this machine, no robot needed; ARGS="--once --json
 lab: setup ## web, worker and stations of this machine; ARGS="deployments/MINE.toml"
 	$(PY) manage.py lab $(ARGS)
 
-# Tests of whole labs and of what ends them have the machine for themselves, the others run beside each other.
+# Tests that need real seconds or a browser run one at a time, the others beside each other.
 test: setup-dev ## every test; ARGS="-m 'not slow'" for the quick ones
 ifeq ($(strip $(ARGS)),)
 	@failed=0; \
-	$(PY) -m pytest -n auto --dist loadfile --ignore=tests/e2e --ignore=tests/crash || failed=1; \
-	$(PY) -m pytest tests/e2e tests/crash || failed=1; \
+	$(PY) -m pytest -n auto --dist loadfile -m "not slow" || failed=1; \
+	$(PY) -m pytest -m slow || failed=1; \
 	exit $$failed
 else
 	$(PY) -m pytest $(ARGS)
