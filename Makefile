@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV   := .venv
 PY     := $(VENV)/bin/python
 ARGS   ?=
+# A station is five processes: where no bytecode is kept, each of them compiles hundreds of sources at every start.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help setup setup-dev lab demo test lint format bench clean
@@ -38,12 +40,15 @@ demo: setup ## a small lab on this machine, no robot needed; ARGS="--once --json
 lab: setup ## web, worker and stations of this machine; ARGS="deployments/MINE.toml"
 	$(PY) manage.py lab $(ARGS)
 
-# Tests that need real seconds or a browser run one at a time, the others beside each other.
+# A third of the tests' time is waiting: one more of them at a time than there are cores.
+WORKERS := $(shell expr $$(nproc) + 1)
+
+# Tests in real time of whole labs and stations have the machine for themselves; all others run beside each other.
 test: setup-dev ## every test; ARGS="-m 'not slow'" for the quick ones
 ifeq ($(strip $(ARGS)),)
 	@failed=0; \
-	$(PY) -m pytest -n auto --dist loadfile -m "not slow" || failed=1; \
-	$(PY) -m pytest -m slow || failed=1; \
+	$(PY) -m pytest -n $(WORKERS) --dist loadfile -m 'not alone' || failed=1; \
+	$(PY) -m pytest -m alone tests/e2e tests/crash tests/runtime/sim || failed=1; \
 	exit $$failed
 else
 	$(PY) -m pytest $(ARGS)

@@ -1,0 +1,43 @@
+"""What holds for every test: which need the machine for themselves, and that none runs in a real-time class."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+_ALONE = [Path(__file__).parent / folder for folder in ("e2e", "crash")]  # whole labs, and what ends them
+_BEGAN = os.sched_getscheduler(0)
+
+
+def pytest_configure() -> None:
+    """Whatever started the tests, they are ordinary: else a busy one starves the real-time loops it looks at."""
+    if _BEGAN != os.SCHED_OTHER:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def pytest_report_header() -> str:
+    """The class in which the tests were started, for whoever wonders about times."""
+    return f"started in the scheduling class {_BEGAN}"
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m chooses
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what `make test` does not run beside anything else."""
+    for item in items:
+        if any(folder in item.path.parents for folder in _ALONE):
+            item.add_marker("alone")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown() -> Iterator[None]:
+    """A test that turned its own process real-time is named."""
+    try:
+        return (yield)
+    finally:
+        left = os.sched_getscheduler(0)
+        if left != os.SCHED_OTHER:
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+            pytest.fail(f"the test left its process in the scheduling class {left}")
