@@ -17,6 +17,7 @@ from robots.shapes import Shape
 PIECES = 2  # capsules that a link has at most: each one more makes a good deal more pairs
 _ROUND = 24  # corners of the polygon about a circle
 _STEPS = 100  # towards the middle of what is to be covered
+_about: dict[bytes, tuple[Capsule, ...]] = {}  # by what the shapes are; some dozens for each robot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,9 +37,27 @@ def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
     by_link: dict[str, list[Shape]] = {}
     for shape in shapes.read(robot.urdf):
         by_link.setdefault(shape.link, []).append(shape)
-    found = {link: about(shown) for link, shown in by_link.items()}
+    found = {link: _remembered(shown) for link, shown in by_link.items()}
     found |= {link: tuple(map(_declared, tables)) for link, tables in robot.collision.capsules.items()}
     return {link: made for link, made in found.items() if link not in robot.collision.without}
+
+
+def _remembered(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
+    """`about`, once for each link that looks like this: a station asks for the same robot several times."""
+    key = b"".join(_content(shape) for shape in shown)
+    if key not in _about:
+        made = about(shown)
+        for capsule in made:
+            capsule.start.flags.writeable = capsule.end.flags.writeable = False
+        _about[key] = made
+    return _about[key]
+
+
+def _content(shape: Shape) -> bytes:
+    lower, upper = shape.bounds()
+    return f"{shape.kind} {shape.size}".encode() + b"".join(
+        numbers.tobytes() for numbers in (shape.origin, lower, upper)
+    )
 
 
 def about(shown: Sequence[Shape]) -> tuple[Capsule, ...]:

@@ -20,16 +20,13 @@ Reason = Annotated[str, Field(min_length=1)]
 Label = Annotated[str, Field(min_length=1)]  # of a joint: what the wire or the URDF calls it
 Topic = Annotated[str, Field(pattern=r"^[~/A-Za-z][A-Za-z0-9_/~]*$")]
 Kind = Literal["arm", "hand", "head", "torso", "base", "other"]
-Measured = Literal["velocity", "effort", "eef"]
 TABLE = "table"  # in pairs of [collision]: the plane z = 0 of the scene
 
 
 class Table(BaseModel):
     """A table of robot.toml: nothing is coerced, unknown keys are errors that list the known ones."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
     @model_validator(mode="before")
     @classmethod
@@ -180,8 +177,6 @@ class RobotTable(Table):
     """Commands per second that the robot is run at unless a deployment says otherwise."""
     cameras: dict[Name, Name]
     """Logical name = observation key."""
-    measures: list[Measured] = []
-    """What its node reports besides the positions of its joints."""
     mount_frame: Name = "world"
     """Name of the frame in which mounts are given: one that all arms have in common."""
     stand: PlaceTable | None = None

@@ -58,7 +58,7 @@ def inspect(name: str | Path) -> Inspection:
 def _heading(robot: Robot, table: RobotTable, whole: Robot) -> Iterator[str]:
     yield f"{robot.name}: {robot.title}"
     yield f"folder: {robot.folder}"
-    yield f"{robot.dim} numbers, {robot.control_rate:g} Hz; measured: {', '.join(['position', *table.measures])}"
+    yield f"{robot.dim} numbers, {robot.control_rate:g} Hz"
     optional = [group.name for group in table.groups if group.optional]
     yield f"groups: {', '.join(group.name for group in robot.groups)}"
     if optional:

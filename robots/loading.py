@@ -88,7 +88,6 @@ def load(
         control_rate=table.control_rate,
         limits_source=table.limits_source,
         overrides=tuple(sentence for part in limits for sentence in part.overrides),
-        measures=frozenset(table.measures),
         mount_frame=table.mount_frame,
         stand=place(f"{file}: stand", table.stand),
         collision=table.collision,

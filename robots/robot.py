@@ -114,7 +114,7 @@ class Robot:
 
     `lower`, `upper`, `velocity` and every pose are read-only float64 [dim]. `overrides` are sentences, one
     for each limit that differs from the URDF. `mount_frame` names what mounts are given in, `stand` [7] places
-    it in the scene, whose z = 0 is the table. `measures` is what the node reports besides joint positions.
+    it in the scene, whose z = 0 is the table.
     """
 
     name: str
@@ -130,7 +130,6 @@ class Robot:
     control_rate: float
     limits_source: str
     overrides: tuple[str, ...]
-    measures: frozenset[str]
     mount_frame: str
     stand: Float64
     collision: CollisionTable

@@ -30,8 +30,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         made.new_policy(
             MonotonicClock()
         ).close()  # what does not fit it is said here, not by a main that dies
+        _require_encoder(made)
         if given.headless:
             headless.check(made)
+        if given.lockstep:
+            lockstep.check(made)
     except RuntimeFault as fault:
         print(fault, file=sys.stderr)
         return 2
@@ -86,6 +89,14 @@ def _resolved(given: argparse.Namespace) -> Resolved:
     return found.resolved
 
 
+def _require_encoder(made: Plan) -> None:
+    """The encoder of the recording is missed here, not by the first run; ConfigurationError."""
+    from runtime.recording import trial
+
+    if made.deployment.recording.enabled:
+        trial.require(made.deployment.recording)
+
+
 def _check(made: Plan) -> int:
     print(json.dumps(dict(made.resolved.tree), indent=1))
     print(f"hash {made.resolved.digest}")
@@ -109,10 +120,11 @@ def run_in_lockstep(made: Plan) -> int:
         print(f"export   {export(Path(episode['path']), made.deployment.data)}")
     # A run that held was ended by nobody's judgement: it is kept, but neither published nor a success.
     well = done.state is State.READY and episode.get("status", "finished") == "finished"
-    if well and made.deployment.publish.dataset and episode and made.deployment.run.mode != "sim":
+    into = made.deployment.publish
+    if well and into.dataset and episode and made.deployment.run.mode != "sim":
         from runtime.datasets.published import publish
 
-        published = publish(Path(episode["path"]), made.deployment.data / made.deployment.publish.dataset)
+        published = publish(Path(episode["path"]), made.deployment.data / into.dataset, version=into.version)
         print(f"dataset  {published.dataset}  episode {published.episode_index}, {published.frames} frames")
     return 0 if well else 1
 

@@ -20,6 +20,7 @@ from runtime.seen import Seen
 from runtime.timeline import Dims, difference
 from runtime.transports.base import Sink
 from runtime.types import Float32, Float64, RobotCommand
+from runtime.yielding import END
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +167,11 @@ class RobotActuator(Actuator):
         return self.commanded + difference(seen.joints, self.commanded, wrapping)
 
     def tell(self, word: str, data: Mapping[str, Any]) -> str:
-        """Pass a control word on to the node, unless the e-stop is pressed; why it was not, "" where it was."""
-        if self._page.estop is not EStop.CLEAR:
+        """Pass a control word on to the node; why it was not, "" where it was.
+
+        While the e-stop is pressed only the word that ends what the node does by itself is.
+        """
+        if self._page.estop is not EStop.CLEAR and word != END:
             return f"{word} is not passed on to the node while the e-stop is not known to be clear"
         try:
             self._sink.tell(word, data)

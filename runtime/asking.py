@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
@@ -10,15 +11,17 @@ from typing import Any, Literal
 import numpy as np
 
 from runtime.clock import Clock
-from runtime.errors import SetupError
+from runtime.errors import PolicyError, RuntimeFault, SetupError
 from runtime.kinematics.base import IkFlag, IkResult
 from runtime.messages import Event
 from runtime.policies.base import Policy
 from runtime.runner import Runner
-from runtime.sight import Sight
+from runtime.sight import Eyes
 from runtime.spaces import CommandRows, Onset, Spaces
 from runtime.types import ActionChunk, Conditioning, Observation
 
+log = logging.getLogger(__name__)
+_EARLY_S = 1e-6  # moments are sums of floats
 Committed = Callable[[int], Conditioning | None]  # by the step of the observation
 
 
@@ -49,7 +52,7 @@ class Asking:
     """
 
     def __init__(
-        self, policy: Policy, task: str, spaces: Spaces, sight: Sight, runner: Runner, clock: Clock
+        self, policy: Policy, task: str, spaces: Spaces, sight: Eyes, runner: Runner, clock: Clock
     ) -> None:
         self.policy = policy
         self.task = task
@@ -58,6 +61,8 @@ class Asking:
         self._spaces = spaces
         self._clock = clock
         self._fresh = True
+        self._held = False  # since it was last asked
+        self._glance_at = float("-inf")
         self.notes: list[Event] = []  # for main to collect
 
     def exchange(self, policy: Policy, task: str) -> None:
@@ -68,16 +73,47 @@ class Asking:
         """
         if policy is not self.policy:
             self.policy.close()
-            self.policy, self._fresh = policy, True
+            self.policy, self._fresh, self._held = policy, True, False
         self.task = task
 
     def forget(self) -> None:
         """Let the policy forget the episode before its next inference."""
         self._fresh = True
 
+    def resume(self) -> None:
+        """Let the policy know before its next inference that the robot was held meanwhile."""
+        self._held = True
+
+    def rest(self) -> None:
+        """The rollout is over: the policy ends what its server keeps of it, and nobody waits for that.
+
+        Where it cannot, the log says so: a policy that owes it does it before it is asked again, or says why not.
+        """
+        policy, self._fresh = self.policy, True
+
+        def end() -> None:
+            try:
+                policy.rest()
+            except RuntimeFault as error:
+                log.warning("the policy's server may still keep the rollout that is over: %s", error)
+
+        self.runner.submit(end)
+
+    def glance(self) -> None:
+        """Show the policy what is seen now, where it wants that and it is time; a gap in what is seen is left one."""
+        every, now = self.policy.glances_s, self._clock.now()
+        if every is None or now < self._glance_at - _EARLY_S:
+            return
+        due = self._glance_at + every
+        self._glance_at = due if due > now else now + every
+        try:
+            self.policy.glance(self.observe())
+        except PolicyError:  # what is missing or old is said of the next request
+            return
+
     def observe(self) -> Observation:
         """What the policy would be shown now; PolicyError where there is nothing, or it is old."""
-        return self.sight.now(self.task)
+        return self.sight.now(self.task, self.policy.sees_pictures)
 
     def ask(
         self, waited: bool = False, committed: Committed | None = None, k_max: int | None = None
@@ -88,11 +124,14 @@ class Asking:
         """
         observation = self.observe()
         conditioning = committed(observation.step) if committed else None
-        policy, fresh, self._fresh = self.policy, self._fresh, False
+        policy, fresh, held = self.policy, self._fresh, self._held
+        self._fresh = self._held = False
 
         def infer() -> Answered:
             if fresh:
                 policy.reset()
+            elif held:
+                policy.resume()
             begun = self._clock.now()
             measured = observation.eef is not None and policy.observation_eef == "measured"
             shown = observation

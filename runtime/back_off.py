@@ -8,7 +8,8 @@ _FIRST_S, _LONGEST_S = 0.1, 2.0
 class BackOff:
     """Doubles the wait with every failure; a success forgets them. Times are the caller's clock [s]."""
 
-    def __init__(self) -> None:
+    def __init__(self, first: float = _FIRST_S, longest: float = _LONGEST_S) -> None:
+        self._first, self._longest = first, longest
         self.forget()
 
     def forget(self) -> None:
@@ -20,7 +21,7 @@ class BackOff:
     def failed(self, now: float) -> None:
         """Once more."""
         self.since = now if self.since is None else self.since
-        self._due = now + min(_LONGEST_S, _FIRST_S * 2.0**self._failures)
+        self._due = now + min(self._longest, self._first * 2.0 ** min(self._failures, 32))
         self._failures += 1
 
     def waiting(self, now: float) -> float:

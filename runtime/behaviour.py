@@ -49,6 +49,16 @@ class Silent(Behaviour):
         return None
 
 
+class Yielded(Behaviour):
+    """Sends nothing because the node drives the robot by its own leader; whatever stops us takes that back."""
+
+    name = "yield"
+    moving = True
+
+    def target(self, step: int, elapsed: float) -> Target | None:
+        return None
+
+
 class Hold(Behaviour):
     """Comes to a stand and sends the held target on every tick: some nodes move when we fall silent."""
 

@@ -16,7 +16,6 @@ from runtime.page import Page
 from runtime.requests import AimRequest, GripperRequest, MoveRequest, read
 from runtime.runs import Runs
 from runtime.setup import first_action
-from runtime.spaces import Spaces
 from runtime.targets import Targets, told
 from runtime.types import Float64
 
@@ -26,22 +25,31 @@ log = logging.getLogger(__name__)
 class ByHand:
     """Motions within limits and the workspace box, locks of grippers; raises RuntimeFault where it refuses."""
 
-    def __init__(self, plan: Plan, page: Page, orders: Orders, runs: Runs, spaces: Spaces) -> None:
+    def __init__(self, plan: Plan, page: Page, orders: Orders, runs: Runs, targets: Targets) -> None:
         self._plan = plan
         self._page = page
         self._orders = orders
         self._runs = runs
-        self._targets = Targets(plan, spaces, plan.kinematics())
+        self._targets = targets
         self.grippers = Grippers(plan)
         status = page.control.read()
         if bytes(status["behaviour"]):  # a predecessor that died may have locked some
             self.grippers.locks = np.array(status["locked"], np.float64)
+
+    def prepare(self) -> None:
+        """A person will move the robot: load what steps of an end effector need, beside everything else."""
+        self._targets.prepare()
 
     def require_robot(self, what: str) -> None:
         """Refuse where the transport moves no robot."""
         if not self._plan.capabilities.moves_robot:
             kind = self._plan.deployment.transport.kind
             raise RuntimeFault(f"{what}: transport {kind!r} moves no robot")
+
+    def waits(self, arguments: Mapping[str, Any]) -> bool:
+        """Whether an aim with these arguments needs what is still being loaded; loading begins with the first aim."""
+        ready = self._targets.prepare()
+        return not ready and arguments.get("jog") is not None
 
     def aim(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Where the robot would go; nothing moves."""

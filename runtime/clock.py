@@ -6,6 +6,8 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 
+_LEAP_S = 0.5  # more than a first message can have been late by
+
 
 class Clock(ABC):
     """Seconds that never go backwards."""
@@ -54,8 +56,10 @@ class ClockMap:
     """Maps a peer's clock onto ours by the smallest (arrival - stamp) of the last `window` seconds.
 
     Clocks drift by tens of ppm, so the minimum is taken over a window and not for ever. A stamp that goes
-    backwards by more than `tolerance` seconds means that the peer restarted: the map starts anew and
-    `restarts` counts it. Source: the minimum filter of NTP (RFC 5905, section 10).
+    backwards by more than `tolerance` seconds means that the peer restarted, or that its clock was set back: the
+    map starts anew and `restarts` counts it. A message that is half a second earlier than any before it means that
+    the peer's clock leapt ahead: it becomes the smallest by itself and `leaps` counts it.
+    Source: the minimum filter of NTP (RFC 5905, section 10).
     """
 
     def __init__(self, window: float = 45.0, tolerance: float = 0.5) -> None:
@@ -64,6 +68,7 @@ class ClockMap:
         self._minima: deque[tuple[float, float]] = deque()  # (arrival, offset), offsets increasing
         self._newest = float("-inf")
         self.restarts = 0
+        self.leaps = 0
 
     def map(self, stamp: float, arrival: float) -> float:
         """The peer's `stamp` in our clock; never later than `arrival`."""
@@ -73,6 +78,8 @@ class ClockMap:
             self.restarts += 1
         self._newest = max(self._newest, stamp)
         offset = arrival - stamp
+        if self._minima and offset < self._minima[0][1] - _LEAP_S:
+            self.leaps += 1
         while self._minima and self._minima[-1][1] >= offset:
             self._minima.pop()
         self._minima.append((arrival, offset))

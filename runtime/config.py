@@ -3,30 +3,22 @@
 from __future__ import annotations
 
 import os
-from functools import reduce
-from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
+from runtime.collection import CollectionSettings
+from runtime.errors import ConfigurationError
 from runtime.kinematics.base import KinematicsSettings
-from runtime.messages import Mode
-from runtime.plugins import variants
+from runtime.messages import PolicyMode
+from runtime.plugins import union, variants
 from runtime.pose_format import PoseFormat
 from runtime.recording.settings import RecordingSettings
 from runtime.safety import SafetySettings
 from runtime.section import Section
 from runtime.strategies.base import StrategyParameters
 from runtime.types import Space
-
-
-def _variants_of(package: str) -> Any:
-    """The union of the variants' Configs, told apart by `kind`; a new file in the package joins by itself."""
-    configs = [module.Config for module in variants(package).values()]
-    union = reduce(or_, configs)
-    return Annotated[union, Field(discriminator="kind")] if len(configs) > 1 else union
-
 
 if TYPE_CHECKING:
 
@@ -49,11 +41,11 @@ if TYPE_CHECKING:
 
         kind: str
 else:
-    TransportConfig = _variants_of("runtime.transports")
-    PolicyConfig = _variants_of("runtime.policies")
-    StrategyConfig = _variants_of("runtime.strategies")
-    CameraConfig = _variants_of("runtime.cameras")
-    KinematicsConfig = _variants_of("runtime.kinematics")
+    TransportConfig = union("runtime.transports")
+    PolicyConfig = union("runtime.policies")
+    StrategyConfig = union("runtime.strategies")
+    CameraConfig = union("runtime.cameras")
+    KinematicsConfig = union("runtime.kinematics")
 
 
 def _loopback(host: str) -> str:
@@ -97,7 +89,7 @@ class RunSettings(Section):
 
     duration_s: float | None = Field(default=None, gt=0)
     """Time after which a run ends by itself [s]; until it is stopped where it is not given."""
-    mode: Mode = "continuous"
+    mode: PolicyMode = "continuous"
     """"continuous": the policy drives the robot until the run ends; "step": one chunk per command; "preview":
     each chunk is shown, then committed or cancelled; "sim": actions go to the 3D scene alone; "manual": a person
     moves it."""
@@ -142,6 +134,8 @@ class PublishSettings(Section):
 
     dataset: str | None = None
     """Folder of the dataset, relative to the data folder; nothing is published where it is not given."""
+    version: Literal["v2.1", "v3.0"] | None = None
+    """Version of the format of a new dataset, v2.1 where it is not given; one that is there keeps its own."""
 
 
 class PublicationSettings(Section):
@@ -237,7 +231,10 @@ class Deployment(Section):
     transport: TransportConfig
     cameras: dict[str, CameraConfig] = Field(default_factory=dict)
     """By the camera's key in the robot's description, those that do not come from the transport."""
-    policy: PolicyConfig
+    policy: PolicyConfig = Field(default_factory=lambda: variants("runtime.policies")["none"].Config())
+    """Who is asked for actions; may be left out where there is a [collection]."""
+    collection: CollectionSettings | None = None
+    """Collecting demonstrations; a station without it collects none."""
     kinematics: KinematicsConfig = Field(
         default_factory=lambda: variants("runtime.kinematics")["compiled"].Config()
     )
@@ -254,6 +251,14 @@ class Deployment(Section):
     bus: BusSettings = BusSettings()
     control_channel: ControlChannelSettings = ControlChannelSettings()
     lockstep: LockstepSettings = LockstepSettings()
+
+    @model_validator(mode="after")
+    def _have_something_to_do(self) -> Deployment:
+        if self.policy.kind == "none" and self.collection is None:
+            raise ConfigurationError(
+                "policy is missing and has no default; it may be left out with a [collection]"
+            )
+        return self
 
     @property
     def data(self) -> Path:

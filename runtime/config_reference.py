@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import ast
+import functools
+import inspect
+import itertools
 import json
+import textwrap
 from collections.abc import Iterator, Mapping
 from typing import Any, get_args, get_origin
 
@@ -74,7 +79,7 @@ def _section(title: str, model: type[BaseModel]) -> Iterator[str]:
             f"`{name}`",
             _type(schema["properties"][name]),
             "required" if tells else _default(field),
-            "Tells this kind of table from the others." if tells else _meaning(name, field),
+            "Tells this kind of table from the others." if tells else _meaning(model, name, field),
         )
         yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
     yield ""
@@ -128,11 +133,28 @@ def _default(field: FieldInfo) -> str:
     return f"`{json.dumps(value)}`"
 
 
-def _meaning(name: str, field: FieldInfo) -> str:
-    if field.description:
-        return " ".join(field.description.split())
+def _meaning(model: type[BaseModel], name: str, field: FieldInfo) -> str:
+    for owner in model.__mro__:
+        if name in inspect.get_annotations(owner) and (said := _said_of_keys(owner).get(name)):
+            return " ".join(said.split())
     models = [model for _, model in _models(name, field.annotation)]
     return _first_line(models[0]) if len(models) == 1 else "One of the kinds below." if models else ""
+
+
+@functools.cache
+def _said_of_keys(model: type) -> dict[str, str]:
+    """The strings below a model's own keys. Read here: every process of a station would wait for its sources else."""
+    (table,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
+    assert isinstance(table, ast.ClassDef)
+    return {
+        key.target.id: said.value.value
+        for key, said in itertools.pairwise(table.body)
+        if isinstance(key, ast.AnnAssign)
+        and isinstance(key.target, ast.Name)
+        and isinstance(said, ast.Expr)
+        and isinstance(said.value, ast.Constant)
+        and isinstance(said.value.value, str)
+    }
 
 
 if __name__ == "__main__":

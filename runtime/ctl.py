@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,16 +19,21 @@ from runtime.terminal.figures import line, report, tuning
 from runtime.terminal.settling import settle
 from runtime.terminal.syntax import parse
 
-DONE, FAILED, UNKNOWN, INTERRUPTED = 0, 1, 3, 130  # exit codes; 2 is argparse's
+DONE, FAILED, UNKNOWN, INTERRUPTED, UNREAD = 0, 1, 3, 130, 141  # exit codes; 2 is argparse's
 _RELEASE_S = 2.0
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Exit code 0 where it was done, 1 where it was refused or failed, 3 where no answer came."""
+    """Exit code 0 where it was done, 1 refused or failed, 3 where no answer came, 141 where nobody reads on."""
     given = parse(sys.argv[1:] if words is None else words)
     client = StationClient(Path(given.data_dir).expanduser().absolute() / "stations" / given.station)
     try:
-        return _do(client, given)
+        code = _do(client, given)
+        sys.stdout.flush()  # here, where a pipe that was closed is no traceback
+        return code
+    except BrokenPipeError:  # `status | head -1`: who reads has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush when the process ends
+        return UNREAD
     except Refused as refusal:
         print(f"refused: {refusal}", file=sys.stderr)
     except TransportError as fault:
@@ -106,6 +112,13 @@ def _setup(client: StationClient, given: argparse.Namespace) -> int:
     if status["state"] != "setting_up":  # else it would stop a run
         raise Refused(f"there is no set-up to cancel: the station is {status['state']}")
     return _within(client, given, "stop", {})
+
+
+def _run(client: StationClient, given: argparse.Namespace) -> int:
+    collect = client.status()["collect"] if given.arm else None
+    if given.arm and not (collect and collect["armed"]):
+        client.command("arm")
+    return _attended(client, given)
 
 
 def _approach(client: StationClient, given: argparse.Namespace) -> int:
@@ -202,6 +215,7 @@ def _watch(client: StationClient, given: argparse.Namespace) -> int:
 
 _OWN_WAYS = {
     "setup": _setup,
+    "run": _run,
     "approach": _approach,
     "move": _move,
     "jog": _jog,

@@ -10,6 +10,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from pydantic import ValidationError
 
@@ -26,6 +27,7 @@ __all__ = [
     "digest_of",
     "load",
     "resolve",
+    "server_of",
 ]
 
 
@@ -87,6 +89,22 @@ def changed(resolved: Resolved, changes: Mapping[str, Any], source: str) -> Reso
     tree = deepcopy(dict(resolved.tree))
     _merge(tree, deepcopy(dict(changes)))
     return resolve(tree, dict.fromkeys(_keys(changes), source), source)
+
+
+def server_of(settings: Deployment) -> str:
+    """Where the policy's server is in one spelling, host and port; "" for a policy without one.
+
+    Two deployments of one machine have the same server where this is the same. What is behind a tunnel is named as
+    from its far end.
+    """
+    policy = settings.policy
+    url = urlsplit(str(getattr(policy, "url", "")))
+    if not url.hostname:
+        return ""
+    host = "127.0.0.1" if url.hostname in ("localhost", "::1") else url.hostname
+    place = f"{host}:{url.port or (443 if url.scheme == 'wss' else 80)}"
+    tunnel = getattr(policy, "tunnel", None)
+    return place if tunnel is None else f"{place} from {tunnel.host}"
 
 
 def _read(path: Path, chain: tuple[Path, ...]) -> tuple[dict[str, Any], dict[Key, str]]:

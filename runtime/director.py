@@ -10,10 +10,14 @@ from runtime.asking import Asking
 from runtime.bus import EventLog
 from runtime.by_hand import ByHand
 from runtime.clock import Clock
+from runtime.collecting import Collecting
 from runtime.commitment import Commitment
 from runtime.errors import PolicyLostError, RuntimeFault
 from runtime.family import Plan
+from runtime.hearing import HEARD, UNHEARD
 from runtime.inference import Inference, Patience
+from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.loading import Loading
 from runtime.lease import Lease
 from runtime.messages import (
     Ack,
@@ -29,6 +33,7 @@ from runtime.messages import (
 from runtime.operations import Operations, Parts
 from runtime.orders import Orders
 from runtime.page import Page
+from runtime.preflight.station import PREFLIGHT_QUERIES, PreflightDesk
 from runtime.punctuality import Punctuality
 from runtime.run import Provenance, Run
 from runtime.runner import Runner
@@ -37,6 +42,7 @@ from runtime.session import LEASE_COMMANDS, Session
 from runtime.setup import SetUp
 from runtime.sight import Sight, SightSettings
 from runtime.snapshot import View, control_figures, facts, snapshot
+from runtime.targets import Targets
 from runtime.transitions import Happening, State
 from runtime.tuning import strategy_of
 from runtime.watch import Watch
@@ -58,10 +64,11 @@ class Director:
         self.lease = Lease(settings.lease.ttl_s)
         self._orders = orders = Orders(page)
         self.media_report = MediaReport(0.0, {}, {}, 0, "", 0)
-        self.spaces = plan.spaces()
-        asking = Asking(
-            plan.new_policy(clock), settings.task, plan.spaces(), _sight(plan, page, clock), runner, clock
-        )
+        self.unheard: dict[str, str] = {}  # as by Sink.unheard
+        kinematics = Loading(ChainForward(plan.robot), plan.kinematics, runner.aside)
+        self.spaces = plan.spaces(kinematics)
+        spaces, sight = plan.spaces(kinematics), _sight(plan, page, clock)
+        asking = Asking(plan.new_policy(clock), settings.task, spaces, sight, runner, clock)
         patience = Patience(settings.control.starvation_hold_s, settings.faults.patience_s)
         self.inference = Inference(
             asking, strategy_of(plan), page, self._orders, clock, patience, Commitment(plan.rate)
@@ -81,10 +88,17 @@ class Director:
             self._orders,
             provenance,
             lambda: control_figures(page, plan.rate),
+            kinematics.prepare,
         )
-        self.by_hand = ByHand(plan, page, orders, self.runs, self.spaces)
-        parts = Parts(page, clock, orders, self.inference, self.setup, self.runs, self.by_hand)
+        self.by_hand = ByHand(plan, page, orders, self.runs, Targets(plan, self.spaces, kinematics))
+        self.collecting = Collecting(
+            plan, page, clock, self.inference, self.setup, lambda: self.runs.open, self.say
+        )
+        parts = Parts(
+            page, clock, orders, self.inference, self.setup, self.runs, self.by_hand, self.collecting
+        )
         self.operations = Operations(plan, parts, self._state, self._watch.absent, self.say)
+        self.preflights = PreflightDesk(lambda: self.plan, plan, self._state, self.say, clock)
         self.session = Session(self.operations, self.lease, self.boot, clock.now)
         for ring in ("control_events", "media_events"):
             for _ in page.rings[ring].drain():
@@ -111,10 +125,14 @@ class Director:
                 self._hear(decode(payload))
         for noticed in self._watch.notice(self.session.state, self.runs.open):
             self._observe(noticed.happening, noticed.reason)
+        if missed := self.collecting.look(self.session.state):
+            self._observe(*missed)
         for event in self._punctuality.look(self.clock.now()):
             self.say(event)
+        self.runs.pump()
         self._advance_setup()
         self._advance_inference()
+        self.preflights.look()
 
     def snapshot(self) -> dict[str, Any]:
         """The station's state at this moment."""
@@ -128,7 +146,9 @@ class Director:
                 setup=self.setup,
                 runs=self.runs,
                 media=self.media_report,
+                unheard=self.unheard,
                 by_hand=self.by_hand,
+                collecting=self.collecting,
                 estop=self._watch.estop,
                 boot=self.boot,
                 now=self.clock.now(),
@@ -151,6 +171,7 @@ class Director:
             self._episode_opened(message)
         elif isinstance(message, EpisodeClosed):
             self.say(self.runs.closed(message))
+            self.collecting.closed(message)
         elif isinstance(message, MediaReport):
             self.media_report = message
 
@@ -167,11 +188,13 @@ class Director:
         settings = self.plan.deployment
         if event.kind == "motion_done":
             self.runs.arrived()
+        if event.kind in (UNHEARD, HEARD):
+            self.unheard = dict(event.data["unheard"])
         self.inference.tally.starved += event.kind == "starved"
         if event.kind == "starvation":
-            failure = self.inference.failure
+            trouble = self.inference.trouble
             stops = settings.faults.starvation == "stop"
-            why = f"{event.text}: {failure}" if failure else event.text
+            why = f"{event.text}: {trouble}" if trouble else event.text
             self._observe(Happening.RUN_FAILED if stops else Happening.HELD, why)
         elif event.kind in _HOLDS or (
             event.kind == "recording_failed" and settings.recording.on_failure == "hold"
@@ -201,9 +224,11 @@ class Director:
     def _observe(self, happening: Happening, reason: str) -> None:
         if happening is Happening.FAMILY_DIED:
             self.say(Event("family_died", reason, self.clock.now()))
+            self.unheard = {}  # a control that is started anew says so again
             self.runs.lost()
         if happening in (Happening.FAMILY_DIED, Happening.ESTOPPED):
             self._unlock()
+        self.collecting.noticed(happening, reason)
         before = self.session.state
         if self.session.observe(happening, reason):
             text = f"{before} -> {self.session.state}: {reason}"
@@ -243,6 +268,8 @@ class Director:
         """Do what the deployment says of a policy that fails: hold, try again for a while, or end the run."""
         faults, lost = self.plan.deployment.faults, isinstance(error, PolicyLostError)
         answer = faults.policy_lost if lost else faults.policy_error
+        if self.plan.collecting:  # a leader is not asked again by itself: who holds it arms anew
+            answer = "hold"
         if answer == "slow" and self.inference.retries(error):
             return
         self.say(Event("policy_lost" if lost else "policy_failed", str(error), self.clock.now()))
@@ -260,11 +287,16 @@ class Director:
             return self._events_since(command)
         if command.kind == "aim":
             return self._aim(command)
+        if command.kind in PREFLIGHT_QUERIES:
+            return self.preflights.handle(command, self.boot)
         before, sequence = self.session.state, self.session.sequence
         ack = self.session.handle(command)
+        if ack.status == "accepted" and command.kind in ("setup", "run"):
+            self.preflights.cancel(f"{command.kind} by {command.user or command.holder}")
         # A lease that is kept is a stream; only its changes and refusals are worth a line.
         kept = command.kind in LEASE_COMMANDS and ack.status == "accepted" and ack.sequence == sequence
         if not kept:
+            self.collecting.touch()
             who = command.user or command.holder
             what = f"{command.kind} by {who}: {ack.status}" + (f", {ack.reason}" if ack.reason else "")
             data = {"uuid": command.uuid, "from": str(before), "to": str(self.session.state)}
@@ -277,6 +309,10 @@ class Director:
             return Ack(command.uuid, "refused", f"events_since number = {number!r}: must be a whole number")
         return Ack(command.uuid, "done", boot=self.boot, data={"events": self.events.since(number)})
 
+    def waits(self, command: Command) -> bool:
+        """Whether its answer needs what is still being loaded, so that it is to be handled in a moment."""
+        return command.kind == "aim" and self.by_hand.waits(command.args)
+
     def _aim(self, command: Command) -> Ack:
         """Where the robot would go; nothing moves, and anybody may ask."""
         try:
@@ -286,6 +322,7 @@ class Director:
 
     def close(self) -> None:
         """Let go of the policy."""
+        self.preflights.close()
         self.inference.policy.close()
         self.inference.runner.close()
 

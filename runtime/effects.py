@@ -8,7 +8,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from runtime.messages import Mode
-from runtime.requests import GripperRequest, MoveRequest, RunRequest, SetUpRequest, TuneRequest
+from runtime.requests import (
+    DiscardRequest,
+    GripperRequest,
+    LabelRequest,
+    MoveRequest,
+    RunRequest,
+    SetUpRequest,
+    TuneRequest,
+)
 
 Told = Mapping[str, Any]  # for the data of an answer
 
@@ -25,13 +33,20 @@ class Situation:
     first_action: bool = False  # the last set-up knows the policy's first action
     opening: bool = False  # the open run has not begun: its recording is being opened
     approaching: bool = False  # the robot is on its way to where the chunk that is shown begins
+    collection: bool = False  # the deployment says how to collect
+    collecting: bool = False  # it is set up to collect
+    armed: bool = False  # a person has switched on that a collected episode may begin
+    unled: str = ""  # why the leader cannot be followed just now
 
 
 class Effects(ABC):
     """What the session makes happen; implemented by main, recorded by tests.
 
-    Each raises RuntimeFault to refuse, and has changed nothing then. What is returned goes into the answer.
+    Each raises RuntimeFault to refuse, and has changed nothing then. What is returned goes into the answer. `by` is who
+    gave the command that is being carried out.
     """
+
+    by: str = ""
 
     @property
     @abstractmethod
@@ -94,3 +109,17 @@ class Effects(ABC):
     @abstractmethod
     def approach(self) -> None:
         """Go to the policy's first action on a limited path: the one of the set-up, or the one that is shown."""
+
+    @abstractmethod
+    def arm(self) -> None:
+        """A collected episode may begin from now on."""
+
+    @abstractmethod
+    def disarm(self) -> None: ...
+
+    @abstractmethod
+    def label(self, asked: LabelRequest) -> Told: ...
+
+    @abstractmethod
+    def discard(self, asked: DiscardRequest) -> Told:
+        """Mark an episode as discarded; the open one ends, as by `end_run`, where none is named."""

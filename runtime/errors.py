@@ -21,8 +21,56 @@ class ContradictionError(SetupError, PolicyError):
     """The policy server says of itself what the deployment says otherwise; names both sides."""
 
 
+class ActionSpaceError(ContradictionError):
+    """The server's actions are of another space, form or width than the deployment says."""
+
+
+class WrongProtocolError(PolicyError):
+    """What answers at the policy's address does not speak the protocol that the deployment says."""
+
+
+class RefusedError(PolicyError):
+    """The policy server wants a key or a token, and was given none, or a wrong one."""
+
+
+class TlsError(PolicyError):
+    """There is no encrypted connection to the policy server: no TLS, or a certificate that is not trusted."""
+
+
+class ServerSaysError(PolicyError):
+    """The policy server answers, and says that it failed."""
+
+
+class ShapeError(PolicyError):
+    """The rows of an answer have another shape than this robot needs."""
+
+
+class NotFiniteError(PolicyError):
+    """The rows of an answer have numbers that are not finite."""
+
+
 class PolicyLostError(PolicyError):
     """The policy server is not there any more, or did not answer in time; it may come back."""
+
+
+class PolicyTimeout(PolicyLostError):
+    """The server did not answer within the deadline; the connection is dropped."""
+
+
+class PolicyGone(PolicyLostError):
+    """The server closed the connection; it may have restarted."""
+
+
+class PortClosedError(PolicyLostError):
+    """The policy server's machine answers, and nobody listens at the port."""
+
+
+class UnreachableError(PolicyLostError):
+    """The policy server's machine cannot be reached: its name is not known, or no way leads there."""
+
+
+class TunnelError(PolicyLostError):
+    """There is no SSH tunnel to the policy server at the moment; says why."""
 
 
 class TransportError(RuntimeFault):

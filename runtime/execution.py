@@ -14,6 +14,7 @@ from runtime.behaviour import Behaviour, Target
 from runtime.errors import ConfigurationError
 from runtime.messages import ChunkMerged, Mode, PostedChunk
 from runtime.plugins import variants
+from runtime.recording.base import ControlSource
 from runtime.strategies.base import Arrival, Merge, Merged, join
 from runtime.timeline import Dims, Timeline, difference
 from runtime.types import Float64
@@ -67,6 +68,7 @@ class Follow(Behaviour):
         self.number = number
         self.timeline = Timeline(len(settings.limits.lower))
         self._one_by_one = mode in _ONE_BY_ONE
+        self._source: ControlSource = "teleop" if mode == "collect" else "policy"
         self._strategy = chosen
         self._settings = settings
         self._switched = False  # the kind of the strategy, since the last chunk that was merged
@@ -78,7 +80,7 @@ class Follow(Behaviour):
         planned = self.timeline.at(step)
         if planned is None:
             return None
-        return Target(planned.action, "policy", "policy", planned.makers)
+        return Target(planned.action, self._source, "policy", planned.makers)
 
     # --- chunks --------------------------------------------------------------------------------------------
 

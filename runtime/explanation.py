@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, get_args, get_origin
@@ -11,6 +12,9 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 Key = tuple[str, ...]
+_SECRET = re.compile(
+    r"pass|secret|token|private", re.IGNORECASE
+)  # keys whose values nobody is to read in a message
 _NO_ORIGIN: Mapping[Key, str] = MappingProxyType({})
 
 
@@ -40,13 +44,16 @@ def _sentence(
         allowed = _allowed(key[:-1], tree, root)
         near = difflib.get_close_matches(key[-1], allowed, 1)
         hint = f" (did you mean {near[0]}?)" if near else ""
-        return f"{where}: {name} = {error['input']!r:.200}: unknown key{hint}; allowed here: {', '.join(allowed)}"
+        given = "" if _SECRET.search(key[-1]) else f" = {error['input']!r:.200}"
+        return f"{where}: {name}{given}: unknown key{hint}; allowed here: {', '.join(allowed)}"
     if kind == "missing":
         return f"{where}: {name} is missing and has no default"
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         where = origin.get((*key, "kind"), where)
         given = f"= {error['input']['kind']!r:.200}" if "kind" in error["input"] else "is missing"
         return f"{where}: {name}.kind {given}: must be one of {', '.join(_kinds(key, tree, root))}"
+    if kind == "secret":
+        return f"{where}: {name}: {error['msg']}"
     if kind in ("model_type", "model_attributes_type", "dict_type"):
         return f"{where}: {name} = {error['input']!r:.200}: must be a table"
     return f"{where}: {name} = {error['input']!r:.200}: {error['msg'].removeprefix('Value error, ')}"

@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import select
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 
@@ -15,7 +15,7 @@ import numpy as np
 
 import robots
 from robots import Robot
-from runtime import deployment, log
+from runtime import collection, deployment, log
 from runtime.cameras.attaching import attached, check
 from runtime.clock import Clock
 from runtime.config import Deployment
@@ -25,9 +25,12 @@ from runtime.errors import ConfigurationError, RuntimeFault, SetupError
 from runtime.formats import PoseRows
 from runtime.kinematics.base import Kinematics
 from runtime.kinematics.forward import ChainForward
+from runtime.leaders.base import Leader
+from runtime.leaders.relay import NodeLed, Relay
 from runtime.page import Page, PageLayout
 from runtime.plugins import variants
 from runtime.policies.base import Policy
+from runtime.policies.tunnel.policy import through_tunnel
 from runtime.pose_format import refuse_format
 from runtime.publication import Publication
 from runtime.safety import Limits
@@ -38,10 +41,14 @@ from runtime.transports.base import Capabilities, Source
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A deployment with everything that can be known of it before anything is connected."""
+    """A deployment with everything that can be known of it before anything is connected.
+
+    `collecting`: it is set up to collect, so that what is asked is the leader of its [collection].
+    """
 
     resolved: Resolved
     robot: Robot
+    collecting: bool = field(default=False, kw_only=True)
 
     @property
     def deployment(self) -> Deployment:
@@ -71,9 +78,12 @@ class Plan:
 
     def new_policy(self, clock: Clock) -> Policy:
         """The policy, not yet connected; raises RuntimeFault where it does not fit the robot, or cannot be made."""
+        if self.collecting:
+            return self._teleoperation(clock)
         settings = self.deployment.policy
         try:
             made: Policy = self.policy.build(settings, self.robot, clock, self.rate)
+            return through_tunnel(made, settings)
         except RuntimeFault:
             raise
         except Exception as error:  # of a policy's own code: it must not end main
@@ -81,6 +91,22 @@ class Plan:
             raise ConfigurationError(
                 f"policy {settings.kind!r} cannot be made: {type(error).__name__}: {error}"
             ) from error
+
+    def _teleoperation(self, clock: Clock) -> Policy:
+        """What is asked while a person drives the robot."""
+        wanted = self.deployment.collection
+        if wanted is None:
+            raise ConfigurationError("this deployment has no [collection]: it says nothing of who leads")
+        if wanted.source == "node":
+            return NodeLed()
+        return Relay(self.leader(clock), self.robot, wanted.mode, wanted.max_age_s, self.rate, clock)
+
+    def leader(self, clock: Clock) -> Leader:
+        """The leader of a deployment that relays one, not yet connected."""
+        wanted = self.deployment.collection
+        if wanted is None or wanted.leader is None:
+            raise ConfigurationError("this deployment has no [collection.leader]")
+        made: Leader = variants("runtime.leaders")[wanted.leader.kind].build(wanted.leader, self.robot, clock)
         return made
 
     @property
@@ -143,14 +169,14 @@ class Plan:
         return Dims(self.robot.binary_dims, tuple(endless.tolist()))
 
     def kinematics(self) -> Kinematics:
-        """Forward and inverse kinematics of the robot."""
+        """Forward and inverse kinematics of the robot, compiled or loaded when this returns."""
         settings = self.deployment.kinematics
         made: Kinematics = variants("runtime.kinematics")[settings.kind].build(settings, self.robot)
         return made
 
-    def spaces(self) -> Spaces:
-        """The robot's action spaces, with its kinematics."""
-        return Spaces(self.robot, self.kinematics(), self.rate)
+    def spaces(self, kinematics: Kinematics | None = None) -> Spaces:
+        """The robot's action spaces, with these kinematics of it or with its own."""
+        return Spaces(self.robot, kinematics or self.kinematics(), self.rate)
 
     def end_effectors(self) -> EndEffectors:
         """Where joints put the robot's end effectors: all that processes need that solve nothing."""
@@ -188,14 +214,32 @@ def plan(resolved: Resolved) -> Plan:
             f"recording.fps = {made.fps:g}: there would be more rows than ticks; "
             f"allowed: at most {made.rate:g}, the control rate"
         )
+    strange = [camera for camera in settings.recording.heights if camera not in made.cameras]
+    if strange:
+        raise ConfigurationError(
+            f"recording.heights: {', '.join(strange)} are no cameras of this station; "
+            f"allowed: {', '.join(made.cameras)}"
+        )
     check(settings.cameras, robot)
+    collection.check(settings.collection, made.cameras)
     _check_publication(made)
+    _check_collection(made)
     if settings.safety.report_only and made.capabilities.moves_robot:
         raise SetupError(
             f"safety.report_only = true with transport {settings.transport.kind!r}: it can move a robot; "
             "report-only is for transports that cannot (dataset)"
         )
     return made
+
+
+def _check_collection(made: Plan) -> None:
+    """A node that drives by itself must be one that can be told to, or says what it applied."""
+    wanted, capabilities = made.deployment.collection, made.capabilities
+    if wanted is not None and wanted.source == "node" and not capabilities.leads:
+        raise SetupError(
+            f'collection.source = "node" with transport {made.deployment.transport.kind!r}, whose robot reads no '
+            'leader of its own; allowed: source = "relay", or the transport zmq'
+        )
 
 
 def _check_publication(made: Plan) -> None:

@@ -183,7 +183,7 @@ def _publish(plan: Plan, episode: Path) -> dict[str, Any]:
     from runtime.datasets.published import publish
 
     dataset = plan.deployment.data / str(plan.deployment.publish.dataset)
-    published = publish(episode, dataset)
+    published = publish(episode, dataset, version=plan.deployment.publish.version)
     return {
         "dataset_path": str(published.dataset),
         "episode_index": published.episode_index,

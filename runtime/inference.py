@@ -119,6 +119,13 @@ class Inference:
         return self._wanted or self._flight is not None or bool(self._unmerged)
 
     @property
+    def trouble(self) -> str:
+        """Why there may be no chunk: what the policy last failed of, or for how long it owes an answer; else ""."""
+        if self.failure or self._flight is None:
+            return self.failure
+        return f"the policy was asked {self._clock.now() - self._asked_at:.1f} s ago and has not answered yet"
+
+    @property
     def lost_for(self) -> float:
         """How long the policy has not answered [s], 0 where it does."""
         return self._back_off.lasts(self._clock.now())
@@ -167,6 +174,8 @@ class Inference:
             self.asking.forget()
             self.tally.forget()
             self.shown = self._planned = None
+        else:
+            self.asking.resume()
         self._commitment.clear()
         self._forget_failures()
         self._stale_since = None
@@ -238,6 +247,7 @@ class Inference:
         """Collect an answer, or ask; returns the answer, for the record. Raises PolicyError."""
         if not self._run:
             return None
+        self.asking.glance()
         if self._flight is not None:
             if not self.runner.ready(self._flight):
                 return None

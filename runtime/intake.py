@@ -18,6 +18,7 @@ from runtime.types import Observation
 log = logging.getLogger(__name__)
 _RATE_WINDOW = 40  # arrivals per stream
 _SILENT_S = 2.0  # after which a stream has no rate any more
+_REPEAT_S = 5.0  # between two events of one fault: thousands of lost frames are not thousands of lines
 
 
 class Intake:
@@ -42,7 +43,8 @@ class Intake:
         self._numbers: Counter[str] = Counter({c: self._newest(c) for c in page.layout.cameras})
         self._captured: dict[str, float] = {}
         self._arrivals: dict[str, deque[float]] = {}
-        self._faults: dict[str, int] = {}
+        self._faults: dict[str, int] = {}  # as they were last said
+        self._said_at: dict[str, float] = {}
         self._too_large: Counter[str] = Counter()
         self._failure = ""
         self._drives = Drives()
@@ -74,16 +76,19 @@ class Intake:
         self._source.end_run()
 
     def faults(self) -> dict[str, int]:
-        """How often what went wrong; every count that has grown since the last call is an event, and so is news."""
+        """How often what went wrong; a count that has grown is an event, each fault's 5 s apart, and so is news."""
         for event in self._source.news():
             self._say(event)
         now, faults = self._clock.now(), {**self._source.faults(), **self._too_large}
         for name, count in faults.items():
-            if count > self._faults.get(name, 0):
-                text = f"source: {name.replace('_', ' ')} ({count} so far)"
+            known = self._faults[name] = min(count, self._faults.get(name, 0))  # a source begins anew at 0
+            if count > known and now - self._said_at.get(name, float("-inf")) >= _REPEAT_S:
+                self._faults[name], self._said_at[name] = count, now
+                why = self._source.why(name)
+                named = name.replace("_", " ").replace(".", ": ")
+                text = f"source: {named} ({count} so far)" + (f": {why}" if why else "")
                 self._say(Event(f"source_{name}", text, now, data={"count": count}))
-        self._faults = faults
-        return dict(faults)
+        return faults
 
     def rates(self) -> dict[str, float]:
         """Arrivals per second [Hz] by stream, over the newest 40; 0 after 2 s of silence."""

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 
 from runtime.actuator import Actuator, Sent, TickSettings
-from runtime.behaviour import Behaviour, Hold, Move, Silent, Target
+from runtime.behaviour import Behaviour, Hold, Move, Silent, Target, Yielded
 from runtime.execution import Follow
 from runtime.locks import Locks
 from runtime.motion import Trajectory
@@ -65,9 +65,16 @@ class Lane:
         self.actuator.engaged = False
         self.behaviour = Silent()
 
+    def give_way(self) -> None:
+        """Leave the robot to its node."""
+        self.silence()
+        self.behaviour = Yielded()
+
     def hold(self) -> None:
-        """Come to a stand and stay there; who is not engaged stays silent."""
-        if self.actuator.engaged and not isinstance(self.behaviour, Hold):
+        """Come to a stand and stay there; who is not engaged stays silent, the node stops what it drives."""
+        if isinstance(self.behaviour, Yielded):
+            self.silence()
+        elif self.actuator.engaged and not isinstance(self.behaviour, Hold):
             self.behaviour = self._standing or self._holding()
 
     def hold_here(self) -> None:

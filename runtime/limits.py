@@ -43,6 +43,10 @@ class Limits:
         standing[list(self.speeds)] = 0.0
         return standing
 
+    def outside(self, position: Float64) -> Float64:
+        """How far `position` [..., D] is beyond its bounds, 0 within them."""
+        return np.maximum(np.maximum(self.lower - position, position - self.upper), 0.0)
+
     @property
     def reach(self) -> Float64:
         """What one radian is worth in each dimension [D]: 1 for angles.

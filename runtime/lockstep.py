@@ -19,6 +19,7 @@ from runtime.latch import Latch
 from runtime.media import Media, make_recorder
 from runtime.messages import Ack, Command
 from runtime.page import Page
+from runtime.plugins import variants
 from runtime.runner import LockstepRunner
 from runtime.transitions import State
 
@@ -79,7 +80,7 @@ class Lockstep:
         self._handle("lease_claim")
         ack = self._handle(kind, arguments)
         if ack.status == "refused":
-            raise SetupError(f"{kind}: {ack.reason}")
+            raise SetupError(f"{kind}: {ack.reason.removeprefix(f'{kind}: ')}")
         return ack
 
     def _handle(self, kind: str, arguments: Mapping[str, Any] | None = None) -> Ack:
@@ -115,6 +116,22 @@ class Lockstep:
         self.main.close()
         self._source.close()
         self._sink.close()
+
+
+def check(plan: Plan) -> None:
+    """Raise SetupError where what is at the other end of the transport goes on by itself.
+
+    Its messages are stamped in a time that the virtual clock does not have: a run would only hold, for the age of
+    its joints.
+    """
+    kind = plan.deployment.transport.kind
+    if getattr(plan.transport, "REAL_TIME", False):
+        known = variants("runtime.transports").items()
+        allowed = ", ".join(sorted(name for name, module in known if not getattr(module, "REAL_TIME", False)))
+        raise SetupError(
+            f"transport.kind = {kind!r} with --lockstep: what is at its other end goes on in real time, and lockstep "
+            f"has a clock of its own; allowed: {allowed}, or leave --lockstep out"
+        )
 
 
 def run(plan: Plan, longest: float = 3600.0) -> LockstepRun:

@@ -8,17 +8,19 @@ from typing import Any
 import numpy as np
 import zmq
 
+from runtime import heap
 from runtime.bus import STREAM_HIGH_WATER, CommandServer, Endpoints, Publisher
 from runtime.clock import MonotonicClock
 from runtime.command_journal import CommandJournal
 from runtime.director import Director
 from runtime.family import join
 from runtime.inference import ShownChunk
-from runtime.messages import Event
+from runtime.messages import Ack, Command, Event
 from runtime.runner import ThreadRunner
 from runtime.transitions import STOPPING
 
-_NOT_JOURNALLED = ("status", "events_since", "aim", "lease_renew")
+_NOT_JOURNALLED = ("status", "events_since", "aim", "lease_renew", "preflight_report", "policy_server")
+_MOST_WAITING = 100  # commands
 
 
 class Service:
@@ -37,12 +39,18 @@ class Service:
         self._told = 0
         self._shown: ShownChunk | None = None
         self._unjournalled = ""
+        self._waiting: list[tuple[list[bytes], Command]] = []  # for what is still being loaded
 
     def serve(self, timeout: float) -> None:
         """Wait up to `timeout` seconds for a command; answer all there are; publish what is due."""
         self._server.socket.poll(int(timeout * 1000))
+        waiting, self._waiting = self._waiting, []
         while (received := self._server.receive()) is not None:
-            address, command = received
+            waiting.append(received)
+        for address, command in waiting:
+            if self._main.waits(command):
+                self._keep(address, command)
+                continue
             ack = self._main.handle(command)
             # Who stops a robot waits for no disk; to stop it twice does no harm.
             stops = command.kind in STOPPING
@@ -53,6 +61,14 @@ class Service:
             if not stops:
                 self._server.answer(address, ack)
         self._publish()
+
+    def _keep(self, address: list[bytes], command: Command) -> None:
+        """Answer it when what it needs is loaded; nobody waits for that here."""
+        if len(self._waiting) < _MOST_WAITING:
+            self._waiting.append((address, command))
+        else:
+            reason = f"{command.kind}: {_MOST_WAITING} wait already for what is still being loaded: ask again"
+            self._server.answer(address, Ack(command.uuid, "refused", reason))
 
     def _tell_once(self, failure: str) -> None:
         """A disk that is full stays so for a while: one event when it begins."""
@@ -138,6 +154,7 @@ class Service:
 
 def main() -> None:
     """The process main: decide and serve until the supervisor is gone."""
+    heap.keep()
     member = join("main")
     deciding = Director(member.plan, member.page, MonotonicClock(), ThreadRunner())
     service = Service(deciding, zmq.Context.instance())

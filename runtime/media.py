@@ -8,6 +8,7 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any
 
+from runtime import heap
 from runtime.clock import Clock, MonotonicClock
 from runtime.closing import Close, at_once, in_background
 from runtime.errors import RecordingError, RuntimeFault
@@ -86,6 +87,9 @@ class Media:
         self._collect()
         self._drain("minutes")
         self._drain("ticks")
+        for event in self._recorder.news():
+            log.warning("%s", event.text)
+            self._tell(event)
         now = self._clock.now()
         if now >= self._next_report:
             self._next_report = now + _REPORT_PERIOD
@@ -217,14 +221,15 @@ def make_recorder(plan: Plan, now: Callable[[], float], patient: bool = False) -
         "dim": robot.dim,
         "eef_dim": robot.eef_dim,
     }
-    root = plan.deployment.episodes_dir
-    journal = EpisodeJournal(root, plan.deployment.recording, patient=patient)
-    grid = Grid(described, plan.layout.cameras, plan.rate, plan.fps, plan.end_effectors().eef_of)
+    root, recording = plan.deployment.episodes_dir, plan.deployment.recording
+    journal = EpisodeJournal(root, recording, patient=patient)
+    grid = Grid(described, plan.layout.cameras, plan.rate, plan.fps, plan.end_effectors().eef_of, recording)
     return Recorder(journal, root, grid, now)
 
 
 def main() -> None:
     """Run media until the supervisor is gone."""
+    heap.keep()
     member = join("media")
     plan, page = member.plan, member.page
     clock = MonotonicClock()

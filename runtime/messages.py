@@ -20,8 +20,13 @@ from runtime.types import Float32, Float64, UInt8
 
 # --- main -> control ---------------------------------------------------------------------------------------
 
-OrderKind = Literal["silent", "hold", "follow", "motion"]
-Mode = Literal["continuous", "step", "preview", "sim", "manual"]
+OrderKind = Literal[
+    "silent", "hold", "follow", "motion", "yield"
+]  # "yield": the node drives, by its own leader
+PolicyMode = Literal[
+    "continuous", "step", "preview", "sim", "manual"
+]  # of a station that was set up with a policy
+Mode = Literal[PolicyMode, "collect"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,14 +10,23 @@ import numpy as np
 from runtime import deployment
 from runtime.by_hand import ByHand
 from runtime.clock import Clock
+from runtime.collecting import Collecting
 from runtime.effects import Effects, Situation, Told
 from runtime.errors import RuntimeFault
 from runtime.family import Plan
 from runtime.inference import Inference
-from runtime.messages import Event
+from runtime.messages import Event, Mode
 from runtime.orders import Orders
 from runtime.page import Page
-from runtime.requests import GripperRequest, MoveRequest, RunRequest, SetUpRequest, TuneRequest
+from runtime.requests import (
+    DiscardRequest,
+    GripperRequest,
+    LabelRequest,
+    MoveRequest,
+    RunRequest,
+    SetUpRequest,
+    TuneRequest,
+)
 from runtime.runs import Runs
 from runtime.setup import SetUp
 from runtime.transitions import State
@@ -35,6 +44,7 @@ class Parts:
     setup: SetUp
     runs: Runs
     by_hand: ByHand
+    collecting: Collecting
 
 
 class Operations(Effects):
@@ -52,7 +62,7 @@ class Operations(Effects):
         self.plan = plan  # as it was last set up or tuned
         self.page, self.clock = parts.page, parts.clock
         self.inference, self.setup = parts.inference, parts.setup
-        self.runs, self.by_hand = parts.runs, parts.by_hand
+        self.runs, self.by_hand, self.collecting = parts.runs, parts.by_hand, parts.collecting
         self._orders = parts.orders
         self._state, self._absent, self._say = state, absent, say
         self._tuned = False  # since the last set-up
@@ -62,7 +72,8 @@ class Operations(Effects):
     def begin_setup(self, asked: SetUpRequest) -> Told:
         plan, reset = self._changed(asked), self.setup.bench.of(asked.bench)
         policy = self.inference.policy
-        if plan.deployment.policy != self.plan.deployment.policy:
+        other = plan.deployment.policy != self.plan.deployment.policy
+        if plan.collecting != self.plan.collecting or (other and not plan.collecting):
             policy = plan.new_policy(self.clock)
         self._orders.tune(plan.deployment.strategy.model_dump())
         self.by_hand.unlock()
@@ -74,17 +85,40 @@ class Operations(Effects):
         self.inference.exchange(policy, plan.deployment.task)
         self.inference.tune(strategy_of(plan), plan.deployment.task)
         self._tuned = False
+        self.collecting.begin_setup(plan.collecting)
         self.setup.begin(reset)
         return {"bench": reset["id"]} if reset else {}
 
     def _changed(self, asked: SetUpRequest) -> Plan:
         """The plan of a set-up; raises RuntimeFault where it is none, or an open recording would not be about it."""
-        resolved = deployment.changed(self._own.resolved, asked.changes, "setup")
+        collects = self._collects(asked)
+        changes = asked.changes | ({"strategy": {"kind": "naive"}} if collects else {})
+        resolved = deployment.changed(self._own.resolved, changes, "setup")
         if self.runs.alone and resolved.digest != self.plan.resolved.digest:
             raise RuntimeFault(
                 "a recording is open, whose manifest says another policy or task: record stop first"
             )
-        return replace(self._own, resolved=resolved)
+        return replace(self._own, resolved=resolved, collecting=collects)
+
+    def _collects(self, asked: SetUpRequest) -> bool:
+        """Whether a person is to drive the robot after this set-up; RuntimeFault where that does not fit."""
+        settings = self._own.deployment
+        absent = settings.policy.kind == "none" and asked.policy is None
+        collects = absent if asked.collect is None else asked.collect
+        if collects and settings.collection is None:
+            raise RuntimeFault(
+                "setup: collect = true, but the deployment has no [collection]; allowed: false"
+            )
+        if not collects and absent:
+            raise RuntimeFault(
+                "setup: collect = false, but the deployment has no [policy]; allowed: collect = true"
+            )
+        given = [name for name in ("policy", "strategy", "checkpoint") if getattr(asked, name) is not None]
+        if collects and given:
+            raise RuntimeFault(
+                f"setup: {', '.join(given)} with collect = true: a person drives; leave it out"
+            )
+        return collects
 
     def cancel_setup(self, reason: str) -> None:
         self.setup.cancel()
@@ -95,15 +129,43 @@ class Operations(Effects):
         self._require_family()
         if asked.trial is not None:
             self._require_comparable(asked)
-        if (asked.mode or self.plan.deployment.run.mode) == "manual":
+        mode = self._mode(asked)
+        asked = asked.model_copy(update={"mode": mode})
+        if mode == "manual":
             self.by_hand.require_robot("run in the mode manual")
+            self.by_hand.prepare()
         # A control that was restarted during the set-up merges as the deployment says until it is told.
         self._orders.tune(self.plan.deployment.strategy.model_dump())
-        return {"episode": self.runs.begin(self.setup.info, asked)}
+        collecting = self.collecting
+        if mode != "collect":
+            return {"episode": self.runs.begin(self.setup.info, asked)}
+        self.by_hand.require_robot("run in the mode collect")
+        episode = self.runs.begin(self.setup.info, asked, collecting.manifest(asked))
+        collecting.begun(episode, asked)
+        return {"episode": episode}
+
+    def _mode(self, asked: RunRequest) -> Mode:
+        """The mode of a run; RuntimeFault where the station is not set up for it."""
+        collects, settings = self.plan.collecting, self.plan.deployment
+        mode = asked.mode or ("collect" if collects else settings.run.mode)
+        if collects and mode not in ("collect", "manual"):
+            raise RuntimeFault(
+                f"run: mode = {mode!r}, but the station is set up to collect; allowed: collect, manual, or set up with "
+                "a policy (setup with collect = false)"
+            )
+        if mode == "collect" and not collects:
+            why = "has no [collection]" if settings.collection is None else "is set up with a policy"
+            raise RuntimeFault(
+                f"run: mode = 'collect', but the station {why}: set up with collect = true first"
+            )
+        given = [name for name in ("task", "session") if getattr(asked, name) is not None]
+        if given and mode != "collect":
+            raise RuntimeFault(f"run: {', '.join(given)} with mode = {mode!r}; allowed with collect alone")
+        return mode
 
     def _require_comparable(self, asked: RunRequest) -> None:
         """What a trial measures is what was set up: nothing by hand, nothing tuned, the policy on the robot."""
-        mode = asked.mode or self.plan.deployment.run.mode
+        mode = self._mode(asked)
         if mode != "continuous":
             raise RuntimeFault(f"a trial runs in the mode continuous, and {mode} was asked for")
         if self._tuned:
@@ -125,9 +187,15 @@ class Operations(Effects):
             first_action=self.setup.first_action is not None and self.plan.capabilities.moves_robot,
             opening=run is not None and run.begun is None,
             approaching=run is not None and run.approaching,
+            collection=self.collecting.declared,
+            collecting=self.plan.collecting,
+            armed=self.collecting.armed,
+            unled=self.collecting.unled,
         )
 
     def tune(self, asked: TuneRequest) -> Told:
+        if self.plan.collecting and asked.strategy is not None:
+            raise RuntimeFault("tune: strategy while the station is set up to collect; allowed: task")
         plan = tuned(self.plan, asked, self.setup.info)
         settings = plan.deployment
         strategy = settings.strategy.model_dump()
@@ -171,6 +239,24 @@ class Operations(Effects):
         elif first is not None:
             self.setup.first_action = self.by_hand.checked("approach", first)
             self.setup.begin_approach()
+
+    # --- demonstrations -----------------------------------------------------------------------------
+
+    def arm(self) -> None:
+        self._require_family()
+        self.collecting.arm()
+
+    def disarm(self) -> None:
+        self.collecting.disarm(f"by {self.by}")
+
+    def label(self, asked: LabelRequest) -> Told:
+        return self.collecting.label(asked, self.by)
+
+    def discard(self, asked: DiscardRequest) -> Told:
+        told = self.collecting.discard(asked, self.by)
+        if asked.episode is None and self.collecting.run is not None:
+            self.end_run("finished", "discarded by the operator")
+        return told
 
     # --- what goes on -------------------------------------------------------------------------------
 

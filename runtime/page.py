@@ -293,6 +293,14 @@ class PictureSlots:
         view[:] = picture.reshape(-1)
         self._done[slot][0] = number
 
+    def shape(self, number: int) -> tuple[int, int] | None:
+        """Height and width of picture `number`, or None where it has been overwritten."""
+        slot = number % PICTURE_SLOTS
+        if self._done[slot][0] != number:
+            return None
+        height, width, _ = self._SHAPE.unpack_from(self._shared, self._at[slot] + 16)
+        return (height, width) if self._begun[slot][0] == number else None
+
     def read(self, number: int) -> UInt8 | None:
         """A copy of picture `number`, or None where it has been overwritten."""
         slot = number % PICTURE_SLOTS

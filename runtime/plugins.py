@@ -5,7 +5,12 @@ from __future__ import annotations
 import functools
 import importlib
 import pkgutil
+from functools import reduce
+from operator import or_
 from types import ModuleType
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from runtime.errors import ConfigurationError
 
@@ -32,3 +37,10 @@ def variants(package: str) -> dict[str, ModuleType]:
             )
         found[kind] = module
     return found
+
+
+def union(package: str) -> Any:
+    """The union of the variants' Configs, told apart by `kind`; a new file in the package joins by itself."""
+    configs = [module.Config for module in variants(package).values()]
+    made = reduce(or_, configs)
+    return Annotated[made, Field(discriminator="kind")] if len(configs) > 1 else made

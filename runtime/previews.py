@@ -13,7 +13,10 @@ from runtime.types import Observation, UInt8
 
 
 class Previews:
-    """Shows each picture small, at most `bus.preview_rate` times a second and camera."""
+    """Shows each new picture small, at most `bus.preview_rate` times a second and camera.
+
+    One that only stands in further observations is not shown again: who looks sees it grow old.
+    """
 
     def __init__(self, plan: Plan) -> None:
         settings = plan.deployment.bus
@@ -23,13 +26,16 @@ class Previews:
         self._period = 1.0 / settings.preview_rate if settings.preview_rate else float("inf")
         self._height = settings.preview_height
         self._due: dict[str, float] = {}
+        self._shown: dict[str, float] = {}  # when each camera's last one was captured
         cv2.setNumThreads(1)  # the other cores belong to the rest of the family
         Endpoints(plan.deployment.station_dir).write("media", {"cameras": self._publisher.endpoint})
 
     def __call__(self, observation: Observation) -> None:
         for camera, picture in observation.pictures.items():
-            if observation.arrived < self._due.get(camera, 0.0):
+            captured = observation.captured.get(camera, observation.arrived)
+            if observation.arrived < self._due.get(camera, 0.0) or captured == self._shown.get(camera):
                 continue
+            self._shown[camera] = captured
             # A little early counts, so that 15 of 30 pictures a second are shown and not 10.
             self._due[camera] = observation.arrived + 0.9 * self._period
             self._publisher.publish(

@@ -7,19 +7,22 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from runtime.errors import RecordingError
-from runtime.messages import ChunkMerged, PolicyAnswer, TickDone
-from runtime.recording.base import ExecutedTick, Journal, Outcome, RawChunk, Row, Status
-from runtime.types import Float32, Observation, UInt8
+from runtime.messages import ChunkMerged, Event, PolicyAnswer, TickDone, event_row
+from runtime.recorded_chunks import RecordedChunks
+from runtime.recording.base import VIDEO_LOST, ExecutedTick, Journal, Outcome, Row, Status
+from runtime.recording.schema import Schema
+from runtime.recording.settings import RecordingSettings
+from runtime.shown import Shown
+from runtime.types import Float32, Observation
 
 _OBSERVATIONS_KEPT = 24  # ticks reach us within a few ms; at 30 Hz this is most of a second
-_CHUNKS_KEPT = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +34,7 @@ class Grid:
     control_rate: float
     fps: float
     eef_of: Callable[[Float32], Float32]  # joints [D] -> poses [8 * arms]
+    recording: RecordingSettings = field(default_factory=RecordingSettings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,41 +79,41 @@ class Recorder:
         if not self._seen:
             raise RecordingError("no observation has arrived: nothing is known of the cameras yet")
         newest = self._seen[-1]
-        missing = [camera for camera in self._grid.cameras if camera not in newest.pictures]
+        self._schema = Schema.of(manifest)
+        self._cameras = self._schema.kept(self._grid.cameras)
+        missing = [camera for camera in self._cameras if camera not in newest.pictures]
         if missing:
             raise RecordingError(f"no picture has arrived from {', '.join(missing)}")
+        self._schema.check(newest)
+        self._shown = Shown(self._cameras, self._grid.recording)
         identity = str(manifest.get("uuid") or uuid.uuid4())
         self._journal.begin(self._manifest(dict(manifest), identity, newest))
         self._uuid, self._run, self.rows, self.repeated = identity, run, 0, 0
         self._first_step: int | None = None
         self._before: tuple[TickDone, Observation | None] | None = None
         self._complete = False
-        self._shown: dict[str, float] = {}
-        self._answers: dict[int, PolicyAnswer] = {}
-        self._merged: dict[int, ChunkMerged] = {}
+        self._news: list[Event] = []
+        self._applied: Float32 | None = None  # the newest action that the robot reported
+        self._lost: list[str] = []  # what was said of cameras whose video has ended
+        self._chunks = RecordedChunks(self._journal)
         return identity, self._root / identity
 
     def _manifest(self, manifest: dict[str, Any], identity: str, newest: Observation) -> dict[str, Any]:
         grid = self._grid
-        has_eef = newest.eef is not None
-        sizes = {
-            camera: {"width": newest.pictures[camera].shape[1], "height": newest.pictures[camera].shape[0]}
-            for camera in grid.cameras
-        }
+        has_eef, posed = newest.eef is not None, bool(grid.robot["eef_dim"])
+        skew = self._schema.max_skew_s or grid.recording.max_skew_s
         return manifest | {
             "format": 1,
             "uuid": identity,
             "robot": dict(grid.robot),
             "fps": grid.fps,
             "control_rate": grid.control_rate,
-            "cameras": sizes,
-            "streams": {
-                "qvel": newest.qvel is not None,
-                "effort": newest.effort is not None,
-                "eef": bool(grid.robot["eef_dim"]),
-                "eef_action": bool(grid.robot["eef_dim"]),
-            },
-            "capture_streams": ["joints", *(["eef"] if has_eef else []), *grid.cameras],
+            "cameras": self._shown.sizes(newest),
+            "streams": self._schema.streams(
+                qvel=newest.qvel is not None, effort=newest.effort is not None, posed=posed
+            ),
+            "capture_streams": ["joints", *(["eef"] if has_eef else []), *self._cameras],
+            "max_skew_s": skew,
             "started_wall": time.time(),
             "started_monotonic": self._now(),
         }
@@ -120,25 +124,40 @@ class Recorder:
         What is returned closes its files, on any thread, and may wait for the disk; until it is done no other
         episode may begin. What could not be saved is named in `Closed.error`.
         """
-        error, rows = "", self.rows
+        error, rows, lost = "", self.rows, self._lost
         identity, path = self._uuid, self._root / self._uuid
         try:
-            for answer in list(self._answers.values()):
-                self._write_chunk(answer, None)
+            self._chunks.rest()
+            for event in self._shown.rest(self._now()):
+                self._journal.mark(event_row(event))
         except RecordingError as fault:
             error = str(fault)
         self._uuid = ""
         outcome = Outcome("failed" if error else status, error or reason, time.time(), details)
 
         def close() -> Closed:
-            failure = error
+            failure, told = error, list(lost)
             try:
                 self._journal.end(outcome)
             except RecordingError as fault:
                 failure = str(fault)
-            return Closed(identity, path, "failed" if failure else status, failure or reason, rows, failure)
+            told += [loss.text for loss in self._journal.losses()]
+            why = "; ".join(filter(None, (failure or reason, *told)))
+            return Closed(identity, path, "failed" if failure else status, why, rows, failure)
 
         return close
+
+    def news(self) -> list[Event]:
+        """What has happened to the open episode since the last call; it is in the episode already."""
+        if not self._uuid:
+            return []
+        for loss in self._journal.losses():
+            self._lost.append(loss.text)
+            self._news.append(
+                Event(VIDEO_LOST, loss.text, self._now(), data={"camera": loss.camera, "row": loss.row})
+            )
+        told, self._news = self._news, []
+        return told
 
     # --- what comes in -------------------------------------------------------------------------------------
 
@@ -154,52 +173,22 @@ class Recorder:
     def answered(self, answer: PolicyAnswer) -> None:
         """A chunk as the policy gave it."""
         if self._uuid and answer.run == self._run:
-            merged = self._merged.pop(answer.chunk_id, None)
-            if merged is None:
-                self._answers[answer.chunk_id] = answer
-            else:
-                self._write_chunk(answer, merged)
+            self._chunks.answered(answer)
 
     def merged(self, merged: ChunkMerged) -> None:
         """Where control put a chunk; may come before the chunk itself."""
         if self._uuid and merged.run == self._run:
-            answer = self._answers.pop(merged.chunk_id, None)
-            if answer is not None:
-                self._write_chunk(answer, merged)
-            elif len(self._merged) < _CHUNKS_KEPT:
-                self._merged[merged.chunk_id] = merged
-
-    def _write_chunk(self, answer: PolicyAnswer, merged: ChunkMerged | None) -> None:
-        targets = np.full(len(answer.actions), -1, np.int64)
-        if merged is not None:
-            # A row of the policy counts for the first step that was made from it.
-            for step, row in zip(merged.targets[::-1], answer.source_rows[::-1], strict=True):
-                targets[row] = step
-        metres, radians, flags = _met(answer)
-        self._journal.append(
-            RawChunk(
-                chunk_id=answer.chunk_id,
-                observation_step=answer.observation_step,
-                arrival_step=merged.arrival_step if merged else -1,
-                actions=answer.actions,
-                target_steps=targets,
-                space="eef" if answer.space == "eef" else "joint",
-                delay=merged.delay if merged else -1,
-                mistimed=merged.mistimed if merged else 0,
-                inference_ms=answer.inference_ms,
-                strategy=merged.strategy if merged else "",
-                overlap=merged.overlap if merged else 0,
-                ik_position_error=metres,
-                ik_rotation_error=radians,
-                ik_flags=flags,
-                eef=answer.eef,
-            )
-        )
+            self._chunks.merged(merged)
 
     def tick(self, tick: TickDone) -> None:
         """One control tick; writes the full-rate stream, and every row of the grid that is now known."""
         if not self._uuid or self._complete or (self._run and tick.run != self._run):
             return
+        if self._schema.reported:
+            applied = self._as_applied(tick)
+            if applied is None:
+                return
+            tick = applied
         if self._first_step is None:
             self._first_step = tick.step
         self._journal.append(_executed(tick))
@@ -209,6 +198,19 @@ class Recorder:
             self._write_row(*chosen)
         self._before = here
         self._complete = here[1] is not None and here[1].last
+
+    def _as_applied(self, tick: TickDone) -> TickDone | None:
+        """A tick of a robot that drives itself, as if we had sent what it reports; None before it reports anything.
+
+        Where it reports nothing for this frame, the action is the one before, and nobody's.
+        """
+        seen = self._observation(tick.sequence)
+        reported = None if seen is None else seen.reported_action
+        if reported is not None:
+            self._applied = reported
+        if self._applied is None:
+            return None
+        return replace(tick, executed=self._applied, source="none" if reported is None else "teleop")
 
     def _target(self, row: int) -> int:
         """The step at or before which row `row` was sampled."""
@@ -227,6 +229,11 @@ class Recorder:
         measured = None if seen is None else seen.eef
         reported = None if seen is None else _reported_eef(seen, action)
         with_eef = bool(self._grid.robot["eef_dim"])
+        pictures = self._shown.pictures(seen)
+        self.repeated += sum(picture is None for picture in pictures.values())
+        for event in self._shown.look(tick.planned, self.rows):
+            self._news.append(event)
+            self._journal.mark(event_row(event))
         row = Row(
             index=self.rows,
             step=tick.step,
@@ -235,7 +242,7 @@ class Recorder:
             qpos=tick.qpos,
             action=action,
             captured={} if seen is None else seen.captured,
-            pictures=self._new_pictures(seen),
+            pictures=pictures,
             control_source=tick.source,  # type: ignore[arg-type]  # control writes nothing else
             qvel=None if seen is None else seen.qvel,
             effort=None if seen is None else seen.effort,
@@ -243,6 +250,8 @@ class Recorder:
             eef_action=self._eef(reported, action) if with_eef else None,
             eef_measured=measured is not None,
             eef_action_reported=reported is not None,
+            intervention=tick.source == "teleop",
+            stale=self._shown.stale,
         )
         self._journal.append(row)
         self.rows += 1
@@ -251,46 +260,12 @@ class Recorder:
         """Poses as the robot told them, else by forward kinematics."""
         return self._grid.eef_of(joints) if told is None else told
 
-    def _new_pictures(self, seen: Observation | None) -> dict[str, UInt8 | None]:
-        """The observation's pictures; None for a camera whose picture an earlier row has already."""
-        pictures: dict[str, UInt8 | None] = {}
-        for camera in self._grid.cameras:
-            picture = None if seen is None else seen.pictures.get(camera)
-            captured = math.nan if seen is None else seen.captured.get(camera, math.nan)
-            if captured == self._shown.get(camera):
-                picture = None
-            if picture is not None:
-                self._shown[camera] = captured
-            self.repeated += picture is None
-            pictures[camera] = picture
-        return pictures
-
 
 def _reported_eef(seen: Observation, action: Float32) -> Float32 | None:
     """The poses that the robot reports for this very action; None where it reports another one, or none."""
     if seen.reported_action is None or not np.array_equal(seen.reported_action, action):
         return None
     return seen.reported_action_eef
-
-
-def _met(answer: PolicyAnswer) -> tuple[Float32 | None, Float32 | None, UInt8 | None]:
-    """How each row [H, arms] of the policy was met: the worst error [m, rad] and all flags of the steps made of it.
-
-    NaN and no flag for a row that no step was made of, None for a chunk of joints.
-    """
-    errors, flags = (answer.position_error, answer.rotation_error), answer.ik_flags
-    if errors[0] is None or errors[1] is None or flags is None:
-        return None, None, None
-    shape = (len(answer.actions), flags.shape[1])
-    made: list[Float32] = []
-    for error in errors:
-        assert error is not None
-        worst = np.full(shape, np.nan, np.float32)
-        np.fmax.at(worst, answer.source_rows, error.astype(np.float32))
-        made.append(worst)
-    gathered = np.zeros(shape, np.uint8)
-    np.bitwise_or.at(gathered, answer.source_rows, flags)
-    return made[0], made[1], gathered
 
 
 def _executed(tick: TickDone) -> ExecutedTick:

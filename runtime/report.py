@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -113,9 +114,9 @@ class Report:
         """The tick that everything is about from here on; planned for `planned`, begun at `woke`."""
         self._step, self._planned, self._woke = step, planned, woke
 
-    def say(self, kind: str, text: str) -> None:
+    def say(self, kind: str, text: str, data: Mapping[str, object] = MappingProxyType({})) -> None:
         """An event, told at the end of the tick, with the order that control was carrying out."""
-        self._outbox.append(Event(kind, text, self._planned, self._step, {"order": self.order}))
+        self._outbox.append(Event(kind, text, self._planned, self._step, {"order": self.order, **data}))
 
     def merged(self, merged: ChunkMerged) -> None:
         """Where a chunk fell, told at the end of the tick."""

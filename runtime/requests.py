@@ -11,6 +11,7 @@ from pydantic import AfterValidator, Field, JsonValue, ValidationError
 from runtime.errors import RuntimeFault
 from runtime.explanation import explanation
 from runtime.messages import Mode
+from runtime.recording.labels import Result
 from runtime.section import Section
 
 LARGEST = 64 * 1024  # characters of JSON that a command may carry into a manifest
@@ -58,7 +59,8 @@ class SetUpRequest(Section):
     """`setup`: what differs from the deployment this time; what is absent is the deployment's own.
 
     `policy` is merged into the deployment's own [policy] as a file over what it extends: a table of another
-    `kind` replaces it whole. `checkpoint` is only written down.
+    `kind` replaces it whole. `checkpoint` is only written down. `collect`: a person is to drive the robot, as the
+    deployment's [collection] says; absent: where the deployment has no policy.
     """
 
     policy: Map | None = None
@@ -66,6 +68,7 @@ class SetUpRequest(Section):
     task: Annotated[str, Field(max_length=2000)] | None = None
     checkpoint: Checkpoint | None = None
     bench: BenchRequest | None = None
+    collect: bool | None = None
 
     @property
     def changes(self) -> dict[str, Any]:
@@ -74,10 +77,56 @@ class SetUpRequest(Section):
         return {key: value for key, value in wanted.items() if value is not None}
 
 
+class PreflightRequest(Section):
+    """`preflight`: which policy is asked without the robot; what is absent is the deployment's own.
+
+    `policy` as in a set-up; `id` names the report; it ends after `deadline_s` [s] at the latest, without it after what
+    the policy's own deadlines come to.
+    """
+
+    id: Annotated[str, Field(min_length=1, max_length=200)]
+    policy: Map | None = None
+    task: Annotated[str, Field(max_length=2000)] | None = None
+    checkpoint: Checkpoint | None = None
+    deadline_s: float | None = Field(default=None, gt=0, le=3600)
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """The tables that go on top of the deployment."""
+        wanted = {"policy": self.policy, "task": self.task}
+        return {key: value for key, value in wanted.items() if value is not None}
+
+    @property
+    def about(self) -> str:
+        """What is looked at, for a sentence."""
+        named = self.checkpoint and (self.checkpoint.name or str(self.checkpoint.id))
+        return f"the checkpoint {named}" if named else "the deployment's policy"
+
+
+class PreflightReportRequest(Section):
+    """`preflight_report`: how the preflight of that `id` went."""
+
+    id: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class PolicyServerRequest(Section):
+    """`policy_server`: which server the policy in force has, or the deployment's with this `policy` on top."""
+
+    policy: Map | None = None
+
+
+class CollectSession(Section):
+    """The session that a collected episode is one of, and the dataset that it is meant for."""
+
+    uuid: Annotated[str, Field(pattern=r"^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$")]
+    dataset: Annotated[str, Field(max_length=200)] = ""
+
+
 class RunRequest(Section):
     """`run`: `trial` is the asker's own and goes into the manifest as it is; `duration_s` ends this run [s].
 
-    Where operator, duration, mode or sim_state are absent, the deployment's own hold.
+    Where operator, duration, mode or sim_state are absent, the deployment's own hold. `task` and `session` are for the
+    mode collect, which is that of a station set up to collect.
     """
 
     trial: Map | None = None
@@ -85,6 +134,22 @@ class RunRequest(Section):
     duration_s: float | None = Field(default=None, gt=0)
     mode: Mode | None = None
     sim_state: Literal["live", "simulated"] | None = None
+    task: Annotated[str, Field(max_length=2000)] | None = None
+    session: CollectSession | None = None
+
+
+class DiscardRequest(Section):
+    """`discard`: mark an episode as one that is never published; absent: the open one, which ends, or the newest."""
+
+    episode: Annotated[str, Field(max_length=100)] | None = None
+
+
+class LabelRequest(Section):
+    """`label`: how an episode went; absent: the open one, or the newest."""
+
+    episode: Annotated[str, Field(max_length=100)] | None = None
+    result: Result
+    note: Annotated[str, Field(max_length=2000)] = ""
 
 
 class TuneRequest(Section):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 import time
 import uuid
@@ -36,9 +37,11 @@ class Run:
     trial: bool = False  # it is one of a trial
     approaching: bool = False  # a motion to the chunk that is shown
     begun: float | None = None  # control follows
+    followed: float = -math.inf  # since when it does, without a hold between
     held_since: float | None = None
     held: float = 0.0  # in total
     opened: bool = False  # media is ready for it
+    waiting: bool = False  # begins when what it needs is loaded
     unrecorded: str = ""  # why its recording ended before it did
     counted: Mapping[str, Any] = field(default_factory=dict)  # control's figures when it was asked for
 
@@ -53,6 +56,7 @@ class Run:
     def begin(self, now: float) -> None:
         """Control follows: its clock starts."""
         self.begun, self.held_since, self.held = now, None, 0.0
+        self.followed = now
 
     def hold(self, now: float) -> None:
         """Its clock is paused."""
@@ -64,6 +68,7 @@ class Run:
         if self.held_since is not None:
             self.held += now - self.held_since
             self.held_since = None
+            self.followed = now
 
     def elapsed(self, now: float) -> float:
         """Time it has run, without the time it was held."""

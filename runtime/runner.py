@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -24,6 +25,10 @@ class Runner(ABC):
 
     @abstractmethod
     def ready(self, future: Future[Result]) -> bool: ...
+
+    @abstractmethod
+    def aside(self, call: Callable[[], Result]) -> Future[Result]:
+        """Start `call`, which has nothing to do with the policy, behind no other."""
 
     @property
     @abstractmethod
@@ -52,6 +57,13 @@ def _told(call: Callable[[], Result]) -> Callable[[], Result]:
     return telling
 
 
+def _settle(future: Future[Result], call: Callable[[], Result]) -> None:
+    try:
+        future.set_result(call())
+    except Exception as error:
+        future.set_exception(error)
+
+
 class ThreadRunner(Runner):
     """One thread of its own, so that a slow policy never stops main."""
 
@@ -62,6 +74,12 @@ class ThreadRunner(Runner):
     def submit(self, call: Callable[[], Result]) -> Future[Result]:
         future = self._pool.submit(_told(call))
         self._newest = future
+        return future
+
+    def aside(self, call: Callable[[], Result]) -> Future[Result]:
+        future: Future[Result] = Future()
+        # A daemon: what is only being prepared keeps no process from ending.
+        threading.Thread(target=_settle, args=(future, call), name="aside", daemon=True).start()
         return future
 
     def ready(self, future: Future[Result]) -> bool:
@@ -90,6 +108,11 @@ class LockstepRunner(Runner):
         except RuntimeFault as error:
             future.set_exception(error)
         self._due[future] = self._now + self._delay
+        return future
+
+    def aside(self, call: Callable[[], Result]) -> Future[Result]:
+        future: Future[Result] = Future()
+        _settle(future, call)
         return future
 
     def ready(self, future: Future[Result]) -> bool:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from runtime.clock import Clock
@@ -42,6 +43,7 @@ class Runs:
         orders: Orders,
         provenance: Provenance,
         figures: Callable[[], dict[str, Any]],
+        prepared: Callable[[], bool],
     ) -> None:
         self._plan = plan
         self._page = page
@@ -50,6 +52,7 @@ class Runs:
         self._orders = orders
         self.provenance = provenance  # of the next manifest
         self._figures = figures  # of control, for the outcome
+        self._prepared = prepared  # begins to load what a person needs; whether it is there
         self.open: Run | None = None
         self._count = int(page.control.read()["run"])
         self._alone = ""  # uuid of a recording without a run
@@ -63,8 +66,13 @@ class Runs:
 
     # --- runs ----------------------------------------------------------------------------------------------
 
-    def begin(self, info: PolicyInfo | None, asked: RunRequest) -> str:
-        """Ask media to open an episode; the run begins when it has. Returns the episode's uuid, "" for none."""
+    def begin(
+        self, info: PolicyInfo | None, asked: RunRequest, more: Mapping[str, Any] = MappingProxyType({})
+    ) -> str:
+        """Ask media to open an episode; the run begins when it has. Returns the episode's uuid, "" for none.
+
+        `more` stands in the manifest in place of what it would say else.
+        """
         if self._alone:
             raise RuntimeFault("a recording without a run is open: record stop first")
         settings = self._plan.deployment
@@ -77,6 +85,7 @@ class Runs:
             manifest = self.provenance.manifest(mode, info, sim_state)
             manifest |= {"trial": asked.trial or {}, "duration_s": limit}
             manifest |= {} if asked.operator is None else {"operator": asked.operator}
+            manifest |= more
         identity = str(manifest["uuid"]) if manifest else str(uuid.uuid4())
         self._tell(BeginEpisode(self._count, manifest))
         self._inference.asking.sight.simulated = mode == "sim" and sim_state == "simulated"
@@ -113,6 +122,7 @@ class Runs:
         self._inference.pause()
         self._orders.give("hold", run=self.open.number if self.open else 0, reason=reason)
         if self.open:
+            self.open.waiting = False  # it begins when it is resumed
             self.open.hold(self._clock.now())
 
     def resume(self) -> None:
@@ -135,6 +145,8 @@ class Runs:
         self._orders.give("hold", reason=reason)
         run, self.open = self.open, None
         if run is not None:
+            if run.begun is not None and run.mode not in ("manual", "collect"):
+                self._inference.asking.rest()
             seconds = run.elapsed(self._clock.now())
             self.last = {"number": run.number, "uuid": run.uuid, "status": status, "reason": reason}
             policy = self._inference.tally.figures()
@@ -144,7 +156,16 @@ class Runs:
             self.note(self._end_alone(status, reason))
             self._alone = ""
 
+    def pump(self) -> None:
+        """Begin a run as soon as what it waited for is there."""
+        if self.open is not None and self.open.waiting:
+            self._start(self.open)
+
     def _start(self, run: Run) -> None:
+        """Begin it; by hand not before steps of an end effector can be answered at once."""
+        run.waiting = run.mode == "manual" and not self._prepared()
+        if run.waiting:
+            return
         run.begin(self._clock.now())
         self._follow(run, fresh=True)
 
@@ -152,9 +173,13 @@ class Runs:
         run.approaching = False
         if run.mode == "manual":
             self._orders.give("hold", run=run.number)
+        elif run.mode == "collect" and not self._inference.policy.answers:
+            self._orders.give("yield", run=run.number, mode=run.mode)
         else:
             self._orders.give("follow", run=run.number, mode=run.mode)
             self._inference.begin(run.number, fresh, run.mode)
+            if run.mode == "collect":  # a leader has moved on while the robot was held: it is engaged anew
+                self._inference.asking.forget()
 
     # --- by a person, within a run ---------------------------------------------------------------------------
 

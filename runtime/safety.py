@@ -262,10 +262,10 @@ class SafetyFilter:
 
     def _violation(self, action: Float64, state: RobotState) -> str:
         limits = self._limits
-        excess = _outside(action, limits)
+        excess = limits.outside(action)
         if not (excess > _TOLERANCE).any():
             return ""
-        worse = (excess > _TOLERANCE) & (excess > _outside(state.previous, limits) + _TOLERANCE)
+        worse = (excess > _TOLERANCE) & (excess > limits.outside(state.previous) + _TOLERANCE)
         if not worse.any():
             return ""
         i = int(np.flatnonzero(worse)[0])
@@ -275,7 +275,7 @@ class SafetyFilter:
         limits = self._limits
         return tuple(
             f"{limits.names[i]} {action[i]:.4f} is outside {limits.lower[i]:g}..{limits.upper[i]:g}"
-            for i in np.flatnonzero(_outside(action, limits) > _TOLERANCE)
+            for i in np.flatnonzero(limits.outside(action) > _TOLERANCE)
         )
 
 
@@ -288,10 +288,6 @@ def _unusable(action: Float64, limits: Limits) -> str:
         return f"action has shape {action.shape}, expected {limits.lower.shape}"
     i = int(np.flatnonzero(~np.isfinite(action))[0])
     return f"{limits.names[i]} is {action[i]}"
-
-
-def _outside(action: Float64, limits: Limits) -> Float64:
-    return np.maximum(np.maximum(limits.lower - action, action - limits.upper), 0.0)
 
 
 def _stopping_speed(distance: Float64, acceleration: Float64, dt: float) -> Float64:

@@ -12,6 +12,4 @@ class Section(BaseModel):
     """
 
     # A limit of infinity or NaN would be no limit at all, and neither is valid in a manifest's JSON.
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)

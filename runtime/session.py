@@ -170,8 +170,9 @@ class Session:
         if self.state is State.SETTING_UP and command.kind in CANCELLING:
             rule = CANCEL
         asked = read(command.kind, rule.takes, command.args) if rule.takes else None
+        self._effects.by = command.user or command.holder
         told = rule.effect(self._effects, asked)
-        after = rule.next(self.state)
+        after = rule.next(self.state, asked)
         if after:
             reason = CANCELLED if rule is CANCEL else REASONS.get(command.kind, "")
             self._enter(after, reason)

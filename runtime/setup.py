@@ -132,8 +132,7 @@ class SetUp:
         if self.stage is Stage.CONNECT:
             if self._inference.runner.ready(self._connection):
                 self.info = self._connection.result()
-                self._check_rtc(self.info)
-                self._check_horizon(self.info)
+                check_info(self.info, self._plan, self._inference.continues)
                 self._enter(Stage.OBSERVE)
         elif self.stage is Stage.OBSERVE:
             return self._observe()
@@ -143,8 +142,7 @@ class SetUp:
         elif self.stage is Stage.SETTLE:
             return self._settle()
         elif self.stage is Stage.RESET:
-            if self.bench.done():
-                self._start_warm_up()
+            return self.bench.done() and self._start_warm_up()
         elif self.stage is Stage.WARM_UP:
             return self._warm_up()
         return False
@@ -153,26 +151,6 @@ class SetUp:
         self.stage = stage
         self._since = self._clock.now()
         self.stages[stage] = self._since
-
-    def _check_rtc(self, info: PolicyInfo) -> None:
-        """A server that drops the conditioning without a word looks healthy, and does something else."""
-        if self._inference.continues and info.supports_rtc is False:
-            raise SetupError(
-                f"strategy 'rtc': the policy {info.name!r} does not continue a chunk that it is given; allowed: "
-                "another strategy, or a server and policy.rtc that do"
-            )
-
-    def _check_horizon(self, info: PolicyInfo) -> None:
-        """More rows cannot be executed of each answer than it has."""
-        wanted = self._plan.deployment.strategy.execution_horizon
-        if wanted is None or info.horizon is None or "execution_horizon" not in self._plan.strategy.USES:
-            return
-        steps = math.floor(info.horizon * self._plan.rate / (info.rate or self._plan.rate) + 1e-9)
-        if wanted > steps:
-            raise SetupError(
-                f"strategy.execution_horizon = {wanted} control steps, but the policy {info.name!r} says that its "
-                f"answers have {info.horizon} rows, {steps} control steps; correct the one that is wrong"
-            )
 
     def _check_drives(self) -> None:
         drives = self._media().drives
@@ -203,9 +181,8 @@ class SetUp:
             raise SetupError(f"no {missing} {waited}") from None
         if settings.home and self._plan.capabilities.moves_robot:
             self._go_home()
-        else:
-            self._start_reset()
-        return False
+            return False
+        return self._start_reset()
 
     def _require_family(self) -> None:
         """An order to a control that is still starting would be lost, and without a guard it only holds."""
@@ -225,21 +202,26 @@ class SetUp:
         if self._motion_only:
             self.stage = Stage.IDLE
             return True
-        self._start_reset()
-        return False
+        return self._start_reset()
 
-    def _start_reset(self) -> None:
-        """The arms are out of the way: lay the bench out anew, where that was asked for."""
+    def _start_reset(self) -> bool:
+        """The arms are out of the way: lay the bench out anew, where that was asked for; True where all is done."""
         if self._reset is None:
-            self._start_warm_up()
-            return
+            return self._start_warm_up()
         self.bench.start(self._reset)
         self._enter(Stage.RESET)
+        return False
 
-    def _start_warm_up(self) -> None:
+    def _start_warm_up(self) -> bool:
+        """Ask the policy; True where there is nobody to ask, and all is done."""
+        if not self._inference.policy.answers:
+            self.validated = f"{self.info.name if self.info else 'the node'} drives the robot"
+            self.stage = Stage.IDLE
+            return True
         self._left = self._plan.deployment.setup.warmup_chunks
         self._asked: Future[Answered] | None = None
         self._enter(Stage.WARM_UP)
+        return False
 
     def _warm_up(self) -> bool:
         if self._asked is None:
@@ -265,6 +247,29 @@ class SetUp:
         self.validated = (
             f"{len(answered.chunk.actions)} rows in {answered.seconds * 1000:.0f} ms, the first at most "
             f"{first['distance']:.3f} rad away ({first['joint']}){far}"
+        )
+
+
+def check_info(info: PolicyInfo, plan: Plan, continues: bool) -> None:
+    """Hold what a policy says of itself against the strategy that asks it; SetupError with both sides.
+
+    `continues`: the strategy's requests carry what the robot is committed to.
+    """
+    # A server that drops the conditioning without a word looks healthy, and does something else.
+    if continues and info.supports_rtc is False:
+        raise SetupError(
+            f"strategy 'rtc': the policy {info.name!r} does not continue a chunk that it is given; allowed: "
+            "another strategy, or a server and policy.rtc that do"
+        )
+    # More rows cannot be executed of each answer than it has.
+    wanted = plan.deployment.strategy.execution_horizon
+    if wanted is None or info.horizon is None or "execution_horizon" not in plan.strategy.USES:
+        return
+    steps = math.floor(info.horizon * plan.rate / (info.rate or plan.rate) + 1e-9)
+    if wanted > steps:
+        raise SetupError(
+            f"strategy.execution_horizon = {wanted} control steps, but the policy {info.name!r} says that its "
+            f"answers have {info.horizon} rows, {steps} control steps; correct the one that is wrong"
         )
 
 

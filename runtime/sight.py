@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -15,6 +16,18 @@ from runtime.types import Float64, Observation
 
 class StaleObservationError(PolicyError):
     """The newest observation is too old to ask a policy about."""
+
+
+class Eyes(Protocol):
+    """What shows a policy the robot; `simulated`: the joints of the simulated one."""
+
+    simulated: bool
+
+    def now(self, prompt: str, pictures: bool = True) -> Observation:
+        """The newest observation, without `pictures` of joints alone; PolicyError where there is none, or it is old."""
+
+    def commanded(self) -> tuple[int, Float64] | None:
+        """The newest control step and what the robot was told then [D]; None before that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,17 +48,20 @@ class Sight:
         self._settings = settings
         self.simulated = False
 
-    def now(self, prompt: str) -> Observation:
-        """The newest observation; PolicyError where there is none, or it is old."""
-        seen = self._page.read_observation(self._page.layout.cameras)
+    def now(self, prompt: str, pictures: bool = True) -> Observation:
+        """The newest observation, without `pictures` of joints alone; PolicyError where there is none, or it is old."""
+        cameras = self._page.layout.cameras if pictures else ()
+        seen = self._page.read_observation(cameras)
         if seen is None:
             raise PolicyError("no observation has arrived yet")
         now, bounds = self._clock.now(), self._settings
         for stream, captured in seen.captured.items():
+            if not (pictures or stream in ("joints", "eef")):
+                continue
             allowed = bounds.joint_age if stream in ("joints", "eef") else bounds.picture_age
             if not now - captured <= allowed:
                 raise StaleObservationError(f"{stream}: {now - captured:.2f} s old, allowed {allowed:g}")
-        missing = [camera for camera in self._page.layout.cameras if camera not in seen.pictures]
+        missing = [camera for camera in cameras if camera not in seen.pictures]
         if missing:
             raise PolicyError(f"no picture has arrived from {', '.join(missing)}")
         shown = replace(seen, step=self._step_of(seen), prompt=prompt)

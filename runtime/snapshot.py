@@ -11,10 +11,11 @@ import numpy as np
 
 from robots.units import units_of
 from runtime.by_hand import ByHand
+from runtime.collecting import Collecting
 from runtime.family import Plan
 from runtime.inference import Inference
 from runtime.lease import Lease
-from runtime.messages import MediaReport, Mode
+from runtime.messages import MediaReport, PolicyMode
 from runtime.page import Page
 from runtime.plugins import variants
 from runtime.runs import Runs
@@ -36,7 +37,9 @@ class View:
     setup: SetUp
     runs: Runs
     media: MediaReport
+    unheard: Mapping[str, str]  # as by Sink.unheard
     by_hand: ByHand
+    collecting: Collecting
     estop: str
     boot: str
     now: float
@@ -66,6 +69,7 @@ def snapshot(view: View) -> dict[str, Any]:
         "proposal": _proposal(view),
         "grippers": view.by_hand.grippers.told(view.by_hand.commanded()),
         "drives": dict(view.media.drives),
+        "collect": view.collecting.shown(),
         "validated": view.setup.validated,
         "task": settings.task,
         "checkpoint": dict(view.runs.provenance.checkpoint),
@@ -112,7 +116,7 @@ def facts(plan: Plan) -> dict[str, Any]:
         "tasks": list(dict.fromkeys(filter(None, [plan.deployment.task, *plan.deployment.tasks]))),
         "strategies": {kind: sorted(module.USES) for kind, module in variants("runtime.strategies").items()},
         "strategy": plan.deployment.strategy.model_dump(),
-        "modes": list(get_args(Mode)),
+        "modes": list(get_args(PolicyMode)),
         "moves_robot": plan.capabilities.moves_robot,
         "cameras": list(plan.cameras),
         "rate": plan.rate,
@@ -253,4 +257,5 @@ def _link(view: View) -> dict[str, Any]:
         "rates": dict(view.media.rates),
         "faults": dict(view.media.faults),
         "cameras": {key: dict(told) for key, told in view.media.cameras.items()},
+        "unheard": dict(view.unheard),
     }

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from robots import Robot
 from robots.rotations import quaternion_of_matrix, transform_of
 from runtime.end_effectors import EndEffectors
-from runtime.errors import PolicyError, SetupError
+from runtime.errors import NotFiniteError, SetupError, ShapeError
 from runtime.formats import PoseRows, continuous
 from runtime.kinematics.base import IkResult, Kinematics
 from runtime.pose_format import CANONICAL, PoseFormat
@@ -248,7 +248,7 @@ class Spaces(EndEffectors):
     def _checked(self, chunk: ActionChunk, rate: float, width: int, names: tuple[str, ...]) -> Float64:
         rows = np.array(chunk.actions, dtype=np.float64)
         if rows.ndim != 2 or rows.shape[1] != width or not len(rows):
-            raise PolicyError(
+            raise ShapeError(
                 f"the policy answered with {chunk.space} actions of shape {rows.shape}; "
                 f"{self._robot.name} takes [H, {width}] with at least one row"
             )
@@ -256,7 +256,7 @@ class Spaces(EndEffectors):
         wrong = np.argwhere(~np.isfinite(rows))
         if len(wrong):
             row, column = wrong[0]
-            raise PolicyError(
+            raise NotFiniteError(
                 f"the policy answered with {rows[row, column]} for {names[column]} in row {row} "
                 f"({len(wrong)} such numbers); allowed: finite numbers"
             )
@@ -266,6 +266,6 @@ class Spaces(EndEffectors):
 def _check_length(count: int, stretched: float) -> None:
     if count * stretched > _LONGEST:
         at_rate = "" if stretched == 1.0 else f", {count * stretched:.0f} at control rate"
-        raise PolicyError(
+        raise ShapeError(
             f"the policy answered with {count} rows{at_rate}; allowed: at most {_LONGEST} in one chunk"
         )

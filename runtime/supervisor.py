@@ -24,7 +24,7 @@ from runtime.page import PROCESSES, Page
 
 log = logging.getLogger(__name__)
 _START_ORDER = ("guard", "media", "control", "main")
-_MOST_RESTARTS, _RESTART_WINDOW_S = 5, 60.0
+MOST_RESTARTS, RESTART_WINDOW_S = 5, 60.0
 _PATIENCE_S = 9.0  # after the lifeline is cut; then what is left is killed
 _DRIVER_PATIENCE_S = 2.0  # for what drives a headless run, after it was told to end
 _POLL_S = 0.05
@@ -141,9 +141,9 @@ class Supervisor:
     def _restart(self, process: str, code: int) -> bool:
         now = time.monotonic()
         self._restarts.append(now)
-        while self._restarts[0] < now - _RESTART_WINDOW_S:
+        while self._restarts[0] < now - RESTART_WINDOW_S:
             self._restarts.popleft()
-        if len(self._restarts) > _MOST_RESTARTS:
+        if len(self._restarts) > MOST_RESTARTS:
             log.error(
                 "%s ended with %d; %d restarts within a minute: giving up",
                 process,

@@ -45,6 +45,10 @@ class Targets:
         self._kinematics = kinematics
         self._ways = Ways(plan)
 
+    def prepare(self) -> bool:
+        """Begin to load what a jog needs, where nobody has; whether it is there."""
+        return self._kinematics.prepare()
+
     def aim(self, asked: AimRequest, commanded: Float64) -> Aim:
         """Where it would go; RuntimeFault for a pose, an arm or a number of joints that the robot has not."""
         start = self._wanted("aim", asked.joints, asked.pose, commanded)

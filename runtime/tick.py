@@ -9,9 +9,10 @@ import numpy as np
 
 from runtime.actuator import Actuator, RobotActuator, Sent, SimulatedActuator, TickSettings
 from runtime.alarms import Displacement, silent_sibling
-from runtime.behaviour import EStopped
+from runtime.behaviour import EStopped, Yielded
 from runtime.errors import CodecError, ConfigurationError
 from runtime.execution import Follow, Strategy, dropped, strategy
+from runtime.hearing import Hearing
 from runtime.lane import Lane
 from runtime.locks import Locks
 from runtime.messages import LockGrippers, Message, NodeRequest, Order, PostedChunk, Tune, decode
@@ -21,6 +22,7 @@ from runtime.safety import SafetyFilter
 from runtime.seen import Eyes
 from runtime.transports.base import Sink
 from runtime.types import Float64
+from runtime.yielding import Yielding
 
 __all__ = ["Tick", "TickSettings"]
 
@@ -51,8 +53,11 @@ class Tick:
         self._locks = Locks(settings.limits)
         self._displacement = Displacement(settings)
         self._actuator = RobotActuator(page, sink, settings, clock)
+        self._hearing = Hearing(page, sink, self._report.say)
         # A restarted control goes on holding where its predecessor stood; a new one keeps silent.
         self._robot = self._lane(self._actuator)
+        left = bytes(self._report.status["behaviour"]) == Yielded.name.encode()
+        self._yielding = Yielding(self._actuator.tell, self._report.say, left)
         self._simulated: Lane | None = None
         self._simulated_run = 0
         self.orphaned = False
@@ -67,6 +72,8 @@ class Tick:
         self._check_family(planned)
         self._check_displaced(planned)
         sent = self._drive(step, planned)
+        self._yielding.look(isinstance(self._robot.behaviour, Yielded), planned)
+        self._hearing.look(planned)
         self._report.record(self._seen, sent, self._simulated is not None)
         self._report.publish(self._seen, self._standing(step, sent))
         for lane in self._lanes:
@@ -186,6 +193,8 @@ class Tick:
             self._simulated = None
         if order.kind == "silent":
             self._robot.silence()
+        elif order.kind == "yield":
+            self._robot.give_way()
         elif order.kind == "hold":
             for lane in self._lanes:
                 lane.hold()

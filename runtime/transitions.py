@@ -9,7 +9,9 @@ from typing import Any
 
 from runtime.effects import Effects, Situation, Told
 from runtime.requests import (
+    DiscardRequest,
     GripperRequest,
+    LabelRequest,
     MoveRequest,
     Nothing,
     RunRequest,
@@ -69,10 +71,44 @@ class Rule:
     effect: Callable[[Effects, Any], Told | None]
     takes: type[Section] | None = Nothing
     guard: Guard = _always
+    stays: Callable[[Any], bool] = lambda asked: False  # by what it took, whether the state is left as it is
 
-    def next(self, state: State) -> State | None:
-        """The state after it, None for the same."""
+    def next(self, state: State, asked: Any = None) -> State | None:
+        """The state after it, None for the same; `asked` is what it took."""
+        if self.stays(asked):
+            return None
         return self.after.get(state) if isinstance(self.after, Mapping) else self.after
+
+
+_NO_COLLECTION = "this station collects nothing: its deployment has no [collection]"
+
+
+def _may_run(state: State, situation: Situation) -> str:
+    unarmed = situation.collecting and not situation.armed
+    return "the station is set up to collect and is not armed: arm first" if unarmed else ""
+
+
+def _may_resume(state: State, situation: Situation) -> str:
+    unarmed = situation.mode == "collect" and not situation.armed
+    return "a demonstration is open and the station is not armed: arm first, or stop" if unarmed else ""
+
+
+def _may_collect(state: State, situation: Situation) -> str:
+    return "" if situation.collection else _NO_COLLECTION
+
+
+def _may_arm(state: State, situation: Situation) -> str:
+    if not situation.collection:
+        return _NO_COLLECTION
+    if not situation.collecting:
+        return "the station is set up with a policy: set up with collect first"
+    return "it is armed already" if situation.armed else situation.unled
+
+
+def _may_disarm(state: State, situation: Situation) -> str:
+    if not situation.collection:
+        return _NO_COLLECTION
+    return "" if situation.armed else "it is not armed"
 
 
 def _untried(state: State, situation: Situation) -> str:
@@ -132,12 +168,12 @@ S = State
 _STOPPED = "stopped by the operator"
 COMMANDS: dict[str, Rule] = {
     "setup": Rule((S.IDLE, S.READY), S.SETTING_UP, lambda e, asked: e.begin_setup(asked), SetUpRequest),
-    "run": Rule((S.READY,), S.RUNNING, lambda e, asked: e.begin_run(asked), RunRequest),
+    "run": Rule((S.READY,), S.RUNNING, lambda e, asked: e.begin_run(asked), RunRequest, _may_run),
     "stop": Rule(
         (S.RUNNING, S.HOLDING, S.READY), S.READY, lambda e, _: e.end_run("finished", _STOPPED), None
     ),
     "halt": Rule((S.RUNNING, S.HOLDING), S.HOLDING, lambda e, _: e.hold("halted by the operator"), None),
-    "resume": Rule((S.HOLDING,), S.RUNNING, lambda e, _: e.resume_run()),
+    "resume": Rule((S.HOLDING,), S.RUNNING, lambda e, _: e.resume_run(), guard=_may_resume),
     "home": Rule((S.READY,), S.SETTING_UP, lambda e, _: e.go_home()),
     "release": Rule((S.FAULTED,), None, lambda e, _: e.release_estop()),
     "record_start": Rule((S.IDLE, S.READY), None, lambda e, _: e.start_recording()),
@@ -159,6 +195,17 @@ COMMANDS: dict[str, Rule] = {
         {S.READY: S.SETTING_UP},
         lambda e, _: e.approach(),
         guard=_may_approach,
+    ),
+    "arm": Rule((S.READY, S.HOLDING), None, lambda e, _: e.arm(), guard=_may_arm),
+    "disarm": Rule((S.READY, S.HOLDING), None, lambda e, _: e.disarm(), guard=_may_disarm),
+    "label": Rule(tuple(State), None, lambda e, asked: e.label(asked), LabelRequest, _may_collect),
+    "discard": Rule(
+        tuple(State),
+        {S.RUNNING: S.READY, S.HOLDING: S.READY},
+        lambda e, asked: e.discard(asked),
+        DiscardRequest,
+        _may_collect,
+        stays=lambda asked: asked is not None and asked.episode is not None,
     ),
 }
 # While it is being set up, both stopping commands mean the same: cancel.
@@ -197,4 +244,5 @@ REASONS = {
     "home": "going home",
     "setup": "setting up",
     "approach": "going to the policy's first action",
+    "discard": "discarded by the operator",
 }

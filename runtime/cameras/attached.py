@@ -64,13 +64,16 @@ class Attached(Source):
             counts |= camera.faults()
         return counts
 
+    def why(self, fault: str) -> str:
+        return self._source.why(fault)
+
     def camera_health(self) -> dict[str, dict[str, Any]]:
         """How each camera is: kind, where, condition, since when, why, the age of its newest picture [s]."""
         return {camera.key: self._told(camera) for camera in self._cameras}
 
     def news(self) -> list[Event]:
-        """A camera that was lost, ended or came back since the last call, and why one cannot be opened."""
-        events = []
+        """That of the source; a camera that was lost, ended or came back, and why one cannot be opened."""
+        events = self._source.news()
         for camera in self._cameras:
             health, before = camera.health(), self._said.get(camera.key)
             if before is not None and (before.condition, before.why) == (health.condition, health.why):

@@ -13,6 +13,10 @@ from runtime.cameras.base import Address, CameraError
 from runtime.cameras.finding import found
 from runtime.types import UInt8
 
+_THERE_S = 0.003  # a packet that comes within was there before it was asked for
+_AT_ONCE = 2
+_SHOWN = 100
+
 
 @dataclass(frozen=True, slots=True)
 class Frame:
@@ -20,6 +24,22 @@ class Frame:
 
     picture: UInt8
     stamp: float | None
+
+
+class Backlog:
+    """Notices by the waits for packets that a stream is read more slowly than it comes, and where its end is."""
+
+    def __init__(self) -> None:
+        self._waiting = 0  # packets in a row that nobody had to wait for
+
+    def passes(self, waited: float) -> bool:
+        """Whether the packet that was waited for so long [s] is to be passed over, as newer ones are there already.
+
+        The first few are not, because two may well come at once; nor is each hundredth: something is shown of a
+        stream that never pauses.
+        """
+        self._waiting = self._waiting + 1 if waited < _THERE_S else 0
+        return self._waiting > _AT_ONCE and self._waiting % _SHOWN != 0
 
 
 class Feed:
@@ -54,6 +74,8 @@ class Feed:
             raise CameraError(f"it has no video{others}")
         self._stream = videos[0]
         self._stream.codec_context.thread_count = 1  # frame threads hold pictures back
+        # A stamp tells how old a picture is. Where there is none, it must not have lain in a socket for seconds.
+        self._passes_over = not address.stamped and self._stream.codec_context.codec.intra_only
         self._frames = self._decoded()
 
     @property
@@ -77,7 +99,8 @@ class Feed:
         return Frame(picture, None if stamp is None else float(stamp))
 
     def close(self) -> None:
-        """Let it go."""
+        """Let it go, with its decoder: the generator and this hold each other, and the collector comes late."""
+        self._frames = iter(())
         self._container.close()
 
     def _decoded(self) -> Iterator[Any]:
@@ -86,7 +109,7 @@ class Feed:
         The first picture may take as long as opening: many cameras send one that stands for itself every few seconds.
         """
         since = time.monotonic()
-        for packet in self._container.demux(self._stream):
+        for packet in self._packets():
             try:
                 frames = packet.decode()
             except self._errors.InvalidDataError:
@@ -97,6 +120,17 @@ class Feed:
             allowed = self._read_s if self._seen else max(self._open_s, self._read_s)
             if time.monotonic() - since > allowed:
                 raise CameraError(f"what it sent for {allowed:g} s cannot be decoded")
+
+    def _packets(self) -> Iterator[Any]:
+        """As they come; of a stream without stamps whose every packet is a picture, without those of a backlog."""
+        backlog, packets = Backlog(), self._container.demux(self._stream)
+        while True:
+            begun = time.monotonic()
+            packet = next(packets, None)
+            if packet is None:
+                return
+            if not (self._passes_over and backlog.passes(time.monotonic() - begun)):
+                yield packet
 
     def _rgb(self, frame: Any) -> UInt8:
         try:

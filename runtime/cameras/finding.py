@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import http.client
 import socket
-import urllib.error
-import urllib.request
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -92,6 +89,10 @@ def _known(host: str) -> bool:
 
 def _content_type(url: str) -> str:
     """What a server says that it sends; "" where it says nothing."""
+    import http.client  # with these every process of a station would start later
+    import urllib.error
+    import urllib.request
+
     with contextlib.suppress(OSError, http.client.HTTPException, urllib.error.URLError, ValueError):
         request = urllib.request.Request(url, headers={"Range": "bytes=0-0"})
         with urllib.request.urlopen(request, timeout=_PEEK_S) as answer:

@@ -6,8 +6,6 @@ import math
 
 from runtime.clock import ClockMap
 
-JUMP_S = 0.5  # more than this is no jitter
-
 
 class StreamTime:
     """Maps the stamps of one stream by the smallest (arrival - stamp) over a window; `jumps` counts where it broke.
@@ -34,12 +32,10 @@ class StreamTime:
         return time
 
     def _begin(self) -> None:
-        self._map = ClockMap(tolerance=JUMP_S)
-        self._before: tuple[float, float] | None = None  # stamp, arrival
+        self._map = ClockMap()
 
     def _mapped(self, stamp: float, arrived: float) -> float:
-        if self._before is not None:
-            ahead = (stamp - self._before[0]) - (arrived - self._before[1])
-            self.jumps += ahead > JUMP_S or stamp < self._before[0] - JUMP_S
-        self._before = (stamp, arrived)
-        return self._map.map(stamp, arrived)
+        before = self._map.restarts + self._map.leaps
+        time = self._map.map(stamp, arrived)
+        self.jumps += self._map.restarts + self._map.leaps - before
+        return time

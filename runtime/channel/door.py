@@ -26,6 +26,7 @@ _CONNECTIONS = 1000  # whose numbers are remembered
 _REPLIES = "inproc://channel-replies-{}"
 _NUMBERS = itertools.count()
 _END_S = 1.0
+_AT_ONCE = 64  # messages, after which answers go out first: a flood keeps nobody waiting for theirs
 
 
 class Names:
@@ -85,15 +86,17 @@ class Door:
         self._local.socket.send_multipart([*address, strict.dumps(answer)])
 
     def serve(self, timeout: float) -> None:
-        """Wait up to `timeout` seconds for messages and answers; pass on all there are."""
+        """Wait up to `timeout` seconds for messages and answers; pass on those there are, answers first."""
         poller = zmq.Poller()
         poller.register(self._socket, zmq.POLLIN)
         poller.register(self._replies, zmq.POLLIN)
         poller.poll(int(timeout * 1000))
-        while (frames := _next(self._replies)) is not None:
-            self._send(frames)
-        while (frames := _next(self._socket)) is not None:
-            self._take(frames)
+        for act, socket in ((self._send, self._replies), (self._take, self._socket)):
+            for _ in range(_AT_ONCE):
+                frames = _next(socket)
+                if frames is None:
+                    break
+                act(frames)
 
     def _take(self, frames: list[bytes]) -> None:
         """Hand a message to its lane; what cannot be read, or finds no room, is answered at once."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from queue import Empty, Full, Queue
@@ -15,6 +16,7 @@ from runtime.channel.message import Message
 
 log = logging.getLogger(__name__)
 WAITING = 64  # messages in one inbox
+EACH = 8  # of one connection, so that a flood finds no room and others do
 LATE_S = 4.0  # the older channel's scripts wait 5 s for an answer
 _PERIOD_S = 0.1
 
@@ -43,7 +45,8 @@ Reply = Callable[[list[bytes], dict[str, Any]], None]
 class Lane:
     """Jobs for one clerk, who is made, used and closed in the lane's own thread.
 
-    `keep` is done about ten times a second. A command is answered without being carried out where it has waited
+    `keep` is done about ten times a second; without it a lane is one of stops, which are carried out whatever comes,
+    also by a lane that is told to end. Elsewhere a command is answered without being carried out where it has waited
     too long for who asked to be waiting still, or a stop has come after it.
     """
 
@@ -56,40 +59,51 @@ class Lane:
         keep: Callable[[], None] | None = None,
     ) -> None:
         self._clerk, self._reply, self._stops, self._keep = clerk, reply, stops, keep
-        self._jobs: Queue[Job | None] = Queue(WAITING)
+        self._jobs: Queue[Job] = Queue(WAITING)
+        self._waiting: Counter[bytes] = Counter()  # jobs by connection
+        self._lock = threading.Lock()
+        self._over = threading.Event()
         self._kept = 0.0
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
         self._thread.start()
 
     def put(self, job: Job) -> bool:
         """Whether there was room for it."""
-        try:
-            self._jobs.put_nowait(job)
-        except Full:
-            return False
+        connection = job.address[0]
+        with self._lock:
+            if self._waiting[connection] >= EACH:
+                return False
+            try:
+                self._jobs.put_nowait(job)
+            except Full:
+                return False
+            self._waiting[connection] += 1
         return True
 
     def end(self, patience: float) -> None:
         """Let it finish what it is about and close its clerk; waits so long at most [s]."""
-        try:
-            self._jobs.put(None, timeout=patience)
-        except Full:
-            log.error("%s is still busy: left as it is", self._thread.name)
-            return
+        self._over.set()
         self._thread.join(patience)
+        if self._thread.is_alive():
+            log.error("%s is still busy: left as it is", self._thread.name)
 
     def _work(self) -> None:
-        while True:
+        while not (self._over.is_set() and (self._keep is not None or self._jobs.empty())):
             try:
                 job = self._jobs.get(timeout=_PERIOD_S)
             except Empty:
                 self._tend()
                 continue
-            if job is None:
-                self._clerk.close()
-                return
+            self._forget(job.address[0])
             self._reply(job.address, self._answer(job))
             self._tend()
+        self._clerk.close()
+
+    def _forget(self, connection: bytes) -> None:
+        with self._lock:
+            self._waiting[connection] -= 1
+            if not self._waiting[connection]:
+                del self._waiting[connection]
 
     def _answer(self, job: Job) -> dict[str, Any]:
         why = self._void(job)

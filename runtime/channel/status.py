@@ -24,8 +24,6 @@ _ABSENT: dict[str, Any] = {
         "frame_index": 0,
         "total_frames": 0,
     },
-    "collection_teleop_armed": False,
-    "collection_teleop_active": False,
     "rollout_intervention_active": False,
     "rollout_intervention_enabled": False,
     "rollout_intervention_active_frames": 0,
@@ -90,7 +88,8 @@ def _session(snapshot: Mapping[str, Any], selection: Selection, newest: str) -> 
 def _run(snapshot: Mapping[str, Any], selection: Selection) -> dict[str, Any]:
     policy, run, control = snapshot["policy"], snapshot["run"], snapshot["control"]
     episode, recording = snapshot["episode"], snapshot["recording"]
-    alone = bool(recording["uuid"]) and not run["number"]
+    collect = snapshot.get("collect") or {"armed": False, "episode": None}
+    alone = bool(recording["uuid"]) and (not run["number"] or collect["episode"] is not None)
     mode = snapshot["mode"] if run["number"] else selection.mode or snapshot["mode"]
     return {
         "cli_mode": _CLI_MODES.get(mode, mode),
@@ -104,5 +103,7 @@ def _run(snapshot: Mapping[str, Any], selection: Selection) -> dict[str, Any]:
         "pending_chunk": snapshot["proposal"] or None,
         "current_episode": recording["uuid"] or episode.get("uuid"),
         "rollout": {**run, "last": snapshot["last_run"]},
+        "collection_teleop_armed": collect["armed"],
+        "collection_teleop_active": collect["episode"] is not None,
         "collect": {"uuid": recording["uuid"], "rows": recording["rows"]} if alone else None,
     }

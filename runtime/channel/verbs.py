@@ -239,11 +239,31 @@ def _intervention(scene: Scene) -> Deed:
 # --- recording -----------------------------------------------------------------------------------------------
 
 
+def _demonstrates(scene: Scene) -> bool:
+    """Whether a person is to drive the robot, or does."""
+    collect = scene.status.get("collect")
+    return collect is not None and collect["set_up"]
+
+
 def _collect(scene: Scene) -> Deed:
     scene.nothing()
     task = scene.selection.collect_task
+    if _demonstrates(scene):
+        return Deed((("run", {"mode": "collect"} | ({} if task is None else {"task": task})),))
     before = () if task is None else (("tune", {"task": task}),)
     return Deed((*before, ("record_start", {})))
+
+
+def _collect_stop(scene: Scene) -> Deed:
+    scene.nothing()
+    return Deed((("stop" if _demonstrates(scene) else "record_stop", {}),))
+
+
+def _collect_cancel(scene: Scene) -> Deed:
+    scene.nothing()
+    if not _demonstrates(scene) or scene.status["collect"]["episode"] is None:
+        scene.refuse(_KEPT)
+    return Deed((("discard", {}),))
 
 
 _CHECKPOINT = (
@@ -295,9 +315,12 @@ VERBS: dict[str, Verb] = {
         _gripper, "`gripper`: 1 opens or closes, 0 is `unlock`; a number is a `move` of it alone"
     ),
     "operator_action": Verb(_action, "start `run`; accept, cancel `stop`; rollout_toggle either; grippers"),
-    "collect_start": Verb(_collect, "`record_start`, after `tune` with the task that was selected for it"),
-    "collect_stop": Verb(_plain("record_stop"), "`record_stop`"),
-    "collect_cancel": _never(_KEPT),
+    "collect_start": Verb(
+        _collect,
+        "`run` with that task where the station is set up to collect, and armed; else `record_start`, after `tune`",
+    ),
+    "collect_stop": Verb(_collect_stop, "`stop` of a demonstration, else `record_stop`"),
+    "collect_cancel": Verb(_collect_cancel, "`discard` of a demonstration that is open; else refused"),
     "select_collect_task": Verb(_collect_task, "the task of the next web:collect_start"),
     "tab_switch": Verb(_tab, f"nothing: {_TABS}"),
     "switch_ckpt": _never(_CHECKPOINT),

@@ -1,20 +1,23 @@
-"""python -m runtime.datasets publish EPISODE --to DIR | check DIR | recover DIR."""
+"""python -m runtime.datasets publish|convert|merge|split|delete|repair|check|push: what is done to LeRobot datasets."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+from runtime.datasets import layout, operations
+from runtime.datasets.assemble import Assembled
 from runtime.datasets.consistency import check
+from runtime.datasets.hub import push
 from runtime.datasets.published import publish
-from runtime.datasets.staging import locked, recover
 from runtime.errors import RecordingError, RuntimeFault
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """0 where all is well, 1 where a check found something or a publication was refused."""
+    """0 where all is well, 1 where a check found something or what was asked for was refused."""
     options = _parser().parse_args(arguments)
     try:
         return int(options.run(options))
@@ -25,10 +28,77 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m runtime.datasets", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    publishing = commands.add_parser("publish", help="publish a finished episode into a LeRobot v2.1 dataset")
-    publishing.add_argument("episode", type=Path, help="folder of the episode")
-    publishing.add_argument("--to", type=Path, required=True, metavar="DIR", help="folder of the dataset")
+    add_commands(parser.add_subparsers(required=True, metavar="COMMAND"))
+    return parser
+
+
+Folder = Callable[[str], Path]  # of what a person calls a dataset, or an episode
+
+
+def add_commands(
+    commands: Any, dataset: Folder = Path, episode: Folder = Path, publishing: bool = True
+) -> None:
+    """Put all commands into a parser's `commands`; each leaves what does it in `run`, which returns the exit code."""
+    if publishing:
+        _add_publish(
+            commands.add_parser("publish", help="publish a finished episode into a dataset"), dataset, episode
+        )
+    converting = commands.add_parser("convert", help="write a dataset as a new one of v2.1 or v3.0")
+    converting.add_argument("dataset", type=dataset, help="folder of the dataset, of any version")
+    _add_target(converting, dataset, required=True)
+    converting.add_argument(
+        "--rename",
+        action="append",
+        default=[],
+        metavar="OLD=NEW",
+        help="give a feature another name; repeatable",
+    )
+    converting.set_defaults(run=_convert)
+    merging = commands.add_parser("merge", help="write the episodes of several datasets as a new one")
+    merging.add_argument("datasets", type=dataset, nargs="+", help="folders of the datasets, in order")
+    _add_target(merging, dataset, required=False)
+    merging.set_defaults(run=_merge)
+    splitting = commands.add_parser("split", help="write some episodes of a dataset as new ones")
+    splitting.add_argument("dataset", type=dataset, help="folder of the dataset")
+    splitting.add_argument(
+        "parts",
+        nargs="+",
+        metavar="NAME=EPISODES",
+        help="a folder below --to and its episodes: train=0:40,45",
+    )
+    _add_target(splitting, dataset, required=False)
+    splitting.set_defaults(run=_split)
+    deleting = commands.add_parser("delete", help="take episodes out of a dataset; later ones move up")
+    deleting.add_argument("dataset", type=dataset, help="folder of the dataset")
+    deleting.add_argument("episodes", help="which: 3 or 0:4,7")
+    deleting.add_argument("--reencode", action="store_true", help=_REENCODE)
+    deleting.set_defaults(run=_delete)
+    repairing = commands.add_parser(
+        "repair", aliases=["recover"], help="take back what a crash left, and check"
+    )
+    repairing.add_argument("dataset", type=dataset, help="folder of the dataset")
+    repairing.set_defaults(run=_repair)
+    checking = commands.add_parser("check", help="check a dataset against its own metadata")
+    checking.add_argument("dataset", type=dataset, help="folder of the dataset")
+    checking.set_defaults(run=_check)
+    pushing = commands.add_parser("push", help="upload a dataset to the Hugging Face hub")
+    pushing.add_argument("dataset", type=dataset, help="folder of the dataset")
+    pushing.add_argument("repository", help="OWNER/NAME on the hub; created where it is not there")
+    pushing.add_argument("--public", action="store_true", help="one that is created can be seen by everybody")
+    pushing.set_defaults(run=_push)
+
+
+_REENCODE = "where pictures cannot be copied as they are coded, code them again"
+
+
+def _add_publish(publishing: argparse.ArgumentParser, dataset: Folder, episode: Folder) -> None:
+    publishing.add_argument("episode", type=episode, help="folder of the episode")
+    publishing.add_argument("--to", type=dataset, required=True, metavar="DIR", help="folder of the dataset")
+    publishing.add_argument(
+        "--version",
+        choices=layout.WRITABLE_VERSIONS,
+        help=f"of a new dataset, {layout.DEFAULT_VERSION} without; one that is there keeps its own",
+    )
     publishing.add_argument(
         "--include-interrupted", action="store_true", help="also one that was interrupted or failed"
     )
@@ -36,13 +106,17 @@ def _parser() -> argparse.ArgumentParser:
     success.add_argument("--success", action="store_const", const=True, default=None, help="it succeeded")
     success.add_argument("--failure", action="store_const", const=False, dest="success", help="it did not")
     publishing.set_defaults(run=_publish)
-    checking = commands.add_parser("check", help="check a dataset against its own metadata")
-    checking.add_argument("dataset", type=Path, help="folder of the dataset")
-    checking.set_defaults(run=_check)
-    recovering = commands.add_parser("recover", help="take back what an interrupted publication left")
-    recovering.add_argument("dataset", type=Path, help="folder of the dataset")
-    recovering.set_defaults(run=_recover)
-    return parser
+
+
+def _add_target(parser: argparse.ArgumentParser, dataset: Folder, required: bool) -> None:
+    parser.add_argument("--to", type=dataset, required=True, metavar="DIR", help="folder of what is written")
+    parser.add_argument(
+        "--version",
+        choices=layout.WRITABLE_VERSIONS,
+        required=required,
+        help="of what is written" + ("" if required else "; that of the first dataset without"),
+    )
+    parser.add_argument("--reencode", action="store_true", help=_REENCODE)
 
 
 def _publish(options: argparse.Namespace) -> int:
@@ -51,6 +125,7 @@ def _publish(options: argparse.Namespace) -> int:
         options.to,
         success=options.success,
         include_interrupted=options.include_interrupted,
+        version=options.version,
     )
     verb = "published" if done.created else "published anew"
     print(
@@ -59,21 +134,96 @@ def _publish(options: argparse.Namespace) -> int:
     return 0
 
 
+def _convert(options: argparse.Namespace) -> int:
+    return _say(
+        operations.convert(
+            options.dataset,
+            options.to,
+            options.version,
+            rename=renamed(options.rename),
+            reencode=options.reencode,
+        )
+    )
+
+
+def renamed(pairs: Sequence[str]) -> dict[str, str]:
+    """New names of features by their old ones, from OLD=NEW each."""
+    found = [pair.partition("=") for pair in pairs]
+    for old, sign, new in found:
+        if not (old and sign and new):
+            raise RecordingError(f"--rename {old}{sign}{new}: expected OLD=NEW")
+    return {old: new for old, _, new in found}
+
+
+def _merge(options: argparse.Namespace) -> int:
+    return _say(operations.merge(options.datasets, options.to, options.version, reencode=options.reencode))
+
+
+def _split(options: argparse.Namespace) -> int:
+    targets = {}
+    for part in options.parts:
+        name, _, which = part.partition("=")
+        if Path(name).name != name or name in ("", ".", "..") or options.to / name in targets:
+            raise RecordingError(f"{part!r}: expected NAME=EPISODES, with a name of its own for a folder")
+        targets[options.to / name] = episodes(which)
+    done = operations.split(options.dataset, targets, options.version, reencode=options.reencode)
+    return max(_say(one) for one in done)
+
+
+def _delete(options: argparse.Namespace) -> int:
+    return _say(operations.delete(options.dataset, episodes(options.episodes), reencode=options.reencode))
+
+
+def _repair(options: argparse.Namespace) -> int:
+    return _report(options.dataset, operations.repair(options.dataset))
+
+
 def _check(options: argparse.Namespace) -> int:
-    problems = check(options.dataset)
+    return _report(options.dataset, check(options.dataset))
+
+
+def _push(options: argparse.Namespace) -> int:
+    address = push(options.dataset, options.repository, private=not options.public, tell=print)
+    print(f"pushed: {options.dataset} to {address}")
+    return 0
+
+
+def episodes(text: str) -> list[int]:
+    """Indices of episodes from "3", "0:4" (without 4) or several of them with commas between."""
+    found: list[int] = []
+    for part in text.split(","):
+        first, colon, end = part.partition(":")
+        if not first.isdecimal() or (colon and not (end.isdecimal() and int(first) < int(end))):
+            raise RecordingError(f"{text!r} names no episodes: expected 3, or 0:4 (without 4), or 0:4,7")
+        found += range(int(first), int(end)) if colon else [int(first)]
+    return found
+
+
+def _say(done: Assembled) -> int:
+    print(f"written: {done.dataset}, {done.version}, {done.episodes} episodes, {done.frames} frames")
+    for video in done.encoded:
+        print(f"coded again: {video}")
+    for thing in done.left_out:
+        print(f"left out: {thing}")
+    return 0
+
+
+def _report(dataset: Path, problems: list[str]) -> int:
     for problem in problems:
         print(problem)
     if not problems:
-        print(f"{options.dataset} is whole")
+        print(f"{dataset} is whole")
+        print("\n".join(_told(layout.read_info(dataset))))
     return 1 if problems else 0
 
 
-def _recover(options: argparse.Namespace) -> int:
-    if not options.dataset.is_dir():
-        raise RecordingError(f"there is no dataset folder {options.dataset}")
-    with locked(options.dataset):
-        recover(options.dataset)
-    return _check(options)
+def _told(info: layout.Info) -> list[str]:
+    """What training code takes for what: LeRobot goes by how names begin."""
+    names = {
+        "inputs": [key for key in info["features"] if key.startswith("observation")],
+        "outputs": [key for key in info["features"] if key.startswith("action")],
+    }
+    return [f"{kind} of a policy: {', '.join(keys) or 'none'}" for kind, keys in names.items()]
 
 
 if __name__ == "__main__":

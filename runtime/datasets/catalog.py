@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from runtime.datasets import layout
+from runtime.datasets import layout, parquet_lists
+from runtime.datasets.entries import (
+    EpisodeEntry,
+    committed,
+    entry,
+    episode_lines,
+    statistic_lines,
+    task_lines,
+)
 from runtime.datasets.features import Features, differences, plain_rate
+from runtime.datasets.layout import Line
 from runtime.datasets.stats import Statistic, aggregate
 from runtime.errors import RecordingError
-
-Line = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,34 +39,36 @@ class Catalog:
 
     @classmethod
     def read(cls, root: Path) -> Catalog:
-        """What is committed in `root`; raises RecordingError where that is no v2.1 dataset or not whole."""
+        """What is committed in `root`; RecordingError where it is not whole, or of a version not written here."""
         if not (root / layout.INFO).exists():
             return cls(root, {}, (), (), (), ())
         info = layout.read_info(root)
-        if info["codebase_version"] != layout.CODEBASE_VERSION:
+        if info["codebase_version"] not in layout.WRITABLE_VERSIONS:
             raise RecordingError(
-                f"{root} is of version {info['codebase_version']}, published is {layout.CODEBASE_VERSION}"
+                f"{root} is of version {info['codebase_version']}, published are {layout.WRITABLE_VERSIONS}: "
+                "convert it first"
             )
-        total = int(info["total_episodes"])
-        episodes = _committed(root / layout.EPISODES, total)
+        episodes = tuple(episode_lines(root, info))
+        eva = committed(root / layout.EVA_EPISODES, layout.read_lines(root / layout.EVA_EPISODES), info)
         catalog = cls(
             root,
             info,
             episodes,
             _committed_tasks(root, info, episodes),
-            _committed(root / layout.EPISODES_STATS, total),
-            _committed(root / layout.EVA_EPISODES, total),
+            tuple(statistic_lines(root, info)),
+            tuple(eva),
         )
         catalog._require_whole()
         return catalog
 
     def _require_whole(self) -> None:
         expected = list(range(self.info["total_episodes"]))
-        for name, lines in ((layout.EPISODES, self.episodes), (layout.EPISODES_STATS, self.statistics)):
+        for name, lines in (("episodes", self.episodes), ("statistics", self.statistics)):
             listed = [line["episode_index"] for line in lines]
             if listed != expected:
                 raise RecordingError(
-                    f"{self.root / name} lists {len(listed)} episodes that are not 0 to {len(expected) - 1}"
+                    f"{self.root / 'meta'} lists the {name} of {len(listed)} episodes that are not "
+                    f"0 to {len(expected) - 1}"
                 )
         frames = sum(line["length"] for line in self.episodes)
         if frames != self.info["total_frames"]:
@@ -73,6 +82,11 @@ class Catalog:
         """The declared features, {} where the dataset is yet to be created."""
         features: Mapping[str, Mapping[str, Any]] = self.info.get("features", {})
         return features
+
+    @property
+    def version(self) -> str:
+        """The version of the format, "" where the dataset is yet to be created."""
+        return str(self.info.get("codebase_version", ""))
 
     def index_of(self, uuid: str) -> int | None:
         """Where the episode `uuid` is published; None where it is not."""
@@ -105,77 +119,180 @@ class Catalog:
         if found:
             raise RecordingError(f"{self.root} holds other data: {'; '.join(found)}. Publish elsewhere")
 
-    def created(self, robot: str, fps: float, features: Features) -> Catalog:
+    def created(self, robot: str, fps: float, features: Features, version: str) -> Catalog:
         """The catalog with an info.json, as it was or for the first time."""
         if self.info:
             return self
-        info = {
-            "codebase_version": layout.CODEBASE_VERSION,
-            "robot_type": robot,
-            "total_episodes": 0,
-            "total_frames": 0,
-            "total_tasks": 0,
-            "total_videos": 0,
-            "total_chunks": 0,
-            "chunks_size": layout.CHUNKS_SIZE,
-            "fps": plain_rate(fps),
-            "splits": {},
-            "data_path": layout.DATA_PATH,
-            "video_path": layout.VIDEO_PATH if layout.video_keys(features) else None,
-            "features": features,
-        }
-        return replace(self, info=info)
+        return replace(self, info=info_of({}, robot=robot, fps=fps, features=features, version=version))
 
-    def including(
-        self, index: int, task: str, length: int, statistics: Mapping[str, Statistic], eva: Line
-    ) -> Catalog:
-        """The catalog with episode `index` added or replaced, and the totals that follow."""
-        number = self.task_index(task)
+    def line(self, index: int, tasks: Sequence[str], length: int) -> Line:
+        """What the list of episodes says of episode `index`: where it is, or will be, and what it holds."""
+        if index < len(self.episodes):
+            return self.episodes[index] | {"tasks": list(tasks), "length": length}
+        last = self.episodes[-1] if self.episodes else {}
+        lists = {name: last.get(name, 0) for name in (parquet_lists.CHUNK, parquet_lists.FILE)}
+        made = own_line(self.info, self._next_file(), tasks, length, self.first_index(index))
+        return made | {"episode_index": index} | (lists if self.version == layout.V30 else {})
+
+    def _next_file(self) -> int:
+        """The number of the next file: in v3.0 beyond all that there are, in v2.1 that of the episode."""
+        size = int(self.info.get("chunks_size") or layout.CHUNKS_SIZE)
+        taken = [
+            int(line[name]) * size + int(line[name.replace("chunk_index", "file_index")])
+            for line in self.episodes
+            for name in line
+            if name.endswith("/chunk_index") and name != parquet_lists.CHUNK
+        ]
+        return max(taken, default=len(self.episodes) - 1) + 1
+
+    def entry(self, line: Line) -> EpisodeEntry:
+        """The files of an episode; raises RecordingError where others are in them too: they are not rewritten."""
+        made = entry(self.root, self.info, line)
+        if not made.shared or made.index == len(self.episodes):
+            return made
+        files = {made.data, *(span.path for span in made.videos.values())}
+        for other in self.episodes:
+            theirs = entry(self.root, self.info, other)
+            if theirs.index != made.index and files & {
+                theirs.data,
+                *(span.path for span in theirs.videos.values()),
+            }:
+                raise RecordingError(
+                    f"{self.root}: episode {made.index} shares its files with episode {theirs.index}: "
+                    "it cannot be written anew in its place"
+                )
+        return made
+
+    def including(self, line: Line, statistics: Mapping[str, Statistic], eva: Line | None) -> Catalog:
+        """The catalog with the episode of `line` added or replaced, and the totals that follow."""
+        index = int(line["episode_index"])
         tasks = self.tasks
-        if number not in {line["task_index"] for line in tasks}:
-            tasks = (*tasks, {"task_index": number, "task": task})
-        episodes = _with(self.episodes, {"episode_index": index, "tasks": [task], "length": length})
-        totals = {
-            "total_episodes": len(episodes),
-            "total_frames": sum(line["length"] for line in episodes),
-            "total_tasks": len(tasks),
-            "total_videos": len(episodes) * len(layout.video_keys(self.features)),
-            "total_chunks": -(-len(episodes) // int(self.info.get("chunks_size") or layout.CHUNKS_SIZE)),
-            "splits": {"train": f"0:{len(episodes)}"},
-        }
-        return replace(
+        for task in line["tasks"]:
+            if task not in {known["task"] for known in tasks}:
+                number = max((int(known["task_index"]) for known in tasks), default=-1) + 1
+                tasks = (*tasks, {"task_index": number, "task": task})
+        changed = replace(
             self,
-            info={**self.info, **totals},
-            episodes=episodes,
+            episodes=_with(self.episodes, line),
             tasks=tasks,
             statistics=_with(self.statistics, {"episode_index": index, "stats": dict(statistics)}),
-            eva=_with(self.eva, {"episode_index": index, **eva}),
+            eva=self.eva if eva is None else _with(self.eva, {"episode_index": index, **eva}),
         )
+        return replace(changed, info={**self.info, **changed.totals()})
+
+    def totals(self) -> dict[str, Any]:
+        """What info.json counts."""
+        count = len(self.episodes)
+        totals = {
+            "total_episodes": count,
+            "total_frames": sum(line["length"] for line in self.episodes),
+            "total_tasks": len(self.tasks),
+            "splits": {"train": f"0:{count}"},
+        }
+        if self.version == layout.V30:
+            return totals
+        return totals | {
+            "total_videos": count * len(layout.video_keys(self.features)),
+            "total_chunks": -(-count // int(self.info.get("chunks_size") or layout.CHUNKS_SIZE)),
+        }
 
     def documents_before_data(self) -> dict[str, bytes]:
         """Files that may name more than there is; an existing modality.json stays, it may be edited."""
-        documents = {layout.TASKS: _lines(self.tasks)}
-        if not ((self.root / layout.INFO).exists() and (self.root / layout.MODALITY).exists()):
-            documents[layout.MODALITY] = _object(modality(self.features))
+        v30 = self.version == layout.V30
+        documents = (
+            {layout.TASKS_V30: parquet_lists.tasks_file(self.tasks)}
+            if v30
+            else {layout.TASKS: _lines(self.tasks)}
+        )
+        groups = modality(self.features)
+        if groups and not ((self.root / layout.INFO).exists() and (self.root / layout.MODALITY).exists()):
+            documents[layout.MODALITY] = _object(groups)
         return documents
 
     def documents_after_data(self) -> dict[str, bytes]:
         """Files that say what there is, in the order in which they are written; info.json is the last."""
-        return {
-            layout.EPISODES_STATS: _lines(self.statistics),
+        shared = {
             layout.STATS: _object(aggregate(line["stats"] for line in self.statistics)),
             layout.EVA_EPISODES: _lines(self.eva),
+        }
+        if self.version == layout.V30:
+            lists = parquet_lists.episode_files(self.episodes, self.statistics)
+            return {**shared, **lists, layout.INFO: _object(self.info)}
+        return {
+            layout.EPISODES_STATS: _lines(self.statistics),
+            **shared,
             layout.EPISODES: _lines(self.episodes),
             layout.INFO: _object(self.info),
         }
 
 
+def own_line(info: layout.Info, number: int, tasks: Sequence[str], length: int, first: int) -> Line:
+    """What the list of episodes says of episode `number`, whose files are its own; its rows begin at `first`."""
+    line: Line = {"episode_index": number, "tasks": list(tasks), "length": length}
+    if info["codebase_version"] != layout.V30:
+        return line
+    chunk, file = divmod(number, int(info.get("chunks_size") or layout.CHUNKS_SIZE))
+    line |= {
+        "data/chunk_index": chunk,
+        "data/file_index": file,
+        "dataset_from_index": first,
+        "dataset_to_index": first + length,
+    }
+    for key in layout.video_keys(info["features"]):
+        line |= {
+            f"videos/{key}/chunk_index": chunk,
+            f"videos/{key}/file_index": file,
+            f"videos/{key}/from_timestamp": 0.0,
+            f"videos/{key}/to_timestamp": length / float(info["fps"]),
+        }
+    return line | {parquet_lists.CHUNK: 0, parquet_lists.FILE: 0}
+
+
+def info_of(
+    given: Mapping[str, Any],
+    *,
+    robot: str | None,
+    fps: float,
+    features: Mapping[str, Mapping[str, Any]],
+    version: str,
+) -> dict[str, Any]:
+    """info.json of a dataset without episodes; keys of `given` that the format does not know go along."""
+    v30 = version == layout.V30
+    info: dict[str, Any] = {
+        "codebase_version": version,
+        "robot_type": robot,
+        "total_episodes": 0,
+        "total_frames": 0,
+        "total_tasks": 0,
+    }
+    if v30:
+        info |= {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
+    else:
+        info |= {"total_videos": 0, "total_chunks": 0}
+    video_path = layout.VIDEO_PATH_V30 if v30 else layout.VIDEO_PATH
+    info |= {
+        "chunks_size": layout.CHUNKS_SIZE,
+        "fps": plain_rate(fps),
+        "splits": {},
+        "data_path": layout.DATA_PATH_V30 if v30 else layout.DATA_PATH,
+        "video_path": video_path if layout.video_keys(features) else None,
+        "features": dict(features),
+    }
+    return info | {key: value for key, value in given.items() if key not in layout.INFO_KEYS}
+
+
 def modality(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """GR00T's meta/modality.json: the parts of state and action by actuator group, the cameras, the task."""
+    """GR00T's meta/modality.json: the parts of state and action by actuator group, the cameras, the task.
+
+    {} where the dataset has no state or action of these names, or their entries have none.
+    """
+    names = {key: features.get(key, {}).get("names") for key in ("observation.state", "action")}
+    if not all(isinstance(entries, list) for entries in names.values()):
+        return {}
     prefix = "observation.images."
     return {
-        "state": _groups(features["observation.state"]["names"]),
-        "action": _groups(features["action"]["names"]),
+        "state": _groups(names["observation.state"] or []),
+        "action": _groups(names["action"] or []),
         "video": {key.removeprefix(prefix): {"original_key": key} for key in layout.video_keys(features)},
         "annotation": {"human.task_description": {"original_key": "task_index"}},
     }
@@ -190,14 +307,9 @@ def _groups(names: list[str]) -> dict[str, dict[str, int]]:
     return groups
 
 
-def _committed(path: Path, total: int) -> tuple[Line, ...]:
-    lines = [line for line in layout.read_lines(path) if line["episode_index"] < total]
-    return tuple(sorted(lines, key=lambda line: int(line["episode_index"])))
-
-
 def _committed_tasks(root: Path, info: Mapping[str, Any], episodes: tuple[Line, ...]) -> tuple[Line, ...]:
     used = {task for line in episodes for task in line["tasks"]}
-    lines = layout.read_lines(root / layout.TASKS)
+    lines = task_lines(root, info)
     total = int(info.get("total_tasks", len(lines)))
     return tuple(line for line in lines if line["task_index"] < total or line["task"] in used)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +26,9 @@ EXTRA_VECTORS = {
     "joint_velocity": "qvel",
     "joint_effort": "effort",
 }
+NOT_FINITE = "not_finite"
+# Flags that datasets have had only since the recorder says them; what ends with a dot stands for one per camera.
+LATER = ("skewed", NOT_FINITE, "lost.", "stale.")
 TIMESTAMP_TOLERANCE = 1e-4  # of LeRobot: distance of neighbouring timestamps from 1 / fps [s]
 
 
@@ -43,7 +46,7 @@ def column_features(journal: RecordedJournal, with_success: bool) -> Features:
     for stream in journal.episode.layout.capture_streams:
         features[f"capture_time.{stream}"] = scalar("float64")
     features["control_source"] = scalar("string")
-    features |= {name: scalar("bool") for name in _flags(journal)}
+    features |= {name: scalar("bool") for name in [*_flags(journal), *_later(journal)]}
     features["next.done"] = scalar("bool")
     if with_success:
         features["next.success"] = scalar("bool")
@@ -57,15 +60,42 @@ def _flags(journal: RecordedJournal) -> list[str]:
     return flags + [f"repeated.{camera}" for camera in journal.cameras]
 
 
-def recorded_columns(journal: RecordedJournal, features: Mapping[str, Feature]) -> Columns:
-    """The columns of `features` that the journal holds or that follow from the grid."""
-    columns: Columns = {
-        "observation.state": journal.finite_vectors("qpos"),
-        "action": journal.finite_vectors("action"),
+def _later(journal: RecordedJournal) -> list[str]:
+    by_camera = [name for name in LATER if name.endswith(".")]
+    plain = [name for name in LATER if name not in by_camera]
+    return plain + [f"{name}{camera}" for name in by_camera for camera in journal.cameras]
+
+
+def without_later(features: Features, known: Collection[str]) -> Features:
+    """`features` as they were before there were the flags of LATER that `known`, those of a dataset, has not."""
+    return {
+        key: feature
+        for key, feature in features.items()
+        if key in known
+        or not any(key == name or (name[-1] == "." and key.startswith(name)) for name in LATER)
     }
+
+
+def recorded_columns(journal: RecordedJournal, features: Mapping[str, Feature]) -> Columns:
+    """The columns of `features` that the journal holds or that follow from the grid.
+
+    Numbers that are not finite in what was observed are 0, their rows flagged; in an action they are a RecordingError.
+    """
+    state, not_finite = journal.observed("qpos")
+    columns: Columns = {"observation.state": state, "action": journal.finite_vectors("action")}
     for name, stream in EXTRA_VECTORS.items():
         if name in features:
-            columns[name] = journal.vectors(stream)
+            columns[name], broken = journal.observed(stream)
+            not_finite |= broken
+    if not_finite.any() and NOT_FINITE not in features:
+        raise RecordingError(
+            f"{journal.folder}: what was observed is not finite in {int(not_finite.sum())} rows, the first is "
+            f"{int(np.argmax(not_finite))}, and the dataset has no column {NOT_FINITE} to say so: publish elsewhere"
+        )
+    columns[NOT_FINITE] = not_finite
+    for name in _later(journal):
+        if name != NOT_FINITE:
+            columns[name] = journal.flags(name)
     same = ["tick_time", "control_source", *_flags(journal)]
     for name in same + [name for name in features if name.startswith("capture_time.")]:
         columns[name] = journal.scalars(name)

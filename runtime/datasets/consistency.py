@@ -1,20 +1,27 @@
-"""Checks a LeRobot v2.1 dataset against what its own metadata promises, file by file."""
+"""Checks a LeRobot dataset against what its own metadata promises, file by file."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from runtime.datasets import layout
+from runtime.datasets import layout, parquet_lists
+from runtime.datasets.entries import EpisodeEntry, Span, committed, entry, statistic_lines, task_lines
 from runtime.datasets.features import INDEX_COLUMNS, arrow_type, stored
+from runtime.datasets.pictures import Pictures, Stretch
+from runtime.datasets.rows import numbers, read_rows
+from runtime.datasets.sides import strays
 from runtime.errors import RecordingError
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+    from runtime.datasets.layout import Line
+
+TOLERANCE = 1e-4  # of LeRobot, between a row and its picture [s]
 
 
 def check(dataset: Path) -> list[str]:
@@ -22,16 +29,18 @@ def check(dataset: Path) -> list[str]:
     root = Path(dataset)
     try:
         info = layout.read_info(root)
-        if info["codebase_version"] != layout.CODEBASE_VERSION:
-            return [f"version is {info['codebase_version']}, checked is {layout.CODEBASE_VERSION}"]
-        episodes, statistics, tasks = (
-            layout.read_lines(root / name) for name in (layout.EPISODES, layout.EPISODES_STATS, layout.TASKS)
-        )
+        v30 = info["codebase_version"] == layout.V30
+        lines = parquet_lists.read_episodes(root) if v30 else layout.read_lines(root / layout.EPISODES)
+        tasks = task_lines(root, info)
+        statistics = {line["episode_index"]: line["stats"] for line in statistic_lines(root, info)}
+        entries = [entry(root, info, line) for line in lines]
         return [
-            *_totals(info, episodes, tasks),
+            *_totals(info, lines, tasks),
+            *(_places(info, lines) if v30 else ()),
             *_declarations(info),
-            *_episodes(root, info, episodes, statistics, {line["task_index"] for line in tasks}),
-            *_strays(root, info),
+            *_episodes(info, entries, statistics, {line["task_index"] for line in tasks}),
+            *_strays(root, info, entries),
+            *_sides(root, info),
         ]
     except RecordingError as error:
         return [str(error)]
@@ -39,23 +48,38 @@ def check(dataset: Path) -> list[str]:
         return [f"the metadata of {root} are not of the format: {error!r}"]
 
 
-def _totals(info: layout.Info, episodes: list[dict[str, Any]], tasks: list[dict[str, Any]]) -> Iterator[str]:
-    chunks_size = int(info.get("chunks_size", layout.CHUNKS_SIZE))
-    expected = {
+def _totals(info: layout.Info, episodes: list[Line], tasks: list[Line]) -> Iterator[str]:
+    expected: dict[str, Any] = {
         "total_episodes": len(episodes),
         "total_frames": sum(line["length"] for line in episodes),
         "total_tasks": len(tasks),
-        "total_videos": len(episodes) * len(layout.video_keys(info["features"])),
-        "total_chunks": -(-len(episodes) // chunks_size),
         "splits": {"train": f"0:{len(episodes)}"},
     }
+    if info["codebase_version"] != layout.V30:
+        chunks_size = int(info.get("chunks_size", layout.CHUNKS_SIZE))
+        expected["total_videos"] = len(episodes) * len(layout.video_keys(info["features"]))
+        expected["total_chunks"] = -(-len(episodes) // chunks_size)
     for key, value in expected.items():
         if info.get(key) != value:
             yield f"info.json says {key} {info.get(key)}, the lists give {value}"
     if [line["episode_index"] for line in episodes] != list(range(len(episodes))):
-        yield f"{layout.EPISODES} does not list episodes 0 to {len(episodes) - 1} in order"
+        yield f"the list of episodes does not have episodes 0 to {len(episodes) - 1} in order"
     if sorted(line["task_index"] for line in tasks) != list(range(len(tasks))):
-        yield f"{layout.TASKS} does not number its tasks 0 to {len(tasks) - 1}"
+        yield f"the list of tasks does not number them 0 to {len(tasks) - 1}"
+
+
+def _places(info: layout.Info, episodes: list[Line]) -> Iterator[str]:
+    """What the list of episodes of v3.0 says of rows and videos that follow each other."""
+    first = 0
+    for line in episodes:
+        given = line["dataset_from_index"], line["dataset_to_index"]
+        if given != (first, first + line["length"]):
+            yield f"episode {line['episode_index']} is rows {given}, expected {(first, first + line['length'])}"
+        first += line["length"]
+        for key in layout.video_keys(info["features"]):
+            start, end = (float(line[f"videos/{key}/{edge}_timestamp"]) for edge in ("from", "to"))
+            if abs(end - start - line["length"] / float(info["fps"])) > TOLERANCE:
+                yield f"episode {line['episode_index']}: {key!r} is {start} to {end} s for {line['length']} rows"
 
 
 def _declarations(info: layout.Info) -> Iterator[str]:
@@ -63,7 +87,7 @@ def _declarations(info: layout.Info) -> Iterator[str]:
         if "/" in key:
             yield f"feature {key!r} has a slash in its name"
         names, shape = feature.get("names"), list(feature["shape"])
-        if isinstance(names, list) and feature["dtype"] != "video" and len(names) != shape[0]:
+        if isinstance(names, list) and feature["dtype"] not in ("video", "image") and len(names) != shape[0]:
             yield f"feature {key!r} has {len(names)} names for shape {shape}"
     for key, dtype in INDEX_COLUMNS.items():
         if info["features"].get(key, {}).get("dtype") != dtype:
@@ -71,39 +95,23 @@ def _declarations(info: layout.Info) -> Iterator[str]:
 
 
 def _episodes(
-    root: Path,
-    info: layout.Info,
-    episodes: list[dict[str, Any]],
-    statistics: list[dict[str, Any]],
-    tasks: set[int],
+    info: layout.Info, entries: list[EpisodeEntry], statistics: Mapping[int, Any], tasks: set[int]
 ) -> Iterator[str]:
-    by_index = {line["episode_index"]: line["stats"] for line in statistics}
     first = 0
-    for line in episodes:
-        index, length, stem = line["episode_index"], line["length"], line.get("file_stem")
+    for listed in entries:
         try:
-            table = _read(layout.data_file(root, info, index, stem))
+            table = read_rows(listed.data, listed.index if listed.shared else None)
             problems = [
-                *_table(table, info, index, length, first),
+                *_table(table, info, listed.index, listed.length, first),
                 *_task_indices(table, tasks),
-                *_statistics(table, info, by_index.get(index)),
+                *_statistics(table, info, statistics.get(listed.index)),
             ]
         except RecordingError as error:
             problems = [str(error)]
-        for key in layout.video_keys(info["features"]):
-            problems += _video(layout.video_file(root, info, key, index, stem), key, info, length)
-        yield from (f"episode {index}: {problem}" for problem in problems)
-        first += length
-
-
-def _read(path: Path) -> pa.Table:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        return pq.ParquetFile(path).read()
-    except (OSError, pa.ArrowException) as error:
-        raise RecordingError(f"{path} cannot be read: {error}") from error
+        for key, span in listed.videos.items():
+            problems += _video(span, key, info, listed.length)
+        yield from (f"episode {listed.index}: {problem}" for problem in problems)
+        first += listed.length
 
 
 def _table(table: pa.Table, info: layout.Info, index: int, length: int, first: int) -> Iterator[str]:
@@ -117,17 +125,17 @@ def _table(table: pa.Table, info: layout.Info, index: int, length: int, first: i
             yield f"{key!r} is stored as {table.schema.field(key).type}, declared {arrow_type(key, feature)}"
     if table.num_rows != length:
         yield f"{table.num_rows} rows, listed are {length}"
-    numbers = np.arange(table.num_rows)
+    frames = np.arange(table.num_rows)
     expected = {
-        "frame_index": numbers,
+        "frame_index": frames,
         "episode_index": np.full(table.num_rows, index),
-        "index": numbers + first,
-        "timestamp": (numbers / float(info["fps"])).astype(np.float32),
+        "index": frames + first,
+        "timestamp": (frames / float(info["fps"])).astype(np.float32),
     }
     if "next.done" in table.column_names:
-        expected["next.done"] = numbers == table.num_rows - 1
+        expected["next.done"] = frames == table.num_rows - 1
     for key, values in expected.items():
-        if key in table.column_names and not np.array_equal(_array(table, key), values):
+        if key in table.column_names and not np.array_equal(numbers(table, key), values):
             yield f"{key!r} is not {values[:2].tolist()} to {values[-1:].tolist()}"
 
 
@@ -142,23 +150,25 @@ def _same_type(given: pa.DataType, expected: pa.DataType) -> bool:
 def _task_indices(table: pa.Table, tasks: set[int]) -> Iterator[str]:
     if "task_index" not in table.column_names:
         return
-    unknown = set(_array(table, "task_index").tolist()) - tasks
+    unknown = set(numbers(table, "task_index").tolist()) - tasks
     if unknown:
-        yield f"task_index {sorted(unknown)} is not in {layout.TASKS}"
+        yield f"task_index {sorted(unknown)} is not in the list of tasks"
 
 
 def _statistics(
     table: pa.Table, info: layout.Info, statistics: Mapping[str, Mapping[str, Any]] | None
 ) -> Iterator[str]:
-    if statistics is None:
-        yield f"no line in {layout.EPISODES_STATS}"
+    if info["codebase_version"] == layout.V20:
+        return  # it has none by episode
+    if not statistics:
+        yield f"no statistics in {layout.EPISODES_STATS if info['codebase_version'] == layout.V21 else 'meta'}"
         return
-    for key in layout.video_keys(info["features"]):
+    for key in (*layout.video_keys(info["features"]), *layout.image_keys(info["features"])):
         yield from _picture_statistic(key, statistics.get(key))
     for key, feature in stored(info["features"]).items():
-        if feature["dtype"] == "string" or key not in table.column_names:
+        if feature["dtype"] in ("string", "image") or key not in table.column_names:
             continue
-        values = _array(table, key).astype(np.float64).reshape(table.num_rows, -1)
+        values = numbers(table, key).astype(np.float64).reshape(table.num_rows, -1)
         known = values[~np.isnan(values).any(axis=1)]
         if key in statistics:
             yield from _column_statistic(key, known, statistics[key])
@@ -192,48 +202,32 @@ def _column_statistic(key: str, known: np.ndarray[Any, Any], statistic: Mapping[
             yield f"{name} of {key!r} is {given.tolist()}, the rows give {value.tolist()}"
 
 
-def _array(table: pa.Table, key: str) -> np.ndarray[Any, Any]:
-    import pyarrow as pa
-
-    column = table.column(key).combine_chunks()
-    nested = pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type)
-    return np.asarray((column.flatten() if nested else column).to_numpy(zero_copy_only=False))
-
-
-def _video(path: Path, key: str, info: layout.Info, length: int) -> Iterator[str]:
-    import av
-
-    if not path.is_file():
-        yield f"there is no {path}"
-        return
+def _video(span: Span, key: str, info: layout.Info, length: int) -> Iterator[str]:
+    fps = float(info["fps"])
     try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            size = [stream.height, stream.width, 3]
-            times = sorted(
-                p.pts * (stream.time_base or Fraction(1))
-                for p in container.demux(stream)
-                if p.size and p.pts is not None
-            )
-    except (av.FFmpegError, IndexError) as error:
-        yield f"{path} cannot be read: {error}"
+        stretch = None if span.start is None else Stretch(span.start, length, fps)
+        with Pictures(span.path, stretch) as pictures:
+            size, times = [*pictures.size, 3], np.array(pictures.times)
+    except RecordingError as error:
+        yield str(error)
         return
     if size != list(info["features"][key]["shape"]):
         yield f"{key!r} is {size}, declared {info['features'][key]['shape']}"
     if len(times) != length:
         yield f"{key!r} has {len(times)} frames for {length} rows"
-    off = np.abs(np.array([float(t) for t in times]) - np.arange(len(times)) / float(info["fps"]))
-    if len(off) and off.max() > 1e-4:
+    off = np.abs(times - (span.start or 0.0) - np.arange(len(times)) / fps)
+    if len(off) and off.max() > TOLERANCE:
         yield f"{key!r}: frame {int(off.argmax())} is {off.max():.6f} s off k / fps"
 
 
-def _strays(root: Path, info: layout.Info) -> Iterator[str]:
+def _strays(root: Path, info: layout.Info, entries: list[EpisodeEntry]) -> Iterator[str]:
     """Data files beyond those that are counted: LeRobot reads every parquet file below data/."""
-    total = int(info["total_episodes"])
-    listed = {
-        line["episode_index"]: line.get("file_stem") for line in layout.read_lines(root / layout.EPISODES)
-    }
-    counted = {layout.data_file(root, info, index, listed.get(index)) for index in range(total)}
+    counted = {listed.data for listed in entries if listed.index < int(info["total_episodes"])}
     for path in sorted((root / "data").rglob("*.parquet")):
         if path not in counted:
-            yield f"{path} belongs to no episode: publishing was interrupted; `recover` removes it"
+            yield f"{path} belongs to no episode: publishing was interrupted; `repair` removes it"
+
+
+def _sides(root: Path, info: layout.Info) -> Iterator[str]:
+    path = root / layout.EVA_EPISODES
+    yield from strays(root, {str(line["uuid"]) for line in committed(path, layout.read_lines(path), info)})

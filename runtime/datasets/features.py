@@ -62,23 +62,41 @@ def stored(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, 
     return {key: feature for key, feature in features.items() if feature["dtype"] != "video"}
 
 
+NUMBERS = (
+    "float16",
+    "float32",
+    "float64",
+    "int8",
+    "int16",
+    "int32",
+    "int64",
+    "uint8",
+    "uint16",
+    "uint32",
+    "uint64",
+)
+
+
 def arrow_type(key: str, feature: Mapping[str, Any]) -> pa.DataType:
     """The parquet type of one declared feature; raises RecordingError for one that has none."""
     import pyarrow as pa
 
-    types = {
-        "float32": pa.float32(),
-        "float64": pa.float64(),
-        "int64": pa.int64(),
-        "bool": pa.bool_(),
-        "string": pa.string(),
-    }
     dtype, shape = feature["dtype"], list(feature["shape"])
-    if dtype not in types or len(shape) != 1:
+    if dtype == "image":
+        return pa.struct({"bytes": pa.binary(), "path": pa.string()})
+    known = (*NUMBERS, "bool", "string")
+    if dtype not in known or not shape:
         raise RecordingError(
-            f"feature {key!r} is {dtype!r} of shape {shape}, stored are {sorted(types)} with one axis"
+            f"feature {key!r} is {dtype!r} of shape {shape}, stored are image and {known} with one axis or more"
         )
-    return types[dtype] if shape == [1] else pa.list_(types[dtype], shape[0])
+    kind: pa.DataType = pa.type_for_alias(dtype)
+    if shape == [1]:
+        return kind
+    if len(shape) == 1:
+        return pa.list_(kind, shape[0])
+    for _ in shape:
+        kind = pa.list_(kind)
+    return kind
 
 
 def arrow_schema(features: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
@@ -94,9 +112,13 @@ def arrow_schema(features: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
 
 
 def _hugging_face(feature: Mapping[str, Any]) -> dict[str, Any]:
-    value = {"dtype": feature["dtype"], "_type": "Value"}
-    length = feature["shape"][0]
-    return value if length == 1 else {"feature": value, "length": length, "_type": "Sequence"}
+    dtype, shape = feature["dtype"], list(feature["shape"])
+    if dtype == "image":
+        return {"_type": "Image"}
+    if len(shape) > 1:
+        return {"shape": shape, "dtype": dtype, "_type": f"Array{len(shape)}D"}
+    value = {"dtype": dtype, "_type": "Value"}
+    return value if shape == [1] else {"feature": value, "length": shape[0], "_type": "Sequence"}
 
 
 def differences(stated: Mapping[str, Mapping[str, Any]], new: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.errors import RecordingError
 from runtime.recording.reader import Episode, open_episode
@@ -73,6 +74,21 @@ class RecordedJournal:
             row = int(broken[0])
             raise RecordingError(f"{self.folder}: {name} of row {row} is not finite: {values[row].tolist()}")
         return values
+
+    def observed(self, name: str) -> tuple[Float32, NDArray[np.bool_]]:
+        """Column `name` as float32 [N, W], and the rows [N] in which it held numbers that are not finite: 0 here.
+
+        NaN in rows where it is not known at all.
+        """
+        values = self.vectors(name)
+        known = np.asarray(self._column(name).is_valid().to_numpy(zero_copy_only=False), dtype=np.bool_)
+        broken = ~np.isfinite(values) & known[:, None]
+        values[broken] = 0.0
+        return values, np.any(broken, axis=1)
+
+    def flags(self, name: str) -> NDArray[np.bool_]:
+        """Column `name` as booleans [N]; false in the rows of a recorder that did not have it."""
+        return np.asarray(self._column(name).fill_null(False).to_numpy(zero_copy_only=False), dtype=np.bool_)
 
     def scalars(self, name: str) -> np.ndarray[Any, Any]:
         """Column `name` as an array [N]; raises RecordingError where it has gaps."""

@@ -1,4 +1,4 @@
-"""The folder of a LeRobot v2.x dataset: its metadata files, and where an episode's data and videos lie."""
+"""The folder of a LeRobot dataset: the names of its files, and how they are read."""
 
 from __future__ import annotations
 
@@ -9,21 +9,38 @@ from typing import Any
 
 from runtime.errors import RecordingError
 
-CODEBASE_VERSION = "v2.1"
-READABLE_VERSIONS = ("v2.0", "v2.1")
-CHUNKS_SIZE = 1000  # episodes per chunk folder
+V20, V21, V30 = "v2.0", "v2.1", "v3.0"
+READABLE_VERSIONS = (V20, V21, V30)
+WRITABLE_VERSIONS = (V21, V30)
+DEFAULT_VERSION = V21  # openpi, GR00T and StarVLA read it; LeRobot from 0.4 on reads v3.0 alone
+
+CHUNKS_SIZE = 1000  # episodes (v2.x) or files (v3.0) per chunk folder
 DATA_PATH = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 VIDEO_PATH = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+DATA_PATH_V30 = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO_PATH_V30 = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 
 INFO = "meta/info.json"
-EPISODES = "meta/episodes.jsonl"
-TASKS = "meta/tasks.jsonl"
-EPISODES_STATS = "meta/episodes_stats.jsonl"
+EPISODES = "meta/episodes.jsonl"  # v2.x
+TASKS = "meta/tasks.jsonl"  # v2.x
+EPISODES_STATS = "meta/episodes_stats.jsonl"  # v2.1
+EPISODES_V30 = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+TASKS_V30 = "meta/tasks.parquet"
 STATS = "meta/stats.json"
 MODALITY = "meta/modality.json"
 EVA_EPISODES = "meta/eva_episodes.jsonl"
 
+COUNTED = ("total_episodes", "total_frames", "total_tasks", "total_videos", "total_chunks", "splits")
+INFO_KEYS = frozenset(  # of any version
+    (
+        *COUNTED,
+        *("codebase_version", "robot_type", "fps", "features", "data_path", "video_path"),
+        *("chunks_size", "data_files_size_in_mb", "video_files_size_in_mb"),
+    )
+)
+
 Info = Mapping[str, Any]
+Line = dict[str, Any]  # what a list of the metadata says of one episode or task
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -62,7 +79,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def read_info(root: Path) -> dict[str, Any]:
-    """meta/info.json of a v2.x dataset; raises RecordingError where the folder holds anything else."""
+    """meta/info.json of a dataset that can be read; raises RecordingError where the folder holds anything else."""
     info = read_json(root / INFO)
     version = info.get("codebase_version")
     if version not in READABLE_VERSIONS:
@@ -76,25 +93,11 @@ def read_info(root: Path) -> dict[str, Any]:
     return info
 
 
-def data_file(root: Path, info: Info, index: int, stem: str | None = None) -> Path:
-    """The parquet file of episode `index`."""
-    return _resolve(root, info.get("data_path") or DATA_PATH, info, index, stem, "")
-
-
-def video_file(root: Path, info: Info, key: str, index: int, stem: str | None = None) -> Path:
-    """The mp4 file of video `key` of episode `index`."""
-    return _resolve(root, info.get("video_path") or VIDEO_PATH, info, index, stem, key)
-
-
-def _resolve(root: Path, template: str, info: Info, index: int, stem: str | None, key: str) -> Path:
+def resolve(root: Path, template: str, **fields: Any) -> Path:
+    """The file that a path template of info.json names; raises RecordingError where it is none below `root`."""
     try:
-        relative = template.format(
-            episode_chunk=index // int(info.get("chunks_size") or CHUNKS_SIZE),
-            episode_index=index,
-            episode_file=stem or f"episode_{index:06d}",
-            video_key=key,
-        )
-    except (KeyError, IndexError, ValueError, TypeError) as error:
+        relative = template.format(**fields)
+    except (KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
         raise RecordingError(
             f"{root / INFO}: the path template {template!r} is unusable: {error!r}"
         ) from error
@@ -106,3 +109,8 @@ def _resolve(root: Path, template: str, info: Info, index: int, stem: str | None
 def video_keys(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """The keys of all features that are stored as videos."""
     return [key for key, feature in features.items() if feature.get("dtype") == "video"]
+
+
+def image_keys(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The keys of all features that are stored as pictures in a column."""
+    return [key for key, feature in features.items() if feature.get("dtype") == "image"]

@@ -1,12 +1,15 @@
-"""The pictures of one video file by frame number, exact whatever its B-frames and groups of pictures."""
+"""The pictures of one episode and camera by frame number, exact whatever B-frames and groups a video has."""
 
 from __future__ import annotations
 
+import io
+from abc import ABC, abstractmethod
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -17,18 +20,61 @@ if TYPE_CHECKING:
     import av
 
 
-class Pictures:
-    """Frame k of a video as RGB uint8 [H, W, 3], read-only.
+KEPT_BYTES = (
+    16 << 20
+)  # decoded frames that are kept of a video: going backwards decodes a group of pictures once
+
+
+class PictureSequence(ABC):
+    """Picture k of one camera and episode as RGB uint8 [H, W, 3], read-only; not safe to share between threads."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """How many pictures there are."""
+
+    @abstractmethod
+    def __getitem__(self, index: int) -> UInt8:
+        """Picture `index`; raises IndexError beyond the last, RecordingError where it cannot be decoded."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release the file; safe to call twice."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """The part of a video that is one episode: frame k at `start` + k / `fps` seconds."""
+
+    start: float
+    frames: int
+    fps: float
+
+    @property
+    def end(self) -> float:
+        return self.start + self.frames / self.fps
+
+
+class Pictures(PictureSequence):
+    """The frames of a video, or of a stretch of one.
 
     Frames are numbered in order of presentation from a scan of the packets, never from rounded times. Reading
     in order decodes each frame once; any other order seeks to the key frame before the wanted one and decodes
-    forward from there. Not safe to share between threads. Raises RecordingError, naming the file.
+    forward from there. The newest decoded frames are kept. Raises RecordingError, naming the file.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, stretch: Stretch | None = None) -> None:
         import av
 
         self._path = path
+        self._stretch = stretch
         self._errors = (av.FFmpegError, ValueError)
         if not path.is_file():
             raise RecordingError(f"there is no video {path}")
@@ -44,6 +90,7 @@ class Pictures:
         self._frames: Iterator[av.VideoFrame] = iter(())
         self._upcoming: int | None = None  # the frame that `_frames` yields next; None: a seek is due
         self._newest: tuple[int, UInt8] | None = None
+        self._kept: dict[int, av.VideoFrame] = {}  # in the order in which they were decoded
 
     def _scan(self) -> None:
         if not self._container.streams.video:
@@ -51,17 +98,60 @@ class Pictures:
         self._stream: Any = self._container.streams.video[0]
         times, keys = [], []
         try:
-            for packet in self._container.demux(self._stream):
-                if packet.pts is None or packet.is_discard:
-                    continue
+            for packet in self._packets():
                 times.append(packet.pts)
                 if packet.is_keyframe:
                     keys.append(packet.pts)
         except self._errors as error:
             raise RecordingError(f"{self._path} is broken after {len(times)} frames: {error}") from error
         self._times, self._keys = sorted(times), sorted(keys)
-        if not self._keys or self._keys[0] != self._times[0]:
+        if self._stretch is not None:
+            self._cut(self._stretch)
+        if not self._times:
+            raise RecordingError(f"{self._path} has no frames")
+        if not self._keys or self._keys[0] > self._times[0]:
             raise RecordingError(f"{self._path} does not start with a key frame")
+
+    def _packets(self) -> Iterator[Any]:
+        """The packets to be numbered; of a stretch, those from the key frame before it to its end."""
+        end = None
+        if self._stretch is not None:
+            self._container.seek(int(self._stretch.start / self._stream.time_base), stream=self._stream)
+            end = self._stretch.end / self._stream.time_base
+        for packet in self._container.demux(self._stream):
+            if packet.pts is None or packet.is_discard:
+                continue
+            if end is not None and packet.dts is not None and packet.dts > end:
+                return
+            yield packet
+
+    def _cut(self, stretch: Stretch) -> None:
+        half, base = 0.5 / stretch.fps, float(self._stream.time_base)
+        first, last = stretch.start - half, stretch.end - half
+        self._times = [time for time in self._times if first <= time * base < last]
+        where = f"{self._path}, {stretch.start:.3f} to {stretch.end:.3f} s"
+        if len(self._times) != stretch.frames:
+            raise RecordingError(f"{where} has {len(self._times)} frames for {stretch.frames} rows")
+        for number, time in enumerate(self._times):
+            off = abs(time * base - stretch.start - number / stretch.fps)
+            if off >= half:
+                raise RecordingError(f"{where}: frame {number} is {off:.4f} s off its row")
+
+    @property
+    def times(self) -> list[float]:
+        """When each frame is shown, in the time of the file [s]."""
+        base = float(self._stream.time_base)
+        return [time * base for time in self._times]
+
+    @property
+    def stamps(self) -> list[int]:
+        """When each frame is shown, as its time stamp in the file."""
+        return list(self._times)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width, as the stream says."""
+        return self._stream.height, self._stream.width
 
     def __len__(self) -> int:
         return len(self._times)
@@ -70,27 +160,44 @@ class Pictures:
         if not 0 <= index < len(self._times):
             raise IndexError(f"{self._path} has frames 0 to {len(self) - 1}, asked for {index}")
         if self._newest is None or self._newest[0] != index:
-            self._newest = (index, self._decode(index))
+            self._newest = (index, self._picture(index))
         return self._newest[1]
 
-    def _decode(self, index: int) -> UInt8:
+    def _picture(self, index: int) -> UInt8:
         try:
-            if not self._reachable(index):
-                self._seek(index)
-            for frame in self._frames:
-                if frame.pts is None or frame.pts < self._times[index]:
-                    continue
-                if frame.pts != self._times[index]:
-                    break
-                self._upcoming = index + 1
-                picture = np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
-                picture.flags.writeable = False
-                return picture
+            frame = self._kept[index] if index in self._kept else self._decode(index)
+            if frame.is_corrupt:
+                raise ValueError("its data are damaged")
+            picture = np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
         except self._errors as error:
             self._upcoming = None
             raise RecordingError(f"{self._path}, frame {index} cannot be decoded: {error}") from error
+        picture.flags.writeable = False
+        return picture
+
+    def _decode(self, index: int) -> av.VideoFrame:
+        if not self._reachable(index):
+            self._seek(index)
+        for frame in self._frames:
+            if frame.pts is None:
+                continue
+            number = bisect_left(self._times, frame.pts)
+            if number < len(self._times) and self._times[number] == frame.pts:
+                self._keep(number, frame)
+                self._upcoming = number + 1
+            if frame.pts == self._times[index]:
+                return frame
+            if frame.pts > self._times[index]:
+                break
         self._upcoming = None
         raise RecordingError(f"{self._path}, frame {index} is listed but does not decode")
+
+    def _keep(self, number: int, frame: av.VideoFrame) -> None:
+        self._kept.pop(number, None)
+        self._kept[number] = frame
+        room = max(2, KEPT_BYTES // (frame.width * frame.height * 3 // 2))
+        while len(self._kept) > room:
+            del self._kept[next(iter(self._kept))]
 
     def _reachable(self, index: int) -> bool:
         """Whether decoding on is the way: the frame lies ahead and no key frame lies between."""
@@ -99,7 +206,8 @@ class Pictures:
         return index == self._upcoming or self._key_before(index) <= self._times[self._upcoming]
 
     def _key_before(self, index: int) -> int:
-        return self._keys[bisect_right(self._keys, self._times[index]) - 1]
+        key: int = self._keys[bisect_right(self._keys, self._times[index]) - 1]
+        return key
 
     def _seek(self, index: int) -> None:
         key = self._key_before(index)
@@ -108,15 +216,53 @@ class Pictures:
         self._upcoming = bisect_left(self._times, key)
 
     def close(self) -> None:
-        """Release the file; safe to call twice."""
         self._frames = iter(())
         self._upcoming = None
+        self._kept.clear()
         self._container.close()
 
-    def __enter__(self) -> Pictures:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+class StoredPictures(PictureSequence):
+    """The pictures of an image column: coded as PNG or JPEG in the rows, or in files that the rows name."""
+
+    def __init__(self, name: str, rows: Sequence[Mapping[str, Any] | None], root: Path) -> None:
+        self._name = name
+        self._rows = rows
+        self._root = root
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, index: int) -> UInt8:
+        from PIL import Image, UnidentifiedImageError
+
+        if not 0 <= index < len(self._rows):
+            raise IndexError(f"{self._name} has pictures 0 to {len(self) - 1}, asked for {index}")
+        try:
+            with Image.open(io.BytesIO(self._coded(index))) as image:
+                picture = np.array(image.convert("RGB"), dtype=np.uint8)
+        except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+            raise RecordingError(f"{self._name}, picture {index} cannot be decoded: {error}") from error
+        picture.flags.writeable = False
+        return picture
+
+    def row(self, index: int) -> dict[str, Any] | None:
+        """What is stored of picture `index`, with what lies in a file of its own read; None where there is nothing."""
+        stored = self._rows[index]
+        if stored is None:
+            return None
+        return {"bytes": self._coded(index), "path": Path(str(stored.get("path") or f"{index}.png")).name}
+
+    def _coded(self, index: int) -> bytes:
+        row = self._rows[index]
+        if row is None or (row.get("bytes") is None and not row.get("path")):
+            raise RecordingError(f"{self._name}, picture {index} is missing")
+        if row.get("bytes") is not None:
+            return bytes(row["bytes"])
+        path = self._root / str(row["path"])
+        if not path.resolve().is_relative_to(self._root.resolve()):
+            raise RecordingError(f"{self._name}, picture {index} lies outside of the dataset: {row['path']}")
+        return path.read_bytes()
+
+    def close(self) -> None:
+        """Nothing to release."""

@@ -1,4 +1,4 @@
-"""Publishes a finished episode of the journal into a LeRobot v2.1 dataset; re-runnable at any time."""
+"""Publishes a finished episode of the journal into a LeRobot dataset; re-runnable at any time."""
 
 from __future__ import annotations
 
@@ -17,13 +17,19 @@ from runtime.datasets.columns import (
     placed_columns,
     recorded_columns,
     table,
+    without_later,
 )
 from runtime.datasets.journal import RecordedJournal, read_journal
 from runtime.datasets.mapping import video_key
-from runtime.datasets.remux import VideoFacts, remux
+from runtime.datasets.remux import VideoFacts, coded, remux
+from runtime.datasets.rows import write_table
+from runtime.datasets.sides import STREAMS, read_sides, side_file
 from runtime.datasets.staging import Staging, locked, recover, require_empty
 from runtime.datasets.stats import Statistic, video_statistic
 from runtime.errors import RecordingError
+from runtime.recording.base import IMPORTED
+from runtime.recording.export import exported
+from runtime.recording.labels import newest
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,7 +37,7 @@ if TYPE_CHECKING:
 
 SUCCESS = "next.success"
 SIMULATED = "sim"  # the mode, and the control source of its rows
-CODEC, PIXELS = "h264", "yuv420p"  # what our recorder writes
+PIXELS = "yuv420p"  # what our recorder writes
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,29 +51,51 @@ class Published:
 
 
 def publish(
-    episode: Path, dataset: Path, *, success: bool | None = None, include_interrupted: bool = False
+    episode: Path,
+    dataset: Path,
+    *,
+    success: bool | None = None,
+    include_interrupted: bool = False,
+    version: str | None = None,
+    sides: Mapping[str, Path] | None = None,
 ) -> Published:
     """Publish the episode folder `episode` into the dataset folder `dataset`, created where it is absent.
 
-    `success` None takes the outcome's own word, if it has one. An episode that is there already (by its uuid)
-    is written anew at its index. Raises RecordingError where the episode is not finished, incomplete, or of
-    other features than the dataset.
+    `success` None takes the outcome's own word, if it has one, else that of the episode's newest label. An episode
+    that is there already (by its uuid) is written anew at its index. `version` is that of a new dataset, v2.1 where
+    None; one that is there keeps its own. The three action streams go along as a side file, and so does what `sides`
+    names by kind ("annotations", "reviews": JSON Lines). Raises RecordingError where the episode is not finished,
+    discarded, incomplete, or of other features than the dataset.
     """
+    if version not in (None, *layout.WRITABLE_VERSIONS):
+        raise RecordingError(f"version is {version!r}, published are {layout.WRITABLE_VERSIONS}")
+    given = read_sides(sides or {})
     journal = read_journal(Path(episode))
     _require_publishable(journal, include_interrupted)
     if success is None and isinstance(journal.outcome.get("success"), bool):
         success = journal.outcome["success"]
+    if success is None and (
+        label := newest(journal.folder.absolute().parent.parent, str(journal.manifest["uuid"]))
+    ):
+        success = None if label.result is None else label.result == "success"
     root = Path(dataset)
     with locked(root):
         recover(root)
         catalog = Catalog.read(root)
         if not catalog.info:
             require_empty(root)
-        return _publish(journal, catalog, success)
+        elif version not in (None, catalog.version):
+            raise RecordingError(
+                f"{root} is of version {catalog.version}, not {version}: publish to another folder, or convert it"
+            )
+        beside = {STREAMS: exported(journal.folder), **given}
+        return _publish(journal, catalog, success, version or layout.DEFAULT_VERSION, beside)
 
 
 def never_published(manifest: Mapping[str, object]) -> str:
     """Why no dataset may ever hold the run of that manifest, to follow its name; "" where one may."""
+    if manifest.get("kind") == IMPORTED:
+        return "was imported: the dataset that it was imported with holds it, and can be converted, merged and split"
     if manifest.get("mode") != SIMULATED:
         return ""
     return (
@@ -76,8 +104,16 @@ def never_published(manifest: Mapping[str, object]) -> str:
     )
 
 
+def _discarded(journal: RecordedJournal) -> str:
+    """Who has discarded an episode of a data folder, in a sentence; "" where nobody has."""
+    label = newest(journal.folder.absolute().parent.parent, str(journal.manifest["uuid"]))
+    if label is None or not label.discarded:
+        return ""
+    return f"was discarded by {label.by}: what is discarded is never published"
+
+
 def _require_publishable(journal: RecordedJournal, include_interrupted: bool) -> None:
-    why = never_published(journal.manifest)
+    why = never_published(journal.manifest) or _discarded(journal)
     if why:
         raise RecordingError(f"{journal.folder} {why}")
     invented = int((journal.scalars("control_source") == SIMULATED).sum()) if journal.frames else 0
@@ -91,22 +127,38 @@ def _require_publishable(journal: RecordedJournal, include_interrupted: bool) ->
         )
     if not journal.frames:
         raise RecordingError(f"{journal.folder} has no rows")
+    for camera, loss in journal.episode.lost.items():
+        raise RecordingError(
+            f"{journal.folder}: the video of {camera} ends at row {loss['row']} of {journal.frames}: {loss['reason']}. "
+            "A dataset has a picture of every camera in every row"
+        )
 
 
-def _publish(journal: RecordedJournal, catalog: Catalog, success: bool | None) -> Published:
+def _publish(
+    journal: RecordedJournal,
+    catalog: Catalog,
+    success: bool | None,
+    version: str,
+    beside: Mapping[str, bytes],
+) -> Published:
     root = catalog.root
     features = _features(journal, _with_success(journal, catalog, success))
+    if catalog.info:
+        features = without_later(features, catalog.features)
     catalog.require_same(journal.robot, journal.fps, features)
-    catalog = catalog.created(journal.robot, journal.fps, features)
+    catalog = catalog.created(journal.robot, journal.fps, features, version)
     index, created = _place(journal, catalog)
-    parquet = layout.data_file(root, catalog.info, index)
-    videos = {
-        camera: layout.video_file(root, catalog.info, video_key(camera), index) for camera in journal.cameras
-    }
-    with Staging(root, index, [*videos.values(), parquet]) as staging:
+    line = catalog.line(index, [journal.task], journal.frames)
+    entry = catalog.entry(line)
+    sides = {side_file(root, kind, journal.uuid): content for kind, content in beside.items()}
+    files = [*(span.path for span in entry.videos.values()), *sides, entry.data]
+    with Staging(root, index, files) as staging:
+        for path, content in sides.items():
+            staging.write(path, content)
         statistics = {}
-        for camera, final in videos.items():
-            statistics[video_key(camera)] = _stage_video(journal, camera, staging.path(final))
+        for camera in journal.cameras:
+            key = video_key(camera)
+            statistics[key] = _stage_video(journal, camera, staging.path(entry.videos[key].path))
         columns = placed_columns(
             recorded_columns(journal, features),
             episode_index=index,
@@ -114,11 +166,9 @@ def _publish(journal: RecordedJournal, catalog: Catalog, success: bool | None) -
             task_index=catalog.task_index(journal.task),
             success=bool(success) if SUCCESS in features else None,
         )
-        _write_table(columns, features, staging.path(parquet))
+        write_table(table(columns, features), staging.path(entry.data))
         statistics |= column_statistics(columns, features)
-        catalog = catalog.including(
-            index, journal.task, journal.frames, statistics, _eva(journal, columns, success)
-        )
+        catalog = catalog.including(line, statistics, _eva(journal, columns, success))
         staging.place(catalog.documents_before_data(), catalog.documents_after_data())
     return Published(root, index, journal.frames, created)
 
@@ -140,7 +190,9 @@ def _features(journal: RecordedJournal, with_success: bool) -> declared.Features
     columns = column_features(journal, with_success)
     leading = {key: columns.pop(key) for key in ("observation.state", "action")}
     videos = {
-        video_key(camera): declared.video(height, width, journal.fps, CODEC, PIXELS)
+        video_key(camera): declared.video(
+            height, width, journal.fps, coded(journal.episode.videos[camera]), PIXELS
+        )
         for camera, (height, width) in journal.cameras.items()
     }
     return leading | videos | columns
@@ -163,20 +215,10 @@ def _place(journal: RecordedJournal, catalog: Catalog) -> tuple[int, bool]:
 def _stage_video(journal: RecordedJournal, camera: str, staged: Path) -> Statistic:
     source = journal.episode.videos[camera]
     facts = remux(source, staged, journal.frames, journal.fps)
-    expected = VideoFacts(*journal.cameras[camera], CODEC, PIXELS)
+    expected = VideoFacts(*journal.cameras[camera], facts.codec, PIXELS)
     if facts != expected:
         raise RecordingError(f"{source} is {facts}, the manifest promises {expected}")
     return video_statistic(staged, journal.frames)
-
-
-def _write_table(columns: Columns, features: declared.Features, path: Path) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        pq.write_table(table(columns, features), path)
-    except (OSError, pa.ArrowException) as error:
-        raise RecordingError(f"{path} cannot be written: {error}") from error
 
 
 def _eva(journal: RecordedJournal, columns: Columns, success: bool | None) -> dict[str, Any]:

@@ -1,8 +1,8 @@
-"""Reads episodes of LeRobot v2.0 and v2.1 datasets, whatever their columns are called."""
+"""Reads episodes of LeRobot v2.0, v2.1 and v3.0 datasets, whatever their columns are called."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,23 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from runtime.datasets import layout
+from runtime.datasets.entries import EpisodeEntry, Span, entry, episode_lines, task_lines
 from runtime.datasets.mapping import ColumnMapping, video_key
-from runtime.datasets.pictures import Pictures
+from runtime.datasets.pictures import Pictures, PictureSequence, StoredPictures, Stretch
+from runtime.datasets.rows import read_rows
 from runtime.errors import RecordingError
 from runtime.types import Float32, Float64
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-
-@dataclass(frozen=True, slots=True)
-class EpisodeEntry:
-    """One line of meta/episodes.jsonl."""
-
-    index: int
-    length: int  # rows
-    tasks: tuple[str, ...]
-    file_stem: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,24 +41,35 @@ class RecordedEpisode:
     effort: Float32 | None
     action_eef: Float32 | None
     captured: Mapping[str, Float64]
-    videos: Mapping[str, Path]  # by camera key
+    videos: Mapping[str, Span]  # by camera key
+    images: Mapping[str, StoredPictures]  # by camera key: those that are stored in columns
 
     @property
     def length(self) -> int:
         """Rows, and pictures per camera."""
         return len(self.qpos)
 
-    def pictures(self, camera: str) -> Pictures:
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The keys of the cameras that there are pictures of."""
+        return (*self.videos, *self.images)
+
+    def pictures(self, camera: str) -> PictureSequence:
         """The pictures of one camera; raises RecordingError where its video is absent or too short."""
+        if camera in self.images:
+            return self.images[camera]
         if camera not in self.videos:
             raise RecordingError(
-                f"episode {self.index} has no video for camera {camera!r}, there are {sorted(self.videos)}"
+                f"episode {self.index} has no pictures of camera {camera!r}, there are {sorted(self.cameras)}"
             )
-        pictures = Pictures(self.videos[camera])
+        span = self.videos[camera]
+        if span.start is not None:
+            return Pictures(span.path, Stretch(span.start, self.length, self.fps))
+        pictures = Pictures(span.path)
         if len(pictures) < self.length:
             frames = len(pictures)
             pictures.close()
-            raise RecordingError(f"{self.videos[camera]} has {frames} frames for {self.length} rows")
+            raise RecordingError(f"{span.path} has {frames} frames for {self.length} rows")
         return pictures
 
 
@@ -81,6 +84,11 @@ class Dataset:
     tasks: Mapping[int, str]
 
     @property
+    def version(self) -> str:
+        """Which version of the format it is written in."""
+        return str(self.info["codebase_version"])
+
+    @property
     def features(self) -> Mapping[str, Mapping[str, Any]]:
         """The declared features by key."""
         features: Mapping[str, Mapping[str, Any]] = self.info["features"]
@@ -88,22 +96,23 @@ class Dataset:
 
     def entry(self, index: int) -> EpisodeEntry:
         """The entry of episode `index`; raises RecordingError naming the episodes there are."""
-        for entry in self.episodes:
-            if entry.index == index:
-                return entry
+        for listed in self.episodes:
+            if listed.index == index:
+                return listed
         there = f"{self.episodes[0].index} to {self.episodes[-1].index}" if self.episodes else "none"
         raise RecordingError(f"{self.root} has no episode {index}, there are {len(self.episodes)}: {there}")
 
     def episode(self, index: int, mapping: ColumnMapping | None = None) -> RecordedEpisode:
         """Episode `index` with its columns as `mapping` names them; raises RecordingError."""
         mapping = mapping or ColumnMapping()
-        entry = self.entry(index)
-        table = self._table(entry)
-        columns = _Columns(table, layout.data_file(self.root, self.info, index, entry.file_stem))
+        listed = self.entry(index)
+        cameras = self._cameras(mapping)
+        images = {camera: key for camera, key in cameras.items() if key not in listed.videos}
+        columns = _Columns(self._table(listed, set(images.values())), listed.data)
         return RecordedEpisode(
             index=index,
             fps=self.fps,
-            task=self._task(entry, columns),
+            task=self._task(listed, columns),
             timestamps=self._timestamps(columns),
             qpos=columns.vectors(mapping.state),
             action=columns.optional(mapping.action),
@@ -112,38 +121,40 @@ class Dataset:
             effort=columns.optional(mapping.effort),
             action_eef=columns.optional(mapping.action_eef),
             captured={stream: columns.scalars(name) for stream, name in mapping.capture_time.items()},
-            videos=self._videos(entry, mapping),
+            videos={camera: listed.videos[key] for camera, key in cameras.items() if camera not in images},
+            images={camera: columns.images(key, self.root) for camera, key in images.items()},
         )
 
-    def _table(self, entry: EpisodeEntry) -> pa.Table:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
+    def table(self, index: int) -> pa.Table:
+        """All columns of episode `index` as stored; raises RecordingError."""
+        return self._table(self.entry(index), set(layout.image_keys(self.features)))
 
-        path = layout.data_file(self.root, self.info, entry.index, entry.file_stem)
-        if not path.is_file():
-            raise RecordingError(f"{self.root} lists episode {entry.index} but there is no {path}")
-        try:
-            table = pq.ParquetFile(path).read()
-        except (OSError, pa.ArrowException) as error:
-            raise RecordingError(f"{path} cannot be read: {error}") from error
-        if table.num_rows != entry.length or not table.num_rows:
-            raise RecordingError(f"{path} has {table.num_rows} rows, {layout.EPISODES} says {entry.length}")
+    def _table(self, listed: EpisodeEntry, images: set[str]) -> pa.Table:
+        """The rows of an episode, without the image columns that are not in `images`."""
+        left_out = set(layout.image_keys(self.features)) - images
+        table = read_rows(listed.data, listed.index if listed.shared else None, left_out)
+        if table.num_rows != listed.length or not table.num_rows:
+            raise RecordingError(
+                f"{listed.data} has {table.num_rows} rows of episode {listed.index}, "
+                f"{self.root / 'meta'} says {listed.length}"
+            )
         return table
 
-    def _task(self, entry: EpisodeEntry, columns: _Columns) -> str:
+    def _task(self, listed: EpisodeEntry, columns: _Columns) -> str:
         if columns.has("task_index"):
             number = int(columns.scalars("task_index")[0])
             if number in self.tasks:
                 return self.tasks[number]
-        return entry.tasks[0] if entry.tasks else ""
+        return listed.tasks[0] if listed.tasks else ""
 
     def _timestamps(self, columns: _Columns) -> Float64:
         if columns.has("timestamp"):
             return columns.scalars("timestamp")
         return np.arange(columns.rows, dtype=np.float64) / self.fps
 
-    def _videos(self, entry: EpisodeEntry, mapping: ColumnMapping) -> dict[str, Path]:
-        stored = layout.video_keys(self.features)
+    def _cameras(self, mapping: ColumnMapping) -> dict[str, str]:
+        """The feature that holds the pictures of each camera."""
+        stored = [*layout.video_keys(self.features), *layout.image_keys(self.features)]
         prefix = video_key("")
         wanted = mapping.videos
         if wanted is None:
@@ -151,12 +162,9 @@ class Dataset:
         for camera, key in wanted.items():
             if key not in stored:
                 raise RecordingError(
-                    f"{self.root} has no video {key!r} for camera {camera!r}, there are {sorted(stored)}"
+                    f"{self.root} has no pictures {key!r} for camera {camera!r}, there are {sorted(stored)}"
                 )
-        return {
-            camera: layout.video_file(self.root, self.info, key, entry.index, entry.file_stem)
-            for camera, key in wanted.items()
-        }
+        return dict(wanted)
 
 
 class _Columns:
@@ -186,6 +194,19 @@ class _Columns:
             raise RecordingError(f"{self._path}: column {name!r} holds vectors, expected one number per row")
         return np.asarray(flat, dtype=np.float64)
 
+    def images(self, name: str, root: Path) -> StoredPictures:
+        """Image column `name`."""
+        import pyarrow as pa
+
+        if not self.has(name):
+            raise RecordingError(f"{self._path} has no column {name!r}, there are {self._table.column_names}")
+        column = self._table.column(name).combine_chunks()
+        if not pa.types.is_struct(column.type) or not {"bytes", "path"} <= {
+            field.name for field in column.type
+        }:
+            raise RecordingError(f"{self._path}: column {name!r} is {column.type}, expected coded pictures")
+        return StoredPictures(f"{self._path}, {name!r}", _Rows(column), root)
+
     def _flat(self, name: str) -> np.ndarray[Any, Any]:
         import pyarrow as pa
 
@@ -206,31 +227,29 @@ class _Columns:
         return np.asarray(column.to_numpy(zero_copy_only=False))
 
 
+class _Rows(Sequence[Mapping[str, Any] | None]):
+    """An arrow column as a sequence; a row becomes Python when it is asked for."""
+
+    def __init__(self, column: pa.Array) -> None:
+        self._column = column
+
+    def __len__(self) -> int:
+        return len(self._column)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._column[index].as_py()
+
+
 def open_dataset(root: Path | str) -> Dataset:
-    """Open the LeRobot v2.0 or v2.1 dataset in `root`; raises RecordingError saying what is there instead."""
+    """Open the LeRobot dataset in `root`; raises RecordingError saying what is there instead."""
     root = Path(root)
     if not root.is_dir():
         raise RecordingError(f"there is no dataset folder {root}")
     info = layout.read_info(root)
-    entries = (_entry(root, line) for line in layout.read_lines(root / layout.EPISODES))
     return Dataset(
         root=root,
         info=info,
         fps=float(info["fps"]),
-        episodes=tuple(
-            sorted((e for e in entries if e.index < info["total_episodes"]), key=lambda entry: entry.index)
-        ),
-        tasks={int(line["task_index"]): str(line["task"]) for line in layout.read_lines(root / layout.TASKS)},
+        episodes=tuple(entry(root, info, line) for line in episode_lines(root, info)),
+        tasks={line["task_index"]: line["task"] for line in task_lines(root, info)},
     )
-
-
-def _entry(root: Path, line: Mapping[str, Any]) -> EpisodeEntry:
-    try:
-        return EpisodeEntry(
-            index=int(line["episode_index"]),
-            length=int(line["length"]),
-            tasks=tuple(str(task) for task in line.get("tasks", ())),
-            file_stem=line.get("file_stem"),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise RecordingError(f"{root / layout.EPISODES}: {dict(line)} is no episode: {error!r}") from error

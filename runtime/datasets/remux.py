@@ -24,6 +24,22 @@ class VideoFacts:
     pixels: str
 
 
+def coded(video: Path) -> str:
+    """The format of its pictures, "h264" for example; raises RecordingError where it cannot be read."""
+    import av
+
+    try:
+        with av.open(str(video)) as container:
+            return str(container.streams.video[0].codec.canonical_name)
+    except (av.FFmpegError, OSError, IndexError) as error:
+        raise RecordingError(f"{video} cannot be read: {error}") from error
+
+
+def copied_stream(container: av.container.OutputContainer, stream: Any) -> Any:
+    """A stream of `container` for the coded pictures of `stream`; needs no encoder, as our AV1 decoder is none."""
+    return container.add_stream_from_template(stream, opaque=stream.codec.canonical_name != "h264")
+
+
 def remux(source: Path, target: Path, frames: int, fps: float) -> VideoFacts:
     """Copy the first `frames` coded pictures of `source` to `target`, frame k at k / fps, index at the front.
 
@@ -40,7 +56,7 @@ def remux(source: Path, target: Path, frames: int, fps: float) -> VideoFacts:
             av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as container,
         ):
             stream = recorded.streams.video[0]
-            copy = container.add_stream_from_template(stream)
+            copy = copied_stream(container, stream)
             copy.time_base = 1 / rate
             for packet in _in_order(source, recorded, frames):
                 packet.pts = packet.dts = copied

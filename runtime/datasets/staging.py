@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
+import errno
 import fcntl
+import glob
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,20 +23,30 @@ from runtime.recording.files import disk_fault, read_document, sync_folder, writ
 FOLDER = ".publishing"  # hidden: readers that take every file below data/ do not look here
 LOCK = ".lock"
 PLAN = "plan.json"
+_HERE, _RENAME_EXCHANGE = -100, 2  # AT_FDCWD and the flag of renameat2(2)
 
 
 @contextmanager
 def locked(root: Path) -> Iterator[None]:
-    """Hold the dataset for one publisher, waiting for another one to finish; creates the folder."""
+    """Hold the dataset for one writer, waiting for another one to finish; creates the folder."""
     try:
         root.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(root / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        descriptor = _lock(root)
     except OSError as error:
         raise disk_fault("locking", root, error) from error
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
     finally:
+        os.close(descriptor)
+
+
+def _lock(root: Path) -> int:
+    """The descriptor of the lock of the folder that is at `root` now: it may have been exchanged meanwhile."""
+    while True:
+        descriptor = os.open(root / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        if (root / LOCK).exists() and os.path.samestat(os.fstat(descriptor), os.stat(root / LOCK)):
+            return descriptor
         os.close(descriptor)
 
 
@@ -57,30 +71,121 @@ def recover(root: Path) -> None:
 
 
 def _take_back(root: Path, index: int, files: list[Path]) -> None:
-    catalog = Catalog.read(root)
-    if index < len(catalog.episodes):
+    if (root / layout.INFO).exists() and index < int(layout.read_info(root)["total_episodes"]):
         return
+    catalog = Catalog.read(root)
     for path in files:
         path.unlink(missing_ok=True)
     if not catalog.info:
         return
     documents = catalog.documents_before_data() | catalog.documents_after_data()
-    for name in (layout.TASKS, layout.EPISODES_STATS, layout.STATS, layout.EVA_EPISODES, layout.EPISODES):
-        write_whole(root / name, documents[name])
+    for name in documents:
+        if name not in (layout.MODALITY, layout.INFO):
+            write_whole(root / name, documents[name])
 
 
 def require_empty(root: Path) -> None:
     """Raise RecordingError where a folder without info.json holds anything that is not ours to overwrite."""
-    ours = {FOLDER, LOCK, "data", "videos", "meta"}
+    ours = {FOLDER, LOCK, "data", "videos", "meta", "eva"}
     foreign = sorted(entry.name for entry in root.iterdir() if entry.name not in ours)
     foreign += [
         str(path.relative_to(root))
-        for folder in ("data", "videos")
+        for folder in ("data", "videos", "eva")
         for path in sorted((root / folder).rglob("*"))
         if path.is_file()
     ]
     if foreign:
         raise RecordingError(f"{root} is no dataset and not empty (no {layout.INFO}, but {foreign[:5]})")
+
+
+class Draft:
+    """A whole new dataset on its way: made in a hidden folder beside `target`, then put there by one rename.
+
+    `replacing`: it takes the place of the folder that is there, exchanged at once; else there must be none, or an
+    empty one. Leaving the block without `place` removes it. One that was killed is removed by `repair`.
+    """
+
+    def __init__(self, target: Path, replacing: bool) -> None:
+        self._target = target
+        self._replacing = replacing
+        self.folder = target
+
+    def __enter__(self) -> Draft:
+        self._require_free()
+        parent = self._target.absolute().parent
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+            self.folder = Path(tempfile.mkdtemp(prefix=_draft_prefix(self._target), dir=parent))
+            self.folder.chmod(0o755)
+            self._descriptor = _lock(self.folder)
+        except OSError as error:
+            raise disk_fault("creating", self._target, error) from error
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        os.close(self._descriptor)
+        if self.folder.exists():
+            shutil.rmtree(self.folder)
+
+    def _require_free(self) -> None:
+        if self._replacing or not self._target.exists():
+            return
+        if not self._target.is_dir() or any(self._target.iterdir()):
+            raise RecordingError(f"{self._target} is there already and not empty: give a folder that is not")
+
+    def place(self) -> None:
+        """Sync everything and put it at the target; what was there before is in `folder` then, and is removed."""
+        try:
+            for path in sorted(self.folder.rglob("*")):
+                if path.is_file():
+                    _sync(path)
+                else:
+                    sync_folder(path)
+            sync_folder(self.folder)
+            if self._replacing:
+                _exchange(self.folder, self._target)
+            else:
+                os.rename(self.folder, self._target)
+            sync_folder(self._target.absolute().parent)
+        except OSError as error:
+            raise disk_fault("putting in place", self._target, error) from error
+
+
+def remove_drafts(target: Path) -> list[Path]:
+    """Remove what killed makers of `target` left beside it; the folders of those still at work stay."""
+    removed = []
+    for folder in sorted(target.absolute().parent.glob(f"{glob.escape(_draft_prefix(target))}*")):
+        try:
+            descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder)
+                removed.append(folder)
+            except BlockingIOError:
+                continue
+            finally:
+                os.close(descriptor)
+        except OSError as error:
+            raise disk_fault("removing", folder, error) from error
+    return removed
+
+
+def _draft_prefix(target: Path) -> str:
+    return f".{target.absolute().name}.draft-"
+
+
+def _exchange(one: Path, other: Path) -> None:
+    """Let two folders change places in one step, so that there is one of them at any moment."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.renameat2(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _RENAME_EXCHANGE):
+        number = ctypes.get_errno()
+        if number in (errno.EINVAL, errno.ENOSYS):
+            raise RecordingError(
+                f"the file system of {other} cannot exchange folders: write the result to another folder"
+            )
+        raise OSError(number, os.strerror(number), str(other))
 
 
 class Staging:
@@ -112,6 +217,13 @@ class Staging:
     def path(self, final: Path) -> Path:
         """Where to prepare the file that goes to `final`."""
         return self._folder / str(final.relative_to(self._root)).replace("/", "|")
+
+    def write(self, final: Path, content: bytes) -> None:
+        """Prepare `content` for `final`."""
+        try:
+            self.path(final).write_bytes(content)
+        except OSError as error:
+            raise disk_fault("publishing to", self._root, error) from error
 
     def place(self, before: dict[str, bytes], after: dict[str, bytes]) -> None:
         """Write the documents, sync everything, then rename: `before`, the data, `after` in their order."""

@@ -1,4 +1,4 @@
-"""Statistics of an episode's columns and pictures, and of all episodes, as LeRobot v2.1 keeps them."""
+"""Statistics of an episode's columns and pictures, and of all episodes, as LeRobot keeps them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.datasets.pictures import PictureSequence
 from runtime.errors import RecordingError
 from runtime.types import UInt8
 
-Statistic = dict[str, list[Any]]  # min, max, mean, std: lists of the feature's shape; count: [n]
+# min, max, mean, std and the quantiles: lists of the feature's shape; count: [n]
+Statistic = dict[str, list[Any]]
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 SAMPLED_PICTURES = 100  # per video and episode
 
 
@@ -32,6 +35,7 @@ def column_statistic(values: NDArray[Any]) -> Statistic | None:
         "mean": exact.mean(axis=0).tolist(),
         "std": exact.std(axis=0).tolist(),
         "count": [len(known)],
+        **{name: np.quantile(exact, share, axis=0).tolist() for name, share in QUANTILES.items()},
     }
 
 
@@ -43,7 +47,7 @@ def video_statistic(path: Path, frames: int) -> Statistic:
     import av
 
     wanted = set(np.linspace(0, frames - 1, min(frames, SAMPLED_PICTURES)).round().astype(int).tolist())
-    sums = _ChannelSums()
+    sums = _Histogram()
     decoded = 0
     try:
         with av.open(str(path)) as container:
@@ -58,36 +62,53 @@ def video_statistic(path: Path, frames: int) -> Statistic:
     return sums.statistic()
 
 
-class _ChannelSums:
+def picture_statistic(pictures: PictureSequence) -> Statistic:
+    """As `video_statistic`, of pictures [H, W, 3] that are stored one by one."""
+    sums = _Histogram()
+    for number in np.unique(
+        np.linspace(0, len(pictures) - 1, min(len(pictures), SAMPLED_PICTURES)).round().astype(int)
+    ):
+        sums.add(pictures[int(number)][::2, ::2])
+    return sums.statistic()
+
+
+class _Histogram:
+    """How often each value 0 to 255 occurs, by channel: everything else follows from it exactly."""
+
     def __init__(self) -> None:
         self._pictures = 0
-        self._pixels = 0
-        self._sum = np.zeros(3)
-        self._squares = np.zeros(3)
-        self._lowest = np.full(3, 255.0)
-        self._highest = np.zeros(3)
+        self._counts = np.zeros((3, 256), dtype=np.int64)
 
     def add(self, picture: UInt8) -> None:
-        pixels = picture.reshape(-1, 3).astype(np.float64)
         self._pictures += 1
-        self._pixels += len(pixels)
-        self._sum += pixels.sum(axis=0)
-        self._squares += (pixels**2).sum(axis=0)
-        self._lowest = np.minimum(self._lowest, pixels.min(axis=0))
-        self._highest = np.maximum(self._highest, pixels.max(axis=0))
+        for channel in range(3):
+            self._counts[channel] += np.bincount(picture[..., channel].reshape(-1), minlength=256)
 
     def statistic(self) -> Statistic:
-        mean = self._sum / self._pixels
-        deviation = np.sqrt(np.maximum(self._squares / self._pixels - mean**2, 0.0))
-        figures = {"min": self._lowest, "max": self._highest, "mean": mean, "std": deviation}
-        scaled = {name: (value / 255).reshape(3, 1, 1).tolist() for name, value in figures.items()}
+        values = np.arange(256, dtype=np.float64)
+        pixels = self._counts[0].sum()
+        mean = self._counts @ values / pixels
+        variance = np.maximum(self._counts @ values**2 / pixels - mean**2, 0.0)
+        reached = self._counts.cumsum(axis=1)
+        figures = {
+            "min": (self._counts > 0).argmax(axis=1),
+            "max": 255 - (self._counts[:, ::-1] > 0).argmax(axis=1),
+            "mean": mean,
+            "std": np.sqrt(variance),
+        }
+        figures |= {name: (reached >= share * pixels).argmax(axis=1) for name, share in QUANTILES.items()}
+        scaled = {
+            name: (np.asarray(value, np.float64) / 255).reshape(3, 1, 1).tolist()
+            for name, value in figures.items()
+        }
         return {**scaled, "count": [self._pictures]}
 
 
 def aggregate(episodes: Iterable[Mapping[str, Statistic]]) -> dict[str, Statistic]:
     """The statistics of all episodes together, each episode weighted by its count.
 
-    Source: the parallel form of the variance (Chan, Golub, LeVeque 1979).
+    Source: the parallel form of the variance (Chan, Golub, LeVeque 1979). Quantiles are the mean of those of the
+    episodes, as LeRobot makes them; there are none where an episode has none.
     """
     collected: dict[str, list[Statistic]] = {}
     for statistics in episodes:
@@ -108,4 +129,9 @@ def _together(parts: list[Statistic]) -> Statistic:
         "mean": mean.tolist(),
         "std": np.sqrt(variance).tolist(),
         "count": [int(counts.sum())],
+        **{
+            name: (weights * np.array([part[name] for part in parts], np.float64)).sum(axis=0).tolist()
+            for name in QUANTILES
+            if all(name in part for part in parts)
+        },
     }

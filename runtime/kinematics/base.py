@@ -85,6 +85,10 @@ class Forward(ABC):
 class Kinematics(Forward):
     """Forward and inverse kinematics of one robot."""
 
+    def prepare(self) -> bool:
+        """Begin what `solve` needs, where nobody has; whether `solve` would not have to wait for it."""
+        return True
+
     @abstractmethod
     def solve(
         self,

@@ -6,16 +6,16 @@ a deployment asks for it.
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import importlib
-from types import ModuleType
+from types import ModuleType, new_class
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from robots import Group, Robot, urdf
-from robots.chain import motion_table, motions
+from robots import Group, Robot
 from robots.rotations import quaternion_of_matrix, transform_of
-from robots.urdf import Joint
 from runtime.errors import SetupError
 from runtime.kinematics import compiled
 from runtime.kinematics.base import IkResult, Kinematics, KinematicsSettings
@@ -33,7 +33,7 @@ class Config(KinematicsSettings):
 
 
 def build(config: Config, robot: Robot) -> PyrokiKinematics:
-    """The kinematics of the robot's arms, compiled for chunks of up to 64 rows."""
+    """The kinematics of the robot's arms, compiled for chunks of up to 64 rows: that takes some ten seconds."""
     made = PyrokiKinematics(robot, config)
     home = robot.poses["home"]
     made.solve(made.forward(home)[None], home)
@@ -98,13 +98,13 @@ class _Arm:
     """One arm as PyRoki sees it: the serial chain of its own joints, and the scan over a chunk."""
 
     def __init__(self, libraries: _Libraries, robot: Robot, group: Group, config: Config) -> None:
+        assert group.chain is not None  # it is an arm
         self._group = group
-        described = _robot_of(libraries, robot, group)
-        order = [group.urdf_joints.index(name) for name in described.joints.actuated_names]
-        self.dims = group.joint_dims[order]
+        self.dims = group.joint_dims[[joint.drive for joint in group.chain.moving]]
         self._lower, self._upper = robot.lower[self.dims], robot.upper[self.dims]
         self._speed = robot.velocity[self.dims] * config.velocity_scale
-        self._scan = _scan_of(libraries, described, config)
+        self._described = _robot_of(libraries, robot, group)
+        self._scan = _scan_of(libraries, config)
 
     def follow(self, asked: _Asked) -> tuple[Float64, Float64, Float64]:
         """Joints [T, n], and the lowest and highest that each row could have."""
@@ -124,7 +124,9 @@ class _Arm:
             self._lower,
             self._upper,
         )
-        q, low, high = (np.asarray(part, np.float64)[:rows] for part in self._scan(*map(_float32, given)))
+        q, low, high = (
+            np.asarray(part, np.float64)[:rows] for part in self._scan(self._described, *map(_float32, given))
+        )
         # float32 may round beyond the box by its last digit
         low, high = np.maximum(low, self._lower), np.minimum(high, self._upper)
         return self._cut(q, asked, steps[:rows], held), low, high
@@ -173,57 +175,63 @@ def _libraries() -> _Libraries:
 
 
 def _robot_of(libraries: _Libraries, robot: Robot, group: Group) -> Any:
-    """PyRoki's robot for the chain of the group's own joints; SetupError where a mimic lies on it."""
+    """PyRoki's robot for the group's chain: its moving joints outwards and what is fixed behind them, each once.
+
+    Arms with as many joints differ in numbers alone, so that one compiled function serves them all. SetupError where a
+    mimic lies on the chain.
+    """
     assert group.chain is not None  # it is an arm
     describe = libraries.yourdfpy.urdf
-    tree = urdf.read(robot.urdf)
-    joints, links = [], [group.chain.frame]
-    for joint in tree.between(group.chain.frame, group.chain.tip):
-        links.append(joint.child)
-        own = joint.name in group.urdf_joints
-        if joint.mimic is not None and not own:
-            raise SetupError(
-                f'kinematics.kind = "pyroki": {joint.name} of {group.name} is a mimic; allowed: arms without, or '
-                'kind = "compiled"'
-            )
-        dim = int(group.joint_dims[group.urdf_joints.index(joint.name)]) if own else -1
-        joints.append(
-            describe.Joint(
-                name=joint.name,
-                type=("prismatic" if joint.kind == "prismatic" else "revolute") if own else "fixed",
-                parent=joint.parent,
-                child=joint.child,
-                origin=joint.origin if own else _standing(joint, group.chain.pinned.get(joint.name, 0.0)),
-                axis=joint.axis,
-                limit=describe.Limit(
-                    effort=1.0,
-                    velocity=float(robot.velocity[dim]),
-                    lower=float(robot.lower[dim]),
-                    upper=float(robot.upper[dim]),
-                )
-                if own
-                else None,
-            )
+    moving = group.chain.moving
+    if any((joint.factor, joint.offset) != (1.0, 0.0) for joint in moving) or len(moving) != group.chain.size:
+        raise SetupError(
+            f'kinematics.kind = "pyroki": a mimic lies on the chain of {group.name}; allowed: arms without, or '
+            'kind = "compiled"'
         )
-    described = describe.Robot(
-        name=group.name, links=[describe.Link(name=link) for link in links], joints=joints
+    links = [f"link{index}" for index in range(len(moving) + 2)]
+    joints = [
+        describe.Joint(
+            name=f"joint{index}",
+            type="prismatic" if joint.slides else "revolute",
+            parent=links[index],
+            child=links[index + 1],
+            origin=joint.origin,
+            axis=joint.axis,
+            limit=describe.Limit(
+                effort=1.0,
+                velocity=float(robot.velocity[dim]),
+                lower=float(robot.lower[dim]),
+                upper=float(robot.upper[dim]),
+            ),
+        )
+        for index, joint in enumerate(moving)
+        for dim in (group.joint_dims[joint.drive],)
+    ]
+    joints.append(
+        describe.Joint(name="tail", type="fixed", parent=links[-2], child=links[-1], origin=group.chain.tail)
     )
-    return libraries.pyroki.Robot.from_urdf(describe.URDF(robot=described, load_meshes=False))
+    described = describe.Robot(name="arm", links=[describe.Link(name=link) for link in links], joints=joints)
+    made = libraries.pyroki.Robot.from_urdf(describe.URDF(robot=described, load_meshes=False))
+    return dataclasses.replace(made, joint_var_cls=_variable_of(libraries, len(moving)))
 
 
-def _standing(joint: Joint, value: float) -> Float64:
-    """The transform [4, 4] of a joint that stands still at `value`."""
-    if joint.kind == "fixed":
-        return joint.origin
-    return np.asarray(motions(np.array([value]), motion_table(joint.origin, joint)[None])[0])
+@functools.cache
+def _variable_of(libraries: _Libraries, size: int) -> Any:
+    """The variable of as many joints: PyRoki makes one for each robot, and what is compiled is bound to it."""
+    zeros = libraries.jax.numpy.zeros(size)
+    return new_class(
+        "Joints", (libraries.jaxls.Var[libraries.jax.Array],), {"default_factory": lambda: zeros}
+    )
 
 
-def _scan_of(libraries: _Libraries, robot: Any, config: Config) -> Any:
-    """The compiled function from poses and bounds of a chunk to joints and the boxes they were solved in."""
+@functools.cache
+def _scan_of(libraries: _Libraries, config: Config) -> Any:
+    """The function from an arm, poses and bounds of a chunk to joints and the boxes they were solved in.
+
+    It is compiled with the first arm of each number of joints, which takes longer than a thousand chunks.
+    """
     jax, jaxlie, jaxls = libraries.jax, libraries.jaxlie, libraries.jaxls
     jnp = jax.numpy
-    variable = robot.joint_var_cls(0)
-    link = jnp.array(len(robot.links.names) - 1)
     termination = jaxls.TerminationConfig(max_iterations=config.max_iterations)
 
     def beyond(values: Any, of: Any, low: Any, high: Any) -> Any:
@@ -232,7 +240,8 @@ def _scan_of(libraries: _Libraries, robot: Any, config: Config) -> Any:
 
     box_cost = jaxls.Cost.factory(beyond)
 
-    def frame(carry: Any, row: Any) -> Any:
+    def frame(robot: Any, carry: Any, row: Any) -> Any:
+        variable = robot.joint_var_cls(0)
         before, start, held, lower, upper = carry
         pose, step, anchored = row
         base = jnp.where(anchored > 0, held, before)
@@ -243,7 +252,7 @@ def _scan_of(libraries: _Libraries, robot: Any, config: Config) -> Any:
                 robot,
                 variable,
                 jaxlie.SE3(pose),
-                link,
+                jnp.array(len(robot.links.names) - 1),
                 pos_weight=config.position_weight,
                 ori_weight=config.rotation_weight,
             ),
@@ -263,9 +272,11 @@ def _scan_of(libraries: _Libraries, robot: Any, config: Config) -> Any:
         q = jnp.clip(solution[variable], low, high)
         return (q, q, held, lower, upper), (q, low, high)
 
-    def chunk(poses: Any, steps: Any, anchored: Any, seed: Any, held: Any, lower: Any, upper: Any) -> Any:
+    def chunk(
+        robot: Any, poses: Any, steps: Any, anchored: Any, seed: Any, held: Any, lower: Any, upper: Any
+    ) -> Any:
         first = (seed, seed, held, lower, upper)
-        return jax.lax.scan(frame, first, (poses, steps, anchored))[1]
+        return jax.lax.scan(functools.partial(frame, robot), first, (poses, steps, anchored))[1]
 
     return jax.jit(chunk)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.errors import ContradictionError
+from runtime.errors import ActionSpaceError, ContradictionError
 from runtime.policies.request import RequestSettings
 from runtime.pose_format import PoseFormat
 from runtime.types import ActionMode, RelativeFrame, Space
@@ -27,7 +27,18 @@ _ORIENTATIONS: dict[str, tuple[str, ...]] = {  # words that are in use for what 
     "rot6d": ("6d",),
     "rotation_6d": ("6d",),
 }
+_OF_ACTIONS = (
+    "action_space",
+    "action_mode",
+    "action_dim",
+    "relative_frame",
+    "action_orientation",
+    "orientation",
+)
 _SIZES = ("image_size", "image_resolution", "training_obs_image_size")
+_COMPARED = frozenset(
+    {*_OF_ACTIONS, *_SIZES, "action_rate", "observation_orientation", "action_pose", "observation_pose"}
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +59,11 @@ def agreed(said: Mapping[str, Any], declared: Declared, where: str) -> Space | N
 
     Compared are action_mode and action_space, action_dim, action_rate, relative_frame, action_orientation (or
     orientation), observation_orientation, action_pose and observation_pose (maps with the keys of a pose format),
-    and image_size (image_resolution, training_obs_image_size). Raises ContradictionError with both sides.
+    and image_size (image_resolution, training_obs_image_size). Raises ContradictionError with both
+    sides, ActionSpaceError where it is about the actions themselves.
     """
+    if _COMPARED.isdisjoint(said):  # as in most answers
+        return None
     space = _space(said, declared, where)
     for key, given, key_here, here in _pairs(said, declared):
         if given != here:
@@ -107,14 +121,14 @@ def _space(said: Mapping[str, Any], declared: Declared, where: str) -> Space | N
         if given is None:
             continue
         if not isinstance(given, str) or given not in words:
-            raise ContradictionError(f"the server's {where} has {key} {given!r}; allowed: {', '.join(words)}")
+            raise ActionSpaceError(f"the server's {where} has {key} {given!r}; allowed: {', '.join(words)}")
         if given in _MODES:
             if given != declared.mode:
                 raise _contradiction(where, key, given, "policy.action_mode", declared.mode)
             continue
         found = _SPACES[given]
         if found != declared.space:
-            raise ContradictionError(
+            raise ActionSpaceError(
                 f"the server's {where} says that actions are {found!r}, policy.action_space is "
                 f"{declared.space!r}; correct the one that is wrong"
             )
@@ -132,6 +146,7 @@ def _size(given: Any) -> Any:
 
 
 def _contradiction(where: str, key: str, given: Any, key_here: str, here: Any) -> ContradictionError:
-    return ContradictionError(
+    kind = ActionSpaceError if key in _OF_ACTIONS or key.startswith("action_pose") else ContradictionError
+    return kind(
         f"the server's {where} has {key} = {given!r}, {key_here} = {here!r}; correct the one that is wrong"
     )

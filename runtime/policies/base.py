@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+from runtime.policies.reach import Dial
 from runtime.types import ActionChunk, Conditioning, Observation, Space
 
 
@@ -31,6 +32,14 @@ class Policy(ABC):
 
     observation_eef: Literal["measured", "fk"] = "measured"
     sees_poses: bool = False  # its answers depend on the poses of an observation
+    glances_s: float | None = (
+        None  # how often it is to be shown what is seen, between requests too [s]; None: never
+    )
+    sees_pictures: bool = True  # it is shown those of an observation
+    answers: bool = True  # False where nobody is asked, because the robot is driven by its own node
+    # Where a server is connected to in the place of its url's host and port, as the near end of a tunnel; asked before
+    # each connection, raises PolicyError where there is none. All else, names of certificates included, is of the url.
+    dial: Dial | None = None
 
     @abstractmethod
     def connect(self) -> PolicyInfo:
@@ -40,9 +49,18 @@ class Policy(ABC):
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
         """The chunk for this observation; raises PolicyError. A connection that timed out is dropped, not reused."""
 
+    def glance(self, observation: Observation) -> None:  # noqa: B027  # most see only what they are asked about
+        """What is seen now, every `glances_s` of a run; waits for nothing, least of all for a request under way."""
+
     @abstractmethod
     def reset(self) -> None:
         """Forget the episode; a reply still in flight belongs to the old one."""
+
+    def resume(self) -> None:  # noqa: B027  # most answer what they are shown
+        """The episode goes on after a hold in which nothing was asked; called before the next inference."""
+
+    def rest(self) -> None:  # noqa: B027  # most servers keep nothing of a rollout
+        """The rollout is over: end what the server keeps of it; raises PolicyError. `reset` comes before the next."""
 
     @abstractmethod
     def close(self) -> None:

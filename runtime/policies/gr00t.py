@@ -18,13 +18,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 
 from runtime.clock import Clock
-from runtime.errors import CodecError, ConfigurationError, PolicyError
+from runtime.errors import (
+    CodecError,
+    ConfigurationError,
+    PolicyError,
+    RefusedError,
+    ServerSaysError,
+    WrongProtocolError,
+)
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.groot import arrays
 from runtime.policies.groot.link import ReqLink
 from runtime.policies.groot.modality import modalities
 from runtime.policies.groot.request import Gr00tRequest, RequestSettings
 from runtime.policies.link import headline
+from runtime.policies.tunnel.settings import TunnelSettings
 from runtime.types import ActionChunk, Conditioning, Observation
 
 if TYPE_CHECKING:
@@ -53,6 +61,8 @@ class Config(RequestSettings):
         "tcp://127.0.0.1:5555"
     )
     """Where the server listens."""
+    tunnel: TunnelSettings | None = None
+    """The SSH tunnel through which the server is reached; url is then as seen from the tunnel's far end."""
     api_token_env: str | None = None
     """Environment variable with the server's API token; the token itself would end up in every manifest."""
     connect_deadline: Positive = 5.0
@@ -68,7 +78,7 @@ def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> Gr
     return Gr00tPolicy(config, robot, control_rate)
 
 
-class UnknownEndpoint(PolicyError):
+class UnknownEndpoint(WrongProtocolError):
     """The server does not know what it was asked for."""
 
 
@@ -146,7 +156,7 @@ class Gr00tPolicy(Policy):
                 self._lock.release()
 
     def _new_link(self) -> ReqLink:
-        return ReqLink(self._config.url, self._config.connect_deadline, ANSWER_LIMIT)
+        return ReqLink(self._config.url, self._config.connect_deadline, ANSWER_LIMIT, self.dial)
 
     def _require_open(self) -> None:
         if self._closed:
@@ -177,14 +187,14 @@ class Gr00tPolicy(Policy):
         message |= {} if self._token is None else {"api_token": self._token}
         reply = self._link.exchange(arrays.pack(message), seconds, f"an answer to {endpoint}")
         if reply == b"ERROR":
-            raise PolicyError(
+            raise ServerSaysError(
                 f"{self._config.url} answers {endpoint} with ERROR: see the server's own output"
             )
         try:
             result = arrays.unpack(reply, ANSWER_LIMIT)
         except CodecError as error:
             self._link.drop()
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"{self._config.url} sent an answer that is not the GR00T protocol: {error}"
             ) from error
         if isinstance(result, dict) and set(result) == {"error"}:
@@ -197,7 +207,8 @@ class Gr00tPolicy(Policy):
             return UnknownEndpoint(
                 f"the policy server at {url} has no endpoint {endpoint!r} ({text}): it is of another version"
             )
-        return PolicyError(self._told(text))
+        kind = RefusedError if text.startswith("Unauthorized") else ServerSaysError
+        return kind(self._told(text))
 
     def _told(self, text: str) -> str:
         url = self._config.url

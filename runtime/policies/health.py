@@ -10,43 +10,54 @@ import time
 from collections.abc import Mapping
 from urllib.parse import urlsplit
 
-from runtime.errors import PolicyError, PolicyLostError
-from runtime.policies.reach import reach
+from runtime.errors import PolicyLostError, PolicyTimeout, RefusedError, TlsError, WrongProtocolError
+from runtime.policies.reach import Dial, reached
 
 _STATUS = re.compile(rb"HTTP/1\.[01] ([0-9]{3})([^\r\n]*)\r?\n")
 _LONGEST = 4096  # bytes of a first line
 
 
-def require_healthy(url: str, path: str, headers: Mapping[str, str], seconds: float) -> None:
+def require_healthy(
+    url: str, path: str, headers: Mapping[str, str], seconds: float, dial: Dial | None = None
+) -> None:
     """GET `path` at the host and port of the websocket `url`, with TLS for wss; returns on status 200.
 
+    `dial` says where these are connected to, where that is elsewhere.
+
     PolicyLostError where nobody answers within `seconds`, or the server says that it is not ready (HTTP 5xx);
-    PolicyError where it answers anything else, because then another server is there, or the path is wrong.
+    another PolicyError where it answers anything else, because then another server is there, or the path is wrong.
     """
     try:
-        status, reason = _asked(url, path, headers, time.monotonic() + seconds)
+        status, reason = _asked(url, path, headers, time.monotonic() + seconds, seconds, dial)
     except TimeoutError as error:
-        raise PolicyLostError(
-            f"{url}: {path} gave no answer within {seconds:g} s: the host is unreachable, or the server is stuck"
+        raise PolicyTimeout(
+            f"{url}: {path} gave no answer within {seconds:g} s: the server is stuck, or no web server"
         ) from error
     except ssl.SSLError as error:
-        raise PolicyError(
+        raise TlsError(
             f"{url}: no encrypted connection ({error}): check host, port and certificate, or use ws://"
         ) from error
     except OSError as error:
         raise PolicyLostError(
-            f"no policy server listens at {url} ({error}): start it, or correct policy.url"
+            f"the connection to {url} ended while {path} was asked for ({error}): see that the policy server runs"
         ) from error
     if status >= 500:
         raise PolicyLostError(f"the policy server at {url} is not well: {path} says HTTP {status} {reason}")
+    if status in (http.HTTPStatus.UNAUTHORIZED, http.HTTPStatus.FORBIDDEN):
+        raise RefusedError(
+            f"{url}: {path} says HTTP {status} {reason}: it wants an API key; policy.api_key_env names the "
+            "environment variable that holds it"
+        )
     if status != http.HTTPStatus.OK:
-        raise PolicyError(
+        raise WrongProtocolError(
             f"{url}: {path} says HTTP {status} {reason}, expected 200: another server listens there, or "
             "policy.health_path is wrong"
         )
 
 
-def _asked(url: str, path: str, headers: Mapping[str, str], deadline: float) -> tuple[int, str]:
+def _asked(
+    url: str, path: str, headers: Mapping[str, str], deadline: float, seconds: float, dial: Dial | None
+) -> tuple[int, str]:
     """Status and reason; TimeoutError at the deadline on the monotonic clock however slowly the server speaks."""
     place = urlsplit(url)
     secure = place.scheme == "wss"
@@ -54,7 +65,8 @@ def _asked(url: str, path: str, headers: Mapping[str, str], deadline: float) -> 
     lines = [f"GET {path} HTTP/1.1", f"Host: {place.netloc}", "Connection: close"]
     lines += [f"{name}: {value}" for name, value in headers.items()]
     with contextlib.ExitStack() as stack:
-        wire = stack.enter_context(reach(host, port, deadline, lambda: None))
+        there = dial() if dial else (host, port)
+        wire = stack.enter_context(reached(url, *there, deadline, seconds, lambda: None))
         wire.settimeout(_left(deadline))
         if secure:
             wire = stack.enter_context(ssl.create_default_context().wrap_socket(wire, server_hostname=host))
@@ -66,9 +78,13 @@ def _asked(url: str, path: str, headers: Mapping[str, str], deadline: float) -> 
             if not piece:
                 break
             answer += piece
+    if not answer:
+        raise PolicyLostError(
+            f"{url}: {path} gave no answer, the connection was closed at once: see that the policy server runs"
+        )
     status = _STATUS.match(answer)
     if status is None:
-        raise PolicyError(
+        raise WrongProtocolError(
             f"{url}: what listens there is no web server, it says {answer[:40]!r}: check host, port and policy.kind"
         )
     return int(status[1]), status[2].decode("latin-1").strip()

@@ -17,13 +17,21 @@ from urllib.parse import urlsplit
 from pydantic import Field
 
 from runtime.clock import Clock
-from runtime.errors import CodecError, ConfigurationError, PolicyError
+from runtime.errors import (
+    CodecError,
+    ConfigurationError,
+    PolicyError,
+    PolicyGone,
+    PolicyTimeout,
+    ServerSaysError,
+    WrongProtocolError,
+)
 from runtime.policies.async_inference import messages
 from runtime.policies.async_inference.link import Channel
 from runtime.policies.async_inference.pickles import MODULES, TimedAction, read_actions
 from runtime.policies.async_inference.request import AsyncRequest, RequestSettings
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.policies.link import PolicyGone, PolicyTimeout
+from runtime.policies.tunnel.settings import TunnelSettings
 from runtime.types import ActionChunk, Conditioning, Observation
 
 if TYPE_CHECKING:
@@ -32,6 +40,7 @@ if TYPE_CHECKING:
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 ANSWER_LIMIT = 8 * 1024 * 1024  # bytes; every row carries the whole chunk: 100 rows of 32 numbers are 1.3 MB
+EXCLUSIVE = True  # the server has one checkpoint and one observation, those of whoever told it last
 _PAUSES = (0.05, 0.5)  # s between questions that were answered with nothing: the first, and the longest
 
 
@@ -42,7 +51,9 @@ class Config(RequestSettings):
     url: Annotated[str, Field(pattern=r"^grpc://[^/:]+:\d{1,5}$|^grpc://\[[0-9a-fA-F:]+\]:\d{1,5}$")] = (
         "grpc://127.0.0.1:8080"
     )
-    """Where the server listens; beyond this machine only with insecure_link."""
+    """Where the server listens; beyond this machine, or the tunnel's far end, only with insecure_link."""
+    tunnel: TunnelSettings | None = None
+    """The SSH tunnel through which the server is reached; url is then as seen from the tunnel's far end."""
     accept_pickle: bool = False
     """Has to be true: a server of this kind runs whatever reaches its port. Ours runs nothing of what it answers."""
     insecure_link: bool = False
@@ -67,9 +78,11 @@ def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> Le
         )
     host = urlsplit(config.url).hostname or ""
     if not config.insecure_link and not _is_loopback(host):
+        left = "this machine" if config.tunnel is None else f"the tunnel's far end {config.tunnel.where}"
+        allowed = "[policy.tunnel] to its machine" if config.tunnel is None else "a tunnel to its own machine"
         raise ConfigurationError(
-            f"policy.url = {config.url!r} leaves this machine over a plain link; allowed: a loopback address, such as "
-            "the end of an SSH tunnel, or policy.insecure_link = true on a network you trust"
+            f"policy.url = {config.url!r} leaves {left} over a plain link; allowed: a loopback address, with {allowed} "
+            "where the server is elsewhere, or policy.insecure_link = true on a network you trust"
         )
     return LerobotPolicy(config, robot, control_rate)
 
@@ -160,7 +173,7 @@ class LerobotPolicy(Policy):
                 self._lock.release()
 
     def _new_link(self) -> Channel:
-        return Channel(self._config.url, self._config.connect_deadline, ANSWER_LIMIT)
+        return Channel(self._config.url, self._config.connect_deadline, ANSWER_LIMIT, self.dial)
 
     def _open(self) -> None:
         left = self._link.open()
@@ -174,7 +187,7 @@ class LerobotPolicy(Policy):
             self._link.drop()
             if "No module named 'lerobot" not in str(error):
                 raise
-            raise PolicyError(
+            raise ServerSaysError(
                 f"{error}\nThe server's LeRobot has its classes in another place: policy.server_version is "
                 f"{self._config.server_version!r}, allowed: {', '.join(MODULES)}"
             ) from error
@@ -208,12 +221,14 @@ class LerobotPolicy(Policy):
             return messages.actions(answer)
         except CodecError as error:
             self._link.drop()
-            raise PolicyError(f"{self._config.url} sent an answer that is not LeRobot's: {error}") from error
+            raise WrongProtocolError(
+                f"{self._config.url} sent an answer that is not LeRobot's: {error}"
+            ) from error
 
     def _nothing(self, asked: int, seconds: float) -> PolicyError:
         self._loaded = False  # perhaps it came back without it
         self._link.drop()
-        return PolicyError(
+        return ServerSaysError(
             f"{self._config.url} answered with nothing, {asked} times within {seconds:g} s: its inference fails, which "
             "it tells its own log alone. What fails most: the model has other images, another number of states, or "
             "another kind than policy.images, policy.state and policy.policy_type say"
@@ -233,7 +248,9 @@ class LerobotPolicy(Policy):
             return read_actions(data, ANSWER_LIMIT)
         except CodecError as error:
             self._link.drop()
-            raise PolicyError(f"{self._config.url} sent an answer that is not LeRobot's: {error}") from error
+            raise WrongProtocolError(
+                f"{self._config.url} sent an answer that is not LeRobot's: {error}"
+            ) from error
 
 
 def _is_loopback(host: str) -> bool:

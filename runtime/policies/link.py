@@ -9,13 +9,22 @@ import contextlib
 import json
 import socket
 import ssl
-import threading
 import time
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from runtime.errors import PolicyError, PolicyLostError
-from runtime.policies.reach import reach
+from runtime.errors import (
+    PolicyError,
+    PolicyGone,
+    PolicyLostError,
+    PolicyTimeout,
+    RefusedError,
+    ServerSaysError,
+    TlsError,
+    WrongProtocolError,
+)
+from runtime.policies.reach import Dial, Place, reached
+from runtime.policies.watchdog import Watchdog
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
@@ -23,25 +32,24 @@ if TYPE_CHECKING:
 _CLOSE_TIMEOUT = 0.5  # seconds for the closing handshake; a server busy with inference does not answer it
 
 
-class PolicyTimeout(PolicyLostError):
-    """The server did not answer within the deadline; the connection is dropped."""
-
-
-class PolicyGone(PolicyLostError):
-    """The server closed the connection; it may have restarted."""
-
-
 class WebsocketLink:
-    """A connection that can be opened again until it is aborted; for one thread, except for `abort`."""
+    """A connection that can be opened again until it is aborted; for one thread, except for `abort`.
 
-    def __init__(self, url: str, headers: Mapping[str, str], connect_deadline: float) -> None:
+    `dial` says where the url's host and port are connected to, where that is elsewhere.
+    """
+
+    def __init__(
+        self, url: str, headers: Mapping[str, str], connect_deadline: float, dial: Dial | None = None
+    ) -> None:
         self._url = url
+        self._dial = dial
         self._headers = dict(headers)
         self._connect_deadline = connect_deadline
         self._stack = contextlib.ExitStack()
         self._connection: ClientConnection | None = None
         self._shaking: ClientConnection | None = None  # its handshake is under way
         self._aborted = False
+        self._watchdog = Watchdog("websocket-send", self._cut)
 
     @property
     def is_open(self) -> bool:
@@ -107,6 +115,7 @@ class WebsocketLink:
         for connection in (self._shaking, self._connection):
             if connection is not None:
                 _end(connection.socket)
+        self._watchdog.end()
 
     def _require_not_aborted(self) -> None:
         if self._aborted:
@@ -114,12 +123,13 @@ class WebsocketLink:
 
     def drop(self) -> None:
         """End the connection without waiting for the server's consent; safe to call twice."""
+        self._watchdog.end()
         connection, self._connection = self._connection, None
         if connection is not None:
             _end(connection.socket)
         self._stack.close()
 
-    def _place(self) -> tuple[str, int]:
+    def _place(self) -> Place:
         from websockets.exceptions import InvalidURI
         from websockets.uri import parse_uri
 
@@ -127,10 +137,10 @@ class WebsocketLink:
             uri = parse_uri(self._url)
         except InvalidURI as error:
             raise PolicyError(f"{self._url} is no websocket address, e.g. ws://127.0.0.1:8000") from error
-        return uri.host, uri.port
+        return self._dial() if self._dial else (uri.host, uri.port)
 
     def _connect(self, deadline: float) -> ClientConnection:
-        from websockets.exceptions import InvalidStatus, InvalidURI, WebSocketException
+        from websockets.exceptions import ConnectionClosed, InvalidStatus, InvalidURI, WebSocketException
         from websockets.sync.client import ClientConnection, connect
 
         link = self
@@ -145,7 +155,10 @@ class WebsocketLink:
                     _end(self.socket)
 
         try:
-            wire = self._stack.enter_context(reach(*self._place(), deadline, self._require_not_aborted))
+            seconds = self._connect_deadline
+            wire = self._stack.enter_context(
+                reached(self._url, *self._place(), deadline, seconds, self._require_not_aborted)
+            )
             return self._stack.enter_context(
                 connect(
                     self._url,
@@ -161,46 +174,50 @@ class WebsocketLink:
                     create_connection=Connection,
                 )
             )
-        except ConnectionRefusedError as error:
-            raise PolicyLostError(
-                f"no policy server listens at {self._url}: start it, or correct policy.url"
-            ) from error
-        except socket.gaierror as error:
-            raise PolicyLostError(
-                f"the host of {self._url} is not known: correct policy.url ({error})"
-            ) from error
         except TimeoutError as error:
+            found = self._shaking and self._shaking.protocol.handshake_exc
+            if isinstance(found, Exception) and not isinstance(found.__cause__, OSError | EOFError):
+                raise self._foreign(found) from error  # it has said something else, and stays
             raise PolicyTimeout(
                 f"{self._url} gave no websocket handshake within {self._connect_deadline:g} s: "
-                "the host is unreachable, or what listens there is stuck or no websocket server"
+                "what listens there is stuck, or no websocket server"
             ) from error
         except InvalidStatus as error:
             raise self._refused(error.response.status_code) from error
         except ssl.SSLError as error:
-            raise PolicyError(
+            raise TlsError(
                 f"{self._url}: no encrypted connection ({error}): correct its certificate, name the authority in "
                 "SSL_CERT_FILE, or use ws:// where the server has no TLS"
             ) from error
         except (InvalidURI, ValueError) as error:  # what websockets raises where it is told to go elsewhere
-            raise PolicyError(f"{self._url} points elsewhere ({error}): correct policy.url") from error
+            raise WrongProtocolError(f"{self._url} points elsewhere ({error}): correct policy.url") from error
         except (WebSocketException, OSError, EOFError) as error:
-            if isinstance(error, OSError) or isinstance(error.__cause__, OSError | EOFError):
+            gone = isinstance(error, OSError | ConnectionClosed)  # or in the middle of a word
+            if gone or isinstance(error.__cause__, OSError | EOFError):
                 raise PolicyLostError(
-                    f"the connection to {self._url} failed ({error}): see that the policy server runs, or correct "
-                    "policy.url"
+                    f"the connection to {self._url} failed in the websocket handshake ({error}): see that the policy "
+                    "server runs, and check host, port and policy.kind: a server of another kind hangs up too"
                 ) from error
-            raise PolicyError(
-                f"what listens at {self._url} does not speak websocket ({error}): "
-                "check host, port and policy.kind"
-            ) from error
+            raise self._foreign(error) from error
+
+    def _foreign(self, error: Exception) -> PolicyError:
+        return WrongProtocolError(
+            f"what listens at {self._url} does not speak websocket ({error}): "
+            "check host, port and policy.kind"
+        )
 
     def _refused(self, status: int) -> PolicyError:
         """A gateway before a server that restarts says 502 to 504; whatever else is said stays so."""
+        if status in (401, 403):
+            return RefusedError(
+                f"{self._url} refused the websocket with HTTP {status}: it wants an API key; policy.api_key_env names "
+                "the environment variable that holds it"
+            )
         if status in (502, 503, 504):
             return PolicyLostError(
                 f"{self._url} has no policy server behind it at the moment (HTTP {status})"
             )
-        return PolicyError(
+        return WrongProtocolError(
             f"{self._url} refused the websocket with HTTP {status}: "
             "another web server listens there, or the path or the API key is wrong; correct policy.url"
         )
@@ -209,30 +226,26 @@ class WebsocketLink:
         """Send, but not for ever: a server that stopped reading leaves our socket full."""
         from websockets.exceptions import ConnectionClosed
 
-        fired = threading.Event()
+        with self._watchdog.watching(seconds) as was_cut:
+            try:
+                connection.send(request)
+            except ConnectionClosed as error:
+                if was_cut():
+                    raise PolicyTimeout(
+                        f"{self._url} did not take the request within {seconds:g} s"
+                    ) from error
+                raise self._gone(error) from error
 
-        def cut() -> None:
-            fired.set()
-            _end(connection.socket)
-
-        watchdog = threading.Timer(seconds, cut)
-        watchdog.daemon = True
-        watchdog.start()
-        try:
-            connection.send(request)
-        except ConnectionClosed as error:
-            if fired.is_set():
-                raise PolicyTimeout(f"{self._url} did not take the request within {seconds:g} s") from error
-            raise self._gone(error) from error
-        finally:
-            watchdog.cancel()
+    def _cut(self) -> None:
+        if self._connection is not None:
+            _end(self._connection.socket)
 
     def _receive(self, connection: ClientConnection, deadline: float, what: str, seconds: float) -> bytes:
         return self._binary(self._frame(connection, deadline, what, seconds))
 
     def _binary(self, answer: str | bytes) -> bytes:
         if isinstance(answer, str):
-            raise PolicyError(f"the policy server at {self._url} reports an error: {headline(answer)}")
+            raise ServerSaysError(f"the policy server at {self._url} reports an error: {headline(answer)}")
         return answer
 
     def _frame(self, connection: ClientConnection, deadline: float, what: str, seconds: float) -> str | bytes:

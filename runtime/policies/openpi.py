@@ -14,7 +14,7 @@ from pydantic import Field
 
 from runtime import codecs
 from runtime.clock import Clock
-from runtime.errors import ConfigurationError, PolicyError
+from runtime.errors import ConfigurationError, PolicyError, WrongProtocolError
 from runtime.policies.agreement import Declared, agreed
 from runtime.policies.answers import AnswerSettings
 from runtime.policies.base import PolicyInfo
@@ -31,6 +31,14 @@ from runtime.types import ActionChunk, Conditioning, Float32, Observation
 
 if TYPE_CHECKING:
     from robots import Robot
+
+
+# Metadata keys by which servers of other protocols are known, and the kind that is theirs.
+_MARKS = {
+    "needs_wrist_camera": "roboarena",
+    "n_external_cameras": "roboarena",
+    "available_unnorm_keys": "starvla",
+}
 
 
 class Config(ServerSettings, RequestSettings, AnswerSettings):
@@ -112,6 +120,7 @@ class OpenpiPolicy(WebsocketPolicy):
         return self._layout.of(self._grip.observed(observation))
 
     def _greeted(self, metadata: dict[str, Any]) -> PolicyInfo:
+        _refuse_others(metadata)
         space = agreed(metadata, self._declared, "metadata")
         supports_rtc = self._dialect.supported(metadata)
         horizon = metadata.get("action_horizon")
@@ -133,7 +142,7 @@ class OpenpiPolicy(WebsocketPolicy):
 
     def _chunk(self, reply: Mapping[str, Any], round_trip: float) -> ActionChunk:
         if "actions" not in reply:
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"the answer has no 'actions'; it has {', '.join(map(str, reply)) or 'nothing'}"
             )
         agreed(reply, self._declared, "answer")
@@ -157,6 +166,17 @@ class OpenpiPolicy(WebsocketPolicy):
         converted = self._scale is not None or self._config.gripper != "robot"
         # Rows that are relative to an observation that is over cannot be continued.
         return given if converted and self._config.action_mode != "relative" else None
+
+
+def _refuse_others(metadata: Mapping[str, Any]) -> None:
+    """WrongProtocolError for servers that greet like openpi's, and take other requests."""
+    kind = next((kind for mark, kind in _MARKS.items() if mark in metadata), None)
+    if kind is not None:
+        found = ", ".join(map(str, metadata))
+        raise WrongProtocolError(
+            f'the server\'s metadata have {found}: it is a server for policy.kind = "{kind}"; correct policy.kind or '
+            "policy.url"
+        )
 
 
 def _scale(given: list[float] | None, width: int) -> Float32 | None:

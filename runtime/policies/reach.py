@@ -13,9 +13,39 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from runtime.errors import PortClosedError, UnreachableError
+
 Address = tuple[Any, ...]
+Place = tuple[str, int]  # host and port
+Dial = Callable[[], Place]
 
 _SPELL_MS = 20  # how soon a connection that is being made notices that nobody wants it any more
+
+
+def reached(
+    url: str, host: str, port: int, deadline: float, seconds: float, require_wanted: Callable[[], None]
+) -> socket.socket:
+    """As `reach`, with errors that name `url`, and the `seconds` that there were until the deadline.
+
+    PortClosedError where the machine answers and nobody listens, UnreachableError where nothing answers.
+    """
+    try:
+        return reach(host, port, deadline, require_wanted)
+    except ConnectionRefusedError as error:
+        raise PortClosedError(
+            f"no policy server listens at {url}: start it, or correct policy.url"
+        ) from error
+    except socket.gaierror as error:
+        raise UnreachableError(f"the host of {url} is not known: correct policy.url ({error})") from error
+    except TimeoutError as error:
+        raise UnreachableError(
+            f"{url} was not reached within {seconds:g} s: the host is off, or something on the way drops what is sent "
+            "to it; correct policy.url, or open the way"
+        ) from error
+    except OSError as error:
+        raise UnreachableError(
+            f"the connection to {url} failed ({error}): correct policy.url, or open the way"
+        ) from error
 
 
 def reach(host: str, port: int, deadline: float, require_wanted: Callable[[], None]) -> socket.socket:

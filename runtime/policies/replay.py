@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 from pydantic import Field
 
+import robots
 from runtime.clock import Clock
 from runtime.datasets.mapping import ColumnMapping
 from runtime.errors import PolicyError, RecordingError
@@ -20,15 +25,15 @@ if TYPE_CHECKING:
 
 
 class Config(Section):
-    """Replays the actions of one episode of a LeRobot v2.x dataset."""
+    """Replays the actions of one episode: of a LeRobot dataset, v2.0, v2.1 or v3.0, or of a recording of ours."""
 
     kind: Literal["replay"] = "replay"
     path: str
-    """Folder of the dataset."""
+    """Folder of the dataset, or of a recorded episode."""
     episode: int = Field(default=0, ge=0)
     """Index of the episode in the dataset."""
     mapping: ColumnMapping = ColumnMapping()
-    """Names of the dataset's columns."""
+    """Names of the dataset's columns; a recorded episode has its own."""
     space: Space = "joint"
     """Which recorded actions: "joint" takes the action column, "eef" the action_eef column."""
     action_pose: PoseFormat = PoseFormat()
@@ -39,10 +44,23 @@ class Config(Section):
     """How long an answer takes [s]: a real wait on the clock."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Recorded:
+    """The actions of an episode, and whose they are as far as it says."""
+
+    actions: Float32  # [N, W]
+    fps: float
+    task: str
+    robot: str  # "": it does not say
+    names: Sequence[str]  # of the numbers; empty: it does not say
+
+
 class ReplayPolicy(Policy):
     """Row 0 belongs to the first observation after a reset, later rows to the steps that passed since.
 
-    Near the end chunks get shorter; past the end the last row is answered alone, for ever.
+    After a hold it goes on with the row it had given that is nearest to the robot's joints, for actions in joints;
+    poses go on with the first row of the last answer. What a chunk has beyond the end is the last row again: there the
+    robot is held, where it would otherwise run out of rows while it moves, and brake beyond it.
     """
 
     def __init__(self, config: Config, robot: Robot, clock: Clock, control_rate: float) -> None:
@@ -55,35 +73,92 @@ class ReplayPolicy(Policy):
         self._actions: Float32 | None = None
         self._fps = 0.0
         self._first_step: int | None = None
+        self._row = 0  # with which the last answer began
+        self._held = False  # since then
 
     def connect(self) -> PolicyInfo:
         """Open the episode; raises PolicyError where it is absent or does not fit the robot."""
-        from runtime.datasets.reader import open_dataset
-
         config = self._config
         try:
-            mapping = config.mapping.model_copy(update={"videos": {}})
-            episode = open_dataset(config.path).episode(config.episode, mapping)
+            recorded = self._recording() if self._is_recording() else self._of_dataset()
         except RecordingError as error:
             raise PolicyError(str(error)) from error
-        self._actions = self._fitting(episode.action if config.space == "joint" else episode.action_eef)
-        self._fps = episode.fps
-        self._first_step = None
+        self._require_same_robot(recorded)
+        self._actions = self._fitting(recorded.actions)
+        self._fps = recorded.fps
+        self.reset()
+        episode = "" if self._is_recording() else f", episode {config.episode}"
         return PolicyInfo(
-            name=f"replay of {config.path}, episode {config.episode}",
+            name=f"replay of {config.path}{episode}",
             action_space=config.space,
             horizon=config.horizon,
-            rate=episode.fps,
-            metadata={"rows": episode.length, "fps": episode.fps, "task": episode.task},
+            rate=recorded.fps,
+            metadata={"rows": len(recorded.actions), "fps": recorded.fps, "task": recorded.task},
         )
 
-    def _fitting(self, actions: Float32 | None) -> Float32:
+    def _is_recording(self) -> bool:
+        return (Path(self._config.path) / "manifest.json").is_file()
+
+    def _of_dataset(self) -> _Recorded:
+        from runtime.datasets.reader import open_dataset
+
+        mapping = self._mapping()
+        dataset = open_dataset(self._config.path)
+        episode = dataset.episode(self._config.episode, mapping)
+        names = dataset.features.get(mapping.state, {}).get("names")
+        return _Recorded(
+            episode.qpos,
+            episode.fps,
+            episode.task,
+            str(dataset.info.get("robot_type") or ""),
+            names if isinstance(names, list) else (),
+        )
+
+    def _recording(self) -> _Recorded:
+        from runtime.datasets.journal import read_journal
+
+        if self._config.episode:
+            raise PolicyError(
+                f"policy.episode = {self._config.episode}, but {self._config.path} is one recorded episode; allowed: 0"
+            )
+        journal = read_journal(Path(self._config.path))
+        poses = self._config.space == "eef"
+        column, key = ("eef_action", "eef_names") if poses else ("action", "joint_names")
+        if poses and not journal.has_stream(column):
+            raise PolicyError(
+                f'{self._config.path} has no poses of its actions; allowed: policy.space = "joint"'
+            )
+        names = journal.manifest["robot"][key]
+        return _Recorded(journal.finite_vectors(column), journal.fps, journal.task, journal.robot, names)
+
+    def _require_same_robot(self, recorded: _Recorded) -> None:
+        """Numbers of another robot of ours, or in another order, would move this one nonsensically."""
+        own = self._robot
+        if recorded.robot in robots.names() and recorded.robot != own.name:
+            raise PolicyError(
+                f"{self._config.path} is of the robot {recorded.robot}, the station's is {own.name}"
+            )
+        if recorded.robot != own.name or self._config.space != "joint" or not recorded.names:
+            return
+        if list(recorded.names) != list(own.joint_names):
+            raise PolicyError(
+                f"{self._config.path}: the actions are of the joints {list(recorded.names)}, the station's are "
+                f"{list(own.joint_names)}"
+            )
+
+    def _mapping(self) -> ColumnMapping:
+        """The column of the actions alone, read as if it were the state: nothing else has to be there."""
         name = "action" if self._config.space == "joint" else "action_eef"
-        if actions is None:
+        column = getattr(self._config.mapping, name)
+        if column is None:
             raise PolicyError(
                 f'policy.space is "{self._config.space}" but policy.mapping.{name} names no column'
             )
+        return ColumnMapping(state=column, action=None, videos={})
+
+    def _fitting(self, actions: Float32) -> Float32:
         if actions.shape[1] != self._width:
+            name = "action" if self._config.space == "joint" else "action_eef"
             raise PolicyError(
                 f"{self._config.path}: the {name} column is {actions.shape[1]} wide, "
                 f"{self._robot.name} needs {self._width}"
@@ -97,6 +172,10 @@ class ReplayPolicy(Policy):
         answered_at = self._clock.now() + self._config.latency_s
         if self._first_step is None:
             self._first_step = observation.step
+        elif self._held:
+            steps = round(self._place(observation) * self._control_rate / self._fps)
+            self._first_step = observation.step - steps
+        self._held = False
         passed = observation.step - self._first_step
         if passed < 0:
             raise PolicyError(
@@ -104,16 +183,31 @@ class ReplayPolicy(Policy):
                 f"which was of step {self._first_step}"
             )
         row = min(round(passed * self._fps / self._control_rate), len(self._actions) - 1)
+        self._row = row
         self._clock.sleep_until(answered_at)
         return ActionChunk(
-            actions=self._actions[row : row + self._config.horizon].copy(),
+            actions=self._actions[
+                np.minimum(np.arange(row, row + self._config.horizon), len(self._actions) - 1)
+            ],
             space=self._config.space,
             rate=self._fps,
             pose=self._config.action_pose,
         )
 
+    def _place(self, observation: Observation) -> int:
+        """The row at which the robot was held."""
+        if self._actions is None or self._config.space != "joint":
+            return self._row
+        given = self._actions[self._row : self._row + self._config.horizon]
+        away = np.abs(given - observation.qpos).max(axis=1)
+        return self._row + int(away.argmin())
+
     def reset(self) -> None:
         self._first_step = None
+        self._row, self._held = 0, False
+
+    def resume(self) -> None:
+        self._held = True
 
     def close(self) -> None:
         self._actions = None

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from runtime import codecs
 from runtime.clock import Clock
-from runtime.errors import ContradictionError, PolicyError
+from runtime.errors import ContradictionError, PolicyError, ServerSaysError, WrongProtocolError
 from runtime.policies.arena.actions import Meant, MeantSettings
 from runtime.policies.arena.request import Shown, ShownSettings
 from runtime.policies.arena.wants import Wants, wanted
@@ -45,7 +45,7 @@ def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> Ro
 
 
 class RoboarenaPolicy(WebsocketPolicy):
-    """One session per run: `reset` ends it on the server, and the next request begins another.
+    """One session per run: its end, or a `reset`, ends it on the server, and the next request begins another.
 
     A connection that the server ended between two requests, as vLLM-Omni does after half a minute, is opened anew.
     """
@@ -60,6 +60,7 @@ class RoboarenaPolicy(WebsocketPolicy):
         self.observation_eef = config.observation_eef
         self.sees_poses = self._shown.sees_poses or (self._meant.cartesian and self._meant.velocity)
         self._wants: Wants | None = None
+        self.glances_s = self._shown.glances_s
         self._session = _new_session()
         self._asked = False  # in this session
         self._ending: dict[str, str] | None = (
@@ -83,19 +84,33 @@ class RoboarenaPolicy(WebsocketPolicy):
         _require_no_error(reply)
         return self._meant.chunk(reply, {"round_trip_ms": round_trip})
 
+    def glance(self, observation: Observation) -> None:
+        """Keep its pictures for the requests to come."""
+        self._shown.glance(observation)
+
     def reset(self) -> None:
         """End the session on the server and wait for its acknowledgement; nothing is sent where it never began.
 
         Where that fails, the next `infer` tries it again before it asks: the server may keep a history.
         """
         with self._lock:
-            if self._asked:
-                self._ending = self._session_field()
-                self._session, self._asked = _new_session(), False
-                self._shown.forget()
+            self._leave_session()
             if self._ending is not None:
                 self._reopen()
                 self._end_session()
+
+    def rest(self) -> None:
+        """As `reset`, on a connection that stands: none is opened to end a session, the next `infer` does that."""
+        with self._lock:
+            self._leave_session()
+            if self._link.is_open and not self._link.was_left and not self._closed:
+                self._end_session()
+
+    def _leave_session(self) -> None:
+        if self._asked:
+            self._ending = self._session_field()
+            self._session, self._asked = _new_session(), False
+            self._shown.forget()
 
     def _end_session(self) -> None:
         if self._ending is None:
@@ -137,7 +152,7 @@ class RoboarenaPolicy(WebsocketPolicy):
         _require_no_error(reply)
         if not isinstance(reply, Mapping) or reply.get("status") != ACKNOWLEDGED:
             self._link.drop()  # whatever this answers, it is no reset
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"{self._config.url} answered a reset with {_short(reply)}; expected the text or the status "
                 f"{ACKNOWLEDGED!r}"
             )
@@ -147,7 +162,7 @@ def _require_no_error(reply: Any) -> None:
     """vLLM-Omni tells errors as a map and stays connected."""
     if isinstance(reply, Mapping) and reply.get("type") == "error":
         said = reply.get("message") or reply.get("error") or "nothing more"
-        raise PolicyError(f"the policy server reports an error: {said}")
+        raise ServerSaysError(f"the policy server reports an error: {said}")
 
 
 def _short(value: Any) -> str:

@@ -7,34 +7,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.errors import PolicyError
+from runtime.errors import NotFiniteError, ShapeError
 from runtime.types import Float32
 
 
 def action_rows(name: str, given: object, width: int | None = None) -> Float32:
-    """float32 [T, W] of [W], [T, W] or [1, T, W]; raises PolicyError that names what is wrong and where.
+    """float32 [T, W] of [W], [T, W] or [1, T, W]; raises ShapeError or NotFiniteError, which say where.
 
     `width` is the only W allowed, None allows any.
     """
     if not isinstance(given, np.ndarray):
-        raise PolicyError(f"{name} is a {type(given).__name__}; expected a number array [T, {width or 'W'}]")
+        raise ShapeError(f"{name} is a {type(given).__name__}; expected a number array [T, {width or 'W'}]")
     if given.dtype.kind not in "fiu":
-        raise PolicyError(f"{name} has dtype {given.dtype.str}; expected floats or integers")
+        raise ShapeError(f"{name} has dtype {given.dtype.str}; expected floats or integers")
     rows = _two_dimensional(name, given)
     if rows.size == 0:
-        raise PolicyError(f"{name} is empty, shape {list(given.shape)}; expected at least one row")
+        raise ShapeError(f"{name} is empty, shape {list(given.shape)}; expected at least one row")
     if width is not None and rows.shape[1] != width:
-        raise PolicyError(f"{name} has rows of {rows.shape[1]} numbers; this robot needs {width}")
-    with np.errstate(over="ignore"):  # what overflows float32 becomes infinite, and is refused as such
-        numbers = rows.astype(np.float32)
-    wrong = np.argwhere(~np.isfinite(numbers))
-    if len(wrong):
+        raise ShapeError(f"{name} has rows of {rows.shape[1]} numbers; this robot needs {width}")
+    numbers = rows.astype(np.float32) if rows.dtype == np.float32 else _narrowed(rows)
+    finite = np.isfinite(numbers)
+    if not finite.all():  # where it fails is looked for only then: every answer passes here
+        wrong = np.argwhere(~finite)
         row, column = wrong[0]
-        raise PolicyError(
+        raise NotFiniteError(
             f"{name} has {rows[row, column]} at row {row}, column {column} ({len(wrong)} such numbers); "
             "expected finite numbers"
         )
     return numbers
+
+
+def _narrowed(rows: NDArray[Any]) -> Float32:
+    """As float32; what overflows becomes infinite, and is refused as such."""
+    with np.errstate(over="ignore"):
+        return rows.astype(np.float32)
 
 
 def _two_dimensional(name: str, given: NDArray[Any]) -> NDArray[Any]:
@@ -43,5 +49,5 @@ def _two_dimensional(name: str, given: NDArray[Any]) -> NDArray[Any]:
     if given.ndim == 3 and given.shape[0] == 1:
         return np.squeeze(given, 0)
     if given.ndim != 2:
-        raise PolicyError(f"{name} has shape {list(given.shape)}; expected [W], [T, W] or [1, T, W]")
+        raise ShapeError(f"{name} has shape {list(given.shape)}; expected [W], [T, W] or [1, T, W]")
     return given

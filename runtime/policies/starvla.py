@@ -17,7 +17,14 @@ from pydantic import Field
 
 from runtime import codecs
 from runtime.clock import Clock
-from runtime.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.errors import (
+    ActionSpaceError,
+    ConfigurationError,
+    ContradictionError,
+    PolicyError,
+    ServerSaysError,
+    WrongProtocolError,
+)
 from runtime.policies.base import PolicyInfo
 from runtime.policies.link import headline
 from runtime.policies.meaning import MeaningSettings
@@ -140,7 +147,7 @@ class StarvlaPolicy(WebsocketPolicy):
         said = metadata.get("env")
         if said != _ENVIRONMENT and "available_unnorm_keys" not in metadata and "ckpt_path" not in metadata:
             found = ", ".join(map(str, metadata)) or "nothing"
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"the server's metadata have env = {said!r} and {found}; expected env = {_ENVIRONMENT!r}: it is no "
                 "StarVLA server; correct policy.kind or policy.url"
             )
@@ -195,31 +202,31 @@ class StarvlaPolicy(WebsocketPolicy):
         asked, found = envelope["request_id"], reply.get("request_id")
         if found != asked:
             self._link.drop()
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"the answer has request_id {found!r}, asked was {asked!r}: it is another request's, or no StarVLA "
                 "server answers here"
             )
         if reply.get("ok") is not True or reply.get("status") != "ok":
             error = reply.get("error")
             said = error.get("message") if isinstance(error, Mapping) else error
-            raise PolicyError(f"the policy server reports an error: {headline(str(said))}")
+            raise ServerSaysError(f"the policy server reports an error: {headline(str(said))}")
 
     def _chunk(self, data: Any, round_trip: float) -> ActionChunk:
         if not isinstance(data, Mapping):
-            raise PolicyError(f"the answer has data that are a {type(data).__name__}; expected a map")
+            raise WrongProtocolError(f"the answer has data that are a {type(data).__name__}; expected a map")
         return self._config.chunk(self._rows(data), {"round_trip_ms": round_trip})
 
     def _rows(self, data: Mapping[str, Any]) -> np.ndarray[Any, np.dtype[np.float32]]:
         if "actions" in data:
             return action_rows("actions", data["actions"], self._width)
         if "normalized_actions" not in data:
-            raise PolicyError(
+            raise WrongProtocolError(
                 "the answer has neither 'actions' nor 'normalized_actions'; it has "
                 f"{', '.join(map(str, data)) or 'nothing'}"
             )
         rows = action_rows("normalized_actions", data["normalized_actions"], self._width)
         if self._config.statistics is None:
-            raise PolicyError(
+            raise ActionSpaceError(
                 "the server answers with normalized_actions, which are no robot's numbers; allowed: a server that "
                 "un-normalises them, or its statistics in policy.statistics (low, high, mask)"
             )
@@ -257,6 +264,6 @@ def _size(said: Any) -> list[int] | None:
         and all(type(n) is int and n > 0 for n in numbers)
     ):
         return numbers[1:] if len(numbers) == 3 and numbers[0] == 3 else numbers[:2]
-    raise PolicyError(
+    raise WrongProtocolError(
         f"the server's metadata have training_obs_image_size = {said!r}; expected height and width"
     )

@@ -11,10 +11,11 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from runtime import codecs
-from runtime.errors import CodecError, ConfigurationError, PolicyError
+from runtime.errors import CodecError, ConfigurationError, PolicyError, WrongProtocolError
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.health import require_healthy
 from runtime.policies.link import WebsocketLink
+from runtime.policies.tunnel.settings import TunnelSettings
 from runtime.section import Section
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -32,6 +33,8 @@ class ServerSettings(Section):
     health_path: Annotated[str, Field(pattern=r"^/")] | None = None
     """Where the same port answers an HTTP GET with 200 while the server is well (openpi: "/healthz"); it is asked
     before each connection. Without it nothing is asked."""
+    tunnel: TunnelSettings | None = None
+    """The SSH tunnel through which the server is reached; url is then as seen from the tunnel's far end."""
     connect_deadline: Positive = 5.0
     """For the connection and the server's metadata [s]."""
     first_inference_deadline: Positive = 120.0
@@ -83,7 +86,7 @@ class WebsocketPolicy(Policy):
             self._link.abort()
 
     def _new_link(self) -> WebsocketLink:
-        return WebsocketLink(self._server.url, self._headers, self._server.connect_deadline)
+        return WebsocketLink(self._server.url, self._headers, self._server.connect_deadline, self.dial)
 
     def _require_open(self) -> None:
         """A connection, another one where there is none any more; PolicyError after `close`."""
@@ -95,7 +98,7 @@ class WebsocketPolicy(Policy):
     def _open(self) -> PolicyInfo:
         if self._server.health_path is not None:
             deadline = self._server.connect_deadline
-            require_healthy(self._server.url, self._server.health_path, self._headers, deadline)
+            require_healthy(self._server.url, self._server.health_path, self._headers, deadline, self.dial)
         metadata = self._unpacked(self._link.open(), "metadata")
         try:
             return self._greeted(metadata)
@@ -115,7 +118,7 @@ class WebsocketPolicy(Policy):
         message = self._value(payload, what)
         if not isinstance(message, dict):
             self._link.drop()
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"{self._server.url} sent {what} that is a {type(message).__name__}; expected a map"
             )
         return message
@@ -125,7 +128,7 @@ class WebsocketPolicy(Policy):
             return codecs.unpack(payload, ANSWER_LIMIT)
         except CodecError as error:
             self._link.drop()
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"{self._server.url} sent {what} that is not the {self.PROTOCOL} protocol: {error}"
             ) from error
 

@@ -85,7 +85,7 @@ def _check_pictures(layout: Layout, row: Row) -> None:
             f"must be of {sorted(layout.cameras)} (None repeats the last one)"
         )
     for camera, picture in row.pictures.items():
-        expected = (*layout.cameras[camera], 3)
+        expected = (*layout.pictures[camera], 3)
         if picture is not None and (picture.shape != expected or picture.dtype != np.uint8):
             raise RecordingError(
                 f"row {row.index}: camera {camera} gave {picture.dtype} {picture.shape}, "

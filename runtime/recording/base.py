@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from runtime.types import Float32, Space, UInt8
 
-ControlSource = Literal["none", "hold", "motion", "policy", "teleop", "estop", "sim"]
+ControlSource = Literal["none", "hold", "motion", "policy", "teleop", "estop", "sim", "unknown"]
 Status = Literal["finished", "interrupted", "failed"]
 
 
@@ -40,6 +40,7 @@ class Row:
     eef_measured: bool = False  # eef came from the robot, not from forward kinematics
     eef_action_reported: bool = False  # likewise eef_action, for this very action
     intervention: bool = False
+    stale: frozenset[str] = frozenset()  # cameras that have given no new picture for too long
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +88,24 @@ class RawChunk:
 Record = Row | ExecutedTick | RawChunk
 
 
+IMPORTED = "imported"  # the kind of an episode that was recorded elsewhere, in whatever way
+VIDEO_LOST = "video_lost"  # the event of a camera whose video has ended; repair goes by it
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """A camera whose video ends at row `row`, while all else is recorded on."""
+
+    camera: str
+    row: int
+    reason: str
+
+    @property
+    def text(self) -> str:
+        """For a person."""
+        return f"{self.reason}; its video ends at row {self.row}, all else is recorded on"
+
+
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """How an episode ended."""
@@ -111,6 +130,10 @@ class Journal(ABC):
     @abstractmethod
     def mark(self, event: Mapping[str, object]) -> None:
         """Append one event to the episode's log."""
+
+    @abstractmethod
+    def losses(self) -> Sequence[Loss]:
+        """Cameras that this episode, or the one that ended last, has lost since the last call."""
 
     @abstractmethod
     def end(self, outcome: Outcome) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -15,10 +16,14 @@ from runtime.types import Float32
 
 
 class RecordedRow(NamedTuple):
-    """A row without its pictures, and the cameras whose frame repeats the one before."""
+    """A row without its pictures, and the cameras whose frame repeats the one before.
+
+    `lost` are those of them that gave a picture, which their video does not have.
+    """
 
     row: Row
     repeated: frozenset[str]
+    lost: frozenset[str] = frozenset()
 
 
 def rows_columns(layout: Layout, records: Sequence[RecordedRow]) -> dict[str, Any]:
@@ -39,12 +44,29 @@ def rows_columns(layout: Layout, records: Sequence[RecordedRow]) -> dict[str, An
     }
     for name in layout.streams:
         columns[name] = _vectors([getattr(row, name) for row in rows], layout.width(name))
-    for stream in layout.capture_streams:
-        times = [row.captured.get(stream, float("nan")) - layout.started for row in rows]
-        columns[f"capture_time.{stream}"] = times
+    times = [
+        [row.captured.get(stream, math.nan) - layout.started for row in rows]
+        for stream in layout.capture_streams
+    ]
+    for stream, captured in zip(layout.capture_streams, times, strict=True):
+        columns[f"capture_time.{stream}"] = captured
+    columns["skewed"] = (
+        spread(np.array(times, dtype=np.float64).reshape(len(times), len(rows))) > layout.max_skew_s
+    )
     for camera in layout.cameras:
         columns[f"repeated.{camera}"] = [camera in record.repeated for record in records]
+        columns[f"lost.{camera}"] = [camera in record.lost for record in records]
+        columns[f"stale.{camera}"] = [camera in record.row.stale for record in records]
     return columns
+
+
+def spread(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far apart in time the streams [S, N] of each row were captured [s]; 0 where fewer than two are known."""
+    known = np.isfinite(times)
+    latest = np.where(known, times, -np.inf).max(axis=0, initial=-np.inf)
+    earliest = np.where(known, times, np.inf).min(axis=0, initial=np.inf)
+    apart: NDArray[np.float64] = np.where(known.sum(axis=0) >= 2, latest - earliest, 0.0)
+    return apart
 
 
 def ticks_columns(layout: Layout, ticks: Sequence[ExecutedTick]) -> dict[str, Any]:

@@ -7,32 +7,42 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 from runtime.errors import RecordingError
 from runtime.recording.admission import admit_chunk, admit_row, admit_tick
-from runtime.recording.base import ExecutedTick, Journal, Outcome, RawChunk, Record, Row
+from runtime.recording.base import VIDEO_LOST, ExecutedTick, Journal, Loss, Outcome, RawChunk, Record, Row
 from runtime.recording.columns import RecordedRow
-from runtime.recording.files import disk_fault, document, require_room, sync_folder, write_whole
+from runtime.recording.encoder import CameraEncoder
+from runtime.recording.files import (
+    DiskFullError,
+    disk_fault,
+    document,
+    require_room,
+    sync_folder,
+    write_whole,
+)
 from runtime.recording.fragments import count_frames
 from runtime.recording.layout import Layout
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.summary import summarise
 from runtime.recording.tables import read_table, rows_schema
-from runtime.recording.video import CameraEncoder
 from runtime.recording.writer import DiskWriter, Faults
 
-_LEAST_DISK_SECONDS = 1.0  # for the last writes, also where the encoders took all of the drain's time
+_LEAST_DISK_SECONDS = 1.0  # for the last writes
 
 
 class EpisodeJournal(Journal):
     """Writes `root`/<uuid>/, one episode after the other; one thread appends.
 
-    A full encoder queue or a missing picture makes a flagged repeat, so that `append` never waits for an
-    encoder. With `patient` (lockstep has no deadline) it waits for a place, up to settings.drain_timeout_s.
-    Pictures are handed over, not copied: they must not change any more.
+    A picture that is missing, or for which an encoder has no time, becomes a flagged repeat, so that `append` never
+    waits for an encoder. With `patient` (lockstep has no deadline) it waits for a place, up to
+    settings.drain_timeout_s. An encoder that fails, or a file of its own that cannot be written, costs the video of
+    its camera: `losses` names it, and all else is recorded on. Pictures are handed over, not copied: they must not
+    change any more.
     """
 
     def __init__(
@@ -42,6 +52,7 @@ class EpisodeJournal(Journal):
         self._settings = settings or RecordingSettings()
         self._patience = self._settings.drain_timeout_s if patient else 0.0
         self._recording: _Recording | None = None
+        self._losses: list[Loss] = []
 
     @property
     def folder(self) -> Path | None:
@@ -62,12 +73,19 @@ class EpisodeJournal(Journal):
             shutil.rmtree(folder, ignore_errors=True)  # it is ours and empty: no row was ever taken
             raise
         self._recording = recording
+        self._losses = []
 
     def append(self, record: Record) -> None:
         self._begun().append(record)
 
     def mark(self, event: Mapping[str, object]) -> None:
         self._begun().mark(event)
+
+    def losses(self) -> Sequence[Loss]:
+        if self._recording is not None:
+            self._losses += self._recording.look()
+        told, self._losses = self._losses, []
+        return told
 
     def end(self, outcome: Outcome) -> None:
         """Drain, close every file, and rename the outcome into place last.
@@ -76,7 +94,10 @@ class EpisodeJournal(Journal):
         status "failed"; it is raised, after everything else was saved, unless `append` has told it already.
         """
         recording, self._recording = self._begun(), None
-        recording.end(outcome)
+        try:
+            recording.end(outcome)
+        finally:
+            self._losses += recording.look()
 
     def _begun(self) -> _Recording:
         if self._recording is None:
@@ -133,7 +154,10 @@ class _Recording:
         self._settings = settings
         self._patience = patience
         self._rows = 0
+        self._newest = layout.started  # time of the newest row [s], on the clock that rows are on
         self._faults = Faults()
+        self._lost: dict[str, Loss] = {}
+        self._told = 0
         self._encoders: dict[str, CameraEncoder] = {}
         with ExitStack() as undo:
             self._lock = _locked(folder)
@@ -167,13 +191,16 @@ class _Recording:
 
     def _append_row(self, row: Row) -> None:
         kept = admit_row(self._layout, row, self._rows)
-        repeated = [
+        repeated = {
             camera
             for camera, encoder in self._encoders.items()
             if not encoder.put(row.pictures[camera], self._patience, self._taken(row, camera))
-        ]
+        }
         self._rows += 1
-        self._writer.add("rows", RecordedRow(kept, frozenset(repeated)), self._patience)
+        self._newest = row.tick_time
+        unseen = {camera for camera in repeated if row.pictures[camera] is not None}
+        lost = unseen | self._lost.keys()
+        self._writer.add("rows", RecordedRow(kept, frozenset(repeated), frozenset(lost)), self._patience)
 
     def _taken(self, row: Row, camera: str) -> float:
         """When the picture was captured; NaN in lockstep, whose clock is not that of the encoders."""
@@ -183,17 +210,24 @@ class _Recording:
         self._tell()
         self._writer.add_line(document(event, "an event"))
 
+    def look(self) -> list[Loss]:
+        """Cameras that have been lost since the last call."""
+        new = list(self._lost.values())[self._told :]
+        self._told += len(new)
+        return new
+
     def end(self, outcome: Outcome) -> None:
         deadline = time.monotonic() + self._settings.drain_timeout_s
         stuck = self._drain(deadline)
-        last = max(deadline, time.monotonic() + _LEAST_DISK_SECONDS)
+        # Of its own, also where the encoders took all of theirs: without an outcome the episode waits for a repair.
+        last = time.monotonic() + max(self._settings.drain_timeout_s, _LEAST_DISK_SECONDS)
         if not self._writer.finish(last, leave=[encoder.file for encoder in stuck]):
             self._faults.report(
                 RecordingError(f"the disk did not take the end of episode {self.folder} in time")
             )
             self._faults.tell()
         try:
-            conclusion = document(self._conclusion(outcome, stuck), "the outcome", indent=1)
+            conclusion = document(self._conclusion(outcome), "the outcome", indent=1)
             write_whole(self.folder / "outcome.json", conclusion)
         finally:
             if not stuck:  # a stuck encoder may still write: the folder stays marked until our process ends
@@ -207,13 +241,11 @@ class _Recording:
             encoder.finish()
         stuck = [encoder for encoder in self._encoders.values() if not encoder.drain(deadline)]
         for encoder in stuck:
-            self._faults.report(encoder.abandon())
-        for encoder in self._encoders.values():
-            if encoder.failure is not None:
-                self._faults.report(encoder.failure)
+            encoder.abandon()
+        self._look_at_encoders()
         return stuck
 
-    def _conclusion(self, outcome: Outcome, stuck: list[CameraEncoder]) -> dict[str, object]:
+    def _conclusion(self, outcome: Outcome) -> dict[str, object]:
         rows = self._rows
         status, reason, fault = outcome.status, outcome.reason, self._faults.first
         if fault is not None:
@@ -221,24 +253,42 @@ class _Recording:
             rows, status = table.table.num_rows, "failed"
             reason = reason if str(fault) in reason else "; ".join(filter(None, (reason, str(fault))))
         videos = {
-            camera: count_frames(encoder.path) if encoder.failure or encoder in stuck else encoder.frames
+            camera: encoder.frames if encoder.failure is None else count_frames(encoder.path)
             for camera, encoder in self._encoders.items()
         }
-        frames = min([rows, *videos.values()])
+        lost = [replace(loss, row=videos[camera]) for camera, loss in self._lost.items()]
+        frames = min([rows, *(count for camera, count in videos.items() if camera not in self._lost)])
         summary = summarise(self.folder / "rows.arrow", self._layout, frames)
         return {
             **outcome.details,
             "status": status,
-            "reason": reason,
+            "reason": "; ".join(filter(None, (reason, *(loss.text for loss in lost)))),
             "ended_wall": outcome.ended_wall,
             **summary.fields(),
             "rows": rows,
             "video_frames": videos,
+            "lost_cameras": {loss.camera: {"row": loss.row, "reason": loss.reason} for loss in lost},
             "muxed_ms": {camera: encoder.muxed_ms for camera, encoder in self._encoders.items()},
         }
 
     def _tell(self) -> None:
-        for encoder in self._encoders.values():
-            if encoder.failure is not None:
-                self._faults.report(encoder.failure)
+        self._look_at_encoders()
         self._faults.tell()
+
+    def _look_at_encoders(self) -> None:
+        """A disk that is full ends the recording, any other failure the video of its camera."""
+        for camera, encoder in self._encoders.items():
+            failure = encoder.failure
+            if isinstance(failure, DiskFullError):
+                self._faults.report(failure)
+            elif failure is not None and camera not in self._lost:
+                loss = self._lost[camera] = Loss(camera, encoder.frames, str(failure))
+                event = {"camera": camera, "row": loss.row}
+                told = {
+                    "kind": VIDEO_LOST,
+                    "text": loss.text,
+                    "time": self._newest,
+                    "step": -1,
+                    "data": event,
+                }
+                self._writer.add_line(document(told, "an event"))

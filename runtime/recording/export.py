@@ -93,6 +93,11 @@ def export(folder: Path, root: Path) -> Path:
     return path
 
 
+def exported(folder: Path) -> bytes:
+    """The table of the episode in `folder` as a parquet file; raises RecordingError where it is damaged."""
+    return _content(_read(folder, read_document(folder / "manifest.json")))
+
+
 def place(manifest: Mapping[str, object], root: Path) -> Path:
     """Where the run of that manifest is exported to; RecordingError where it has no uuid of its own."""
     prompt, mode, strategy = (manifest.get(key) for key in ("task", "mode", "strategy"))

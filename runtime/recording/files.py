@@ -14,7 +14,12 @@ import numpy as np
 
 from runtime.errors import RecordingError
 
-_FULL = {errno.ENOSPC: "disk full", errno.EDQUOT: "disk quota used up", errno.EFBIG: "file too large"}
+_FULL = {errno.ENOSPC: "disk full", errno.EDQUOT: "disk quota used up"}
+_OTHERS = {errno.EFBIG: "file too large"}
+
+
+class DiskFullError(RecordingError):
+    """Nothing more can be written, to whichever file of an episode."""
 
 
 class AppendFile:
@@ -70,14 +75,15 @@ class AppendFile:
 
 def disk_fault(doing: str, path: Path, error: OSError) -> RecordingError:
     """The error for a person: what failed, on which file, why, and how much room there is."""
-    what = _FULL.get(error.errno or 0, "disk error")
+    full = _FULL.get(error.errno or 0)
+    what = full or _OTHERS.get(error.errno or 0, "disk error")
     reason = error.strerror or str(error)
     folder = _existing(path)
     try:
         room = f"{shutil.disk_usage(folder).free} bytes free in {folder}"
     except OSError as unknown:
         room = f"free space of {folder} unknown ({unknown.strerror})"
-    return RecordingError(f"{what} while {doing} {path}: {reason}; {room}")
+    return (DiskFullError if full else RecordingError)(f"{what} while {doing} {path}: {reason}; {room}")
 
 
 def require_room(folder: Path, wanted: int) -> None:

@@ -18,7 +18,7 @@ _Kind = TypeVar("_Kind")
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The part of a manifest that decides how the files look; `cameras` maps a key to (height, width)."""
+    """The part of a manifest that decides how the files look; `cameras` maps a key to (height, width) of its video."""
 
     uuid: str
     fps: float
@@ -28,6 +28,8 @@ class Layout:
     cameras: Mapping[str, tuple[int, int]]
     streams: tuple[str, ...]  # those of VECTOR_STREAMS that are recorded
     capture_streams: tuple[str, ...]
+    pictures: Mapping[str, tuple[int, int]]  # as `cameras`, of the pictures before they are scaled
+    max_skew_s: float  # a row whose streams were captured farther apart is flagged; inf: none is
 
     def width(self, vector: str) -> int:
         """Numbers in the vector of that name."""
@@ -42,15 +44,18 @@ class Layout:
         streams = _get(manifest, "streams", dict)
         chosen = tuple(name for name in VECTOR_STREAMS if streams.get(name) is True)
         poses = any(name.startswith("eef") for name in chosen)
+        cameras = _get(manifest, "cameras", dict)
         return cls(
             uuid=_uuid(manifest),
             fps=_rate(manifest, "fps"),
             dim=_count(robot, "dim"),
             eef_dim=_count(robot, "eef_dim") if poses else 0,
             started=_number(manifest, "started_monotonic"),
-            cameras={key: _camera(key, value) for key, value in _get(manifest, "cameras", dict).items()},
+            cameras={key: _camera(key, value) for key, value in cameras.items()},
             streams=chosen,
             capture_streams=tuple(str(name) for name in _get(manifest, "capture_streams", list)),
+            pictures={key: _captured(value) for key, value in cameras.items()},
+            max_skew_s=_number(manifest, "max_skew_s") if "max_skew_s" in manifest else math.inf,
         )
 
 
@@ -110,3 +115,9 @@ def _camera(key: str, size: object) -> tuple[int, int]:
     if height % 2 or width % 2:
         raise _wrong(f"cameras.{key}", f"{width}x{height}", "even in width and height (yuv420p)")
     return height, width
+
+
+def _captured(size: Mapping[str, object]) -> tuple[int, int]:
+    """Height and width of a camera's pictures: those of its video where it is not scaled."""
+    names = ("captured_height", "captured_width") if "captured_height" in size else ("height", "width")
+    return _count(size, names[0]), _count(size, names[1])

@@ -18,9 +18,9 @@ from runtime.recording.tables import SCHEMAS, read_table
 class Episode:
     """One episode as it lies on disk; tables are pyarrow.Table with the columns of runtime.recording.tables.
 
-    `rows` has exactly `frames` rows, and frame k of every video belongs to row k for k < `frames`; it may
-    have more. Without an outcome the episode is being written or was cut off: then `frames` only counts rows,
-    and videos may still lack some of them.
+    `rows` has exactly `frames` rows, and frame k of every video belongs to row k for k < `frames`; it may have more,
+    and that of a camera that was lost has fewer: `shown`. Without an outcome the episode is being written or was cut
+    off: then `frames` only counts rows, and videos may still lack some of them.
     """
 
     path: Path
@@ -34,6 +34,16 @@ class Episode:
     raw: Any
     events: tuple[Mapping[str, object], ...]
     videos: Mapping[str, Path]
+
+    @property
+    def lost(self) -> Mapping[str, Mapping[str, Any]]:
+        """Cameras whose video ended before the episode did: `row`, the first without a picture, and `reason`."""
+        lost = (self.outcome or {}).get("lost_cameras")
+        return lost if isinstance(lost, Mapping) else {}
+
+    def shown(self, camera: str) -> int:
+        """How many rows, from the first, have a frame of that camera."""
+        return min(self.frames, int(self.lost[camera]["row"])) if camera in self.lost else self.frames
 
 
 def open_episode(path: Path) -> Episode:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from runtime.errors import RecordingError
+from runtime.recording.base import VIDEO_LOST
 from runtime.recording.episode import lock
 from runtime.recording.files import disk_fault, document, read_document, sync_folder, write_whole
 from runtime.recording.fragments import count_frames, whole_bytes
@@ -37,13 +39,15 @@ class Report:
     video_frames: Mapping[str, int] = field(default_factory=dict)
     torn_bytes: int = 0  # cut from the tables and videos
     torn_lines: int = 0  # cut from the events
+    lost: Mapping[str, str] = field(default_factory=dict)  # cameras whose video had ended before, and why
 
 
 def repair(path: Path) -> Report:
     """Complete the episode in folder `path` where it has no outcome; running it again changes nothing.
 
-    Rows without a frame in every video are cut; the table as found stays beside as rows.uncut.arrow. Videos
-    are never re-encoded: only a torn fragment at their end is cut. RecordingError where the disk fails.
+    Rows without a frame in every video are cut, but for cameras whose video had ended before; the table as found stays
+    beside as rows.uncut.arrow. Videos are never re-encoded: only a torn fragment at their end is cut. RecordingError
+    where the disk fails.
     """
     if not path.is_dir():
         raise RecordingError(f"{path} is no folder of an episode")
@@ -85,9 +89,10 @@ def _judge(path: Path) -> Report:
 def _complete(path: Path, layout: Layout) -> Report:
     ended = max(file.stat().st_mtime for file in path.iterdir())
     videos, torn_video = _mend_videos(path, layout)
-    frames, cut, torn_tables = _mend_tables(path, layout, videos)
-    torn_lines = _mend_events(path)
-    report = Report(path, "repaired", "", frames, cut, videos, torn_video + torn_tables, torn_lines)
+    torn_lines, lost = _mend_events(path)
+    going = [frames for camera, frames in videos.items() if camera not in lost]
+    frames, cut, torn_tables = _mend_tables(path, layout, going)
+    report = Report(path, "repaired", "", frames, cut, videos, torn_video + torn_tables, torn_lines, lost)
     write_whole(path / "outcome.json", document(_outcome(report, layout, ended), "the outcome", indent=1))
     return report
 
@@ -113,8 +118,8 @@ def _cut_fragment(video: Path) -> int:
     return torn
 
 
-def _mend_tables(path: Path, layout: Layout, videos: Mapping[str, int]) -> tuple[int, int, int]:
-    """Common number of rows and frames, whole rows cut, torn bytes cut."""
+def _mend_tables(path: Path, layout: Layout, videos: Sequence[int]) -> tuple[int, int, int]:
+    """Common number of rows and frames in videos of so many, whole rows cut, torn bytes cut."""
     torn = frames = cut = 0
     for name, schema in SCHEMAS.items():
         file = path / f"{name}.arrow"
@@ -122,7 +127,7 @@ def _mend_tables(path: Path, layout: Layout, videos: Mapping[str, int]) -> tuple
         table = read.table
         torn += read.torn_bytes
         if name == "rows":
-            frames = min([table.num_rows, *videos.values()])
+            frames = min([table.num_rows, *videos])
             cut = table.num_rows - frames
             table = table.slice(0, frames)
         if name == "rows" and cut:
@@ -138,12 +143,16 @@ def _keep_uncut(path: Path) -> None:
         sync_folder(path)
 
 
-def _mend_events(path: Path) -> int:
+def _mend_events(path: Path) -> tuple[int, dict[str, str]]:
+    """Torn lines, and the cameras whose video had ended, with what was said of it."""
     log = path / "events.jsonl"
     events = read_events(log)
     if events.torn or not log.exists():
         write_whole(log, b"".join(line + b"\n" for line in events.lines))
-    return events.torn
+    said = [json.loads(line) for line in events.lines]
+    return events.torn, {
+        str(event["data"]["camera"]): str(event["text"]) for event in said if event.get("kind") == VIDEO_LOST
+    }
 
 
 def _outcome(report: Report, layout: Layout, ended: float) -> dict[str, object]:
@@ -155,6 +164,9 @@ def _outcome(report: Report, layout: Layout, ended: float) -> dict[str, object]:
         **summary.fields(),
         "rows": report.frames,
         "video_frames": dict(report.video_frames),
+        "lost_cameras": {
+            camera: {"row": report.video_frames[camera], "reason": why} for camera, why in report.lost.items()
+        },
         "repair": {
             "rows_cut": report.rows_cut,
             "torn_bytes": report.torn_bytes,

@@ -1,30 +1,86 @@
-"""How episodes are written: the encoder, the bounds of its queue, and when the disk counts as full."""
+"""How episodes are written: the encoder and its bounds, what is flagged, and when the disk counts as full."""
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Annotated, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from runtime.errors import ConfigurationError
+from runtime.recording.codecs import CODECS, CodecName
 from runtime.section import Section
+
+Height = Annotated[int, Field(ge=32, le=4320, multiple_of=2)]
+_GOP_SECONDS, _GOP = 0.5, 15
 
 
 class RecordingSettings(Section):
     """The `recording` table of a deployment file."""
 
-    codec: Literal["libx264"] = "libx264"
-    """Video encoder; H.264 plays in every browser and in every reader of datasets."""
-    preset: Literal["ultrafast", "superfast", "veryfast", "faster", "fast", "medium"] = "veryfast"
-    """x264's trade of processor time against size."""
-    crf: int = Field(default=23, ge=0, le=40)
-    """Constant rate factor: smaller is better and larger on disk."""
-    gop: int = Field(default=15, ge=1, le=15)
-    """Most frames between two key frames; half a second is a second bound."""
-    queue_frames: int = Field(default=8, ge=1, le=64)
+    codec: CodecName = "libx264"
+    """Video encoder. H.264 (libx264, h264_nvenc) plays in every browser and in every reader of datasets."""
+    preset: str | None = None
+    """The encoder's trade of processor time against size: libx264 and libx265 `ultrafast` to `veryslow`, libsvtav1 `4`
+    to `10`, h264_nvenc `p1` to `p7`; where it is not given `veryfast`, `ultrafast`, `10`, `p4`."""
+    crf: int | None = Field(default=None, ge=0, le=63)
+    """Constant quality: smaller is better and larger on disk, up to 51 (libsvtav1: 63); where it is not given 23, 28,
+    35, 23."""
+    gop: int | None = Field(default=None, ge=1, le=300)
+    """Most frames between two key frames; half a second of them, at most 15, where it is not given."""
+    height: Height | None = None
+    """Height of all videos, the width in proportion; that of the camera where it is not given, or is smaller."""
+    heights: dict[str, Height] = Field(default_factory=dict)
+    """The same by observation key of a camera; goes before `height`."""
+    queue_frames: int = Field(default=16, ge=1, le=64)
     """Most pictures per camera that wait for the encoder; beyond it rows repeat the last picture."""
+    max_lag_s: float = Field(default=0.4, gt=0.0, le=10.0)
+    """Pictures are taken as long as the encoder has all that waits done within so long [s]; others are flagged lost."""
+    give_up_s: float = Field(default=5.0, ge=1.0, le=60.0)
+    """An encoder that is so far behind is given up: its video ends, all else is recorded on [s]."""
+    max_skew_s: float = Field(default=0.05, gt=0.0, le=5.0)
+    """How far apart in time the streams of one row may be before the row is flagged [s]; that of a `[collection]` goes
+    before it."""
+    max_picture_age_s: float = Field(default=0.5, gt=0.0, le=60.0)
+    """Oldest picture that a row may have before the row is flagged and the camera named [s]."""
     flush_period_s: float = Field(default=0.5, gt=0.0, le=1.0)
     """Longest time that rows and events stay in memory before they are written and synced [s]."""
     min_free_bytes: int = Field(default=1 << 30, ge=0)
     """Free space below which nothing is recorded [bytes]."""
     drain_timeout_s: float = Field(default=10.0, gt=0.0)
-    """Longest time that the end of an episode waits for encoders and the disk [s]."""
+    """Longest time that the end of an episode waits for the encoders, and then for the disk [s]."""
+
+    @model_validator(mode="after")
+    def _fit_the_codec(self) -> Self:
+        codec = CODECS[self.codec]
+        if self.preset is not None and self.preset not in codec.presets:
+            raise ConfigurationError(
+                f"recording.preset = {self.preset!r} with codec {self.codec!r}; allowed: {', '.join(codec.presets)}"
+            )
+        if self.crf is not None and self.crf > codec.largest_crf:
+            raise ConfigurationError(
+                f"recording.crf = {self.crf} with codec {self.codec!r}; allowed: 0 to {codec.largest_crf}"
+            )
+        return self
+
+    @property
+    def chosen_preset(self) -> str:
+        return CODECS[self.codec].preset if self.preset is None else self.preset
+
+    @property
+    def chosen_crf(self) -> int:
+        return CODECS[self.codec].crf if self.crf is None else self.crf
+
+    def chosen_gop(self, fps: float) -> int:
+        """Most frames between two key frames at that rate."""
+        return self.gop or max(1, min(_GOP, int(_GOP_SECONDS * fps)))
+
+    def sizes(self, cameras: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
+        """(height, width) of each video, of cameras of those (height, width)."""
+        return {camera: self._size(camera, *size) for camera, size in cameras.items()}
+
+    def _size(self, camera: str, height: int, width: int) -> tuple[int, int]:
+        wanted = self.heights.get(camera, self.height)
+        if wanted is None or wanted >= height:
+            return height, width
+        return wanted, max(2, 2 * round(width * wanted / height / 2))

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from runtime.errors import RecordingError
+from runtime.recording.columns import spread
 from runtime.recording.layout import Layout
 
 HELD = ("hold", "none")  # sources under which nobody asked the robot for anything
@@ -25,6 +26,9 @@ class Summary:
     duration_s: float  # held rows excluded
     held_rows: int
     repeated: Mapping[str, int]  # per camera
+    lost: Mapping[str, int]  # per camera: those of `repeated` whose picture there was, but the video has not
+    stale: Mapping[str, int]  # per camera: rows whose picture is too old
+    skewed_rows: int
     skew_mean_s: float | None  # None where no row has two known capture times
     skew_max_s: float | None
 
@@ -35,6 +39,9 @@ class Summary:
             "duration_s": self.duration_s,
             "held_rows": self.held_rows,
             "repeated": dict(self.repeated),
+            "lost": dict(self.lost),
+            "stale": dict(self.stale),
+            "skewed_rows": self.skewed_rows,
             "skew": {"mean_s": self.skew_mean_s, "max_s": self.skew_max_s},
         }
 
@@ -60,27 +67,29 @@ class _Tally:
         self.frames = 0
         self._layout = layout
         self._held = 0
-        self._repeated = dict.fromkeys(layout.cameras, 0)
+        self._flags = {flag: dict.fromkeys(layout.cameras, 0) for flag in ("repeated", "lost", "stale")}
+        self._skewed = 0
         self._spread_sum, self._spread_count, self._spread_max = 0.0, 0, -math.inf
 
     def add(self, batch: Any) -> None:
         self.frames += batch.num_rows
         self._held += sum(source in HELD for source in batch.column("control_source").to_pylist())
-        for camera in self._repeated:
-            self._repeated[camera] += batch.column(f"repeated.{camera}").true_count
-        spread = self._spread(batch)
-        if spread.size:
-            self._spread_sum += float(spread.sum())
-            self._spread_count += spread.size
-            self._spread_max = max(self._spread_max, float(spread.max()))
+        for flag, counts in self._flags.items():
+            for camera in counts:
+                counts[camera] += _true(batch, f"{flag}.{camera}")
+        self._skewed += _true(batch, "skewed")
+        apart = self._spread(batch)
+        if apart.size:
+            self._spread_sum += float(apart.sum())
+            self._spread_count += apart.size
+            self._spread_max = max(self._spread_max, float(apart.max()))
 
     def _spread(self, batch: Any) -> Any:
         streams = self._layout.capture_streams
         if len(streams) < 2:
             return np.empty(0)
         times = np.stack([batch.column(f"capture_time.{stream}").to_numpy() for stream in streams])
-        times = times[:, np.isfinite(times).sum(axis=0) >= 2]
-        return np.nanmax(times, axis=0) - np.nanmin(times, axis=0) if times.size else np.empty(0)
+        return spread(times[:, np.isfinite(times).sum(axis=0) >= 2])
 
     def summary(self) -> Summary:
         known = self._spread_count > 0
@@ -88,7 +97,15 @@ class _Tally:
             frames=self.frames,
             duration_s=(self.frames - self._held) / self._layout.fps,
             held_rows=self._held,
-            repeated=self._repeated,
+            repeated=self._flags["repeated"],
+            lost=self._flags["lost"],
+            stale=self._flags["stale"],
+            skewed_rows=self._skewed,
             skew_mean_s=self._spread_sum / self._spread_count if known else None,
             skew_max_s=self._spread_max if known else None,
         )
+
+
+def _true(batch: Any, column: str) -> int:
+    """Rows that have the flag; 0 in a table from before there was one."""
+    return int(batch.column(column).true_count) if column in batch.schema.names else 0

@@ -23,7 +23,11 @@ def rows_schema(layout: Layout) -> Any:
     """rows.arrow: one row per step of the dataset's grid; frame k of every video belongs to row k."""
     vectors = [pa.field(name, _vector(layout.width(name))) for name in layout.streams]
     captures = [pa.field(f"capture_time.{stream}", pa.float64()) for stream in layout.capture_streams]
-    repeats = [pa.field(f"repeated.{camera}", pa.bool_()) for camera in layout.cameras]
+    flags = [
+        pa.field(f"{flag}.{camera}", pa.bool_())
+        for flag in ("repeated", "lost", "stale")
+        for camera in layout.cameras
+    ]
     return pa.schema(
         [
             pa.field("index", pa.int64()),
@@ -39,7 +43,8 @@ def rows_schema(layout: Layout) -> Any:
             pa.field("control_source", pa.string()),
             pa.field("intervention", pa.bool_()),
             *captures,
-            *repeats,
+            pa.field("skewed", pa.bool_()),
+            *flags,
         ]
     )
 
@@ -108,10 +113,21 @@ SCHEMAS: Mapping[str, Callable[[Layout], Any]] = {
 
 
 # Columns that tables did not have from the beginning, oldest first: null in those of older episodes.
+# A name that ends with a dot stands for those of all cameras.
 ADDED = (
     frozenset({"strategy", "overlap", "woke"}),
     frozenset({"ik_position_error", "ik_rotation_error", "ik_flags", "eef_source"}),
+    frozenset({"skewed", "lost.", "stale."}),
 )
+
+
+def added(column: str) -> bool:
+    """Whether older tables may lack that column."""
+    return _among(column, frozenset[str]().union(*ADDED))
+
+
+def _among(column: str, names: frozenset[str]) -> bool:
+    return column in names or f"{column.partition('.')[0]}." in names
 
 
 def _vector(width: int) -> Any:
@@ -121,7 +137,7 @@ def _vector(width: int) -> Any:
 def _generations(schema: Any) -> list[Any]:
     """The schema as it is, and as it was before each of the times when columns were added."""
     absent = [frozenset[str]().union(*ADDED[first:]) for first in range(len(ADDED) + 1)]
-    return [pa.schema([field for field in schema if field.name not in names]) for names in absent]
+    return [pa.schema([field for field in schema if not _among(field.name, names)]) for names in absent]
 
 
 class TableWriter:

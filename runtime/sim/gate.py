@@ -1,4 +1,4 @@
-"""What a careful execution node lets through: one master, finite targets within limits, a deadline.
+"""What a careful execution node lets through: one master, fresh finite targets within limits, a deadline.
 
 Words that switch the drives of a simulated robot (runtime.sim.drives) are taken of anybody. A node with a bench
 also takes the word "scene_reset", with `id`, `seed` and, if wanted, `positions`.
@@ -6,13 +6,15 @@ also takes the word "scene_reset", with `id`, `seed` and, if wanted, `positions`
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import numpy as np
 
 from runtime import codecs
+from runtime.clock import ClockMap
 from runtime.errors import CodecError
 from runtime.sim import drives
 from runtime.sim.tabletop import Reset
@@ -43,6 +45,8 @@ class Accepted:
 class Gate:
     """Judges commands by their arrival on our own clock; `refused` counts what it sent away, by reason.
 
+    A target that was sent more than `deadline` seconds ago is refused as well, by the master's own clock, where that
+    goes on. `ack` is the `seq` of the master's newest message that took effect, None where it does not number.
     `bench` says whether there is one that could be laid anew.
     """
 
@@ -52,7 +56,10 @@ class Gate:
         self._bench = bench
         self._heard = float("-inf")  # the master's last message, accepted or not
         self._accepted = float("-inf")
+        self._stamp = float("-inf")  # of the master's newest command, on its clock
+        self._clock = ClockMap()
         self.master: str | None = None
+        self.ack: int | None = None
         self.refused: Counter[str] = Counter()
 
     def judge(self, payload: bytes, arrival: float) -> Accepted | None:
@@ -65,10 +72,17 @@ class Gate:
             return self._switch(word, message)
         if not self._rules(message, arrival):
             return None
+        accepted = self._accept(word, message, arrival)
+        if accepted is not None:
+            number = message.get("seq")
+            self.ack = number if type(number) is int else None
+        return accepted
+
+    def _accept(self, word: str, message: dict[Any, Any], arrival: float) -> Accepted | None:
         if word == "real":
             return self._target(message, arrival)
         if word in get_args(Control):
-            return Accepted(control=word)
+            return Accepted(control=cast(Control, word))
         if word == _RESET:
             return self._reset(message)
         if word != "sim":
@@ -96,7 +110,9 @@ class Gate:
         if self.master != name and self.master is not None and arrival - self._heard <= MASTER_SILENCE:
             self.refused["other_master"] += 1
             return False
-        self.master = name
+        if self.master != name:
+            self.master, self.ack = name, None
+            self._stamp, self._clock = float("-inf"), ClockMap()
         self._heard = arrival
         return True
 
@@ -122,12 +138,21 @@ class Gate:
 
     def _target(self, message: dict[Any, Any], arrival: float) -> Accepted | None:
         action = message.get("action")
-        reason = self._wrong(action)
+        reason = "stale" if self._late(message.get("t"), arrival) else self._wrong(action)
         if reason:
             self.refused[reason] += 1
             return None
         self._accepted = arrival
         return Accepted(target=np.clip(np.asarray(action, np.float64), self._robot.lower, self._robot.upper))
+
+    def _late(self, stamp: object, arrival: float) -> bool:
+        """Whether it was sent too long ago; never where the sender's clock says nothing."""
+        if type(stamp) not in (int, float) or not math.isfinite(cast(float, stamp)):
+            return False
+        before, self._stamp = self._stamp, cast(float, stamp)
+        if before == self._stamp:
+            return False  # a clock that stands still
+        return arrival - self._clock.map(self._stamp, arrival) > self._deadline
 
     def _wrong(self, action: object) -> str:
         if not isinstance(action, np.ndarray) or action.dtype.kind != "f":

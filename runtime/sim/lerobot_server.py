@@ -67,7 +67,8 @@ class LerobotServer:
     def start(self) -> dict[str, object]:
         """Listen, and return the address."""
         options = [("grpc.so_reuseport", 0)]
-        self._server = grpc.server(ThreadPoolExecutor(8, "lerobot"), options=options)
+        self._workers = ThreadPoolExecutor(8, "lerobot")
+        self._server = grpc.server(self._workers, options=options)
         self._server.add_generic_rpc_handlers([self._handlers()])
         try:
             self._port = self._server.add_insecure_port(f"127.0.0.1:{self._port}")
@@ -81,6 +82,7 @@ class LerobotServer:
         self._ended.set()
         if self._server is not None:
             self._server.stop(0).wait()
+            self._workers.shutdown(wait=False)
         self._server = None
 
     def _handlers(self) -> Any:

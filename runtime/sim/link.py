@@ -12,8 +12,7 @@ from runtime import codecs
 from runtime.clock import Clock
 from runtime.sim.node import Node
 from runtime.transports.base import Sink, Source
-from runtime.transports.node_messages import NodeMessages
-from runtime.transports.zmq import MESSAGE_LIMIT
+from runtime.transports.node_messages import MESSAGE_LIMIT, NodeMessages
 from runtime.types import Observation, RobotCommand
 
 if TYPE_CHECKING:

@@ -1,10 +1,10 @@
 """A simulated execution node: `python -m runtime.sim.node --robot NAME`; speaks what real nodes speak.
 
 Each tick: take the newest command, move the plant, publish one observation. Beyond the plain protocol it
-says its frame number (`seq`), colour order (`encoding`), whom it obeys (`master`), what it `refused`, by
-reason, whether it is `holding` because nobody commands it, and how its `drives` are. With `--bench tabletop`
-or `conveyor` there is something to touch, which the word "scene_reset" lays anew and of which the field `truth`
-says how it really is.
+says its frame number (`seq`), colour order (`encoding`), whom it obeys (`master`) and the number of what it obeyed
+last (`ack`), what it `refused`, by reason, whether it is `holding` because nobody commands it, and how its `drives`
+are. With `--bench tabletop` or `conveyor` there is something to touch, which the word "scene_reset" lays anew and of
+which the field `truth` says how it really is.
 """
 
 from __future__ import annotations
@@ -170,6 +170,7 @@ class Node:
             message["hil_error"] = self._hil_error
         message |= {"proto": 1, "seq": self._sequence, "encoding": "bgr", "holding": self._holding}
         message |= {"refused": dict(self._gate.refused), "master": self._gate.master or ""}
+        message |= {} if self._gate.ack is None else {"ack": self._gate.ack}
         message["drives"] = self._drives.said()
         truth = self._surroundings.truth()
         return message if truth is None else message | {"truth": truth}

@@ -2,35 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
-import http
-import os
-import socket
-import threading
 import time
-import traceback
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from websockets.exceptions import ConnectionClosed
-from websockets.frames import Frame, Opcode
-from websockets.sync.server import Server, ServerConnection, serve
 
-from runtime import codecs
-from runtime.errors import SetupError
+from runtime.sim.arrays import packed, unpacked
 from runtime.sim.continuing import ModelSpace, continued
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.rtc_wires import WIRES, Asked, Name
 from runtime.sim.script import Answer, Script, Waving
+from runtime.sim.websocket_server import Answering, Frames, WebsocketServer, spoilt
 from runtime.types import UInt8
 
 if TYPE_CHECKING:
-    from websockets.http11 import Request, Response
-
     from robots import Robot
-
-_LATE = 3.0  # s
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,116 +35,53 @@ class Behaviour:
     rtc: Name = "prev_action"
 
 
-class OpenpiServer:
+class OpenpiServer(WebsocketServer):
     """Serves on loopback in threads of its own; plays `script`, a gesture where none is given."""
+
+    says_well = True
 
     def __init__(
         self, robot: Robot, behaviour: Behaviour, port: int = 0, script: Script | None = None
     ) -> None:
+        super().__init__("openpi", behaviour.fault, port)
         self._robot = robot
         self._behaviour = behaviour
-        self._port = port
         self._script = script or Waving(robot, behaviour.horizon, behaviour.rate, behaviour.seed)
         self._space = ModelSpace(robot)
         self._wire = WIRES[behaviour.rtc](self._space, behaviour.horizon, behaviour.fault)
-        self._device = threading.Lock()  # one inference at a time, as on one GPU
-        self._asked = 0
-        self._server: Server | None = None
-        self._thread: threading.Thread | None = None
 
-    def start(self) -> dict[str, object]:
-        """Listen, and return the address."""
-        try:
-            self._server = serve(
-                self._converse,
-                "127.0.0.1",
-                self._port,
-                process_request=self._admit,
-                compression=None,
-                max_size=None,
-                ping_interval=None,
-                close_timeout=1.0,
-            )
-        except OSError as error:
-            raise SetupError(f"cannot listen at 127.0.0.1:{self._port}: {error}") from error
-        self._port = self._server.socket.getsockname()[1]
-        self._thread = threading.Thread(target=self._server.serve_forever, name="openpi", daemon=True)
-        self._thread.start()
-        return {"url": f"ws://127.0.0.1:{self._port}", "port": self._port}
-
-    def close(self) -> None:
-        """Stop listening; safe to call twice."""
-        if self._server is not None and self._thread is not None:
-            self._server.shutdown()
-            self._thread.join()
-        self._server = self._thread = None
-
-    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        if request.path == "/healthz":
-            return connection.respond(http.HTTPStatus.OK, "OK\n")
-        if self._behaviour.fault.name == "http_404":
-            return connection.respond(http.HTTPStatus.NOT_FOUND, "there is no policy here\n")
-        return None
-
-    def _converse(self, connection: ServerConnection) -> None:
-        """One client: metadata, then an answer for each request, until it leaves."""
-        fault = self._behaviour.fault.name
-        with contextlib.suppress(ConnectionClosed):
-            if fault == "text_first":
-                connection.send("the checkpoint could not be loaded")
-            elif fault != "mute_on_connect":
-                connection.send(codecs.pack(self._metadata()))
-            answer, previous = self._script.begin(), None
-            while True:
-                request = connection.recv()
-                started = time.monotonic()
-                if not self._answer(connection, answer, request, previous):
-                    return
-                previous = 1e3 * (time.monotonic() - started)
-
-    def _metadata(self) -> dict[str, object]:
+    def greeting(self) -> Frames | None:
+        """The metadata."""
         metadata = dict(self._script.metadata) | self._wire.metadata()
         if self._behaviour.fault.name == "action_mode":
             metadata["action_mode"] = self._behaviour.fault.argument
-        return metadata
+        return packed(metadata)
 
-    def _answer(
-        self, connection: ServerConnection, answer: Answer, request: str | bytes, previous: float | None
-    ) -> bool:
-        """Answer one request, rightly or as the fault has it; False where the conversation is over."""
-        with self._device:
-            number, self._asked = self._asked, self._asked + 1
-            message: Any = None
-            try:
-                if isinstance(request, str):
-                    raise TypeError("the request is a text frame; expected a binary one")
-                message = codecs.unpack(request)
-                if self._behaviour.fault.name == "exception":
-                    raise RuntimeError("CUDA out of memory (on purpose)")
-                asked = self._wire.read(message)
-                reply = self._wire.answer(self._result(answer, asked, previous), asked)
-            except Exception:  # whatever goes wrong in a policy is told to the client, as openpi does it
-                connection.send(self._wire.failure(traceback.format_exc(), message))
-                connection.close(1011, "Internal server error. Traceback included in previous frame.")
-                return False
-        return self._send(connection, reply, number)
+    def begin(self) -> Answering:
+        """One connection of the script."""
+        return _Conversation(self, self._script.begin())
 
-    def _send(self, connection: ServerConnection, payload: bytes, number: int) -> bool:
-        fault = self._behaviour.fault
-        due = number >= fault.number(0)
-        if fault.name == "die" and due:
-            os._exit(1)
-        if fault.name == "mute_on_infer" and due:
-            return True
-        if fault.name == "close_mid_reply" and due:
-            _send_half(connection, payload)
-            return False
-        if fault.name == "late_reply" and number == 1:
-            time.sleep(fault.number(_LATE))
-        connection.send(payload)
-        return True
+    def answered(self, answer: Answering, seconds: float) -> None:
+        """The next answer says how long this one took."""
+        assert isinstance(answer, _Conversation)
+        answer.previous_ms = 1e3 * seconds
 
-    def _result(self, answer: Answer, asked: Asked, previous: float | None) -> dict[str, object]:
+    def failure(self, traceback: str, request: Frames) -> Frames:
+        """Text, or an envelope with the number of the request, where it has one."""
+        try:
+            message = unpacked(request) if isinstance(request, bytes) else None
+        except ValueError:
+            message = None
+        return self._wire.failure(traceback, message)
+
+    def reply(self, request: Frames, answer: Answer, previous_ms: float | None) -> bytes:
+        """The frame that answers a request; an exception where it cannot be answered."""
+        if isinstance(request, str):
+            raise TypeError("the request is a text frame; expected a binary one")
+        asked = self._wire.read(unpacked(request))
+        return self._wire.answer(self._result(answer, asked, previous_ms), asked)
+
+    def _result(self, answer: Answer, asked: Asked, previous_ms: float | None) -> dict[str, object]:
         started = time.monotonic()
         observation = asked.observation
         state, pictures = self._state(observation), self._pictures(observation)
@@ -166,10 +90,10 @@ class OpenpiServer:
             actions = continued(actions, asked.prefix, self._robot.binary_dims)
         time.sleep(max(0.0, self._behaviour.latency - (time.monotonic() - started)))
         took = 1e3 * (time.monotonic() - started)
-        timing = {"infer_ms": took} | ({} if previous is None else {"prev_total_ms": previous})
+        timing = {"infer_ms": took} | ({} if previous_ms is None else {"prev_total_ms": previous_ms})
         own = {"origin_actions": self._space.of(actions)} if self._behaviour.rtc != "none" else {}
         return {
-            "actions": self._spoilt(actions),
+            "actions": spoilt(self._behaviour.fault, actions),
             **own,
             "policy_timing": {"infer_ms": took},
             "server_timing": timing,
@@ -190,38 +114,14 @@ class OpenpiServer:
                 )
         return pictures
 
-    def _spoilt(self, actions: np.ndarray[Any, Any]) -> object:
-        """The actions, or what the fault makes of them."""
-        name = self._behaviour.fault.name
-        if name == "nan":
-            actions[min(3, len(actions) - 1), 2] = np.nan
-        shapes = {
-            "wrong_dim": actions[:, :-1],
-            "empty": actions[:0],
-            "batched": actions[None],
-            "two_batches": np.stack([actions, actions]),
-            "single_row": actions[0],
-        }
-        if name == "bad_array_dialect":
-            return _foreign(actions)
-        if name == "object_array":
-            return {b"__ndarray__": True, b"data": b"\x80\x04N.", b"dtype": "|O", b"shape": [1]}
-        return shapes.get(name, actions)
 
+@dataclass(slots=True)
+class _Conversation:
+    """Answers the requests of one connection; `previous_ms` is how long the last one took."""
 
-def _foreign(array: np.ndarray[Any, Any]) -> dict[bytes, object]:
-    """An array as the package msgpack_numpy writes it."""
-    return {
-        b"nd": True,
-        b"type": array.dtype.str,
-        b"kind": b"",
-        b"shape": list(array.shape),
-        b"data": array.tobytes(),
-    }
+    server: OpenpiServer
+    answer: Answer
+    previous_ms: float | None = None
 
-
-def _send_half(connection: ServerConnection, payload: bytes) -> None:
-    """Half a frame, then the end of the TCP connection: what a killed server leaves."""
-    raw = Frame(Opcode.BINARY, payload).serialize(mask=False)
-    connection.socket.sendall(raw[: len(raw) // 2])
-    connection.socket.shutdown(socket.SHUT_RDWR)
+    def __call__(self, request: Frames) -> Frames:
+        return self.server.reply(request, self.answer, self.previous_ms)

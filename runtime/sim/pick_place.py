@@ -41,12 +41,13 @@ _EMPTY = 0.75  # of the block's edge: jaws narrower than that hold nothing
 _SHORT = 0.05  # m by which a grasp is short where it slips
 _CARRYING = ("lift", "carry", "lower")
 _LEAVING = ("back off", "retreat")
+_COMING = ("make way", "reach")
 _ARM = 0.25  # m
 _PAUSED = 3.0  # s without a request, after which a robot that was leaving begins another episode
 
 
 Apart = Callable[["Group", Float64, Float64], Float64]
-"""From the arm at work, rows float64 [n, D] and joints [D] to how far apart they are [n], in rad."""
+"""From the arm that moves, rows float64 [n, D] and joints [D] to how far apart they are [n], in rad."""
 
 
 class ScriptError(RuntimeFault):
@@ -198,7 +199,7 @@ class Pursuit:
         if self._route is None:
             return False
         return self._distances(q).min() > _LOST or (
-            self._route.legs[self._leg].name == "reach" and _differs(sight, self._seen)
+            self._route.legs[self._leg].name in _COMING and _differs(sight, self._seen)
         )
 
     # --- following -----------------------------------------------------------------------------------------
@@ -212,7 +213,9 @@ class Pursuit:
         return self._apart(self._on().legs[self._leg].rows, q)
 
     def _apart(self, rows: Float64, q: Float64) -> Float64:
-        return self._policy.apart(self._on().arm, rows, q)
+        route = self._on()
+        movers = route.legs[self._leg].others or (route.arm,)
+        return np.asarray(np.max([self._policy.apart(arm, rows, q) for arm in movers], axis=0))
 
     def _advance(self, q: Float64, elapsed: float) -> None:
         """Find the leg and the row that the robot is at; a route that is done is dropped."""

@@ -124,11 +124,15 @@ class Postures:
                 return np.asarray(found[0])
         return q
 
+    def aside(self, arm: Group, q: Float64) -> Float64:
+        """Joints [D] with an arm at rest, its jaws as they are."""
+        rest = q.copy()
+        rest[arm.joint_dims] = self._rest[arm.joint_dims]
+        return rest
+
     def rested(self, arm: Group, q: Float64) -> Float64:
         """Joints [D] with an arm at rest, its jaws open."""
-        rest = q.copy()
-        rest[arm.slice] = self._rest[arm.slice]
-        return opened(arm, rest)
+        return opened(arm, self.aside(arm, q))
 
     def tip(self, arm: Group, q: Float64) -> Float64:
         """An arm's fingertips in the world, [4, 4], at joints q [D]."""

@@ -103,10 +103,10 @@ class RoboarenaServer(WebsocketServer):
         answer = self._script.begin()
         return lambda request: self._reply(answer, request)
 
-    def failed(self, connection: ServerConnection, error: Exception) -> bool:
+    def failed(self, connection: ServerConnection, error: Exception, request: Frames) -> bool:
         """vLLM-Omni says little, in binary, and stays."""
         if self._arena.variant == "roboarena":
-            return super().failed(connection, error)
+            return super().failed(connection, error, request)
         known = "Invalid request payload" if isinstance(error, ValueError) else "Internal inference error"
         connection.send(packed({"type": "error", "message": known}))
         return True

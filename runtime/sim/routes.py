@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
@@ -19,6 +19,7 @@ from runtime.sim.bench import Bench
 from runtime.sim.down import Place
 from runtime.sim.hands import Opening
 from runtime.sim.postures import CLEAR, TILTS, Postures, closed, gripper_dim, jaws, opened
+from runtime.sim.room import room_of
 from runtime.types import Float64
 
 if TYPE_CHECKING:
@@ -31,17 +32,22 @@ _JAW_SPEED = 0.16  # m/s
 _PAUSE = 0.3  # s that a route stands still at first: its rows arrive late
 _DWELL = 0.2  # s by which a gate outlasts the way of its jaws
 _PEAK = 1.875  # highest over mean speed of a minimum-jerk motion
+_AT_REST = 0.02  # rad
 
 Gate = Literal["", "close", "open"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Leg:
-    """Rows float64 [n, D], one per control period; a gate's leg ends when the jaws are seen to have obeyed."""
+    """Rows float64 [n, D], one per control period; a gate's leg ends when the jaws are seen to have obeyed.
+
+    `others` are the arms that move instead of the route's own: those that make way.
+    """
 
     name: str
     rows: Float64
     gate: Gate = ""
+    others: tuple[Group, ...] = ()
 
     @property
     def end(self) -> Float64:
@@ -59,7 +65,7 @@ class Slip:
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """What one arm does, leg after leg; the rest of the robot stays.
+    """What one arm does, leg after leg; the rest of the robot stays, or makes way first.
 
     `rows` [N, D] are those of all legs, `starts` the places of each leg's first one among them.
     """
@@ -83,6 +89,7 @@ class Planner:
         self._robot = robot
         self._rate = rate
         self._postures = Postures(robot, table)
+        self._room = room_of(robot)
         self._speed = np.minimum(0.5 * robot.velocity, _SPEED)
         for arm in self._postures.arms:
             self._speed[gripper_dim(arm)] = min(0.5 * robot.velocity[gripper_dim(arm)], _jaw_speed(arm))
@@ -90,13 +97,57 @@ class Planner:
     def pick_and_place(
         self, q: Float64, block: tuple[float, float, float], plate: Place, slip: Slip
     ) -> Route | None:
-        """The route from joints q [D], by the arm nearest the block that reaches all of it; None if none does."""
-        for arm in sorted(self._postures.arms, key=lambda arm: self._postures.distance(arm, block)):
-            for tilts in TILTS:
-                down, over = self._postures.stations(arm, q, block, plate, slip.short, tilts)
-                if down is not None and over is not None:
-                    return self._route(arm, q, down, over, slip)
-        return None
+        """The route from joints q [D], by the arm nearest the block that reaches all of it; None if none does.
+
+        Where that would come too near to another arm or the body, it is another arm's, or others make way; where
+        nothing helps, the one with most room.
+        """
+        found, most = None, -math.inf
+        for route in self._routes(q, block, plate, slip):
+            spare = self._room.spare(route.rows)
+            if spare >= 0:
+                return route
+            if spare > most:
+                found, most = route, spare
+        return found
+
+    def _routes(
+        self, q: Float64, block: tuple[float, float, float], plate: Place, slip: Slip
+    ) -> Iterator[Route]:
+        """By each arm that can, the nearest first: while the others stay, then with those at rest that are not."""
+        nearest = sorted(self._postures.arms, key=lambda arm: self._postures.distance(arm, block))
+        for makes_way in (False, True):
+            for arm in nearest:
+                before = self._made_way(arm, q) if makes_way else []
+                if makes_way and not before:
+                    continue
+                start = before[-1].end if before else q
+                for tilts in TILTS:
+                    down, over = self._postures.stations(arm, start, block, plate, slip.short, tilts)
+                    if down is not None and over is not None:
+                        yield self._begun(arm, [*before, *self._legs(arm, start, down, over, slip)])
+
+    def _made_way(self, arm: Group, q: Float64) -> list[Leg]:
+        """The legs by which all other arms that are not at rest go there, up from the table first; [] where none is."""
+        others = tuple(
+            other
+            for other in self._robot.arms
+            if other is not arm and np.abs(self._postures.aside(other, q) - q).max() > _AT_REST
+        )
+        if not others:
+            return []
+        high = q
+        for other in others:
+            high = self._postures.risen(other, high) if self._low(other, high) else high
+        rest = high
+        for other in others:
+            rest = self._postures.aside(other, rest)
+        ways = [("rise", q, high)] * (high is not q) + [("make way", high, rest)]
+        return [replace(self._leg(*way), others=others) for way in ways]
+
+    def _low(self, arm: Group, q: Float64) -> bool:
+        """Whether the fingertips are so near to the table that they have to rise before they go elsewhere."""
+        return bool(self._postures.tip(arm, q)[2, 3] < 0.75 * CLEAR)
 
     def retreat(self, q: Float64, arm: Group) -> Route:
         """Open the jaws, rise, and go where the arm is out of the camera's way."""
@@ -105,11 +156,11 @@ class Planner:
             arm, [self._leg("back off", q, high), self._leg("retreat", high, self._postures.rested(arm, q))]
         )
 
-    def _route(self, arm: Group, q: Float64, down: Float64, over: Float64, slip: Slip) -> Route:
+    def _legs(self, arm: Group, q: Float64, down: Float64, over: Float64, slip: Slip) -> list[Leg]:
         """From the stations above to below the block, `down`, and the plate, `over`, [stations, D], jaws open."""
         held, lowered = (closed(arm, way) for way in (down, over))
         legs = []
-        if self._postures.tip(arm, q)[2, 3] < 0.75 * CLEAR:
+        if self._low(arm, q):
             legs.append(self._leg("rise", q, self._postures.risen(arm, q)))
             q = legs[-1].end
         legs += [self._leg("reach", q, down[0]), self._vertical_leg("descend", down)]
@@ -124,7 +175,7 @@ class Planner:
             legs += [carry, self._vertical_leg("lower", lowered)]
             legs += [self._jaw_leg("open", lowered[-1], over[-1]), self._vertical_leg("leave", over[::-1])]
         legs.append(self._leg("retreat", last, self._postures.rested(arm, q)))
-        return self._begun(arm, legs)
+        return legs
 
     def _begun(self, arm: Group, legs: Sequence[Leg]) -> Route:
         first = legs[0]

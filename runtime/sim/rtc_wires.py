@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from runtime import codecs
-from runtime.policies.rtc import async_rtc
+from runtime.sim.arrays import packed
 from runtime.sim.continuing import STAND_IN, ModelSpace, Prefix
 from runtime.sim.faults import Fault
 
 Name = Literal["none", "prev_action", "openpi_rtc", "kai0", "async_rtc"]
 _SHIFT, _FROZEN = 25, 10  # rows that openpi-rtc takes off, and that it keeps to
+_ENVELOPE, _VERSION = "openpi-async-rtc", 2
 _FIELDS = (
     "prev_chunk_left_over",
     "inference_delay",
@@ -72,7 +72,7 @@ class Ignorant(Wire):
         return Asked(message)
 
     def answer(self, result: dict[str, object], asked: Asked) -> bytes:
-        return codecs.pack(result)
+        return packed(result)
 
     def failure(self, traceback: str, message: Any) -> str | bytes:
         return traceback
@@ -153,10 +153,8 @@ class Envelope(Wire):
 
     def read(self, message: Any) -> Asked:
         found = (message.get("protocol"), message.get("protocol_version"))
-        if found != (async_rtc.NAME, async_rtc.VERSION):
-            raise ValueError(
-                f"protocol {found[0]!r} version {found[1]!r}; expected {async_rtc.NAME!r} version 2"
-            )
+        if found != (_ENVELOPE, _VERSION):
+            raise ValueError(f"protocol {found[0]!r} version {found[1]!r}; expected {_ENVELOPE!r} version 2")
         number, codec = message.get("request_id"), message["image_transport"]["codec"]
         if not isinstance(number, int) or number < 0:
             raise ValueError(f"request_id is {number!r}, expected 0 or more")
@@ -172,18 +170,18 @@ class Envelope(Wire):
             number += 1
         timing = {"image_decode_ms": 0.0, "codec": "raw"}
         whole = {**self._head(), "request_id": number, "result": {**result, "image_transport": timing}}
-        return codecs.pack(whole)
+        return packed(whole)
 
     def failure(self, traceback: str, message: Any) -> str | bytes:
         number = message.get("request_id") if isinstance(message, dict) else None
         known = number if isinstance(number, int) else None
-        return codecs.pack({**self._head(), "request_id": known, "error": traceback})
+        return packed({**self._head(), "request_id": known, "error": traceback})
 
     def _head(self) -> dict[str, object]:
-        version = async_rtc.VERSION
+        version = _VERSION
         if self._fault.name == "envelope_version":
-            version = int(self._fault.number(async_rtc.VERSION + 1))
-        return {"protocol": async_rtc.NAME, "protocol_version": version}
+            version = int(self._fault.number(_VERSION + 1))
+        return {"protocol": _ENVELOPE, "protocol_version": version}
 
     def _prefix(self, rtc: Any) -> Prefix:
         missing = [name for name in _FIELDS if name not in rtc]

@@ -10,6 +10,7 @@ from runtime.errors import SetupError
 from runtime.transports.zmq import is_loopback
 
 _QUEUED_FRAMES = 4
+_QUEUED_COMMANDS = 64  # what waits while the node stands still is old when it goes on
 _DRAINED_COMMANDS = 1000  # at once; a flood must not stop the publishing
 
 
@@ -17,9 +18,9 @@ class Sockets:
     """Bound on construction; SetupError where an address is taken, or open to others without `insecure`."""
 
     def __init__(self, observations: str, commands: str, insecure: bool) -> None:
-        self._publisher = _bound(zmq.PUB, observations, insecure)
+        self._publisher = bound(zmq.PUB, observations, insecure)
         try:
-            self._subscriber = _bound(zmq.SUB, commands, insecure)
+            self._subscriber = bound(zmq.SUB, commands, insecure)
         except SetupError:
             self._publisher.close(linger=0)
             raise
@@ -28,7 +29,7 @@ class Sockets:
     @property
     def addresses(self) -> dict[str, str]:
         """Where they really are."""
-        return {"obs_endpoint": _address(self._publisher), "action_endpoint": _address(self._subscriber)}
+        return {"obs_endpoint": address(self._publisher), "action_endpoint": address(self._subscriber)}
 
     def received(self) -> list[bytes]:
         """The commands that have come, in order."""
@@ -51,11 +52,13 @@ class Sockets:
             socket.close(linger=0)
 
 
-def _bound(kind: int, endpoint: str, insecure: bool) -> zmq.Socket[bytes]:
+def bound(kind: int, endpoint: str, insecure: bool) -> zmq.Socket[bytes]:
+    """A socket of that kind at that address; SetupError where it is taken, or open to others without `insecure`."""
     if not insecure and not is_loopback(endpoint):
         raise SetupError(f"{endpoint} can be reached from other machines; add --insecure-link to allow it")
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
     socket.setsockopt(zmq.SNDHWM, _QUEUED_FRAMES)
+    socket.setsockopt(zmq.RCVHWM, _QUEUED_COMMANDS)
     try:
         socket.bind(endpoint)
     except zmq.ZMQError as error:
@@ -64,7 +67,8 @@ def _bound(kind: int, endpoint: str, insecure: bool) -> zmq.Socket[bytes]:
     return socket
 
 
-def _address(socket: zmq.Socket[bytes]) -> str:
+def address(socket: zmq.Socket[bytes]) -> str:
+    """Where a socket really is."""
     raw = socket.getsockopt(zmq.LAST_ENDPOINT)
     assert isinstance(raw, bytes)
     return raw.rstrip(b"\0").decode()

@@ -36,6 +36,8 @@ class WebsocketServer(ABC):
     A request that cannot be answered is told to the client as a traceback in text, and then code 1011.
     """
 
+    says_well = False  # whether GET /healthz is answered
+
     def __init__(self, name: str, fault: Fault, port: int = 0, idle: float | None = None) -> None:
         self._name = name
         self._fault = fault
@@ -86,6 +88,8 @@ class WebsocketServer(ABC):
         self._server = self._thread = None
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        if self.says_well and request.path == "/healthz":
+            return connection.respond(http.HTTPStatus.OK, "OK\n")
         if self._fault.name == "http_404" or not self.admits(request.path):
             return connection.respond(http.HTTPStatus.NOT_FOUND, "there is no policy here\n")
         return None
@@ -100,8 +104,15 @@ class WebsocketServer(ABC):
                 if first is None:
                     return
             answer = self.begin()
-            while self._answer(connection, answer, connection.recv(timeout=self._idle)):
-                pass
+            while True:
+                request = connection.recv(timeout=self._idle)
+                started = time.monotonic()
+                if not self._answer(connection, answer, request):
+                    return
+                self.answered(answer, time.monotonic() - started)
+
+    def answered(self, answer: Answering, seconds: float) -> None:  # noqa: B027  # most keep no account of it
+        """An answer has been sent, so long after its request."""
 
     def refusal(self) -> Frames:
         """What is sent where nothing is served."""
@@ -116,14 +127,18 @@ class WebsocketServer(ABC):
                     raise RuntimeError("CUDA out of memory (on purpose)")
                 reply = answer(request)
             except Exception as error:  # whatever goes wrong in a policy is told to the client
-                return self.failed(connection, error)
+                return self.failed(connection, error, request)
         return self._send(connection, reply, number)
 
-    def failed(self, connection: ServerConnection, error: Exception) -> bool:
+    def failed(self, connection: ServerConnection, error: Exception, request: Frames) -> bool:
         """Tell the client; False where it is left then."""
-        connection.send("".join(traceback.format_exception(error)))
+        connection.send(self.failure("".join(traceback.format_exception(error)), request))
         connection.close(1011, "Internal server error. Traceback included in previous frame.")
         return False
+
+    def failure(self, traceback: str, request: Frames) -> Frames:
+        """The frame that says what went wrong with a request."""
+        return traceback
 
     def _send(self, connection: ServerConnection, reply: Frames, number: int) -> bool:
         fault = self._fault

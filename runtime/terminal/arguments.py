@@ -23,6 +23,7 @@ def _setup(given: argparse.Namespace) -> dict[str, Any]:
         if given.checkpoint is None
         else {"id": given.checkpoint, "name": given.checkpoint},
         "bench": None if given.bench_seed is None else {"seed": given.bench_seed},
+        "collect": given.collect,
     }
 
 
@@ -32,7 +33,16 @@ def _run(given: argparse.Namespace) -> dict[str, Any]:
         "sim_state": given.sim_state,
         "duration_s": given.duration,
         "operator": given.operator,
+        "task": given.task,
     }
+
+
+def _label(given: argparse.Namespace) -> dict[str, Any]:
+    return {"result": given.result, "note": given.note, "episode": given.episode}
+
+
+def _discard(given: argparse.Namespace) -> dict[str, Any]:
+    return {"episode": given.episode}
 
 
 def _gripper(given: argparse.Namespace) -> dict[str, Any]:
@@ -44,7 +54,14 @@ def _tune(given: argparse.Namespace) -> dict[str, Any]:
     return {"strategy": strategy or None, "task": given.task}
 
 
-_BUILDERS = {"setup": _setup, "run": _run, "gripper": _gripper, "tune": _tune}
+_BUILDERS = {
+    "setup": _setup,
+    "run": _run,
+    "gripper": _gripper,
+    "tune": _tune,
+    "label": _label,
+    "discard": _discard,
+}
 
 
 def _said(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any, get_args
 
 from runtime.messages import Mode
+from runtime.recording.labels import Result
 
 # States of a station, and phases of a run that goes on.
 WORDS = (
@@ -80,7 +81,15 @@ def _check(given: argparse.Namespace, command: argparse.ArgumentParser) -> None:
 
 
 def _setup_says_more(given: argparse.Namespace) -> bool:
-    said = (given.policy_url, given.policy, given.strategy, given.task, given.checkpoint, given.bench_seed)
+    said = (
+        given.policy_url,
+        given.policy,
+        given.strategy,
+        given.task,
+        given.checkpoint,
+        given.bench_seed,
+        given.collect,
+    )
     return any(value is not None for value in said)
 
 
@@ -98,6 +107,12 @@ def _setup(line: argparse.ArgumentParser) -> None:
     line.add_argument("--task", metavar="TEXT", help="another instruction than the deployment's")
     line.add_argument("--checkpoint", metavar="NAME", help="which one is behind the policy, for the manifest")
     line.add_argument("--bench-seed", type=int, metavar="N", help="lay a simulated bench out anew")
+    line.add_argument(
+        "--collect",
+        action="store_true",
+        default=None,
+        help="a person drives, as the deployment's [collection] says",
+    )
     line.add_argument("--cancel", action="store_true", help="end the set-up that goes on")
 
 
@@ -108,6 +123,8 @@ def _run(line: argparse.ArgumentParser) -> None:
     )
     line.add_argument("--duration", type=_finite, metavar="S", help="seconds after which it ends by itself")
     line.add_argument("--operator", metavar="NAME", help="who runs it, for the manifest")
+    line.add_argument("--task", metavar="TEXT", help="what this demonstration is of (mode collect)")
+    line.add_argument("--arm", action="store_true", help="arm first, under the same lease (mode collect)")
 
 
 def _waits(line: argparse.ArgumentParser) -> None:
@@ -178,6 +195,16 @@ def _record(line: argparse.ArgumentParser) -> None:
     line.add_argument("what", choices=["start", "stop"])
 
 
+def _episode(line: argparse.ArgumentParser) -> None:
+    line.add_argument("--episode", metavar="UUID", help="another than the open or the newest one")
+
+
+def _label(line: argparse.ArgumentParser) -> None:
+    line.add_argument("result", choices=get_args(Result))
+    line.add_argument("--note", metavar="TEXT")
+    _episode(line)
+
+
 def _estop(line: argparse.ArgumentParser) -> None:
     line.add_argument("why", nargs="?", default="pressed in a terminal")
 
@@ -211,6 +238,10 @@ _COMMANDS = {
     "resume": ("go on with the run that is held, and attend it", _nothing),
     "release": ("unlatch the e-stop", _nothing),
     "estop": ("the software e-stop; needs no lease", _estop),
+    "arm": ("switch on that a demonstration may begin; falls with the lease, so see run --arm", _nothing),
+    "disarm": ("switch it off", _nothing),
+    "label": ("say how a demonstration went", _label),
+    "discard": ("mark a demonstration as never to be published; the open one ends", _episode),
     "record": ("an episode without a policy", _record),
     "status": ("how the station is", _nothing),
     "wait": ("until the station is in a state, or its run in a phase", _wait),

@@ -26,6 +26,7 @@ class Capabilities:
     poses: tuple[
         PoseFormat, ...
     ] = ()  # formats of poses that it takes where it publishes "eef"; any where empty
+    leads: bool = False  # its robot reads a leader of its own when it is told to, and reports what it applied
     resets_bench: bool = (
         False  # declared simulated: it lays out its bench when told, and says the truth of it
     )
@@ -59,6 +60,10 @@ class Source(ABC):
         """Counts by name of what went wrong since connect, e.g. {"clock_backwards": 1, "malformed": 3}."""
         return {}
 
+    def why(self, fault: str) -> str:
+        """The newest sentence about one of `faults`; "" where its name says all there is to say."""
+        return ""
+
     def camera_health(self) -> dict[str, dict[str, Any]]:
         """How each camera of the deployment's own is; {} where all pictures come from the transport."""
         return {}
@@ -85,6 +90,13 @@ class Sink(ABC):
         A word may be lost like a command: who needs it obeyed repeats it until the observations show that it was.
         """
         raise TransportError(f"this transport takes no control words; {word!r} was to be sent")
+
+    def unheard(self) -> dict[str, str]:
+        """Where commands go that nobody takes, each with a sentence that says why, or "" where nothing is known.
+
+        {} also where a transport cannot know. Asks nobody and waits for nothing; raises TransportError.
+        """
+        return {}
 
     @abstractmethod
     def close(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
@@ -15,14 +16,14 @@ from runtime.types import EEF_WIDTH, Observation, RobotCommand, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot
-    from runtime.datasets.pictures import Pictures
+    from runtime.datasets.pictures import PictureSequence
     from runtime.datasets.reader import RecordedEpisode
 
 TOLERANCE = 1e-6  # a frame counts as due this much early [s]: due times are sums of floats
 
 
 class Config(Section):
-    """Plays one episode of a LeRobot v2.x dataset."""
+    """Plays one episode of a LeRobot dataset: v2.0, v2.1 or v3.0."""
 
     kind: Literal["dataset"] = "dataset"
     path: str
@@ -38,8 +39,8 @@ class Config(Section):
 class DatasetSource(Source):
     """Frame k of the episode, due at the start of the run plus k / fps on the given clock.
 
-    Until `begin_run` the first frame is delivered again and again, at most at the recording's rate, as if the
-    robot stood there now. A reader that comes late gets the newest frame due; those it missed are counted as
+    Before and between runs the first frame is delivered again and again, at most at the recording's rate, as if
+    the robot stood there now. A reader that comes late gets the newest frame due; those it missed are counted as
     `skipped_frames`. The last frame says so, and nothing follows it. Row k comes with picture k of every
     camera: pictures are decoded by frame number, the next ones while waiting for them to be due.
     """
@@ -49,7 +50,7 @@ class DatasetSource(Source):
         self._robot = robot
         self._clock = clock
         self._episode: RecordedEpisode | None = None
-        self._pictures: dict[str, Pictures] = {}
+        self._pictures: dict[str, PictureSequence] = {}
         self._sequence = 0
         self._skipped = 0
         self._start: float | None = None  # of the run; None: before it
@@ -64,7 +65,7 @@ class DatasetSource(Source):
         try:
             episode = open_dataset(self._config.path).episode(self._config.episode, self._mapping())
             self._check(episode)
-            for camera in episode.videos:
+            for camera in episode.cameras:
                 self._pictures[camera] = episode.pictures(camera)
             self._episode = episode
             self._decode(self._config.start_frame)
@@ -106,6 +107,11 @@ class DatasetSource(Source):
         self._start = self._clock.now()
         self._next = 0
 
+    def end_run(self) -> None:
+        """The robot stands where a run begins."""
+        self._start = None
+        self._standing_due = float("-inf")
+
     def receive(self, timeout: float) -> Observation | None:
         episode = self._episode
         if episode is None:
@@ -129,7 +135,7 @@ class DatasetSource(Source):
             return None
         due = start + self._next / episode.fps
         if self._clock.now() + TOLERANCE < due:
-            self._decode(self._config.start_frame + self._next)
+            self._decode_ahead(self._config.start_frame + self._next)
         if not self._wait(due, deadline):
             return None
         newest = int((self._clock.now() + TOLERANCE - start) * episode.fps)
@@ -143,6 +149,11 @@ class DatasetSource(Source):
         if self._clock.now() + TOLERANCE < due:
             self._clock.sleep_until(min(due, deadline))
         return self._clock.now() + TOLERANCE >= due
+
+    def _decode_ahead(self, row: int) -> None:
+        """Use the time until `row` is due; what is broken is told when it is."""
+        with suppress(RecordingError):
+            self._decode(row)
 
     def _decode(self, row: int) -> dict[str, UInt8]:
         return {camera: pictures[row] for camera, pictures in self._pictures.items()}

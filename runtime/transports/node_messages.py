@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from robots import Robot
 
 Encoding = Literal["bgr", "rgb"]
+MESSAGE_LIMIT = 64 * 1024 * 1024  # bytes; three 1080p pictures are 19 MB
 TRUTH_LIMIT = 16 * 1024  # bytes; it goes into snapshots ten times a second
 DRIVE_FAULTS_LIMIT = 64  # of one message
 DRIVE_FAULT_LENGTH = 200
@@ -42,6 +43,7 @@ class NodeStatus:
     holding: bool | None = None  # its own command deadline has passed; it holds position
     refused: Mapping[str, int] = field(default_factory=dict)  # commands it refused, by reason
     master: str | None = None  # whose commands it obeys
+    ack: int | None = None  # the number of the newest message of that master's that it has obeyed
     hil_supported: bool = False
     hil_active: bool = False
     hil_error: str = ""
@@ -80,7 +82,7 @@ class NodeMessages:
         self._eef_width = EEF_WIDTH * len(robot.arms)
         self._limit = limit
 
-    def read(self, payload: bytes) -> NodeFrame:
+    def read(self, payload: bytes | memoryview) -> NodeFrame:
         """The frame of one message; raises MessageRefused where a part that control needs is missing."""
         message = self._message(payload)
         remarks: list[tuple[str, str]] = []
@@ -92,14 +94,14 @@ class NodeMessages:
             eef=self._optional(remarks, "eef", self._eef, message.get("eef")),
             action=self._optional(remarks, "action", self._action, message.get("action")),
             action_eef=self._optional(remarks, "action_eef", self._poses, message.get("action_eef")),
-            sequence=_sequence(message),
+            sequence=_number(message.get("seq")),
             status=_status(message),
             truth=self._optional(remarks, "truth", _truth, message.get("truth")),
             drives=self._optional(remarks, "drives", _drives, message.get("drives")),
             remarks=tuple(remarks),
         )
 
-    def _message(self, payload: bytes) -> dict[Any, Any]:
+    def _message(self, payload: bytes | memoryview) -> dict[Any, Any]:
         try:
             message = codecs.unpack(payload, self._limit)
         except CodecError as error:
@@ -243,8 +245,7 @@ def _drives(name: str, given: object) -> Mapping[str, Any]:
     return {"enabled": enabled, "faults": list(faults)}
 
 
-def _sequence(message: Mapping[Any, Any]) -> int | None:
-    given = message.get("seq")
+def _number(given: object) -> int | None:
     return given if type(given) is int else None
 
 
@@ -255,6 +256,7 @@ def _status(message: Mapping[Any, Any]) -> NodeStatus:
         holding=holding if isinstance(holding, bool) else None,
         refused={str(reason): n for reason, n in counts if type(n) is int},
         master=master if isinstance(master, str) else None,
+        ack=_number(message.get("ack")),
         hil_supported=message.get("hil_supported") is True,
         hil_active=message.get("hil_active") is True,
         hil_error=str(message.get("hil_error", "")),

@@ -36,8 +36,13 @@ def arrow_type(feature):
         "int64": pa.int64(),
         "bool": pa.bool_(),
         "string": pa.string(),
+        "image": pa.struct({"bytes": pa.binary(), "path": pa.string()}),
     }[feature["dtype"]]
-    return base if feature["shape"] == [1] else pa.list_(pa.field("element", base), feature["shape"][0])
+    return (
+        base
+        if feature["shape"] == [1] or feature["dtype"] == "image"
+        else pa.list_(pa.field("element", base), feature["shape"][0])
+    )
 
 
 def numbers(column):
@@ -106,7 +111,7 @@ class Reader:
             self.expect(table.schema.field(key).type == arrow_type(feature), f"{index}: type of {key}")
         self.hugging_face(index, table.schema, stored)
         self.indices(index, table, length, first)
-        columns = {k: numbers(table[k]) for k, f in stored.items() if f["dtype"] != "string"}
+        columns = {k: numbers(table[k]) for k, f in stored.items() if f["dtype"] not in ("string", "image")}
         self.statistics(index, columns)
         return {
             "length": table.num_rows,
@@ -119,7 +124,9 @@ class Reader:
         declared = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
         for key, feature in stored.items():
             value = {"dtype": feature["dtype"], "_type": "Value"}
-            if feature["shape"] != [1]:
+            if feature["dtype"] == "image":
+                value = {"_type": "Image"}
+            elif feature["shape"] != [1]:
                 value = {"feature": value, "length": feature["shape"][0], "_type": "Sequence"}
             self.expect(declared.get(key) == value, f"{index}: declared feature {key}")
 

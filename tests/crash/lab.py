@@ -20,6 +20,9 @@ FREE = "tcp://127.0.0.1:0"
 class Lab:
     """A node, a policy server and a station in a folder of its own."""
 
+    patience = 20.0  # for whatever the station does in its own time [s]
+    ending = 15.0  # for its end [s]
+
     def __init__(self, folder: Path):
         self.folder = folder
         self.data = folder / "data"
@@ -78,7 +81,7 @@ class Lab:
             cwd=ROOT,
         )
         self.client = StationClient(self.data / "stations" / "demo", holder="test")
-        eventually(self.answers, 20, "the station answers")
+        eventually(self.answers, self.patience, "the station answers")
         return self
 
     def answers(self):
@@ -97,8 +100,8 @@ class Lab:
         self.reach("idle")
         return self
 
-    def reach(self, *states, seconds=20):
-        return self.client.wait(lambda status: status["state"] in states, seconds)
+    def reach(self, *states, seconds=None):
+        return self.client.wait(lambda status: status["state"] in states, seconds or self.patience)
 
     def ready(self):
         self.client.command("setup")
@@ -142,7 +145,7 @@ class Lab:
             self.client.close()
         if self.supervisor and self.supervisor.poll() is None:
             self.supervisor.send_signal(signal.SIGTERM)
-            self.supervisor.wait(15)
+            self.supervisor.wait(self.ending)
         for child in self.children.values():
             child.stdin.close()
             child.wait(10)

@@ -1,14 +1,17 @@
-"""Where fingertips stand in the scene, how far fingers are apart, and joints that bring fingertips somewhere."""
+"""Where fingertips and links stand in the scene, how far fingers are apart, and what arms reach."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from robots import Group, Robot, scene_of, shapes
 from robots.body import Body
+from robots.clearance import Clearance
 from robots.rotations import Float64, matrix_of_quaternion, quaternion_of_matrix
 
 AREA = (-0.22, 0.22, 0.18, 0.40)  # of the simulated bench: x from, x to, y from, y to [m]
@@ -41,6 +44,71 @@ def gap(robot: Robot, arm: Group, q: Float64, links: tuple[str, str]) -> float:
         sides.append(np.concatenate(corners)[:, 1])
     low, high = sorted(sides, key=lambda side: float(side.mean()))
     return float(low.max() * -1 + high.min())
+
+
+def gap_as_said(robot: Robot, links: tuple[str, str], opening: float) -> Iterator[tuple[float, float]]:
+    """Of each arm at `ready`, the gripper at number `opening`: how far its fingers are apart and ought to be [m]."""
+    for arm in robot.arms:
+        assert arm.gripper is not None
+        assert arm.gripper.apart is not None
+        q = robot.poses["ready"].copy()
+        q[arm.gripper_dim] = opening
+        said = np.interp(opening, (arm.gripper.close, arm.gripper.open), arm.gripper.apart)
+        yield gap(robot, arm, q, links), float(said)
+
+
+def off_mirror(robot: Robot, pose: str) -> tuple[float, float]:
+    """How far the right fingertips are from where the left ones are in a mirror: the worst number of place and turn.
+
+    The mirror is the scene's yz-plane. A hand opens to both sides alike: mirrored, its x and y point the other way
+    about.
+    """
+    left, right = (tip_in_scene(robot, arm, robot.poses[pose]) for arm in robot.arms)
+    seen = np.diag([-1.0, 1.0, 1.0, 1.0]) @ right @ np.diag([1.0, -1.0, 1.0, 1.0])
+    off = np.abs(left - seen)
+    return float(off[:3, 3].max()), float(off[:3, :3].max())
+
+
+def from_home_to_ready(robot: Robot) -> tuple[float, float]:
+    """On the straight way: the smallest clearance, and how low fingertips come above the table [m]."""
+    way = np.linspace(robot.poses["home"], robot.poses["ready"], 40)
+    heights = [tip_in_scene(robot, arm, q)[2, 3] for arm in robot.arms for q in way]
+    return float(Clearance(robot).distances(way).min()), float(min(heights))
+
+
+class Ready(NamedTuple):
+    """An arm at `ready`: how far beside the bench's area, off vertical, and from the nearest limit."""
+
+    beside: float  # m
+    off_vertical: float  # degrees
+    to_limit: float  # rad
+    opened: bool
+
+
+def at_ready(robot: Robot) -> Iterator[Ready]:
+    """Every arm."""
+    q = robot.poses["ready"]
+    for arm in robot.arms:
+        assert arm.gripper is not None
+        tip, dims = tip_in_scene(robot, arm, q), arm.joint_dims
+        yield Ready(
+            beside=float(abs(tip[0, 3]) - AREA[1]),
+            off_vertical=float(np.degrees(np.arccos(-tip[2, 2]))),
+            to_limit=float(np.minimum(q - robot.lower, robot.upper - q)[dims].min()),
+            opened=bool(q[arm.gripper_dim] == arm.gripper.open),
+        )
+
+
+def lowest(robot: Robot) -> dict[str, float]:
+    """How low each link's drawn shapes come in the scene [m], over all named poses."""
+    body, found = Body(robot), dict[str, float]()
+    for shape in shapes.read(robot.urdf):
+        corners = np.array([[*corner, 1.0] for corner in itertools.product(*np.transpose(shape.bounds()))])
+        for pose in robot.poses.values():
+            for part in body.parts_of(shape.link):
+                z = float((body.poses(pose)[part] @ shape.origin @ corners.T)[2].min())
+                found[shape.link] = min(found.get(shape.link, np.inf), z)
+    return found
 
 
 def extents(robot: Robot, link: str) -> tuple[Float64, Float64]:

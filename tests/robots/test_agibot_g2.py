@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robots import Body, load, shapes
+from robots import Body, load
 from robots.clearance import MARGIN, Clearance
 from robots.rotations import matrix_of_quaternion, rotation_vector, transform_of
+from tests.robots.standing import extents, lowest
 
 ROBOT = load("agibot_g2")
 MIRROR = np.array([-1, 1, -1, 1, -1, 1, -1])  # of the arm's joints
@@ -133,19 +134,9 @@ def test_the_tip_is_where_the_fingertips_meet_and_its_y_the_way_they_open() -> N
 
 
 def test_it_stands_on_the_floor_with_its_arms_above_the_table() -> None:
-    body = Body(ROBOT)
-    lowest: dict[str, float] = {}
-    for shape in shapes.read(ROBOT.urdf):
-        low, high = shape.bounds()
-        corners = [
-            [x, y, z, 1] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])
-        ]
-        for pose in ROBOT.poses.values():
-            for part in body.parts_of(shape.link):
-                z = (body.poses(pose)[part] @ shape.origin @ np.transpose(corners))[2].min()
-                lowest[shape.link] = min(lowest.get(shape.link, np.inf), z)
-    assert min(lowest.values()) == pytest.approx(ROBOT.stand[2] - 0.04, abs=0.001)  # the wheels
-    above = [z for link, z in lowest.items() if link.startswith(("arm_", "gripper_"))]
+    low = lowest(ROBOT)
+    assert min(low.values()) == pytest.approx(ROBOT.stand[2] - 0.04, abs=0.001)  # the wheels
+    above = [z for link, z in low.items() if link.startswith(("arm_", "gripper_"))]
     assert len(above) == 2 * (7 + 10)
     assert min(above) > 0.1
 
@@ -197,14 +188,4 @@ EXTENTS = {  # of the meshes of the published description [m]
 
 @pytest.mark.parametrize("link", EXTENTS)
 def test_the_drawn_shapes_of_a_link_fill_the_extents_of_the_real_one_to_10_mm(link: str) -> None:
-    corners = [
-        (shape.origin @ [x, y, z, 1])[:3]
-        for shape in shapes.read(ROBOT.urdf)
-        if shape.link == link
-        for low, high in [shape.bounds()]
-        for x in (low[0], high[0])
-        for y in (low[1], high[1])
-        for z in (low[2], high[2])
-    ]
-    np.testing.assert_allclose(np.min(corners, axis=0), EXTENTS[link][0], rtol=0, atol=0.01)
-    np.testing.assert_allclose(np.max(corners, axis=0), EXTENTS[link][1], rtol=0, atol=0.01)
+    np.testing.assert_allclose(extents(ROBOT, link), EXTENTS[link], rtol=0, atol=0.01)

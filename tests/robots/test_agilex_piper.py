@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robots import load, shapes
+from robots import load
+from tests.robots.standing import extents
 
 HOME = ([0.0] * 6, [0.056142472, -5.6e-08, 0.213193093], [0.737256126, 2.326e-06, 0.675613354, -4.995e-06])
 LEFT = (
@@ -72,16 +73,4 @@ EXTENTS = {  # of the meshes of the published description [m]
 
 @pytest.mark.parametrize("link", EXTENTS)
 def test_the_drawn_shapes_of_a_link_fill_the_extents_of_the_real_one_to_3_mm(link: str) -> None:
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for shape in shapes.read(load("agilex_piper").urdf):
-        if shape.link != link:
-            continue
-        turn, middle = shape.origin[:3, :3], shape.origin[:3, 3]
-        if shape.kind == "box":
-            reach = np.abs(turn) @ np.array(shape.size) / 2
-        else:
-            radius, length = shape.size
-            reach = np.abs(turn[:, 2]) * length / 2 + radius * np.sqrt(np.clip(1 - turn[:, 2] ** 2, 0, 1))
-        low, high = np.minimum(low, middle - reach), np.maximum(high, middle + reach)
-    np.testing.assert_allclose(low, EXTENTS[link][0], rtol=0, atol=0.003)
-    np.testing.assert_allclose(high, EXTENTS[link][1], rtol=0, atol=0.003)
+    np.testing.assert_allclose(extents(load("agilex_piper"), link), EXTENTS[link], rtol=0, atol=0.003)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from robots import load
-from robots.clearance import MARGIN, Clearance
-from tests.robots.standing import AREA, extents, gap, tip_in_scene, unreached
+from robots.clearance import MARGIN
+from tests.robots.standing import at_ready, extents, from_home_to_ready, gap_as_said, off_mirror, unreached
 
 ROBOT = load("arx_r5")
 EXTENTS = {  # of the meshes of the published description [m]
@@ -51,41 +51,29 @@ def test_both_arms_have_the_same_limits() -> None:
 
 @pytest.mark.parametrize("pose", ["home", "ready"])
 def test_the_postures_of_the_arms_are_mirror_images(pose: str) -> None:
-    left, right = (tip_in_scene(ROBOT, arm, ROBOT.poses[pose]) for arm in ROBOT.arms)
-    flip = np.diag([-1.0, 1.0, 1.0])  # the middle between the arms is the scene's yz-plane
-    np.testing.assert_allclose(left[:3, 3], flip @ right[:3, 3], rtol=0, atol=1e-5)
-    # A hand opens to both sides alike: mirrored, its x and y point the other way about.
-    np.testing.assert_allclose(left[:3, :3], flip @ right[:3, :3] @ np.diag([1.0, -1.0, 1.0]), atol=3e-5)
+    place, turn = off_mirror(ROBOT, pose)
+    assert place < 1e-5
+    assert turn < 3e-5
 
 
 @pytest.mark.parametrize("opening", [0.0, 0.5, 1.0])
 def test_jaws_are_as_far_apart_as_the_gripper_says(opening: float) -> None:
-    for arm in ROBOT.arms:
-        assert arm.gripper is not None
-        assert arm.gripper.apart is not None
-        q = ROBOT.poses["ready"].copy()
-        q[arm.gripper_dim] = opening
-        said = np.interp(opening, (arm.gripper.close, arm.gripper.open), arm.gripper.apart)
-        assert gap(ROBOT, arm, q, ("link7", "link8")) == pytest.approx(said, abs=1e-4)
+    for apart, said in gap_as_said(ROBOT, ("link7", "link8"), opening):
+        assert apart == pytest.approx(said, abs=1e-4)
 
 
 def test_from_home_to_ready_nothing_touches_and_the_fingertips_stay_up() -> None:
-    way = np.linspace(ROBOT.poses["home"], ROBOT.poses["ready"], 40)
-    assert Clearance(ROBOT).distances(way).min() > MARGIN
-    heights = [tip_in_scene(ROBOT, arm, q)[2, 3] for arm in ROBOT.arms for q in way]
-    assert min(heights) > 0.14
+    clearance, height = from_home_to_ready(ROBOT)
+    assert clearance > MARGIN
+    assert height > 0.14
 
 
 def test_ready_is_outside_of_the_workspace_fingers_down_and_away_from_limits() -> None:
-    q = ROBOT.poses["ready"]
-    for arm in ROBOT.arms:
-        assert arm.gripper is not None
-        tip, dims = tip_in_scene(ROBOT, arm, q), arm.joint_dims
-        assert abs(tip[0, 3]) > AREA[1] + 0.1
-        assert np.degrees(np.arccos(-tip[2, 2])) < 12
-        assert (q[dims] - ROBOT.lower[dims]).min() > 0.25
-        assert (ROBOT.upper[dims] - q[dims]).min() > 0.25
-        assert q[arm.gripper_dim] == arm.gripper.open
+    for ready in at_ready(ROBOT):
+        assert ready.beside > 0.1
+        assert ready.off_vertical < 12
+        assert ready.to_limit > 0.25
+        assert ready.opened
 
 
 def test_every_place_on_the_table_is_reached_from_above() -> None:
@@ -94,6 +82,4 @@ def test_every_place_on_the_table_is_reached_from_above() -> None:
 
 @pytest.mark.parametrize("link", EXTENTS)
 def test_the_drawn_shapes_of_a_link_fill_the_extents_of_the_real_one_to_1_mm(link: str) -> None:
-    low, high = extents(ROBOT, link)
-    np.testing.assert_allclose(low, EXTENTS[link][0], rtol=0, atol=0.001)
-    np.testing.assert_allclose(high, EXTENTS[link][1], rtol=0, atol=0.001)
+    np.testing.assert_allclose(extents(ROBOT, link), EXTENTS[link], rtol=0, atol=0.001)

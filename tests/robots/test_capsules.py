@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import robots
@@ -55,6 +55,7 @@ def depth(points: Float64, capsule: Capsule) -> Float64:
     return np.asarray(capsule.radius - np.linalg.norm(points - nearest, axis=1))
 
 
+@settings(deadline=None)
 @given(st.lists(shapes(), min_size=1, max_size=4))
 def test_one_capsule_covers_every_shape_whole(shown: list[Shape]) -> None:
     capsule = around(shown)
@@ -62,6 +63,7 @@ def test_one_capsule_covers_every_shape_whole(shown: list[Shape]) -> None:
         assert depth(surface(shape), capsule).min() > -1e-9
 
 
+@settings(deadline=None)
 @given(st.lists(shapes(), min_size=1, max_size=5))
 def test_the_capsules_of_a_link_cover_each_of_its_shapes_and_are_few(shown: list[Shape]) -> None:
     made = about(shown)
@@ -103,12 +105,18 @@ ignore = ["""
 
 @pytest.mark.parametrize(
     ("name", "link"),
-    [("r1_lite", "torso_link3"), ("agibot_g2", "body_link5"), ("dual_franka", "panda_link5")],
+    [
+        ("r1_lite", "torso_link3"),
+        ("agibot_g2", "body_link5"),
+        ("agibot_g2", "arm_l_link3"),
+        ("agibot_g2", "arm_r_link3"),
+        ("dual_franka", "panda_link5"),
+    ],
 )
 def test_capsules_that_are_declared_of_a_link_cover_its_shapes(name: str, link: str) -> None:
     robot = robots.load(name)
     made = capsules(robot)[link]
-    assert len(made) > PIECES
+    assert len(made) == len(robot.collision.capsules[link])
     for shape in drawn(robot.urdf):
         if shape.link == link:
             inside = np.max([depth(surface(shape, 4000), capsule) for capsule in made], axis=0)

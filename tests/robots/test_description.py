@@ -40,11 +40,6 @@ Edit = Callable[..., Path]
             "urdf = 'agilex_piper.xacro': String should",
         ),
         (
-            'measures = ["velocity", "effort", "eef"]',
-            "measures = ['force']",
-            "measures.0 = 'force': Input should be 'velocity', 'effort'",
-        ),
-        (
             "[cameras]",
             'mount_frame = "the floor"\n[cameras]',
             "mount_frame = 'the floor': String should match",

@@ -8,6 +8,7 @@ import pytest
 from robots import Body, load, shapes
 from robots.clearance import MARGIN, Clearance
 from robots.rotations import matrix_of_quaternion, rotation_vector, transform_of
+from tests.robots.standing import extents, lowest
 
 ROBOT = load("r1_lite")
 WHOLE = load("r1_lite", groups=["left_arm", "right_arm", "torso", "base"])
@@ -146,19 +147,9 @@ def test_fingertips_are_where_the_fingers_end_and_point_the_way_the_hand_does() 
 
 
 def test_it_stands_on_the_floor_with_its_arms_above_the_table() -> None:
-    body = Body(ROBOT)
-    lowest = {}
-    for shape in shapes.read(ROBOT.urdf):
-        low, high = shape.bounds()
-        corners = np.array(
-            [[x, y, z, 1] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
-        )
-        for pose in ROBOT.poses.values():
-            for part in body.parts_of(shape.link):
-                z = (body.poses(pose)[part] @ shape.origin @ corners.T)[2].min()
-                lowest[shape.link] = min(lowest.get(shape.link, np.inf), z)
-    assert min(lowest.values()) == pytest.approx(ROBOT.stand[2], abs=1e-3)
-    above = [z for link, z in lowest.items() if "arm_link" in link or "gripper" in link or "D405" in link]
+    low = lowest(ROBOT)
+    assert min(low.values()) == pytest.approx(ROBOT.stand[2], abs=1e-3)
+    above = [z for link, z in low.items() if "arm_link" in link or "gripper" in link or "D405" in link]
     assert len(above) == 2 * 10
     assert min(above) > 0.15
 
@@ -205,14 +196,4 @@ EXTENTS = {  # of the meshes of the published description [m]
 
 @pytest.mark.parametrize("link", EXTENTS)
 def test_the_drawn_shapes_of_a_link_fill_the_extents_of_the_real_one_to_10_mm(link: str) -> None:
-    corners = [
-        (shape.origin @ [x, y, z, 1])[:3]
-        for shape in shapes.read(ROBOT.urdf)
-        if shape.link == link
-        for low, high in [shape.bounds()]
-        for x in (low[0], high[0])
-        for y in (low[1], high[1])
-        for z in (low[2], high[2])
-    ]
-    np.testing.assert_allclose(np.min(corners, axis=0), EXTENTS[link][0], rtol=0, atol=0.01)
-    np.testing.assert_allclose(np.max(corners, axis=0), EXTENTS[link][1], rtol=0, atol=0.01)
+    np.testing.assert_allclose(extents(ROBOT, link), EXTENTS[link], rtol=0, atol=0.01)

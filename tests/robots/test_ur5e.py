@@ -7,8 +7,8 @@ import pytest
 
 from robots import load
 from robots.body import Body
-from robots.clearance import MARGIN, Clearance
-from tests.robots.standing import AREA, extents, gap, tip_in_scene, unreached
+from robots.clearance import MARGIN
+from tests.robots.standing import at_ready, extents, from_home_to_ready, gap_as_said, tip_in_scene, unreached
 
 ROBOT = load("ur5e")
 EXTENTS = {  # of the meshes of the published description [m]
@@ -61,12 +61,8 @@ def test_home_stands_in_front_of_the_table_fingers_down() -> None:
 
 @pytest.mark.parametrize("opening", [0.0, 1.0])
 def test_jaws_are_as_far_apart_as_the_gripper_says(opening: float) -> None:
-    (arm,) = ROBOT.arms
-    assert arm.gripper is not None
-    assert arm.gripper.apart is not None
-    q = ROBOT.poses["ready"].copy()
-    q[arm.gripper_dim] = opening
-    assert gap(ROBOT, arm, q, JAWS) == pytest.approx(arm.gripper.apart[int(opening)], abs=2e-4)
+    ((apart, said),) = gap_as_said(ROBOT, JAWS, opening)
+    assert apart == pytest.approx(said, abs=2e-4)
 
 
 def test_pads_stay_parallel_and_come_ahead_as_they_close_and_never_beyond_the_tip() -> None:
@@ -88,22 +84,17 @@ def test_pads_stay_parallel_and_come_ahead_as_they_close_and_never_beyond_the_ti
 
 
 def test_from_home_to_ready_nothing_touches_and_the_fingertips_stay_up() -> None:
-    way = np.linspace(ROBOT.poses["home"], ROBOT.poses["ready"], 40)
-    assert Clearance(ROBOT).distances(way).min() > MARGIN
-    heights = [tip_in_scene(ROBOT, arm, q)[2, 3] for arm in ROBOT.arms for q in way]
-    assert min(heights) > 0.19
+    clearance, height = from_home_to_ready(ROBOT)
+    assert clearance > MARGIN
+    assert height > 0.19
 
 
 def test_ready_is_outside_of_the_workspace_fingers_down_and_away_from_limits() -> None:
-    q = ROBOT.poses["ready"]
-    for arm in ROBOT.arms:
-        assert arm.gripper is not None
-        tip, dims = tip_in_scene(ROBOT, arm, q), arm.joint_dims
-        assert abs(tip[0, 3]) > AREA[1] + 0.1
-        assert np.degrees(np.arccos(-tip[2, 2])) < 1
-        assert (q[dims] - ROBOT.lower[dims]).min() > 1.0
-        assert (ROBOT.upper[dims] - q[dims]).min() > 1.0
-        assert q[arm.gripper_dim] == arm.gripper.open
+    for ready in at_ready(ROBOT):
+        assert ready.beside > 0.1
+        assert ready.off_vertical < 1
+        assert ready.to_limit > 1.0
+        assert ready.opened
 
 
 def test_every_place_on_the_table_is_reached_from_above() -> None:
@@ -112,6 +103,4 @@ def test_every_place_on_the_table_is_reached_from_above() -> None:
 
 @pytest.mark.parametrize("link", EXTENTS)
 def test_the_drawn_shapes_of_a_link_fill_the_extents_of_the_real_one_to_1_mm(link: str) -> None:
-    low, high = extents(ROBOT, link)
-    np.testing.assert_allclose(low, EXTENTS[link][0], rtol=0, atol=0.001)
-    np.testing.assert_allclose(high, EXTENTS[link][1], rtol=0, atol=0.001)
+    np.testing.assert_allclose(extents(ROBOT, link), EXTENTS[link], rtol=0, atol=0.001)

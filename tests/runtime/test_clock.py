@@ -107,4 +107,37 @@ def test_a_peer_whose_clock_leaps_ahead_is_followed_at_once():
     clock_map = ClockMap()
     clock_map.map(10.0, 100.0)
     assert clock_map.map(1010.0, 100.1) == pytest.approx(100.1)
-    assert clock_map.restarts == 0
+    assert (clock_map.restarts, clock_map.leaps) == (0, 1)
+    assert clock_map.map(1010.1, 100.3) == pytest.approx(100.2)
+    assert clock_map.leaps == 1
+
+
+def test_messages_that_were_held_up_and_come_at_once_are_no_leap():
+    clock_map = ClockMap(tolerance=0.1)
+    clock_map.map(10.0, 100.0)
+    for stamp in (10.1, 10.5, 11.0, 12.0):
+        assert clock_map.map(stamp, 102.0) == pytest.approx(stamp + 90)
+    assert (clock_map.restarts, clock_map.leaps) == (0, 0)
+
+
+@given(
+    offset=st.floats(-1e6, 1e6),
+    delays=DELAYS,
+    jump=st.floats(0.9, 1e6) | st.floats(-1e6, -0.2),
+    after=st.integers(1, 40),
+)
+def test_a_jump_of_any_size_is_counted_once_and_the_map_is_right_again_at_once(offset, delays, jump, after):
+    clock_map = ClockMap(tolerance=0.1)
+    seen = []
+    for index, delay in enumerate([*delays, *delays]):
+        sent = 1000.0 + index / 30
+        stamp = sent - offset + (jump if index >= after else 0.0)
+        seen.append(delay)
+        if index == after:
+            seen = [delay]
+        mapped = clock_map.map(stamp, sent + delay)
+        if index >= after or jump > 0:
+            assert mapped - sent == pytest.approx(min(seen), abs=1e-6)
+    jumped = after < 2 * len(delays)
+    counted = (clock_map.leaps, clock_map.restarts)
+    assert counted == ((jumped, 0) if jump > 0 else (0, jumped))

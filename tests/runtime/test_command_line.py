@@ -36,3 +36,15 @@ def test_what_does_not_fit_the_robot_ends_before_anything_starts(
 def test_deployments_that_come_along_fit(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command_line.main([str(file), "--check"]) == 0
     assert "ok: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("file", ["tabletop.toml", "ros2_r1_lite.toml", "tabletop_ros1.toml"])
+def test_lockstep_refuses_what_goes_on_in_real_time_before_anything_is_connected(
+    file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = ["--set", f'data_dir="{tmp_path}"']
+    assert command_line.main([str(DEPLOYMENTS / file), *data, "--lockstep"]) == 2
+    said = capsys.readouterr().err
+    assert "with --lockstep: what is at its other end goes on in real time" in said
+    assert "allowed: dataset, or leave --lockstep out" in said
+    assert not list(tmp_path.iterdir())

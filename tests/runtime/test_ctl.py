@@ -1,4 +1,5 @@
 import json
+import os
 
 import pytest
 
@@ -53,6 +54,15 @@ def test_no_answer_is_an_unknown_outcome_with_a_code_of_its_own(run, capsys):
 
 def test_an_interrupted_terminal_says_so(run):
     assert run(Script([status()], streams=[KeyboardInterrupt()]), "watch") == 130
+
+
+def test_a_pipe_that_nobody_reads_any_more_is_no_traceback(run, monkeypatch):
+    read, written = os.pipe()
+    os.close(read)
+    with os.fdopen(written, "w") as pipe:
+        monkeypatch.setattr("sys.stdout", pipe)
+        assert run(Script([status()]), "status") == 141
+        pipe.write("goes nowhere, and ends nothing")
 
 
 # --- commands ------------------------------------------------------------------------------------------------

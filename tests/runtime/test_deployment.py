@@ -1,12 +1,14 @@
 import json
 import math
 import random
+import re
 from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
 
 from runtime import config, deployment
+from runtime.collection import CollectionSettings
 from runtime.config import Deployment
 from runtime.deployment import load
 from runtime.errors import ConfigurationError, SetupError
@@ -72,6 +74,7 @@ def test_every_variant_of_every_part_can_be_chosen_by_its_kind():
                 "robot": "r",
                 "transport": {"kind": "zmq"},
                 "policy": {"kind": "mock"},
+                "collection": {"source": "node"},
                 part: {"kind": kind},
             }
             try:
@@ -285,12 +288,15 @@ def test_an_unknown_table_is_an_unknown_key(small):
         ("bus.host=::1", "bus.host = '::1': must be 127.0.0.1 or localhost"),
         (
             "policy.kind=mok",
-            "policy.kind = 'mok': must be one of 'gr00t', 'lerobot', 'mock', 'openpi', 'replay'",
+            "policy.kind = 'mok': must be one of 'gr00t', 'lerobot', 'mock', 'none', 'openpi', 'replay'",
         ),
-        ("policy.kind=5", "policy.kind = 5: must be one of 'gr00t', 'lerobot', 'mock', 'openpi', 'replay'"),
+        (
+            "policy.kind=5",
+            "policy.kind = 5: must be one of 'gr00t', 'lerobot', 'mock', 'none', 'openpi', 'replay'",
+        ),
         (
             "policy={horizon=3}",
-            "policy.kind is missing: must be one of 'gr00t', 'lerobot', 'mock', 'openpi', 'replay'",
+            "policy.kind is missing: must be one of 'gr00t', 'lerobot', 'mock', 'none', 'openpi', 'replay'",
         ),
         (
             "strategy={kind=['sync']}",
@@ -500,3 +506,29 @@ def test_a_wrong_change_names_where_it_came_from(write):
         deployment.changed(own, {"policy": {"amplitud": 1}}, "setup")
     with pytest.raises(ConfigurationError, match=r"^setup: policy\.kind = \[\]: must be one of 'gr00t'"):
         deployment.changed(own, {"policy": {"kind": []}}, "setup")
+
+
+def test_a_policy_may_be_left_out_where_there_is_a_collection_and_nowhere_else(small):
+    path = small
+    text = path.read_text("utf-8")
+    path.write_text(re.sub(r"\[policy\][^\[]*", "", text), "utf-8")
+    assert "policy is missing and has no default; it may be left out with a [collection]" in refusal(path)
+    assert load(path, ["collection.source=node"]).deployment.policy.kind == "none"
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ({"source": "relay"}, "collection.leader is missing"),
+        ({"source": "node", "leader": {"kind": "zmq"}}, "the node reads its own"),
+        ({"source": "node", "mode": "relative"}, "the node decides that"),
+        ({"source": "node", "streams": ["effort"], "columns": ["eef"]}, "leaves out effort"),
+        (
+            {"source": "relay", "leader": {"kind": "zmq", "endpoint": "tcp://10.0.0.7:5560"}},
+            "leaves this machine over a plain link",
+        ),
+    ],
+)
+def test_a_collection_that_contradicts_itself_is_refused(given, why):
+    with pytest.raises(ConfigurationError, match=why):
+        CollectionSettings.model_validate(given)

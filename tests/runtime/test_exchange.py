@@ -66,7 +66,7 @@ REFUSED = {
     "a setting out of bounds": ({"policy": {"amplitude": 2.0}}, r"setup: policy\.amplitude = 2\.0: "),
     "an unknown kind": (
         {"policy": {"kind": "telepathy"}},
-        r"setup: policy\.kind = 'telepathy': must be one of 'gr00t', 'lerobot', 'mock', 'openpi'",
+        r"setup: policy\.kind = 'telepathy': must be one of 'gr00t', 'lerobot', 'mock', 'none', 'openpi'",
     ),
     "an address that is none": (
         {"policy": {"kind": "openpi", "url": "http://there"}},
@@ -74,7 +74,7 @@ REFUSED = {
     ),
     "a key that is no argument": (
         {"plicy": OTHER},
-        r"setup: plicy = .*allowed here: bench, checkpoint, policy",
+        r"setup: plicy = .*allowed here: bench, checkpoint, collect, policy",
     ),
     "a bench where there is none": (
         {"policy": OTHER, "bench": {"seed": 1}},

@@ -1,5 +1,8 @@
+from typing import Annotated
+
 import pytest
-from pydantic import Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
+from pydantic_core import PydanticCustomError
 
 from runtime.explanation import explanation
 from runtime.section import Section
@@ -49,3 +52,22 @@ def test_what_was_given_is_cut_where_it_is_endless():
     said = explained({"legs": [], "name": ["x"] * 100_000})
     assert said.startswith("shop: name = ['x', 'x'")
     assert len(said) < 300
+
+
+def _no_secret(value):
+    raise PydanticCustomError("secret", "name a file")
+
+
+class Keyed(Section):
+    key: Annotated[str, AfterValidator(_no_secret)]
+
+
+def test_secrets_are_not_shown():
+    tree = {"key": "hush", "Passphrase": "hush", "api_token": "hush"}
+    with pytest.raises(ValidationError) as invalid:
+        Keyed.model_validate(tree)
+    assert explanation(invalid.value, Keyed, tree, "shop").splitlines() == [
+        "shop: key: name a file",
+        "shop: Passphrase: unknown key; allowed here: key",
+        "shop: api_token: unknown key; allowed here: key",
+    ]

@@ -151,6 +151,57 @@ def desk() -> Desk:
     return Desk().going()
 
 
+class GlancingPolicy(FakePolicy):
+    """Wants to see something ten times a second."""
+
+    glances_s = 0.1
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.glanced: list[int] = []
+
+    def glance(self, observation: Observation) -> None:
+        self.glanced.append(observation.sequence)
+
+
+def test_who_wants_it_is_shown_what_is_seen_between_requests_and_only_in_a_run() -> None:
+    desk = Desk(strategy=SYNC)
+    policy = GlancingPolicy()
+    desk.asking.policy = policy
+    desk.going()
+    for _ in range(31):
+        desk.ticked(desk.sequence + 7, remaining=5)  # enough is planned: nothing is asked
+        desk.inference.pump()
+        desk.clock.advance(1 / 30)
+        desk.observe()
+    assert policy.glanced == [1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31]
+    assert policy.calls == []
+    desk.inference.pause()
+    desk.clock.advance(1.0)
+    desk.observe()
+    desk.inference.pump()
+    assert len(policy.glanced) == 11
+
+
+def test_what_is_too_old_is_glanced_at_by_nobody_and_a_gap_is_followed_by_no_burst() -> None:
+    desk = Desk(strategy=SYNC)
+    policy = GlancingPolicy()
+    desk.asking.policy = policy
+    desk.going()
+    desk.ticked(7, remaining=5)
+    desk.inference.pump()
+    desk.clock.advance(0.4)  # longer than joints may be old
+    desk.inference.pump()
+    desk.observe()
+    for _ in range(4):
+        desk.inference.pump()
+        desk.clock.advance(0.01)
+    assert policy.glanced == [1]
+    desk.clock.advance(0.07)
+    desk.inference.pump()
+    assert policy.glanced == [1, 2]
+
+
 def test_an_observation_that_control_has_seen_is_of_the_step_that_saw_it(desk: Desk) -> None:
     assert desk.asking.observe().step == 7
 
@@ -305,6 +356,23 @@ def test_the_policy_is_reset_once_per_run_and_before_its_first_inference(desk: D
     desk.inference.begin(2, fresh=True)
     desk.inference.pump()
     assert desk.policy.calls[4:] == ["infer", "reset", "infer"]
+
+
+def test_the_policy_learns_once_that_the_robot_was_held(desk: Desk) -> None:
+    told: list[int] = []
+    desk.policy.resume = lambda: told.append(len(desk.policy.calls))  # type: ignore[method-assign]
+    desk.inference.pump()
+    desk.merged(1)
+    desk.inference.pause()
+    desk.inference.begin(1, fresh=False)
+    for chunk in (2, 3):
+        desk.inference.pump()
+        desk.merged(chunk)
+    desk.inference.pause()
+    desk.inference.begin(2, fresh=True)
+    desk.inference.pump()
+    assert told == [2]
+    assert desk.policy.calls == ["reset", "infer", "infer", "infer", "reset", "infer"]
 
 
 def test_a_run_that_is_halted_before_it_asked_is_still_reset_when_it_resumes(desk: Desk) -> None:

@@ -80,11 +80,44 @@ def test_a_fault_is_said_when_its_count_has_grown(gate: Gate) -> None:
     gate.source.counts["frozen_cam"] = 2
     assert gate.intake.faults() == {"frozen_cam": 2}
     gate.intake.faults()
+    gate.clock.advance(5.0)
     gate.source.counts["frozen_cam"] = 3
     gate.intake.faults()
     assert [(event.kind, event.text) for event in gate.said] == [
         ("source_frozen_cam", "source: frozen cam (2 so far)"),
         ("source_frozen_cam", "source: frozen cam (3 so far)"),
+    ]
+
+
+def test_a_fault_that_goes_on_is_said_every_five_seconds_and_nothing_of_it_is_lost(gate: Gate) -> None:
+    for count in range(1, 101):
+        gate.source.counts["frames_lost_cam"] = count
+        assert gate.intake.faults() == {"frames_lost_cam": count}
+        gate.clock.advance(0.125)
+    gate.clock.advance(5.0)
+    gate.intake.faults()
+    gate.intake.faults()
+    assert [event.data["count"] for event in gate.said] == [1, 41, 81, 100]
+
+
+def test_a_source_that_counts_anew_is_heard_again(gate: Gate) -> None:
+    for count in (100, 0, 3):
+        gate.source.counts["stalled_cam"] = count
+        gate.intake.faults()
+        gate.clock.advance(5.0)
+    assert [event.data["count"] for event in gate.said] == [100, 3]
+
+
+def test_a_fault_is_said_with_its_sentence_where_the_source_has_one(
+    gate: Gate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate.source.counts.update({"missing_camera": 1, "node_refused.stale": 2})
+    why = {"missing_camera": "images lack cam", "node_refused.stale": "too late"}
+    monkeypatch.setattr(gate.source, "why", why.get)
+    gate.intake.faults()
+    assert [event.text for event in gate.said] == [
+        "source: missing camera (1 so far): images lack cam",
+        "source: node refused: stale (2 so far): too late",
     ]
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import pytest
 from runtime import __main__ as command_line
 from runtime import deployment, family, lockstep
 from runtime.datasets.published import publish
-from runtime.errors import SetupError
+from runtime.errors import PolicyError, SetupError
 from runtime.latch import Latch
 from runtime.page import EStop
 from runtime.recording.reader import Episode, open_episode
@@ -234,6 +235,14 @@ def test_a_policy_that_is_always_too_late_is_held_and_not_running_for_ever(tmp_p
     station.close()
 
 
+def test_of_a_policy_that_does_not_answer_it_is_said_since_when(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, delay=300)).running(0)
+    station.reach(State.HOLDING, 20.0)
+    reason = r"no usable chunk for [\d.]+ s: the policy was asked [1-9][\d.]* s ago and has not answered yet"
+    assert re.fullmatch(reason, station.reason), station.reason
+    station.close()
+
+
 def test_a_run_that_held_is_no_success_and_is_not_published(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -391,6 +400,46 @@ def test_stop_writes_the_outcome_and_holds(tmp_path: Path) -> None:
     station.go(10)
     assert len(station.robot.commands) == before + 10  # holding is never silence
     assert station.main.run is None
+    station.close()
+
+
+def test_the_policy_is_told_once_of_each_end_of_what_it_drove(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    station = Station(plan(tmp_path)).ready()
+    policy = station.main.inference.policy
+    monkeypatch.setattr(policy, "rest", lambda: policy.calls.append("rest"))
+    station.command("run", mode="manual")
+    station.go(5)
+    station.command("stop")
+    assert "rest" not in policy.calls
+    for _ in range(2):
+        station.command("run")
+        station.go(20)
+        station.command("stop")
+    station.go(5)
+    told = [call for call in policy.calls if call in ("rest", "reset")]
+    assert told == ["reset", "reset", "rest", "reset", "rest"]  # the first of the set-up
+    station.close()
+
+
+def test_a_policy_that_cannot_end_its_rollout_keeps_no_run_from_ending(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def rest() -> None:
+        raise PolicyError("the server is mute")
+
+    station = Station(plan(tmp_path)).ready()
+    monkeypatch.setattr(station.main.inference.policy, "rest", rest)
+    station.command("run")
+    station.go(20)
+    episode = station.stop()
+    assert episode.outcome is not None
+    assert episode.outcome["status"] == "finished"
+    assert "may still keep the rollout that is over: the server is mute" in caplog.text
+    station.command("run")
+    station.go(20)
+    assert station.state is State.RUNNING
     station.close()
 
 

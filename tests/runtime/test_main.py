@@ -11,7 +11,8 @@ import pytest
 import zmq
 
 from runtime.bus import Endpoints, Subscriber
-from runtime.main import Service
+from runtime.main import _MOST_WAITING, Service
+from runtime.messages import Ack, Command, decode, encode
 from tests.runtime.station import DIM, Station, plan
 
 PATIENCE = 500  # times 10 ms
@@ -26,6 +27,8 @@ class Watched:
         self._service = Service(self.station.main, self._context)
         endpoint = Endpoints(self.station.plan.deployment.station_dir).read("main")["state"]
         self._reader = Subscriber(self._context, endpoint, "joints")
+        self.serve = self._service.serve
+        self.context, self.endpoints = self._context, Endpoints(self.station.plan.deployment.station_dir)
 
     def joints(self) -> dict[str, Any]:
         """The newest joints, of the step that the station is at."""
@@ -83,3 +86,63 @@ def test_after_a_run_nothing_is_planned_any_more(watched: Watched) -> None:
     assert np.isnan(seen["raw"]).all()
     assert np.isnan(seen["planned"]).all()
     assert seen["engaged"] is True
+
+
+class Asker:
+    """A client that asks and does not wait."""
+
+    def __init__(self, watched: Watched) -> None:
+        self._watched = watched
+        self._socket = watched.context.socket(zmq.DEALER)
+        self._socket.connect(watched.endpoints.read("main")["commands"])
+
+    def ask(self, uuid: str, **arguments: Any) -> None:
+        self._socket.send(encode(Command(uuid, "aim", arguments)))
+
+    def answers(self, count: int) -> list[Ack]:
+        """What has been answered after a while of service, `count` at least."""
+        found: list[Ack] = []
+        for _ in range(PATIENCE):
+            self._watched.serve(0.01)
+            while self._socket.poll(0):
+                message = decode(self._socket.recv())
+                assert isinstance(message, Ack)
+                found.append(message)
+            if len(found) >= count:
+                return found
+        raise AssertionError(f"{len(found)} of {count} answers")
+
+
+JOG = {"arm": "left_arm", "translation": [0.01, 0.0, 0.0]}
+
+
+def test_an_aim_that_needs_what_is_being_loaded_is_answered_when_it_is_there(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watched.station.ready()
+    loaded: list[bool] = []
+    monkeypatch.setattr(watched.station.main.by_hand._targets, "prepare", lambda: bool(loaded))
+    asker = Asker(watched)
+    asker.ask("step", jog=JOG)
+    asker.ask("pose", pose="home")
+    assert [(ack.uuid, ack.status) for ack in asker.answers(1)] == [("pose", "done")]
+    asker.ask("again", pose="home")
+    assert [ack.uuid for ack in asker.answers(1)] == ["again"]
+    loaded.append(True)
+    (ack,) = asker.answers(1)
+    assert (ack.uuid, ack.status) == ("step", "done")
+    assert ack.data["reached"]
+
+
+def test_of_many_that_wait_for_what_is_being_loaded_some_are_refused(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watched.station.main.by_hand._targets, "prepare", lambda: False)
+    asker = Asker(watched)
+    for number in range(_MOST_WAITING + 3):
+        asker.ask(str(number), jog=JOG)
+    answers = asker.answers(3)
+    assert [(ack.uuid, ack.status) for ack in answers] == [
+        (str(_MOST_WAITING + n), "refused") for n in range(3)
+    ]
+    assert answers[0].reason == "aim: 100 wait already for what is still being loaded: ask again"

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ from hypothesis import strategies as st
 from runtime.errors import RecordingError
 from runtime.messages import ChunkMerged, PolicyAnswer, TickDone
 from runtime.recorder import Grid, Recorder
-from runtime.recording.base import ExecutedTick, Journal, Outcome, RawChunk, Record, Row
+from runtime.recording.base import ExecutedTick, Journal, Loss, Outcome, RawChunk, Record, Row
+from runtime.recording.settings import RecordingSettings
 from runtime.types import Observation
 
 CAMERA = "cam"
@@ -28,6 +30,7 @@ class FakeJournal(Journal):
         self.taken: list[Record] = []
         self.events: list[Mapping[str, object]] = []
         self.outcome: Outcome | None = None
+        self.lost: list[Loss] = []
         self.failing: set[str] = set()
 
     def _check(self, name: str) -> None:
@@ -45,6 +48,10 @@ class FakeJournal(Journal):
     def mark(self, event: Mapping[str, object]) -> None:
         self._check("mark")
         self.events.append(event)
+
+    def losses(self) -> list[Loss]:
+        told, self.lost = self.lost, []
+        return told
 
     def end(self, outcome: Outcome) -> None:
         self.outcome = outcome
@@ -428,3 +435,94 @@ def test_a_row_of_a_simulated_robot_has_its_action_beside_what_was_measured(desk
     assert row.control_source == "sim"
     assert (row.action == 7.25).all()
     assert (row.qpos == 1).all()
+
+
+def test_a_camera_without_new_pictures_is_flagged_row_by_row_and_named_once() -> None:
+    desk = Desk()
+    desk.see(1, captured=100.0)
+    desk.recorder.begin({"uuid": "one", "task": "t"}, 1)
+    for step in range(60):  # pictures of its own until row 20, and from row 50 on
+        fresh = step < 20 or step >= 50
+        desk.see(step + 2, captured=100.0 + (step if fresh else 19) / 30.0)
+        desk.tick(step, sequence=step + 2)
+    stale = [CAMERA in row.stale for row in desk.journal.rows]
+    assert stale == [34 < k < 50 for k in range(60)]  # half a second after its last picture, of row 19
+    told = desk.recorder.news()
+    assert [(event.kind, event.data) for event in told] == [
+        ("pictures_stopped", {"camera": CAMERA, "row": 35}),
+        ("pictures_back", {"camera": CAMERA, "row": 50}),
+    ]
+    assert [event["kind"] for event in desk.journal.events] == ["pictures_stopped", "pictures_back"]
+    assert desk.recorder.news() == []
+
+
+def test_a_camera_that_flutters_is_flagged_in_every_row_and_named_now_and_then() -> None:
+    desk = Desk()
+    desk.see(1, captured=100.0)
+    desk.recorder.begin({"uuid": "one", "task": "t"}, 1)
+    for step in range(100):  # 20 rows without a new picture of its own, 4 with, and so on
+        seen = step if step % 24 >= 20 else step - step % 24
+        desk.see(step + 2, captured=100.0 + seen / 30.0)
+        desk.tick(step, sequence=step + 2)
+    assert [CAMERA in row.stale for row in desk.journal.rows] == [16 <= step % 24 < 20 for step in range(100)]
+    desk.recorder.end("finished", "", {})
+    assert [(event["kind"], event["data"]) for event in desk.journal.events] == [
+        ("pictures_stopped", {"camera": CAMERA, "row": 16}),
+        ("pictures_back", {"camera": CAMERA, "row": 20}),
+        ("pictures_back", {"camera": CAMERA, "row": 92, "more": 3, "since_row": 40}),
+    ]
+
+
+def test_a_camera_that_is_absent_from_what_arrives_is_flagged_too() -> None:
+    desk = Desk()
+    desk.begin()
+    for step in range(30):
+        desk.see(step + 2, pictures={})
+        desk.tick(step, sequence=step + 2)
+    assert [CAMERA in row.stale for row in desk.journal.rows] == [k > 15 for k in range(30)]
+
+
+def test_what_the_journal_has_lost_is_told_once_and_stands_in_the_end() -> None:
+    desk = Desk()
+    desk.see(1, captured=100.0)
+    desk.recorder.begin({"uuid": "one"}, 1)
+    desk.tick(0)
+    desk.journal.lost = [Loss(CAMERA, 7, "its encoder failed")]
+    (event,) = desk.recorder.news()
+    assert (event.kind, event.data) == ("video_lost", {"camera": CAMERA, "row": 7})
+    assert desk.recorder.news() == []
+    close = desk.recorder.end("finished", "stopped", {})
+    desk.journal.lost = [Loss("wrist", 9, "did not end in time")]
+    closed = close()
+    assert closed.status == "finished"
+    assert closed.reason.startswith("stopped; its encoder failed")
+    assert "did not end in time" in closed.reason
+
+
+def test_the_manifest_says_what_is_flagged_and_how_large_videos_are() -> None:
+    desk = Desk()
+    desk.see(1)
+    desk.recorder.begin({"uuid": "one"}, 1)
+    assert desk.journal.manifest["max_skew_s"] == 0.05
+    assert desk.journal.manifest["cameras"] == {CAMERA: {"width": 6, "height": 4}}
+    scaled = Desk()
+    scaled.recorder._grid = replace(
+        scaled.recorder._grid, recording=RecordingSettings(height=64, heights={"other": 32})
+    )
+    scaled.see(1, pictures={CAMERA: np.zeros((480, 640, 3), np.uint8)})
+    collection = {"cameras": [CAMERA], "columns": None, "streams": [], "source": "relay", "max_skew_s": 0.2}
+    scaled.recorder.begin({"uuid": "one", "collection": collection}, 1)
+    assert scaled.journal.manifest["max_skew_s"] == 0.2
+    assert scaled.journal.manifest["cameras"] == {
+        CAMERA: {"width": 86, "height": 64, "captured_width": 640, "captured_height": 480}
+    }
+
+
+def test_answers_that_never_come_to_control_are_written_before_they_gather() -> None:
+    desk = Desk()
+    desk.begin()
+    for chunk in range(300):
+        desk.answer(chunk)
+    chunks = desk.journal.of(RawChunk)
+    assert [chunk.chunk_id for chunk in chunks] == list(range(44))
+    assert {chunk.arrival_step for chunk in chunks} == {-1}

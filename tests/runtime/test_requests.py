@@ -19,7 +19,8 @@ REFUSED = {
     "an unknown key": (
         SetUpRequest,
         {"polcy": {}},
-        "say: polcy = {}: unknown key (did you mean policy?); allowed here: bench, checkpoint, policy, strategy, task",
+        "say: polcy = {}: unknown key (did you mean policy?); "
+        "allowed here: bench, checkpoint, collect, policy, strategy, task",
     ),
     "an unknown key of a table": (
         SetUpRequest,

@@ -55,3 +55,25 @@ def test_an_error_in_the_thread_is_told_as_a_policy_error() -> None:
     with pytest.raises(PolicyError, match="ZeroDivisionError"):
         future.result(10)
     runner.close()
+
+
+def test_what_is_made_aside_waits_for_no_call_to_the_policy_and_makes_none_wait() -> None:
+    runner = ThreadRunner()
+    gate = threading.Event()
+    first = runner.submit(lambda: gate.wait(10))
+    assert runner.aside(lambda: 7).result(10) == 7
+    gate.set()
+    assert first.result(10)
+    never = threading.Event()
+    runner.aside(never.wait)
+    assert runner.submit(lambda: 8).result(10) == 8
+    assert not runner.busy
+    never.set()
+    runner.close()
+
+
+def test_an_error_aside_is_its_own() -> None:
+    for runner in (ThreadRunner(), LockstepRunner(0)):
+        with pytest.raises(ZeroDivisionError):
+            runner.aside(lambda: 1 // 0).result(10)
+        runner.close()

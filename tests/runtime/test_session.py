@@ -10,7 +10,7 @@ from runtime.effects import Effects, Situation
 from runtime.errors import RuntimeFault
 from runtime.lease import Lease
 from runtime.messages import Ack, Command
-from runtime.requests import BenchRequest, RunRequest, SetUpRequest
+from runtime.requests import BenchRequest, LabelRequest, RunRequest, SetUpRequest
 from runtime.session import Session
 from runtime.transitions import COMMANDS, HAPPENINGS, STOPPING, Happening, State
 
@@ -32,8 +32,12 @@ EFFECTS = {
     "move": "move",
     "gripper": "grip",
     "approach": "approach",
+    "arm": "arm",
+    "disarm": "disarm",
+    "label": "label",
+    "discard": "discard",
 }
-ARGUMENTS = {"gripper": {"action": "open"}}  # where one is needed
+ARGUMENTS = {"gripper": {"action": "open"}, "label": {"result": "success"}}  # where one is needed
 # Written out a second time, so that a change of the table is a decision and not a slip.
 ALLOWED = {
     S.DISCONNECTED: {"record_stop", "estop"},
@@ -55,9 +59,15 @@ GUARDED = {
     "cancel": (S.RUNNING, lambda s: s.mode in (*ON_DEMAND, "manual") and not s.opening),
     "move": (S.RUNNING, lambda s: s.mode == "manual" and not s.opening),
 }
+MODES = (None, "continuous", "step", "preview", "sim", "manual")
 SITUATIONS = [
-    Situation(*fields)
-    for fields in product((None, "continuous", "step", "preview", "sim", "manual"), *[(False, True)] * 7)
+    *(Situation(*fields) for fields in product(MODES, *[(False, True)] * 7)),
+    *(
+        Situation(mode, collection=collection, collecting=collecting, armed=armed, unled=unled)
+        for mode, collection, collecting, armed, unled in product(
+            (None, "collect", "manual"), *[(False, True)] * 3, ("", "the leader is silent")
+        )
+    ),
 ]
 
 
@@ -69,6 +79,15 @@ def allowed_in(state, situation):
     if situation.opening and state is S.RUNNING:
         found.discard("gripper")
     found |= {kind for kind, (where, holds) in GUARDED.items() if state is where and holds(situation)}
+    if situation.collecting and not situation.armed:
+        found.discard("run")
+    if situation.mode == "collect" and not situation.armed:
+        found.discard("resume")
+    if situation.collection:
+        found |= {"label", "discard"}
+        switched = "disarm" if situation.armed else "arm"
+        possible = situation.armed or (situation.collecting and not situation.unled)
+        found |= {switched} if possible and state in (S.READY, S.HOLDING) else set()
     committable = situation.mode == "preview" and situation.proposed
     if (state is S.READY and situation.first_action) or (state is S.RUNNING and committable):
         found.add("approach")
@@ -144,6 +163,20 @@ class Recorded(Effects):
 
     def approach(self):
         self._do("approach")
+
+    def arm(self):
+        self._do("arm")
+
+    def disarm(self):
+        self._do("disarm")
+
+    def label(self, asked):
+        self._do("label", asked)
+        return {"episode": "episode-9"}
+
+    def discard(self, asked):
+        self._do("discard", asked)
+        return {"episode": "episode-9"}
 
 
 class Bench:
@@ -222,6 +255,38 @@ def test_a_refusal_names_the_state_or_what_the_guard_says():
     assert "a chunk is shown: commit or cancel it first" in bench.give("step").reason
     bench.effects.situation = Situation(mode="continuous", trial=True)
     assert "one of a trial" in bench.give("tune").reason
+
+
+def test_what_collects_is_refused_with_what_is_missing():
+    bench = Bench(S.READY)
+    assert "its deployment has no [collection]" in bench.give("arm").reason
+    bench.effects.situation = Situation(collection=True)
+    assert "set up with collect first" in bench.give("arm").reason
+    bench.effects.situation = Situation(collection=True, collecting=True, unled="the leader is silent")
+    assert "the leader is silent" in bench.give("arm").reason
+    assert "not armed: arm first" in bench.give("run").reason
+    bench = Bench(S.HOLDING)
+    bench.effects.situation = Situation(mode="collect", collection=True, collecting=True)
+    assert "arm first, or stop" in bench.give("resume").reason
+
+
+@pytest.mark.parametrize("state", State)
+def test_discarding_what_goes_on_ends_it_and_discarding_what_is_named_ends_nothing(state):
+    collects = Situation(mode="collect", collection=True, collecting=True, armed=True)
+    named, open_one = Bench(state), Bench(state)
+    named.effects.situation = open_one.effects.situation = collects
+    named.give("discard", args={"episode": "e"})
+    assert named.session.state is state
+    open_one.give("discard")
+    assert open_one.session.state is (S.READY if state in (S.RUNNING, S.HOLDING) else state)
+
+
+def test_an_effect_knows_who_gave_the_command():
+    bench = Bench(S.READY)
+    bench.effects.situation = Situation(collection=True)
+    bench.give("label", args={"result": "fail", "note": "dropped"}, user="ben")
+    assert bench.effects.by == "ben"
+    assert bench.effects.done == [("label", LabelRequest(result="fail", note="dropped"))]
 
 
 def test_going_to_the_first_action_is_a_set_up_of_its_own_but_within_a_run_the_run_goes_on():

@@ -11,7 +11,17 @@ from tests.sources import ROOT, Sources
 
 GROUND_FLOOR = {"types", "clock", "messages", "codecs", "errors", "section", "memory"}
 # By these alone the web comes in; to read a deployment file belongs to the configuration.
-DOORS = {"messages", "bus", "config", "deployment", "kinematics", "recording", "datasets"}
+DOORS = {
+    "messages",
+    "bus",
+    "config",
+    "deployment",
+    "kinematics",
+    "recording",
+    "datasets",
+    "preflight",
+    "quality",
+}
 FAMILY = {"control", "main", "media", "guard", "headless"}
 ROOF = FAMILY | {"lockstep", "supervisor", "ctl", "terminal", "channel", "__main__"}
 

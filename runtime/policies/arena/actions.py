@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from runtime.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.errors import ActionSpaceError, ConfigurationError, ShapeError
 from runtime.formats import PoseRows
 from runtime.policies.answers import Rate
 from runtime.policies.arena.wants import ActionSpace, Wants
@@ -67,15 +67,15 @@ class Meant:
         self._parts: tuple[str, ...] = tuple(settings.action_keys or ())
 
     def agree(self, wants: Wants) -> None:
-        """Hold the server's words against the deployment's; ContradictionError with both sides."""
+        """Hold the server's words against the deployment's; ActionSpaceError with both sides."""
         settings = self._settings
         if wants.space != settings.action_space:
-            raise ContradictionError(
+            raise ActionSpaceError(
                 f"the server's metadata has action_space = {wants.space!r}, policy.action_space = "
                 f"{settings.action_space!r}; correct the one that is wrong"
             )
         if wants.width is not None and wants.width != self.width:
-            raise ContradictionError(
+            raise ActionSpaceError(
                 f"the server's metadata has action_dim = {wants.width}, this robot has {self.width} numbers in "
                 f"{settings.action_space}; correct policy.action_space, or another robot's policy is served"
             )
@@ -104,14 +104,14 @@ class Meant:
         missing = [name for name in self._parts if name not in reply]
         if missing or not self._parts:
             found = ", ".join(map(str, reply)) or "nothing"
-            raise PolicyError(
+            raise ShapeError(
                 f"the answer has no 'actions' but {found}; allowed: an array, a map with 'actions', or parts named "
                 f"in policy.action_keys ({', '.join(self._parts) or 'none'})"
             )
         parts = [action_rows(name, reply[name]) for name in self._parts]
         if len({len(part) for part in parts}) != 1:
             lengths = ", ".join(f"{name} {len(part)}" for name, part in zip(self._parts, parts, strict=True))
-            raise PolicyError(f"the parts of the answer have different numbers of rows: {lengths}")
+            raise ShapeError(f"the parts of the answer have different numbers of rows: {lengths}")
         return np.concatenate(parts, axis=1)
 
     def _steps_of_joints(self, rows: Float32) -> Float32:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from runtime.errors import PolicyError
+from runtime.errors import ConfigurationError, PolicyError
 from runtime.formats import PoseRows
 from runtime.policies.arena.cameras import Cameras, Numbering, Slot
+from runtime.policies.arena.history import History
 from runtime.policies.arena.wants import Wants
 from runtime.policies.grip import Convention, Grip
 from runtime.policies.pictures import fitted
@@ -23,6 +24,7 @@ from runtime.types import EEF_WIDTH, Float32, Observation, UInt8
 if TYPE_CHECKING:
     from robots import Robot
 
+Steps = Annotated[int, Field(ge=0, le=64)]
 _FIELD_SIZE = (288, 512)  # to which the field's client brings every picture first
 
 
@@ -43,6 +45,11 @@ class ShownSettings(Section):
     frames: Annotated[int, Field(ge=1, le=64)] = 1
     """Pictures per camera: 1 sends the newest, [H, W, 3], and leaves the history to the server; more send the newest
     that this policy was asked with, [T, H, W, 3], from the second request of a run on, the oldest repeated."""
+    frame_steps: Annotated[list[Steps], Field(min_length=2, max_length=16)] | None = None
+    """In the place of `frames`: which moments a request shows, in steps before it, oldest first, such as
+    [23, 16, 8, 0], as DreamZero's own clients do. The cameras are looked at between requests too."""
+    frame_rate: Annotated[float, Field(gt=0, le=60)] = 15.0
+    """How many of these steps a second has [Hz]; DROID's have 15."""
     gripper: Convention = "droid"
     """"droid": 0 is open, 1 closed, in observation and answer; "robot": the robot's own numbers."""
     cartesian_position: Literal["pose", "zeros"] = "pose"
@@ -51,6 +58,22 @@ class ShownSettings(Section):
     """How that pose is written."""
     observation_eef: Literal["measured", "fk"] = "measured"
     """Poses as the robot measures them, where it does; or as its joints have them in any case."""
+
+    @model_validator(mode="after")
+    def _one_history(self) -> ShownSettings:
+        steps = self.frame_steps
+        if steps is None:
+            return self
+        if self.frames != 1:
+            raise ConfigurationError(
+                f"policy.frames = {self.frames} and policy.frame_steps = {steps}: allowed is one of the two"
+            )
+        if steps[-1] != 0 or steps != sorted(set(steps), reverse=True):
+            raise ConfigurationError(
+                f"policy.frame_steps = {steps}: allowed are steps before the request, oldest first, the last 0, "
+                "such as [23, 16, 8, 0]"
+            )
+        return self
 
 
 class Shown:
@@ -68,6 +91,19 @@ class Shown:
         self._keys: Mapping[str, str] = {}
         self._size: tuple[int, int] | None = None
         self._seen: deque[dict[str, UInt8]] = deque(maxlen=settings.frames)
+        steps = settings.frame_steps
+        self._history = None if steps is None else History(tuple(steps), settings.frame_rate)
+        self._begun = False  # something was shown since it was forgotten
+
+    @property
+    def glances_s(self) -> float | None:
+        """How often what is seen is to be kept [s], None for not at all."""
+        return None if self._history is None else 1.0 / self._settings.frame_rate
+
+    def glance(self, observation: Observation) -> None:
+        """Keep its pictures, where a history is shown."""
+        if self._history is not None:
+            self._history.add(observation)
 
     @property
     def sees_poses(self) -> bool:
@@ -79,11 +115,14 @@ class Shown:
         self._keys = self._cameras.of(wants)
         own = self._settings.image_size
         self._size = wants.resolution if own is None else (own[0], own[1])
-        self._seen.clear()  # another server's pictures may have been of another size
+        self.forget()  # another server's pictures may have been of another size
 
     def forget(self) -> None:
         """No picture was shown yet."""
         self._seen.clear()
+        self._begun = False
+        if self._history is not None:
+            self._history.forget()
 
     def of(self, observation: Observation) -> dict[str, Any]:
         """The request without session and endpoint; PolicyError where the observation lacks what belongs into it."""
@@ -100,18 +139,29 @@ class Shown:
         }
 
     def _pictures(self, observation: Observation) -> dict[str, UInt8]:
-        first = not self._seen
-        self._seen.append({key: self._picture(observation, camera) for key, camera in self._keys.items()})
+        if self._history is not None and self._begun:
+            return self._of_moments(self._history.before(observation))
+        if self._history is not None:
+            self._history.add(observation)
+        first, self._begun = not self._seen, True
+        self._seen.append(self._views(observation.pictures))
         newest = self._seen[-1]
         if self._settings.frames == 1 or first:
             return dict(newest)
         shown = [self._seen[0]] * (self._settings.frames - len(self._seen)) + list(self._seen)
         return {key: np.stack([pictures[key] for pictures in shown]) for key in newest}
 
-    def _picture(self, observation: Observation, camera: str) -> UInt8:
-        picture = observation.pictures.get(camera)
+    def _of_moments(self, moments: Sequence[Mapping[str, UInt8]]) -> dict[str, UInt8]:
+        views = [self._views(pictures) for pictures in moments]
+        return {key: np.stack([view[key] for view in views]) for key in self._keys}
+
+    def _views(self, pictures: Mapping[str, UInt8]) -> dict[str, UInt8]:
+        return {key: self._picture(pictures, camera) for key, camera in self._keys.items()}
+
+    def _picture(self, pictures: Mapping[str, UInt8], camera: str) -> UInt8:
+        picture = pictures.get(camera)
         if picture is None:
-            given = ", ".join(observation.pictures) or "none"
+            given = ", ".join(pictures) or "none"
             raise PolicyError(f"the observation has no picture {camera!r}; it has {given}")
         if self._settings.resize == "droid":
             picture = fitted(picture, *_FIELD_SIZE, "stretch", "lanczos")

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from runtime.errors import PolicyError
+from runtime.errors import ActionSpaceError, PolicyError, WrongProtocolError
 
 ActionSpace = Literal["joint_position", "joint_velocity", "cartesian_position", "cartesian_velocity"]
 SPACES: tuple[ActionSpace, ...] = get_args(ActionSpace)
@@ -43,7 +43,7 @@ def wanted(metadata: Mapping[str, Any]) -> Wants:
     """From the metadata, with the defaults of the field's clients; PolicyError names what is wrong in them."""
     if not any(name in metadata for name in _FIELDS):
         found = ", ".join(map(str, metadata)) or "nothing"
-        raise PolicyError(
+        raise WrongProtocolError(
             f"the server's metadata have none of {', '.join(_FIELDS)}, but {found}: it is no server of the "
             'RoboArena family; correct policy.kind (a plain openpi server: "openpi") or policy.url'
         )
@@ -86,7 +86,7 @@ def _space(given: Any) -> ActionSpace:
     for space in SPACES:
         if given == space:
             return space
-    raise _wrong("action_space", given, ", ".join(SPACES))
+    raise ActionSpaceError(_unknown("action_space", given, ", ".join(SPACES)))
 
 
 def _positive(metadata: Mapping[str, Any], name: str) -> int | None:
@@ -97,4 +97,8 @@ def _positive(metadata: Mapping[str, Any], name: str) -> int | None:
 
 
 def _wrong(name: str, given: Any, allowed: str) -> PolicyError:
-    return PolicyError(f"the server's metadata have {name} = {given!r}; allowed: {allowed}")
+    return WrongProtocolError(_unknown(name, given, allowed))
+
+
+def _unknown(name: str, given: Any, allowed: str) -> str:
+    return f"the server's metadata have {name} = {given!r}; allowed: {allowed}"

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from runtime.errors import ConfigurationError, PolicyError, PolicyLostError
-from runtime.policies.link import PolicyGone, PolicyTimeout, headline
-from runtime.policies.reach import reach
+from runtime.errors import (
+    ConfigurationError,
+    PolicyError,
+    PolicyGone,
+    PolicyTimeout,
+    RefusedError,
+    ServerSaysError,
+    WrongProtocolError,
+)
+from runtime.policies.link import headline
+from runtime.policies.reach import Dial, reached
 
 if TYPE_CHECKING:
     import grpc
@@ -22,12 +29,14 @@ _LARGEST_MESSAGE = 4 * 1024 * 1024  # bytes that the server takes in one message
 class Channel:
     """One channel that can be opened again until it is aborted; for one thread at a time, except for `abort`.
 
-    Answers of more than `limit` bytes are refused. ConfigurationError where gRPC is not installed.
+    Answers of more than `limit` bytes are refused. `dial` says where the url's host and port are connected to, where
+    that is elsewhere. ConfigurationError where gRPC is not installed.
     """
 
-    def __init__(self, url: str, connect_deadline: float, limit: int) -> None:
+    def __init__(self, url: str, connect_deadline: float, limit: int, dial: Dial | None = None) -> None:
         _grpc()
         self._url = url
+        self._dial = dial
         self._connect_deadline = connect_deadline
         self._limit = limit
         self._channel: grpc.Channel | None = None
@@ -44,24 +53,10 @@ class Channel:
         """Make sure that somebody listens, and make a channel; what is left of the connect deadline [s]."""
         self.drop()
         deadline = time.monotonic() + self._connect_deadline
-        place = urlsplit(self._url)
-        host, port = place.hostname or "", place.port or 0
-        try:
-            reach(host, port, deadline, self._require_not_aborted).close()
-        except ConnectionRefusedError as error:
-            raise PolicyLostError(
-                f"no policy server listens at {self._url}: start it, or correct policy.url"
-            ) from error
-        except socket.gaierror as error:
-            raise PolicyLostError(
-                f"the host of {self._url} is not known: correct policy.url ({error})"
-            ) from error
-        except TimeoutError as error:
-            raise PolicyTimeout(
-                f"{self._url} was not reached within {self._connect_deadline:g} s: the host is unreachable"
-            ) from error
-        except OSError as error:
-            raise PolicyLostError(f"the connection to {self._url} failed ({error})") from error
+        parts = urlsplit(self._url)
+        host, port = self._dial() if self._dial else (parts.hostname or "", parts.port or 0)
+        seconds = self._connect_deadline
+        reached(self._url, host, port, deadline, seconds, self._require_not_aborted).close()
         self._channel = _grpc().insecure_channel(
             f"[{host}]:{port}" if ":" in host else f"{host}:{port}",
             options=[
@@ -124,7 +119,7 @@ class Channel:
         codes, name = _grpc().StatusCode, method.rpartition("/")[2]
         if code is codes.UNKNOWN:  # the server's own code failed: it goes on serving
             said = details.removeprefix("Exception calling application: ")
-            return PolicyError(
+            return ServerSaysError(
                 f"the policy server at {self._url} reports an error in {name}: {headline(said)}"
             )
         self.drop()
@@ -132,23 +127,27 @@ class Channel:
             return PolicyError(f"the connection to {self._url} was closed from our side")
         if code is codes.DEADLINE_EXCEEDED:
             return PolicyTimeout(
-                f"{self._url} did not answer {name} within {seconds:g} s; the connection is dropped"
+                f"{self._url} did not answer {name} within {seconds:.3g} s; the connection is dropped"
             )
         if code is codes.UNIMPLEMENTED:
-            return PolicyError(
+            return WrongProtocolError(
                 f"{self._url} is a gRPC server without LeRobot's {name} ({details}): check host, port and policy.kind"
             )
         if code is codes.RESOURCE_EXHAUSTED:
             return PolicyError(f"{self._url} and a message that is too large for {name}: {details}")
         if code is codes.UNAVAILABLE and _is_foreign(details):
-            return PolicyError(
+            return WrongProtocolError(
                 f"what listens at {self._url} does not speak gRPC ({details}): check host, port and policy.kind"
             )
         if code is codes.UNAVAILABLE:
             return PolicyGone(
-                f"the policy server at {self._url} closed the connection ({details}): see that it runs, and speaks gRPC"
+                f"the policy server at {self._url} closed the connection ({details}): "
+                "see that it runs, and speaks gRPC: a server of another kind hangs up too; check policy.kind"
             )
-        return PolicyError(f"the policy server at {self._url} refuses {name}: {code.name}, {details}")
+        refusal = f"the policy server at {self._url} refuses {name}: {code.name}, {details}"
+        if code in (codes.UNAUTHENTICATED, codes.PERMISSION_DENIED):
+            return RefusedError(refusal)
+        return ServerSaysError(refusal)
 
 
 def _is_foreign(details: str) -> bool:

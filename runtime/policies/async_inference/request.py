@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from runtime.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.errors import ConfigurationError, ContradictionError, ShapeError, WrongProtocolError
 from runtime.policies.async_inference.pickles import (
     MODULES,
     RemotePolicyConfig,
@@ -120,16 +120,16 @@ class AsyncRequest:
         actions = sorted(given, key=lambda one: one.timestep)
         steps = [one.timestep for one in actions]
         if not actions:
-            raise PolicyError("the answer has no actions")
+            raise ShapeError("the answer has no actions")
         if steps != list(range(timestep, timestep + len(steps))):
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"the answer has actions for the steps {_short(steps)}; expected {timestep} and those after it, as it "
                 "answers the observation of that step: another client uses the same server?"
             )
         self._agree([one.timestamp for one in actions])
         for one in actions:
             if one.action.ndim != 1 or one.action.shape != actions[0].action.shape:
-                raise PolicyError(
+                raise ShapeError(
                     f"the action for step {one.timestep} has shape {list(one.action.shape)}, the first "
                     f"{list(actions[0].action.shape)}; expected [{self._row_width}] each"
                 )

@@ -65,7 +65,14 @@ class Tensors:
         if not isinstance(data, bytes):
             raise CodecError(f"a storage is {type(data).__name__}; expected bytes")
         if data not in self._known:
-            self._known[data] = self._read(data)
+            try:
+                self._known[data] = self._read(data)
+            except CodecError:
+                raise
+            except Exception as error:  # a broken pickle may raise anything, and has run nothing
+                raise CodecError(
+                    f"{len(data)} bytes are no storage of torch's: {type(error).__name__}: {error}"
+                ) from error
         return self._known[data]
 
     def _read(self, data: bytes) -> Array:

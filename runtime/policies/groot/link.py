@@ -9,11 +9,9 @@ from collections.abc import Iterator
 from urllib.parse import urlsplit
 
 import zmq
-from zmq.utils.monitor import recv_monitor_message
 
-from runtime.errors import PolicyError, PolicyLostError
-from runtime.policies.link import PolicyGone, PolicyTimeout
-from runtime.policies.reach import reach
+from runtime.errors import PolicyError, PolicyGone, PolicyLostError, PolicyTimeout, WrongProtocolError
+from runtime.policies.reach import Dial, Place, reached
 
 _SPELL_MS = 20  # how soon a wait notices that it was aborted; an answer is noticed at once
 _SIGNATURE = b"\xff\0\0\0\0\0\0\0\1\x7f"  # how every ZMTP peer begins
@@ -27,10 +25,14 @@ _WATCHED = zmq.EVENT_HANDSHAKE_SUCCEEDED | _FAILED | zmq.EVENT_DISCONNECTED
 
 
 class ReqLink:
-    """For one thread at a time, except for `abort`; messages of more than `limit` bytes end the connection."""
+    """For one thread at a time, except for `abort`; messages of more than `limit` bytes end the connection.
 
-    def __init__(self, url: str, connect_deadline: float, limit: int) -> None:
+    `dial` says where the url's host and port are connected to, where that is elsewhere.
+    """
+
+    def __init__(self, url: str, connect_deadline: float, limit: int, dial: Dial | None = None) -> None:
         self._url = url
+        self._dial = dial
         self._connect_deadline = connect_deadline
         self._limit = limit
         self._socket: zmq.Socket[bytes] | None = None
@@ -50,7 +52,8 @@ class ReqLink:
         self.drop()
         deadline = time.monotonic() + self._connect_deadline
         self._require_not_aborted()
-        self._knock(deadline)
+        place = self._place()
+        self._knock(place, deadline)
         made: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REQ)
         for option, value in (
             (zmq.LINGER, 0),
@@ -60,7 +63,9 @@ class ReqLink:
             made.setsockopt(option, value)
         self._socket, self._monitor = made, made.get_monitor_socket(_WATCHED)
         with self._dropping_on_error():
-            made.connect(self._url)
+            made.connect(
+                f"tcp://[{place[0]}]:{place[1]}" if ":" in place[0] else f"tcp://{place[0]}:{place[1]}"
+            )
             self._shake_hands(deadline)
         return max(0.0, deadline - time.monotonic())
 
@@ -71,7 +76,12 @@ class ReqLink:
             raise PolicyError(f"there is no connection to {self._url}; connect first")
         deadline = time.monotonic() + seconds
         with self._dropping_on_error():
-            wire.send(request, zmq.NOBLOCK)
+            try:
+                wire.send(request, zmq.NOBLOCK)
+            except zmq.Again as error:  # there is nobody any more to send it to
+                raise PolicyGone(
+                    f"the policy server at {self._url} closed the connection since the last request: see that it runs"
+                ) from error
             while not wire.poll(_SPELL_MS):
                 self._require_not_aborted()
                 if time.monotonic() >= deadline:
@@ -85,7 +95,7 @@ class ReqLink:
                     )
             frames = wire.recv_multipart(zmq.NOBLOCK)
             if len(frames) != 1:
-                raise PolicyError(
+                raise WrongProtocolError(
                     f"{self._url} sent a message of {len(frames)} frames; expected one: it is no GR00T server"
                 )
             return frames[0]
@@ -108,27 +118,22 @@ class ReqLink:
         if self._aborted:
             raise PolicyError(f"the connection to {self._url} was closed from our side")
 
-    def _knock(self, deadline: float) -> None:
+    def _place(self) -> Place:
+        parts = urlsplit(self._url)
+        return self._dial() if self._dial else (parts.hostname or "", parts.port or 0)
+
+    def _knock(self, place: Place, deadline: float) -> None:
         """See who listens, before ZMQ, which would try again for ever and say nothing."""
-        place = urlsplit(self._url)
-        host, port = place.hostname or "", place.port or 0
         try:
-            with reach(host, port, deadline, self._require_not_aborted) as wire:
+            seconds = self._connect_deadline
+            with reached(self._url, *place, deadline, seconds, self._require_not_aborted) as wire:
                 wire.settimeout(_SPELL_MS / 1e3)
                 wire.sendall(_KNOCK)
                 self._require_zmq(self._greeting(wire, deadline))
-        except ConnectionRefusedError as error:
-            raise PolicyLostError(
-                f"no policy server listens at {self._url}: start it, or correct policy.url"
-            ) from error
-        except socket.gaierror as error:
-            raise PolicyLostError(
-                f"the host of {self._url} is not known: correct policy.url ({error})"
-            ) from error
         except TimeoutError as error:
             raise PolicyTimeout(
-                f"{self._url} gave no ZMQ greeting within {self._connect_deadline:g} s: the host is unreachable, or "
-                "what listens there is stuck or speaks another protocol"
+                f"{self._url} gave no ZMQ greeting within {self._connect_deadline:g} s: what listens there is stuck, "
+                "or speaks another protocol"
             ) from error
         except OSError as error:
             raise PolicyLostError(f"the connection to {self._url} failed ({error})") from error
@@ -148,9 +153,12 @@ class ReqLink:
 
     def _require_zmq(self, said: bytes) -> None:
         if not said:
-            raise PolicyLostError(f"{self._url} closed the connection at once: see what listens there")
+            raise PolicyLostError(
+                f"{self._url} closed the connection at once: see that the policy server runs, and check "
+                "host, port and policy.kind: a server of another kind hangs up too"
+            )
         if said[0] != 0xFF or len(said) < len(_SIGNATURE) or said[9] != 0x7F:
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"what listens at {self._url} does not speak ZMQ (it says {said[:40]!r}): "
                 "check host, port and policy.kind"
             )
@@ -162,7 +170,7 @@ class ReqLink:
             if heard & zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 return
             if heard:  # it failed, or the peer hung up in the middle, as it does where sockets do not match
-                raise PolicyError(
+                raise WrongProtocolError(
                     f"{self._url} speaks ZMQ but takes no requests (its socket is no REP socket, or it wants keys): "
                     "the port of an execution node, perhaps; correct policy.url"
                 )
@@ -174,6 +182,8 @@ class ReqLink:
 
     def _heard(self, milliseconds: int = 0) -> int:
         """What happened to the connection since the last time, as one set of ZMQ's events."""
+        from zmq.utils.monitor import recv_monitor_message  # it brings asyncio along
+
         monitor, events = self._monitor, 0
         assert monitor is not None
         while monitor.poll(0 if events else milliseconds):

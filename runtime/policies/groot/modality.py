@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from runtime.errors import PolicyError
+from runtime.errors import WrongProtocolError
 
 Name = Literal["video", "state", "action", "language"]
 _NAMES: tuple[Name, ...] = ("video", "state", "action", "language")
@@ -53,7 +53,7 @@ class Modalities:
 def modalities(reply: object) -> Modalities:
     """The answer to get_modality_config; PolicyError where it is none. A modality that is not in it has no keys."""
     if not isinstance(reply, Mapping) or not any(name in reply for name in _NAMES):
-        raise PolicyError(
+        raise WrongProtocolError(
             f"the answer to get_modality_config is {_short(reply)}; expected a map of {', '.join(_NAMES)}"
         )
     early = [_is_early(reply[name], name) for name in _NAMES if name in reply]
@@ -64,7 +64,7 @@ def modalities(reply: object) -> Modalities:
 def _is_early(given: Any, name: Name) -> bool:
     """N1.5 writes the fields as JSON text."""
     if not isinstance(given, Mapping) or not any(mark in given for mark in _MARKS):
-        raise PolicyError(
+        raise WrongProtocolError(
             f"the server's modality {name!r} is {_short(given)}; expected a modality configuration"
         )
     return isinstance(given.get("as_json"), str)
@@ -76,14 +76,18 @@ def _modality(given: Mapping[str, Any], name: Name) -> Modality:
         try:
             fields = json.loads(fields)
         except (ValueError, RecursionError) as error:
-            raise PolicyError(f"the server's modality {name!r} is no JSON: {error}") from error
+            raise WrongProtocolError(f"the server's modality {name!r} is no JSON: {error}") from error
     if not isinstance(fields, Mapping):
-        raise PolicyError(f"the server's modality {name!r} has as_json {_short(fields)}; expected a map")
+        raise WrongProtocolError(
+            f"the server's modality {name!r} has as_json {_short(fields)}; expected a map"
+        )
     keys, steps = fields.get("modality_keys"), fields.get("delta_indices")
     if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
-        raise PolicyError(f"the server's modality {name!r} has modality_keys {_short(keys)}; expected names")
+        raise WrongProtocolError(
+            f"the server's modality {name!r} has modality_keys {_short(keys)}; expected names"
+        )
     if not isinstance(steps, list) or not steps or not all(type(step) is int for step in steps):
-        raise PolicyError(
+        raise WrongProtocolError(
             f"the server's modality {name!r} has delta_indices {_short(steps)}; expected integers"
         )
     bare = tuple(key.removeprefix(f"{name}.") for key in keys)

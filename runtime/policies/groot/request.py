@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from runtime.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.errors import (
+    ActionSpaceError,
+    ConfigurationError,
+    ContradictionError,
+    PolicyError,
+    ShapeError,
+    WrongProtocolError,
+)
 from runtime.policies.grip import Convention, Grip
 from runtime.policies.groot.modality import Modalities, Modality, Written, listed
 from runtime.policies.meaning import MeaningSettings
@@ -139,7 +146,7 @@ class Gr00tRequest:
         heights = {key: len(part) for key, part in parts.items()}
         if len(set(heights.values())) != 1:
             told = ", ".join(f"{key} {height}" for key, height in heights.items())
-            raise PolicyError(f"the parts of the answer have different numbers of rows: {told}")
+            raise ShapeError(f"the parts of the answer have different numbers of rows: {told}")
         made = np.empty((next(iter(heights.values())), self._row_width), np.float32)
         for key, part in parts.items():
             made[:, self._settings.actions[key]] = part
@@ -150,7 +157,7 @@ class Gr00tRequest:
         answer = reply if early else reply[0] if isinstance(reply, list) and len(reply) == 2 else None
         if not isinstance(answer, Mapping):
             expected = "a map of actions" if early else "a list of two: actions and information"
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"the answer is {_kind(reply)}; expected {expected} with policy.dialect = {self._settings.dialect!r}"
             )
         return answer
@@ -158,10 +165,10 @@ class Gr00tRequest:
     def _part(self, answer: Mapping[str, Any], key: str, dims: Sequence[int]) -> Float32:
         name = key if key in answer else f"action.{key}"
         if name not in answer:
-            raise PolicyError(f"the answer has no action {key!r}; it has {listed(map(str, answer))}")
+            raise ShapeError(f"the answer has no action {key!r}; it has {listed(map(str, answer))}")
         given = answer[name]
         if isinstance(given, Mapping):
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"action {key!r} is a map of {listed(map(str, given))}; expected an array in NPY or MNP: "
                 "the server writes arrays in another dialect"
             )
@@ -221,7 +228,8 @@ def _same_keys(name: str, wanted: Modality, given: Iterable[str]) -> None:
     """Servers refuse a request with a key too many or too few, and name neither."""
     here = list(given)
     if set(here) != set(wanted.keys):
-        raise ContradictionError(
+        kind = ActionSpaceError if name == "actions" else ContradictionError
+        raise kind(
             f"the server's model has the {name} keys {listed(wanted.keys)}; policy.{name} has {listed(here)}; "
             "correct policy." + name
         )
@@ -260,13 +268,13 @@ def _check_written(key: str, written: Written | None, settings: RequestSettings)
         return
     orientation, mine = _ORIENTATIONS.get(written.format), settings.action_pose.orientation
     if orientation is not None and (settings.action_space != "eef" or mine != orientation):
-        raise ContradictionError(
+        raise ActionSpaceError(
             f"the server's model writes action {key!r} as {written.format}; policy.action_space = "
             f'{settings.action_space!r}, policy.action_pose.orientation = {mine!r}; allowed: "eef" '
             f"and {orientation!r}, or the key in policy.ignored_actions"
         )
     if written.representation == "DELTA" and settings.action_mode == "absolute":
-        raise ContradictionError(
+        raise ActionSpaceError(
             f"the server's model answers with changes for the action {key!r} (DELTA); policy.action_mode = 'absolute'; "
             'allowed: "delta" or "relative"'
         )

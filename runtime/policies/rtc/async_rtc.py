@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from runtime.errors import PolicyError
+from runtime.errors import ServerSaysError, WrongProtocolError
 from runtime.policies.link import headline
 from runtime.policies.rtc.base import Dialect, Message
 from runtime.types import Conditioning
@@ -35,17 +35,17 @@ class AsyncRtc(Dialect):
         said = metadata.get("async_rtc")
         if not isinstance(said, Mapping):
             found = ", ".join(map(str, metadata)) or "nothing"
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"the server's metadata have no async_rtc map, only {found}: it is no {NAME} server; correct "
                 "policy.rtc or policy.url"
             )
         _check_version(said, "the server's async_rtc metadata")
         codecs = said.get("image_transport_codecs", ["raw"])
         if not isinstance(codecs, list) or "raw" not in codecs:
-            raise PolicyError(f"the server takes pictures as {codecs!r}; needed: raw")
+            raise WrongProtocolError(f"the server takes pictures as {codecs!r}; needed: raw")
         supported = said.get("rtc_supported")
         if not isinstance(supported, bool):
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"the server's async_rtc metadata have rtc_supported {supported!r}; needed: a bool"
             )
         horizon = said.get("model_action_horizon")
@@ -68,15 +68,17 @@ class AsyncRtc(Dialect):
         """What is in the envelope; PolicyError for the server's error, another version, another request's number."""
         _check_version(reply, "the answer")
         if reply.get("error"):
-            raise PolicyError(f"the policy server reports an error: {headline(str(reply['error']))}")
+            raise ServerSaysError(f"the policy server reports an error: {headline(str(reply['error']))}")
         number = reply.get("request_id")
         if number != self._number:
-            raise PolicyError(
+            raise WrongProtocolError(
                 f"the answer has request_id {number!r}, asked was {self._number}: it is another request's"
             )
         result = reply.get("result")
         if not isinstance(result, dict):
-            raise PolicyError(f"the answer has a result that is a {type(result).__name__}; expected a map")
+            raise WrongProtocolError(
+                f"the answer has a result that is a {type(result).__name__}; expected a map"
+            )
         return result
 
     def _rtc(self, conditioning: Conditioning) -> Message:
@@ -95,6 +97,6 @@ class AsyncRtc(Dialect):
 def _check_version(message: Mapping[str, Any], where: str) -> None:
     found = (message.get("protocol"), message.get("protocol_version"))
     if found != (NAME, VERSION):
-        raise PolicyError(
+        raise WrongProtocolError(
             f"{where} has protocol {found[0]!r} version {found[1]!r}; needed: {NAME!r} version {VERSION}"
         )

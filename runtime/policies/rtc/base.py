@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
-from runtime.errors import PolicyError
+from runtime.errors import ContradictionError, PolicyError, WrongProtocolError
 from runtime.types import Conditioning
 
 Message = dict[str, Any]
@@ -61,21 +61,21 @@ class Plain(Dialect):
 def dialect_told(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
     """The map under the metadata key `rtc`, that of our bundled server; None where the server does not say.
 
-    PolicyError for a server that takes versioned envelopes alone, or whose key is something else.
+    ContradictionError for a server that takes versioned envelopes alone, or whose key is something else.
     """
     refuse_envelopes(metadata, name)
     said = metadata.get("rtc")
     if said is None:
         return None
     if not isinstance(said, Mapping) or not isinstance(said.get("dialect"), str):
-        raise PolicyError(f"the server's metadata have rtc = {said!r}; expected a map with a dialect")
+        raise WrongProtocolError(f"the server's metadata have rtc = {said!r}; expected a map with a dialect")
     return said
 
 
 def refuse_envelopes(metadata: Mapping[str, Any], configured: str) -> None:
-    """PolicyError where the server says that it takes versioned envelopes: it would answer nothing else."""
+    """ContradictionError where the server says that it takes versioned envelopes: it would answer nothing else."""
     if "async_rtc" in metadata:
-        raise PolicyError(
+        raise ContradictionError(
             f"the server's metadata have async_rtc, so it takes envelopes alone; policy.rtc is {configured!r}, "
             "allowed with this server: 'async_rtc'"
         )

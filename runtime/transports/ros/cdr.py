@@ -7,28 +7,20 @@ definitions. Strings carry their terminating zero, sequences their length.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
-
-import numpy as np
 
 from runtime.errors import CodecError
-from runtime.transports.ros.messages import (
-    CompressedImage,
-    Image,
-    JointState,
-    Message,
-    MessageName,
-    PoseStamped,
-)
-from runtime.types import Float64, UInt8
+from runtime.transports.ros import fields
+from runtime.transports.ros.fields import SECOND
+from runtime.transports.ros.messages import Message, MessageName
 
 _LITTLE, _BIG = b"\x00\x01", b"\x00\x00"
 _HEADER = 4
-_SECOND = 1_000_000_000
 
 
-class Reader:
-    """Reads one message from front to back; CodecError for whatever does not fit into its bytes."""
+class Reader(fields.Reader):
+    """Reads plain CDR of either byte order."""
+
+    SHORTEST_TEXT = 5  # a length and a zero byte
 
     def __init__(self, payload: bytes) -> None:
         kind = payload[:2]
@@ -37,171 +29,45 @@ class Reader:
                 f"a message begins with {payload[:_HEADER].hex() or 'nothing'}; expected plain CDR, "
                 "0001 (little-endian) or 0000 (big-endian)"
             )
-        self._order = "<" if kind == _LITTLE else ">"
-        self._payload = payload
-        self._at = _HEADER
+        super().__init__(payload, "<" if kind == _LITTLE else ">", _HEADER)
 
-    def _take(self, size: int, alignment: int) -> int:
-        """The place of the next `size` bytes."""
-        start = self._at + -(self._at - _HEADER) % alignment
-        if size > len(self._payload) - start:
-            raise CodecError(
-                f"a message of {len(self._payload)} bytes ends within {size} bytes that begin at {start}"
-            )
-        self._at = start + size
-        return start
+    def _gap(self, alignment: int) -> int:
+        return -(self._at - _HEADER) % alignment
 
-    def _number(self, code: str, size: int) -> int:
-        value: int = struct.unpack_from(self._order + code, self._payload, self._take(size, size))[0]
-        return value
-
-    def u8(self) -> int:
-        return self._payload[self._take(1, 1)]
-
-    def u32(self) -> int:
-        return self._number("I", 4)
-
-    def i32(self) -> int:
-        return self._number("i", 4)
-
-    def string(self) -> str:
-        size = self.u32()
-        start = self._take(size, 1)
-        raw = self._payload[start : start + size]
+    def _text(self, raw: bytes, start: int) -> bytes:
         if not raw.endswith(b"\0"):
-            raise CodecError(f"a string of {size} bytes at {start} does not end with a zero byte")
-        try:
-            return raw[:-1].decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise CodecError(f"a string at {start} is not UTF-8: {error}") from error
-
-    def strings(self) -> tuple[str, ...]:
-        count = self.u32()
-        if count > (len(self._payload) - self._at) // 5:  # a length and a zero byte each
-            raise CodecError(f"a message of {len(self._payload)} bytes announces {count} strings")
-        return tuple(self.string() for _ in range(count))
-
-    def doubles(self, count: int | None = None) -> Float64:
-        """A sequence of float64, or an array of `count`, which has no length of its own."""
-        count = self.u32() if count is None else count
-        if count == 0:  # an empty sequence is not aligned
-            return np.zeros(0)
-        start = self._take(8 * count, 8)
-        return np.frombuffer(self._payload, self._order + "f8", count, start).astype(np.float64)
-
-    def octets(self) -> UInt8:
-        """A sequence of uint8, a view."""
-        count = self.u32()
-        return np.frombuffer(self._payload, np.uint8, count, self._take(count, 1))
+            raise CodecError(f"a string of {len(raw)} bytes at {start} does not end with a zero byte")
+        return raw[:-1]
 
     def header(self) -> tuple[int, str]:
-        """std_msgs/Header: the stamp [ns] and the frame."""
-        seconds, nanoseconds = self.i32(), self.u32()
-        if nanoseconds >= _SECOND:
-            raise CodecError(f"a stamp has {nanoseconds} nanoseconds; expected less than a second")
-        return seconds * _SECOND + nanoseconds, self.string()
+        """Seconds and nanoseconds, the frame."""
+        return self.stamp(self.i32(), self.u32()), self.string()
 
 
-class Writer:
-    """Writes one message, little-endian."""
+class Writer(fields.Writer):
+    """Writes plain CDR, little-endian."""
 
     def __init__(self) -> None:
-        self._out = bytearray(_LITTLE + b"\0\0")
+        super().__init__(_LITTLE + b"\0\0")
 
     def _align(self, alignment: int) -> None:
         self._out += bytes(-(len(self._out) - _HEADER) % alignment)
 
-    def u8(self, value: int) -> None:
-        self._out.append(value)
-
-    def u32(self, value: int) -> None:
-        self._align(4)
-        self._out += struct.pack("<I", value)
-
     def string(self, text: str) -> None:
-        raw = text.encode("utf-8") + b"\0"
-        self.u32(len(raw))
-        self._out += raw
-
-    def strings(self, texts: tuple[str, ...]) -> None:
-        self.u32(len(texts))
-        for text in texts:
-            self.string(text)
-
-    def doubles(self, values: Float64, fixed: bool = False) -> None:
-        if not fixed:
-            self.u32(len(values))
-        if len(values):
-            self._align(8)
-            self._out += np.ascontiguousarray(values, "<f8").tobytes()
-
-    def octets(self, values: UInt8) -> None:
-        self.u32(len(values))
-        self._out += np.ascontiguousarray(values, np.uint8).data
+        self._counted(text.encode("utf-8") + b"\0")
 
     def header(self, stamp: int, frame: str) -> None:
-        seconds, nanoseconds = divmod(stamp, _SECOND)
+        """Seconds and nanoseconds, the frame."""
         self._align(4)
-        self._out += struct.pack("<iI", seconds, nanoseconds)
+        self._out += struct.pack("<iI", *divmod(stamp, SECOND))
         self.string(frame)
-
-    def done(self) -> bytes:
-        return bytes(self._out)
 
 
 def decode(name: MessageName, payload: bytes) -> Message:
     """The message of that type; CodecError where the bytes are none. Bytes behind it (padding) do not matter."""
-    return _READ[name](Reader(payload))
+    return fields.read(name, Reader(payload))
 
 
 def encode(message: Message) -> bytes:
     """The bytes of a message; struct.error where a number does not fit."""
-    out = Writer()
-    out.header(message.stamp, message.frame)
-    if isinstance(message, JointState):
-        out.strings(message.names)
-        for numbers in (message.position, message.velocity, message.effort):
-            out.doubles(numbers)
-    elif isinstance(message, Image):
-        out.u32(message.height)
-        out.u32(message.width)
-        out.string(message.encoding)
-        out.u8(0)  # is_bigendian
-        out.u32(message.step)
-        out.octets(message.data)
-    elif isinstance(message, CompressedImage):
-        out.string(message.format)
-        out.octets(message.data)
-    else:
-        out.doubles(message.pose, fixed=True)
-    return out.done()
-
-
-def _joint_state(given: Reader) -> JointState:
-    stamp, frame = given.header()
-    return JointState(stamp, frame, given.strings(), given.doubles(), given.doubles(), given.doubles())
-
-
-def _image(given: Reader) -> Image:
-    stamp, frame = given.header()
-    height, width, encoding = given.u32(), given.u32(), given.string()
-    given.u8()  # is_bigendian: of no meaning to bytes
-    return Image(stamp, frame, height, width, encoding, given.u32(), given.octets())
-
-
-def _compressed(given: Reader) -> CompressedImage:
-    stamp, frame = given.header()
-    return CompressedImage(stamp, frame, given.string(), given.octets())
-
-
-def _pose(given: Reader) -> PoseStamped:
-    stamp, frame = given.header()
-    return PoseStamped(stamp, frame, given.doubles(7))
-
-
-_READ: dict[MessageName, Callable[[Reader], Message]] = {
-    "JointState": _joint_state,
-    "Image": _image,
-    "CompressedImage": _compressed,
-    "PoseStamped": _pose,
-}
+    return fields.write(message, Writer())

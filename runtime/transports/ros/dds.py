@@ -12,7 +12,6 @@ import logging
 import threading
 from collections.abc import Mapping
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 from runtime.errors import SetupError, TransportError
 from runtime.transports.ros.messages import PACKAGES
@@ -30,6 +29,9 @@ log = logging.getLogger(__name__)
 LOOPBACK, ENVIRONMENT = "loopback", "environment"
 _WAKE_NS = 100_000_000  # how soon the reader notices that it is to end
 _TAKEN = 64
+_RECEIVED = (
+    "16MB"  # kept by the kernel, as far as it permits: three raw pictures are more than the usual 1 MB
+)
 _MOST_ENDPOINTS = 2000
 _POLICIES = {
     2: "durability", 4: "deadline", 5: "latency_budget", 6: "ownership", 8: "liveliness", 10: "partition",
@@ -43,6 +45,8 @@ def configuration(network: str, peers: tuple[str, ...] = ()) -> str | None:
     On loopback there is no multicast: participants look for each other by address, at the first 30 ports of the
     domain. That finds nodes of Cyclone DDS 0.10 (Jazzy) and 11 so configured, and Fast DDS.
     """
+    from xml.sax.saxutils import quoteattr  # it brings HTTP and TLS along
+
     if network == ENVIRONMENT:
         return None
     local = network == LOOPBACK
@@ -55,11 +59,13 @@ def configuration(network: str, peers: tuple[str, ...] = ()) -> str | None:
         + "</General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
         "<MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>"
         + (f"<Peers>{found}</Peers>" if found else "")
-        + "</Discovery></Domain></CycloneDDS>"
+        + f'</Discovery><Internal><SocketReceiveBufferSize max="{_RECEIVED}"/></Internal></Domain></CycloneDDS>'
     )
 
 
 def _interface(network: str) -> str:
+    from xml.sax.saxutils import quoteattr
+
     kind = "address" if network.replace(".", "").isdigit() or ":" in network else "name"
     return f"{kind}={quoteattr(network)}"
 

@@ -32,8 +32,9 @@ class JointOrder:
     names = "ignore" the first numbers count as they come.
     """
 
-    def __init__(self, part: Part, names: Names) -> None:
+    def __init__(self, part: Part, names: Names, key: str = "transport.topics.groups") -> None:
         self._part = part
+        self._key = f"{key}.{part.of}.joints"  # of the deployment, for sentences
         self._check = names == "check"
         self._seen: tuple[str, ...] | None = None
         self._order: list[int] = []
@@ -73,7 +74,7 @@ class JointOrder:
             raise Unusable(
                 "joint_names",
                 f"the joints {', '.join(names)} {wrong}; expected {', '.join(wanted)} "
-                f"(transport.topics.groups.{self._part.of}.joints says what messages call them)",
+                f"({self._key} says what messages call them)",
             )
         return [names.index(name) for name in wanted]
 

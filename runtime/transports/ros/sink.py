@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -20,10 +19,6 @@ from runtime.types import EEF_WIDTH, Float32, RobotCommand
 if TYPE_CHECKING:
     from robots import Robot
     from runtime.transports.ros.middleware import Quality
-
-
-log = logging.getLogger(__name__)
-_LOOK_S = 2.0
 
 
 class RosSink(Sink):
@@ -47,14 +42,11 @@ class RosSink(Sink):
         self._posed = any(outlet.message == "PoseStamped" for outlet in outlets)
         self._middleware: Middleware | None = None
         self._publish: list[tuple[Outlet, Publish]] = []
-        self._look_at = 0.0
-        self._unheard: dict[str, str] = {}
 
     def connect(self) -> None:
         """Advertise every topic; subscribers that are not there yet are found by themselves when they come."""
         self.close()
         self._middleware = middleware = self._open()
-        self._look_at = self._clock.now() + _LOOK_S
         self._publish = [
             (one, middleware.advertise(Topic(one.topic, one.message, self._quality(one.topic))))
             for one in self._outlets
@@ -78,29 +70,11 @@ class RosSink(Sink):
         messages = [self._wire.encode(self._message(one, stamp, action, eef)) for one, _ in self._publish]
         for (_, publish), payload in zip(self._publish, messages, strict=True):
             publish(payload)
-        self._look()
 
     def unheard(self) -> dict[str, str]:
         """The command topics to which nobody listens, and why not where that is known, or ""."""
         matches = {} if self._middleware is None else self._middleware.matches()
         return {topic: match.refused for topic, match in matches.items() if not match.peers or match.refused}
-
-    def _look(self) -> None:
-        """Say now and then who does not hear us, when that has changed."""
-        now = self._clock.now()
-        if now < self._look_at:
-            return
-        self._look_at = now + _LOOK_S
-        try:
-            unheard = self.unheard()
-        except TransportError as error:  # commands go out all the same
-            log.warning("%s", error)
-            return
-        for topic in unheard.keys() - self._unheard.keys():
-            log.warning("%s", unheard[topic] or f"nobody listens to {topic}")
-        for topic in self._unheard.keys() - unheard.keys():
-            log.info("%s is heard", topic)
-        self._unheard = unheard
 
     def close(self) -> None:
         """Withdraw the topics."""

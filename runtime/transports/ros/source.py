@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 _PICTURES_DEPTH = 32  # of a camera; a second of them at 30 Hz
 _HISTORY_S = 1.0
+_LOOK_S = 0.5  # how often it is looked who is at the other side of silent topics
 _GRACE_S = 1.0  # for publishers and us to find each other
+_JUMPED = "the clock that stamps {} {}: it was set, or its node was started anew"
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +129,11 @@ class RosSource(Source):
             jumps = {"clock_backwards": self._ros.backwards, "clock_forwards": self._ros.forwards}
         return counts | {name: count for name, count in jumps.items() if count}
 
+    def why(self, fault: str) -> str:
+        """The newest sentence of a fault."""
+        with self._changed:
+            return self._sentences.get(fault, "")
+
     def news(self) -> list[Event]:
         """Why no frame comes: a stream that is silent, with its age, and who is at the other side of its topic."""
         told, self._news = self._news, []
@@ -160,6 +167,7 @@ class RosSource(Source):
         self._assembly = Assembly(self._robot, self._parts, self._terms.detect_frozen)
         self._faults: Counter[str] = Counter()
         self._last_fault = ""
+        self._sentences: dict[str, str] = {}  # by fault, the newest
         self._refusals: dict[str, tuple[str, str]] = {}  # by stream: why its newest message is unusable
         self._heard_at: dict[str, float] = {}
         self._stalled: set[str] = set()
@@ -167,7 +175,7 @@ class RosSource(Source):
         self._news = []
         self._cursor = None
         self._count = 0
-        self._began = self._framed_at = 0.0
+        self._began = self._framed_at = self._look_at = 0.0
 
     def _taker(self, one: Heard) -> Callable[[bytes], None]:
         def take(payload: bytes) -> None:
@@ -175,7 +183,7 @@ class RosSource(Source):
             try:
                 message = self._wire.decode(one.topic.message, payload)
             except CodecError as error:
-                self._blame("malformed", f"{one.topic.name}: {error}")
+                self._blame("malformed", f"{one.topic.name}: {error}", *(part.name for part in one.parts))
                 return
             for part in one.parts:
                 self._take(part, message, arrived)
@@ -195,18 +203,22 @@ class RosSource(Source):
             self._blame("reader_failed", f"{part.topic}: {type(error).__name__}: {error}", part.name)
             return
         with self._changed:
-            before = self._ros.backwards
+            before, leaps = self._ros.backwards, self._ros.forwards
             ours = self._ros.see(part.name, stamp, arrived)
             if self._ros.backwards > before:
                 self.alignment.clear()
                 self._cursor = None
+                self._sentences["clock_backwards"] = _JUMPED.format(part.name, "went back")
+            if self._ros.forwards > leaps:
+                self._sentences["clock_forwards"] = _JUMPED.format(part.name, "leapt ahead")
             if self.alignment.add(part.name, Sample(stamp, arrived, Received(value, ours))):
                 self._heard_at[part.name] = arrived
                 self._refusals.pop(part.name, None)
                 self._changed.notify_all()
             else:
                 self._faults["not_newer"] += 1
-                self._refusals[part.name] = ("not_newer", "its stamps do not advance")
+                text = self._sentences["not_newer"] = "its stamps do not advance"
+                self._refusals[part.name] = ("not_newer", text)
 
     def _stamp(self, message: Message, arrived: float) -> float:
         if not self._terms.stamped:
@@ -222,34 +234,40 @@ class RosSource(Source):
         """Count each stream that has just stalled."""
         now = self.stalled()
         for name in now.keys() - self._stalled:
-            self._faults[f"stalled_{name.replace(' ', '_')}"] += 1
-            self._last_fault = self._silence(name, now[name], Match(1))
+            fault = f"stalled_{name.replace(' ', '_')}"
+            self._faults[fault] += 1
+            self._last_fault = self._sentences[fault] = self._silence(name, now[name], Match(1))
         self._stalled = set(now)
 
     def _complain(self) -> None:
         """Tell why no frame comes, once per reason; says nothing while streams are merely on their way."""
         with self._changed:
             stalled = self.stalled()
-            fresh = {self._reason(name): name for name in stalled}
             apart = [] if stalled or self._waited() <= self._terms.stalled else self.alignment.apart()
-        fresh = {reason: name for reason, name in fresh.items() if reason not in self._told}
         if apart and "apart" not in self._told:
             self._told.add("apart")
             self._tell(self._distance(apart))
-        if not fresh:
+        if not stalled or (
+            self._clock.now() < self._look_at and self._told.issuperset(self._reasons(stalled))
+        ):
             return
         assert self._middleware is not None
+        self._look_at = self._clock.now() + _LOOK_S
         try:
             matches = self._middleware.matches()
         except TransportError as error:
             log.warning("%s", error)
             matches = {}
-        self._told |= fresh.keys()
-        sentences = [
-            self._silence(name, stalled[name], matches.get(self._topics[name].name, Match(1)))
-            for name in fresh.values()
-        ]
-        self._tell("; ".join(sentences))
+        found = {name: matches.get(self._topics[name].name, Match(1)) for name in stalled}
+        causes = {name: {self._reason(name), f"{name}: {found[name].refused}"} for name in found}
+        fresh = {name: found[name] for name in found if not causes[name] <= self._told}
+        for name in fresh:
+            self._told |= causes[name]
+        shared = {match.refused for match in fresh.values()}
+        if len(fresh) > 1 and len(shared) == 1 and any(shared) and not fresh.keys() & self._refusals.keys():
+            self._tell(f"waiting for {', '.join(fresh)}: {shared.pop()}")
+        elif fresh:
+            self._tell("; ".join(self._silence(name, stalled[name], match) for name, match in fresh.items()))
 
     def _tell(self, sentence: str) -> None:
         self._last_fault = sentence
@@ -257,6 +275,9 @@ class RosSource(Source):
 
     def _waited(self) -> float:
         return self._clock.now() - self._framed_at
+
+    def _reasons(self, names: Iterable[str]) -> set[str]:
+        return {self._reason(name) for name in names}
 
     def _reason(self, name: str) -> str:
         """What is said once: a stream's silence, or what is wrong with its messages."""
@@ -282,11 +303,11 @@ class RosSource(Source):
             "(transport.max_skew_s)"
         )
 
-    def _blame(self, fault: str, text: str, stream: str = "") -> None:
+    def _blame(self, fault: str, text: str, *streams: str) -> None:
         with self._changed:
             self._faults[fault] += 1
-            self._last_fault = text
-            if stream:
+            self._last_fault = self._sentences[fault] = text
+            for stream in streams:
                 self._refusals[stream] = (fault, text)
 
 

@@ -8,6 +8,7 @@ import pytest
 from runtime.cameras.attached import Attached
 from runtime.cameras.base import Camera, Condition, Health, Shot
 from runtime.clock import VirtualClock
+from runtime.messages import Event
 from runtime.transports.base import Source
 from runtime.types import Observation
 
@@ -21,6 +22,7 @@ class Robot(Source):
     def __init__(self, clock: VirtualClock) -> None:
         self.clock, self.heard = clock, []
         self.silent = False
+        self.told: list[Event] = []
 
     def connect(self) -> None:
         self.heard.append("connect")
@@ -42,6 +44,13 @@ class Robot(Source):
 
     def faults(self) -> dict[str, int]:
         return {"malformed": 1}
+
+    def why(self, fault: str) -> str:
+        return f"why {fault}"
+
+    def news(self) -> list[Event]:
+        told, self.told = self.told, []
+        return told
 
 
 class Hand(Camera):
@@ -134,6 +143,13 @@ def test_both_hear_of_connection_runs_and_end(bench: Bench) -> None:
     assert bench.robot.heard == ["connect", "begin_run", "end_run", "close"]
     assert bench.camera.heard == ["start", "begin_run", "end_run", "leave", "close"]
     assert bench.source.faults() == {"malformed": 1, "camera_clock_jumped_wrist": 2}
+
+
+def test_what_the_robots_own_link_says_is_said_too(bench: Bench) -> None:
+    bench.robot.told = [Event("source_waiting", "waiting for the node", 100.0)]
+    assert bench.told() == [("source_waiting", "waiting for the node")]
+    assert bench.told() == []
+    assert bench.source.why("malformed") == "why malformed"
 
 
 def test_that_a_camera_is_a_video_is_said_once(bench: Bench) -> None:

@@ -12,7 +12,7 @@ from runtime.cameras.live import LiveCamera
 from runtime.clock import MonotonicClock, VirtualClock
 from runtime.errors import ConfigurationError, SetupError
 from runtime.family import Plan
-from runtime.transports.zmq import NodeSource
+from runtime.transports.node_source import NodeSource
 
 HIGH = {"kind": "mjpeg", "url": "http://127.0.0.1:1/x"}
 

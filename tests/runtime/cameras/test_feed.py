@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import gc
+import weakref
 from pathlib import Path
 
 import av
@@ -7,7 +9,7 @@ import numpy as np
 import pytest
 
 from runtime.cameras.base import Address, CameraError
-from runtime.cameras.feed import Feed
+from runtime.cameras.feed import Backlog, Feed
 from runtime.sim.mjpeg_server import MjpegServer
 from tests.runtime.cameras.movies import movie, number_of
 
@@ -26,6 +28,19 @@ def test_a_file_is_read_to_its_end_with_the_stamp_of_each_picture(tmp_path: Path
     feed.close()
 
 
+def test_what_is_closed_goes_with_its_decoder_and_without_the_collector(tmp_path: Path) -> None:
+    feed = opened(movie(tmp_path / "film.mp4", pictures=5))
+    gc.disable()
+    try:
+        assert feed.read() is not None
+        feed.close()
+        kept = weakref.ref(feed)
+        del feed
+        assert kept() is None
+    finally:
+        gc.enable()
+
+
 def test_a_stream_without_a_time_of_its_own_has_no_stamps() -> None:
     server = MjpegServer()
     url = server.start()
@@ -35,6 +50,45 @@ def test_a_stream_without_a_time_of_its_own_has_no_stamps() -> None:
     assert frame.stamp is None
     feed.close()
     server.close()
+
+
+def test_of_a_stream_without_stamps_that_is_read_too_slowly_what_has_waited_is_passed_over() -> None:
+    server = MjpegServer(rate=1e6)  # as fast as it is taken
+    url = server.start()
+    feed = Feed(Address(url, url, "mpjpeg", stamped=False), 2.0, 2.0)
+    for _ in range(10):
+        assert feed.read() is not None
+    feed.close()
+    server.close()
+    assert server.sent > 100
+
+
+def test_of_a_file_no_picture_is_passed_over_however_fast_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "film.avi"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mjpeg", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+        for _ in range(30):
+            picture = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+    feed = opened(path)
+    read = [feed.read() for _ in range(30)]
+    feed.close()
+    assert None not in read
+
+
+def test_a_backlog_begins_with_the_third_packet_in_a_row_and_ends_with_a_wait() -> None:
+    backlog = Backlog()
+    assert [backlog.passes(waited) for waited in (0.03, 0.0, 0.0, 0.0, 0.0, 0.03, 0.0)] == [
+        False, False, False, True, True, False, False,
+    ]  # fmt: skip
+
+
+def test_of_a_stream_that_never_pauses_something_is_shown() -> None:
+    backlog = Backlog()
+    passed = [backlog.passes(0.0) for _ in range(1000)]
+    assert passed.count(False) == 2 + 10
 
 
 def test_a_file_with_sound_alone_says_what_it_has(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ _TICK_S = 0.003  # ten times as fast as life
 
 
 class Bench:
-    """Ticks in a thread; `channel` is its door's endpoint."""
+    """Ticks in a thread, one of its `threads`; `channel` is its door's endpoint."""
 
     def __init__(self, folder, silence_s=60.0, scripts="apart", **settings):
         self.context = zmq.Context()
@@ -37,8 +37,8 @@ class Bench:
             self.context, 0, Names("lab", scripts), silence_s, lambda name: StationClient(self.folder, name)
         )
         self.channel = self.door.endpoint
-        self._threads = [threading.Thread(target=run) for run in (self._tick, self._press, self._listen)]
-        for thread in self._threads:
+        self.threads = [threading.Thread(target=run) for run in (self._tick, self._press, self._listen)]
+        for thread in self.threads:
             thread.start()
 
     def _tick(self):
@@ -76,7 +76,7 @@ class Bench:
 
     def close(self):
         self._ended.set()
-        for thread in self._threads:
+        for thread in self.threads:
             thread.join(10)
         for script in self._open:
             script.close()

@@ -6,12 +6,10 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-import zmq
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from runtime.channel.door import Names
-from runtime.channel.message import LARGEST
 from runtime.client import Refused, StationClient
 from runtime.transitions import State
 from tests.processes import eventually
@@ -104,44 +102,6 @@ def test_queries_have_the_older_form(start):
     assert "web:setup" in script.query("commands")["cmd"]
 
 
-@pytest.mark.parametrize(
-    ("frame", "error"),
-    [
-        (b"[]", "message must be a JSON object"),
-        (b"{}", "message must carry 'cmd' or 'query'"),
-        (b'{"cmd": "start"}', "command must start with 'web:', got 'start'"),
-        (b'{"cmd": "web:dance:now"}', "command not allowed: 'web:dance:now'"),
-        (b'{"query": "moon"}', "unknown query: 'moon'"),
-        (b'{"query": "events", "since": -1}', "since = -1: must be a whole number"),
-        (b'{"query": "result", "id": []}', "id = []: must be a UUID"),
-        (b"\x93NUMPY", "recv failed: "),
-        (b'"' + b"x" * LARGEST + b'"', "recv failed: "),
-        (b'{"command": "fly"}', "unknown command 'fly'; known: setup, run, stop"),
-        (b'{"command": "claim", "arguments": {"a": 1}}', "claim takes no arguments; given: a"),
-        (b'{"command": "aim", "arguments": {"kind": 1, "timeout": 2}}', "kind"),
-        (b'{"query": "result"}', "id = None: no command of that id"),
-        (b'{"command": "setup", "arguments": {"task": "\\ud800"}}', "surrogates not allowed"),
-        (
-            b'{"command": "setup", "arguments": {"bench": {"seed": 99999999999999999999999999}}}',
-            "cannot pack",
-        ),
-    ],
-)
-def test_what_cannot_be_done_is_a_sentence_and_the_channel_goes_on(start, frame, error, caplog):
-    script = start().script()
-    answer = script.raw(frame)
-    assert answer["ok"] is False
-    assert error in answer["error"]
-    assert answer["error"]
-    assert script.query("status")["state"] == "idle"
-
-
-def test_more_than_one_frame_is_an_error_and_not_two_messages(start):
-    script = start().script()
-    assert "one frame of JSON, and 2 came" in script.raw(b'{"cmd": "web:setup"}', b"{}")["error"]
-    assert script.query("status")["state"] == "idle"
-
-
 def test_the_script_of_the_document_sets_up_and_runs(start):
     bench = start()
     document = (ROOT / "docs/control-channel.md").read_text("utf-8")
@@ -164,6 +124,10 @@ def test_arguments_are_checked_before_the_answer_and_nothing_is_changed(start):
     script = bench.script()
     assert "duration_s" in refused(script.command("run", duration_s=-1))
     assert "timeout" in refused(script.command("run", timeout=1e9))  # a word of the client's own
+    aim = {"command": "aim", "arguments": {"kind": 1, "timeout": 2}}
+    eventually(
+        lambda: "kind" in script.send(**aim)["error"], 20, "what is wrong with it, once it can be solved"
+    )
     assert "colour" in refused(script.command("setup", colour="red"))
     assert "k_max" in refused(script.cmd('update_infer_params:{"k_max": "many"}'))
     assert "needs 14 finite numbers" in refused(script.cmd('init_move:{"qpos": [0]}'))
@@ -408,17 +372,6 @@ def noisy(tmp_path_factory):
     yield script
     assert script.query("status")["state"] == "idle"
     bench.close()
-
-
-def test_a_peer_that_is_no_req_socket_is_answered_in_its_own_form(start):
-    bench = start()
-    with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
-        peer.linger = 0
-        peer.connect(bench.channel)
-        peer.send(b'{"query": "status"}')
-        assert peer.poll(5000)
-        (answer,) = peer.recv_multipart()
-        assert json.loads(answer)["ok"] is True
 
 
 def test_the_names_of_holders_cannot_be_those_of_others():

@@ -36,10 +36,10 @@ class World:
             "test", self.clerk, lambda to, answer: self.replies.put(answer), lambda: self.stops, keep
         )
 
-    def put(self, name, form="cmd", came=None, stops=0):
+    def put(self, name, form="cmd", came=None, stops=0, of=b"x"):
         message = Message(form, name, {"cmd": f"web:{name}"})
         came = time.monotonic() if came is None else came
-        return self.lane.put(Job([b"x", b""], "me", message, came, stops))
+        return self.lane.put(Job([of, b""], "me", message, came, stops))
 
     def reply(self):
         return self.replies.get(timeout=PATIENCE)
@@ -92,7 +92,35 @@ def test_what_waits_while_a_stop_comes_is_not_carried_out_after_it(world):
 def test_a_full_inbox_takes_no_more(world):
     world.put("slow")
     assert world.clerk.began.wait(PATIENCE)
-    assert [world.put("a") for _ in range(module.WAITING + 1)] == [True] * module.WAITING + [False]
+    found = [world.put("a", of=b"%d" % number) for number in range(module.WAITING + 1)]
+    assert found == [True] * module.WAITING + [False]
+
+
+def test_one_connection_cannot_take_the_room_of_others(world):
+    world.put("slow")
+    assert world.clerk.began.wait(PATIENCE)
+    assert [world.put("a") for _ in range(module.EACH + 1)] == [True] * module.EACH + [False]
+    assert world.put("b", of=b"another")
+    world.clerk.let_go.set()
+    assert [world.reply()["name"] for _ in range(module.EACH + 2)][-1] == "b"
+    assert [world.put("a") for _ in range(module.EACH)] == [True] * module.EACH
+
+
+@pytest.mark.parametrize(("keep", "carried_out"), [(lambda: None, 1), (None, 4)])
+def test_a_lane_that_ends_answers_what_it_is_about_and_stops_alone_to_the_last(keep, carried_out):
+    world = World(keep)
+    world.put("slow")
+    assert world.clerk.began.wait(PATIENCE)
+    for _ in range(3):
+        world.put("a")
+    ending = threading.Thread(target=world.lane.end, args=(PATIENCE,))
+    ending.start()
+    while not world.lane._over.is_set():
+        time.sleep(0.001)
+    world.clerk.let_go.set()
+    ending.join(PATIENCE)
+    assert world.clerk.closed
+    assert world.replies.qsize() == carried_out
 
 
 def test_what_is_due_is_done_with_messages_and_without_and_may_fail():

@@ -263,3 +263,17 @@ def test_the_document_says_of_every_verb_what_it_comes_to():
     document = (ROOT / "docs/control-channel.md").read_text("utf-8").splitlines()
     rows = [f"| `web:{verb}` | {what.ours} |" for verb, what in VERBS.items()]
     assert [line for line in document if line.startswith("| `web:")] == rows
+
+
+def test_where_a_person_is_to_drive_collecting_is_a_run():
+    def steps(verb, episode=None, **selected):
+        made = scene(verb, "running" if episode else "ready", Selection(**selected))
+        made.status["collect"] = {"set_up": True, "armed": True, "episode": episode}
+        return [(kind, dict(arguments)) for kind, arguments in deed(made).steps]
+
+    assert steps("collect_start", collect_task="wipe") == [("run", {"mode": "collect", "task": "wipe"})]
+    assert steps("collect_start") == [("run", {"mode": "collect"})]
+    assert steps("collect_stop", "e") == [("stop", {})]
+    assert steps("collect_cancel", "e") == [("discard", {})]
+    with pytest.raises(NotOurs, match="web:collect_stop"):
+        steps("collect_cancel")

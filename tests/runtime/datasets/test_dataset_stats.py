@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -15,6 +15,7 @@ from tests.runtime.datasets.small import picture, write_video
 ROWS = arrays(np.float32, st.tuples(st.integers(1, 9), st.just(3)), elements=st.floats(-100, 100, width=32))
 
 
+@settings(deadline=None)
 @given(parts=st.lists(ROWS, min_size=1, max_size=5))
 def test_statistics_of_parts_together_are_those_of_the_whole(parts: list[np.ndarray]) -> None:
     statistics = [{"x": statistic} for part in parts if (statistic := column_statistic(part))]
@@ -32,6 +33,11 @@ def test_a_scalar_column_has_one_figure_each() -> None:
         "mean": [3.0],
         "std": [pytest.approx(np.std([1, 2, 6]))],
         "count": [3],
+        "q01": [pytest.approx(1.02)],
+        "q10": [pytest.approx(1.2)],
+        "q50": [2.0],
+        "q90": [pytest.approx(5.2)],
+        "q99": [pytest.approx(5.92)],
     }
 
 

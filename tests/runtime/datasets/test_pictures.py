@@ -76,3 +76,60 @@ def test_a_file_that_is_no_video_is_named(tmp_path: Path) -> None:
         Pictures(tmp_path / "film.mp4")
     with pytest.raises(RecordingError, match=r"no video .*absent\.mp4"):
         Pictures(tmp_path / "absent.mp4")
+
+
+def damage(path: Path, frame: int) -> None:
+    """Overwrite the middle of what is stored of frame number `frame`, in the order of decoding."""
+    import av
+
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+        start, size = packets[frame].pos, packets[frame].size
+    content = bytearray(path.read_bytes())
+    content[start + 8 : start + size] = np.random.default_rng(1).bytes(size - 8)
+    path.write_bytes(content)
+
+
+def noise(path: Path, frames: int) -> None:
+    import av
+
+    draw = np.random.default_rng(0)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.options = {"g": "4", "bf": "0"}
+        for _ in range(frames):
+            pixels = draw.integers(0, 255, (48, 64, 3), dtype=np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def test_a_damaged_frame_is_an_error_and_never_a_guess(tmp_path: Path) -> None:
+    path = tmp_path / "film.mp4"
+    noise(path, 12)
+    with Pictures(path) as pictures:
+        whole = [pictures[k] for k in range(12)]
+    damage(path, 4)
+    with Pictures(path) as pictures:
+        for k in (0, 3, 8, 11):
+            assert np.array_equal(pictures[k], whole[k])
+        with pytest.raises(RecordingError, match=r"film\.mp4, frame 4 cannot be decoded"):
+            pictures[4]
+        assert np.array_equal(pictures[9], whole[9])
+
+
+def test_going_backwards_decodes_a_group_a_few_times_and_not_once_a_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames, kept = 40, 12
+    path = tmp_path / "film.mp4"
+    write_video(path, frames, 30)
+    monkeypatch.setattr("runtime.datasets.pictures.KEPT_BYTES", kept * 48 * 64 * 3 // 2)
+    with Pictures(path) as pictures:
+        seeks = []
+        seek = pictures._seek
+        monkeypatch.setattr(pictures, "_seek", lambda index: (seeks.append(index), seek(index)))
+        shades = [float(pictures[k].mean()) for k in reversed(range(frames))]
+    assert seeks == [39, 27, 15, 3]
+    with Pictures(path) as pictures:
+        assert shades == [float(pictures[k].mean()) for k in range(frames)][::-1]

@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import threading
 import uuid
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,15 @@ from runtime.datasets.mapping import ColumnMapping
 from runtime.datasets.published import publish
 from runtime.datasets.reader import open_dataset
 from runtime.errors import RecordingError
+from runtime.recording.base import Outcome
+from runtime.recording.episode import EpisodeJournal
 from runtime.recording.reader import open_episode
-from tests.runtime.datasets.small import CAMERAS, JOINTS, picture, record, row, seen
+from runtime.recording.settings import RecordingSettings
+from runtime.recording.video import FragmentedVideo
+from tests.runtime.datasets.small import CAMERAS, JOINTS, manifest, picture, record, row, seen
 from tests.runtime.recording.test_tables import old_raw
 
-STRANGER = Path(__file__).parents[2] / "conformance" / "read_lerobot_v21.py"
+CONFORMANCE = Path(__file__).parents[2] / "conformance"
 WHOLE = ColumnMapping(
     eef="eef_state", velocity="joint_velocity", effort="joint_effort", action_eef="eef_action"
 )
@@ -31,8 +36,9 @@ WHOLE = ColumnMapping(
 
 def stranger(dataset: Path) -> dict[str, Any]:
     """What a program that knows only the format reads, in a process of its own."""
+    script = CONFORMANCE / f"read_lerobot_{info(dataset)['codebase_version'].replace('.', '')}.py"
     done = subprocess.run(
-        [sys.executable, "-I", str(STRANGER), str(dataset)], capture_output=True, text=True, check=True
+        [sys.executable, "-I", str(script), str(dataset)], capture_output=True, text=True, check=True
     )
     report: dict[str, Any] = json.loads(done.stdout)
     return report
@@ -279,12 +285,89 @@ def test_an_episode_without_rows_is_refused(tmp_path: Path) -> None:
         publish(record(tmp_path / "episodes", frames=0), tmp_path / "set")
 
 
-def test_a_state_that_is_not_finite_is_refused_with_its_row(tmp_path: Path) -> None:
+def test_an_action_that_is_not_finite_is_refused_with_its_row(tmp_path: Path) -> None:
     broken = {3: {"action": np.array([0, np.nan, 0, 0, 0, 0], np.float32)}}
     with pytest.raises(RecordingError, match="action of row 3 is not finite"):
         publish(record(tmp_path / "episodes", frames=5, rows=broken), tmp_path / "set")
     assert not (tmp_path / "set/meta/info.json").exists()
     assert publish(record(tmp_path / "episodes", frames=5), tmp_path / "set").episode_index == 0
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_what_was_observed_and_is_not_finite_is_zero_flagged_and_never_dropped(
+    tmp_path: Path, version: str
+) -> None:
+    whole = row(0)
+    assert whole.qvel is not None
+    broken = {
+        2: {"qpos": np.array([0.5, np.nan, 0.5, 0.5, np.inf, 0.5], np.float32)},
+        4: {"qvel": np.full_like(whole.qvel, -np.inf), "effort": None},
+    }
+    done = publish(record(tmp_path / "episodes", frames=6, rows=broken), tmp_path / "set", version=version)
+    assert done.frames == 6
+    episode = open_dataset(tmp_path / "set").episode(0, WHOLE)
+    assert episode.qpos[2].tolist() == [0.5, 0.0, 0.5, 0.5, 0.0, 0.5]
+    assert episode.qvel is not None
+    assert episode.effort is not None
+    assert episode.qvel[4].tolist() == [0.0] * len(whole.qvel)
+    assert np.isnan(episode.effort[4]).all(), "not measured is no measurement that is broken"
+    (data,) = (tmp_path / "set/data").rglob("*.parquet")
+    assert pq.read_table(data)["not_finite"].to_pylist() == [False, False, True, False, True, False]
+    assert check(tmp_path / "set") == []
+
+
+def test_a_dataset_from_before_a_flag_stays_as_it_is_unless_the_flag_is_needed(tmp_path: Path) -> None:
+    later = ("skewed", "not_finite", "lost.", "stale.")
+    publish(record(tmp_path / "episodes", frames=5), tmp_path / "set")
+    known = info(tmp_path / "set")
+    assert {
+        "skewed",
+        "not_finite",
+        *(f"{flag}{camera.split('.')[-1]}" for flag in later[2:] for camera in CAMERAS),
+    } <= {key.replace("observation.images.", "") for key in known["features"]}
+    old = {key: value for key, value in known["features"].items() if not key.startswith(later)}
+    (tmp_path / "set/meta/info.json").write_text(json.dumps(known | {"features": old}))
+    path = tmp_path / "set/data/chunk-000/episode_000000.parquet"
+    pq.write_table(pq.read_table(path).select([key for key in old if old[key]["dtype"] != "video"]), path)
+    assert publish(record(tmp_path / "episodes", frames=5), tmp_path / "set").episode_index == 1
+    assert table(tmp_path / "set", 1).column_names == table(tmp_path / "set", 0).column_names
+    broken = {1: {"qpos": np.full(len(JOINTS), np.nan, np.float32)}}
+    with pytest.raises(
+        RecordingError, match="not finite in 1 rows, the first is 1, and the dataset has no column"
+    ):
+        publish(record(tmp_path / "episodes", frames=5, rows=broken), tmp_path / "set")
+
+
+def test_an_episode_that_lost_a_camera_is_refused_with_its_row_and_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = FragmentedVideo.encode
+
+    def failing(video: FragmentedVideo, picture: Any) -> None:
+        if video.frames == 4 and threading.current_thread().name == f"encoder {CAMERAS[1]}":
+            raise ValueError("out of order")
+        real(video, picture)
+
+    monkeypatch.setattr(FragmentedVideo, "encode", failing)
+    episode = record(tmp_path / "episodes", frames=9)
+    assert (open_episode(episode).frames, open_episode(episode).shown(CAMERAS[1])) == (9, 4)
+    with pytest.raises(RecordingError, match=f"the video of {CAMERAS[1]} ends at row 4 of 9: .*out of order"):
+        publish(episode, tmp_path / "set")
+
+
+def test_videos_of_another_encoder_are_said_to_be_what_they_are(tmp_path: Path) -> None:
+    journal = EpisodeJournal(tmp_path, RecordingSettings(min_free_bytes=0, codec="libsvtav1"), patient=True)
+    journal.begin(told := manifest())
+    for index in range(8):
+        journal.append(row(index))
+    journal.end(Outcome("finished", "", 1.7e9))
+    publish(tmp_path / told["uuid"], tmp_path / "set")
+    videos = [
+        feature for feature in info(tmp_path / "set")["features"].values() if feature["dtype"] == "video"
+    ]
+    assert [video["info"]["video.codec"] for video in videos] == ["av1"] * len(CAMERAS)
+    with open_dataset(tmp_path / "set").episode(0).pictures(CAMERAS[0]) as pictures:
+        assert [seen(pictures[k]) for k in range(8)] == list(range(8))
 
 
 @pytest.mark.parametrize(
@@ -336,7 +419,7 @@ def test_an_episode_of_another_length_is_refused_in_its_place(tmp_path: Path) ->
         publish(record(tmp_path / "b", frames=6, uuid=name), tmp_path / "set")
 
 
-def _publish_until(episode: Path, dataset: Path, steps: int) -> None:
+def _publish_until(episode: Path, dataset: Path, steps: int, version: str | None = None) -> None:
     """Publish in a process that dies, as by a power cut, at rename number `steps`."""
     real, left = os.replace, steps
 
@@ -349,21 +432,21 @@ def _publish_until(episode: Path, dataset: Path, steps: int) -> None:
         real(source, target)
 
     staging.os.replace = replace  # type: ignore[assignment]
-    publish(episode, dataset)
+    publish(episode, dataset, version=version)
     os._exit(0)
 
 
-def _die(episode: Path, dataset: Path, steps: int) -> int:
+def _die(episode: Path, dataset: Path, steps: int, version: str | None = None) -> int:
     context = multiprocessing.get_context("spawn")
-    process = context.Process(target=_publish_until, args=(episode, dataset, steps))
+    process = context.Process(target=_publish_until, args=(episode, dataset, steps, version))
     process.start()
     process.join()
     assert process.exitcode is not None
     return process.exitcode
 
 
-# tasks, two videos, parquet, statistics twice, our lines, episodes, info (the first adds modality.json)
-RENAMES = 9
+# tasks, two videos, streams, parquet, statistics twice, our lines, episodes, info (the first adds modality.json)
+RENAMES = 10
 
 
 @pytest.mark.parametrize("steps", range(RENAMES))
@@ -469,6 +552,112 @@ def test_two_publishers_at_once_get_two_indices(tmp_path: Path) -> None:
     assert sorted(line["uuid"] for line in lines(dataset / "meta/eva_episodes.jsonl")) == sorted(
         episode.name for episode in episodes
     )
+    assert check(dataset) == []
+
+
+# --- v3.0 --------------------------------------------------------------------------------------------------
+
+# tasks, two videos, streams, parquet, statistics, our lines, episodes, info
+RENAMES_V30 = 9
+
+
+def test_v30_is_written_where_it_is_asked_for_and_kept(tmp_path: Path) -> None:
+    episodes = [
+        record(tmp_path / "episodes", frames=n, seed=n, task=task) for n, task in ((20, "a"), (7, "b"))
+    ]
+    publish(episodes[0], tmp_path / "set", version="v3.0", success=True)
+    done = publish(episodes[1], tmp_path / "set", success=False)
+    assert (done.episode_index, info(tmp_path / "set")["codebase_version"]) == (1, "v3.0")
+    assert check(tmp_path / "set") == []
+    report = stranger(tmp_path / "set")
+    assert report["broken"] == []
+    assert report["policy_outputs"] == ["action"]
+    assert report["policy_inputs"] == ["observation.state", *(f"observation.images.{c}" for c in CAMERAS)]
+    for index, (n, task) in enumerate(((20, "a"), (7, "b"))):
+        episode = open_dataset(tmp_path / "set").episode(index, WHOLE)
+        rows = [row(k, seed=n) for k in range(n)]
+        assert episode.task == task
+        assert np.array_equal(episode.qpos, [one.qpos for one in rows])
+        assert episode.action is not None
+        assert np.array_equal(episode.action, [one.action for one in rows])
+        assert report["episodes"][index]["tasks"] == [task]
+        for camera in CAMERAS:
+            expected = [float(picture(k).mean()) for k in range(n)]
+            read = report["episodes"][index]["brightness"][f"observation.images.{camera}"]
+            assert read == pytest.approx(expected, abs=2)
+    assert report["episodes"][0]["sums"]["next.success"] == 1
+    assert sorted(path.name for path in (tmp_path / "set/data/chunk-000").iterdir()) == [
+        "file-000.parquet",
+        "file-001.parquet",
+    ]
+
+
+def test_a_version_that_a_dataset_does_not_have_is_refused(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes", frames=3), tmp_path / "set")
+    with pytest.raises(RecordingError, match=r"is of version v2\.1, not v3\.0"):
+        publish(record(tmp_path / "episodes", frames=3), tmp_path / "set", version="v3.0")
+    with pytest.raises(RecordingError, match=r"version is 'v2\.0', published are"):
+        publish(record(tmp_path / "episodes", frames=3), tmp_path / "other", version="v2.0")
+
+
+def test_in_v30_the_same_episode_again_is_written_anew_in_its_place(tmp_path: Path) -> None:
+    first, second = (record(tmp_path / "episodes", frames=n, seed=n) for n in (6, 8))
+    for episode in (first, second):
+        publish(episode, tmp_path / "set", success=True, version="v3.0")
+    other = tmp_path / "set/data/chunk-000/file-001.parquet"
+    before = other.read_bytes()
+    done = publish(first, tmp_path / "set", success=False)
+    assert (done.episode_index, done.created) == (0, False)
+    assert other.read_bytes() == before
+    sums = [episode["sums"]["next.success"] for episode in stranger(tmp_path / "set")["episodes"]]
+    assert sums == [0, 1]
+    assert check(tmp_path / "set") == []
+
+
+def test_in_v30_folders_hold_as_many_files_as_the_info_says(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes", frames=3), tmp_path / "set", version="v3.0")
+    (tmp_path / "set/meta/info.json").write_text(json.dumps(info(tmp_path / "set") | {"chunks_size": 2}))
+    for _ in range(2):
+        publish(record(tmp_path / "episodes", frames=3), tmp_path / "set")
+    assert (tmp_path / "set/data/chunk-001/file-000.parquet").is_file()
+    assert (tmp_path / "set/videos/observation.images.cam_high/chunk-001/file-000.mp4").is_file()
+    assert check(tmp_path / "set") == []
+    assert stranger(tmp_path / "set")["broken"] == []
+
+
+@pytest.mark.parametrize("steps", [2, 5, 7, RENAMES_V30 - 1])
+def test_in_v30_a_crash_between_renames_is_taken_back_without_a_trace(tmp_path: Path, steps: int) -> None:
+    dataset = tmp_path / "set"
+    publish(record(tmp_path / "episodes", frames=6), dataset, version="v3.0")
+
+    def contents() -> dict[str, bytes]:
+        return {str(p.relative_to(dataset)): p.read_bytes() for p in dataset.rglob("*") if p.is_file()}
+
+    old = contents()
+    episode = record(tmp_path / "episodes", frames=8, seed=8, task="another")
+    assert _die(episode, dataset, steps) == 9
+    assert [entry.length for entry in open_dataset(dataset).episodes] == [6]
+    with staging.locked(dataset):
+        staging.recover(dataset)
+    assert contents() == old
+    done = publish(episode, dataset)
+    assert (done.episode_index, done.created) == (1, True)
+    assert check(dataset) == []
+    assert stranger(dataset)["broken"] == []
+
+
+def test_in_v30_one_more_rename_than_that_is_not_needed(tmp_path: Path) -> None:
+    dataset = tmp_path / "set"
+    publish(record(tmp_path / "episodes", frames=6), dataset, version="v3.0")
+    assert _die(record(tmp_path / "episodes", frames=8), dataset, RENAMES_V30) == 0
+
+
+@pytest.mark.parametrize("steps", [5, RENAMES_V30])
+def test_in_v30_a_crash_at_the_very_first_episode_leaves_no_dataset(tmp_path: Path, steps: int) -> None:
+    dataset, episode = tmp_path / "set", record(tmp_path / "episodes", frames=4)
+    assert _die(episode, dataset, steps, "v3.0") == 9
+    assert not (dataset / "meta/info.json").exists()
+    assert publish(episode, dataset, version="v2.1").episode_index == 0
     assert check(dataset) == []
 
 

@@ -20,6 +20,7 @@ from robots import Robot, load, names
 from robots.rotations import transform_of
 from runtime.kinematics.base import IkFlag, IkResult, KinematicsError
 from runtime.kinematics.compiled import CompiledKinematics, Config, build
+from runtime.kinematics.kernels import compiling
 from runtime.kinematics.kernels.chains import poses_of
 from runtime.kinematics.kernels.chunks import solve_chunk
 from tests.runtime.kinematics.crane import crane
@@ -470,23 +471,35 @@ def test_kernels_are_kept_in_the_folder_that_is_named(tmp_path: Path) -> None:
     assert [path.suffix for path in sorted(tmp_path.glob("kernels-*/*/*"))] == [".nbc", ".nbi"]
 
 
+def test_that_something_has_to_be_compiled_is_said_before(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(compiling, "is_kept", lambda: False)
+    with caplog.at_level("INFO"):
+        build(Config(), ROBOT)
+    assert "compiling the kinematics for this processor, once" in caplog.text
+
+
 @pytest.mark.slow
 def test_what_is_kept_on_disk_and_broken_is_compiled_again(tmp_path: Path) -> None:
-    build = (
+    code = (
         "import logging, robots; logging.basicConfig(level='INFO'); from runtime.kinematics import compiled; "
         "compiled.build(compiled.Config(), robots.load('ur5e'))"
     )
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    build(Config(), load("ur5e"))  # so that it is kept
+    assert compiling.CACHE is not None
+    shutil.copytree(compiling.CACHE, tmp_path / compiling.CACHE.name)
 
     def started() -> str:
         done = subprocess.run(
-            [sys.executable, "-c", build], env=environment, capture_output=True, text=True, check=True
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
         )
         return done.stderr
 
-    assert "compiling the kinematics for this processor" in started()
     kept = sorted(tmp_path.rglob("*.nbc"))
     assert kept
+    assert started() == ""
     for file in kept:
         file.write_bytes(file.read_bytes()[:100])
     assert "cannot be used as they are kept" in started()

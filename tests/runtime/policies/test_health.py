@@ -1,19 +1,14 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import socket
-import ssl
-import subprocess
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
-from runtime import codecs
 from runtime.clock import MonotonicClock
 from runtime.errors import PolicyError, PolicyLostError
 from runtime.policies import openpi
@@ -21,6 +16,7 @@ from runtime.policies.health import require_healthy
 from runtime.policies.openpi import OpenpiPolicy
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from tests.runtime.policies.peers import FRANKA, seen
+from tests.runtime.policies.tls import Certificate, encrypted, self_signed
 
 
 @contextlib.contextmanager
@@ -85,6 +81,23 @@ def test_nobody_at_the_port_is_said_so() -> None:
         require_healthy(f"ws://127.0.0.1:{port}", "/healthz", {}, 5.0)
 
 
+def test_a_server_that_hangs_up_is_lost() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def hang_up() -> None:
+            peer = listener.accept()[0]
+            peer.recv(65536)
+            peer.close()
+
+        thread = threading.Thread(target=hang_up)
+        thread.start()
+        with pytest.raises(
+            PolicyLostError, match="/healthz gave no answer, the connection was closed at once"
+        ):
+            require_healthy(f"ws://127.0.0.1:{listener.getsockname()[1]}", "/healthz", {}, 5.0)
+        thread.join()
+
+
 def built(url: str, **settings: str) -> OpenpiPolicy:
     config = openpi.Config(url=url, connect_deadline=10.0, **settings)  # type: ignore[arg-type]
     return openpi.build(config, FRANKA, MonotonicClock(), 30.0)
@@ -119,58 +132,12 @@ def test_a_policy_asks_for_it_before_it_connects_where_that_is_configured() -> N
 
 
 @pytest.fixture(scope="module")
-def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Of localhost, signed by itself: certificate and key."""
-    if shutil.which("openssl") is None:
-        pytest.skip("openssl, which makes the certificate, is not installed")
-    folder = tmp_path_factory.mktemp("tls")
-    made, key = folder / "cert.pem", folder / "key.pem"
-    subprocess.run(
-        [
-            *(
-                "openssl",
-                "req",
-                "-x509",
-                "-newkey",
-                "ec",
-                "-pkeyopt",
-                "ec_paramgen_curve:prime256v1",
-                "-nodes",
-            ),
-            *("-days", "2", "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost"),
-            *("-keyout", str(key), "-out", str(made)),
-        ],
-        check=True,
-        capture_output=True,
-    )
-    return made, key
-
-
-@contextlib.contextmanager
-def encrypted(certificate: tuple[Path, Path]) -> Iterator[str]:
-    """A websocket server with TLS that answers with rows; its address."""
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(*certificate)
-
-    def converse(connection: ServerConnection) -> None:
-        assert connection.request is not None
-        connection.send(codecs.pack({"name": connection.request.path}))
-        for _ in connection:
-            connection.send(codecs.pack({"actions": [], "error": "unused"}))
-
-    def admit(connection: ServerConnection, request: Request) -> Response | None:
-        return connection.respond(200, "OK\n") if request.path == "/healthz" else None
-
-    with serve(converse, "127.0.0.1", 0, ssl=context, process_request=admit) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"wss://localhost:{server.socket.getsockname()[1]}/lab/policy?model=a"
-        server.shutdown()
-        thread.join()
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> Certificate:
+    return self_signed(tmp_path_factory.mktemp("tls"))
 
 
 def test_a_server_with_tls_and_a_path_is_reached(
-    certificate: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+    certificate: Certificate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate[0]))
     with (
@@ -182,7 +149,7 @@ def test_a_server_with_tls_and_a_path_is_reached(
 
 @pytest.mark.parametrize("health", [{}, {"health_path": "/healthz"}])
 def test_a_certificate_that_nobody_vouches_for_is_refused(
-    certificate: tuple[Path, Path], health: dict[str, str]
+    certificate: Certificate, health: dict[str, str]
 ) -> None:
     with (
         encrypted(certificate) as url,

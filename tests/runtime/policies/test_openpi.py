@@ -18,9 +18,18 @@ from websockets.sync.server import ServerConnection, serve
 import robots
 from runtime import codecs
 from runtime.clock import MonotonicClock
-from runtime.errors import ConfigurationError, ContradictionError, PolicyError, PolicyLostError
+from runtime.errors import (
+    ConfigurationError,
+    ContradictionError,
+    PolicyError,
+    PolicyGone,
+    PolicyLostError,
+    PolicyTimeout,
+    UnreachableError,
+    WrongProtocolError,
+)
 from runtime.policies import openpi
-from runtime.policies.link import PolicyGone, PolicyTimeout, WebsocketLink, headline
+from runtime.policies.link import WebsocketLink, headline
 from runtime.policies.openpi import Config, OpenpiPolicy
 from runtime.pose_format import PoseFormat
 from runtime.sim.faults import NONE, Fault
@@ -87,7 +96,7 @@ def replying(reply: object, metadata: object = None, seen: list[Any] | None = No
 
 
 @contextlib.contextmanager
-def raw_server(answer: bytes) -> Iterator[int]:
+def raw_server(answer: bytes, end: bool = True) -> Iterator[int]:
     """A TCP server that says `answer` to whoever connects, and nothing more."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         held: list[socket.socket] = []
@@ -99,7 +108,8 @@ def raw_server(answer: bytes) -> Iterator[int]:
                 if answer:
                     peer.recv(65536)
                     peer.sendall(answer)
-                    peer.shutdown(socket.SHUT_WR)
+                    if end:
+                        peer.shutdown(socket.SHUT_WR)
 
         thread = threading.Thread(target=accept)
         thread.start()
@@ -107,6 +117,23 @@ def raw_server(answer: bytes) -> Iterator[int]:
         thread.join()
         for peer in held:
             peer.close()
+
+
+def test_who_hangs_up_at_once_is_lost_whether_or_not_our_first_word_was_out() -> None:
+    tries = 20
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def hang_up() -> None:
+            for _ in range(tries):
+                listener.accept()[0].close()
+
+        thread = threading.Thread(target=hang_up)
+        thread.start()
+        for _ in range(tries):
+            link = WebsocketLink(f"ws://127.0.0.1:{listener.getsockname()[1]}", {}, 10.0)
+            with pytest.raises(PolicyLostError, match="see that the policy server runs"):
+                link.open()
+        thread.join()
 
 
 @contextlib.contextmanager
@@ -438,17 +465,19 @@ def test_a_name_that_is_never_resolved_does_not_outlast_the_deadline(monkeypatch
     monkeypatch.setattr(socket, "getaddrinfo", lambda *given, **options: [None] * (not ended.wait(60)))
     with (
         policy_at("ws://slow.invalid:8000", connect_deadline=0.2) as policy,
-        pytest.raises(PolicyTimeout, match=r"within 0\.2 s"),
+        pytest.raises(UnreachableError, match=r"was not reached within 0\.2 s"),
     ):
         policy.connect()
     ended.set()
 
 
-def test_a_server_of_another_kind_is_said_not_to_speak_websocket() -> None:
+@pytest.mark.parametrize("end", [True, False])
+def test_a_server_of_another_kind_is_said_not_to_speak_websocket(end: bool) -> None:
+    """Also one that waits for the next word, as a real SSH server does."""
     with (
-        raw_server(b"SSH-2.0-OpenSSH_9.6\r\n") as port,
-        policy_at(f"ws://127.0.0.1:{port}") as policy,
-        pytest.raises(PolicyError, match="does not speak websocket"),
+        raw_server(b"SSH-2.0-OpenSSH_9.6\r\n", end) as port,
+        policy_at(f"ws://127.0.0.1:{port}", connect_deadline=1.0) as policy,
+        pytest.raises(WrongProtocolError, match="does not speak websocket"),
     ):
         policy.connect()
 
@@ -876,11 +905,11 @@ def unreachable_port() -> Iterator[int]:
         yield listener.getsockname()[1]
 
 
-def test_a_host_that_does_not_answer_times_out() -> None:
+def test_a_host_that_does_not_answer_is_not_reached_in_time() -> None:
     with (
         unreachable_port() as port,
         policy_at(f"ws://127.0.0.1:{port}", connect_deadline=0.2) as policy,
-        pytest.raises(PolicyTimeout, match=r"within 0\.2 s"),
+        pytest.raises(UnreachableError, match=r"within 0\.2 s"),
     ):
         policy.connect()
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.clock import VirtualClock
+from runtime.datasets.journal import read_journal
 from runtime.datasets.mapping import ColumnMapping
 from runtime.errors import PolicyError
 from runtime.policies import replay
 from runtime.policies.replay import Config, ReplayPolicy
 from runtime.pose_format import PoseFormat
 from runtime.types import Observation
-from tests.runtime.datasets.small import robot, write_dataset
+from tests.runtime.datasets.foreign import Plan, column, write
+from tests.runtime.datasets.small import record, robot, write_dataset
 
 FRAMES, FPS = 12, 10.0
 
@@ -73,16 +76,17 @@ def test_steps_of_another_rate_find_the_row_of_their_time(
     assert np.array_equal(policy.infer(observation(step)).actions, actions[row : row + 1])
 
 
-def test_chunks_get_shorter_at_the_end_and_then_hold_the_last_row(root: Path, actions: np.ndarray) -> None:
+def test_beyond_the_end_chunks_hold_the_last_row(root: Path, actions: np.ndarray) -> None:
     policy = connected(root, horizon=5)
     policy.infer(observation(0))
-    assert np.array_equal(policy.infer(observation(9)).actions, actions[9:])
-    assert np.array_equal(policy.infer(observation(11)).actions, actions[11:])
-    assert np.array_equal(policy.infer(observation(500)).actions, actions[-1:])
+    held = np.repeat(actions[-1:], 5, axis=0)
+    assert np.array_equal(policy.infer(observation(9)).actions, np.concatenate([actions[9:], held])[:5])
+    assert np.array_equal(policy.infer(observation(11)).actions, held)
+    assert np.array_equal(policy.infer(observation(500)).actions, held)
 
 
 def test_whoever_changes_a_chunk_does_not_change_the_recording(root: Path, actions: np.ndarray) -> None:
-    policy = connected(root)
+    policy = connected(root, horizon=FRAMES)
     policy.infer(observation(0)).actions[:] = 0
     assert np.array_equal(policy.infer(observation(0)).actions, actions)
 
@@ -146,3 +150,85 @@ def test_it_answers_only_while_it_is_connected(root: Path) -> None:
     policy.close()
     with pytest.raises(PolicyError, match="not connected"):
         policy.infer(observation(0))
+
+
+@pytest.mark.parametrize("version", ["v2.0", "v2.1", "v3.0"])
+def test_every_version_is_replayed(tmp_path: Path, version: str) -> None:
+    plan = Plan(version)
+    write(tmp_path / "set", plan)
+    policy = connected(tmp_path / "set", rate=plan.fps, episode=1, horizon=plan.lengths[1])
+    assert np.array_equal(policy.infer(observation(0)).actions, column(1, "action", plan.lengths[1]))
+
+
+def test_only_the_column_of_the_actions_has_to_be_there(tmp_path: Path) -> None:
+    rows = write_dataset(tmp_path, fps=FPS, cameras=(), names={"observation.state": "joints"})[0]
+    policy = connected(tmp_path, horizon=3)
+    assert np.array_equal(policy.infer(observation(0)).actions, rows["action"][:3])
+
+
+# --- after a hold ------------------------------------------------------------------------------------------
+
+
+def held_at(qpos: np.ndarray, step: int) -> Observation:
+    return Observation(sequence=step, arrived=0.0, captured={}, qpos=qpos, pictures={}, step=step)
+
+
+def test_after_a_hold_it_goes_on_where_the_robot_was_held(root: Path, actions: np.ndarray) -> None:
+    policy = connected(root, horizon=5)
+    policy.infer(observation(0))
+    policy.infer(observation(3))
+    policy.resume()
+    assert np.array_equal(policy.infer(held_at(actions[5], 70)).actions, actions[5:10])
+    assert np.array_equal(policy.infer(held_at(actions[6], 71)).actions, actions[6:11])
+
+
+def test_without_a_hold_a_late_question_finds_the_row_of_its_time(root: Path, actions: np.ndarray) -> None:
+    policy = connected(root, horizon=2)
+    policy.infer(observation(0))
+    assert np.array_equal(policy.infer(held_at(actions[1], 9)).actions, actions[9:11])
+
+
+def test_a_hold_before_a_new_run_is_forgotten(root: Path, actions: np.ndarray) -> None:
+    policy = connected(root, horizon=2)
+    policy.infer(observation(4))
+    policy.resume()
+    policy.reset()
+    assert np.array_equal(policy.infer(held_at(actions[7], 50)).actions, actions[:2])
+
+
+# --- a recording of ours -----------------------------------------------------------------------------------
+
+
+def test_a_recorded_episode_is_replayed_without_a_dataset(tmp_path: Path) -> None:
+    episode = record(tmp_path / "episodes", frames=FRAMES)
+    policy = replay.build(Config(path=str(episode), horizon=3), robot(), VirtualClock(), FPS)
+    info = policy.connect()
+    assert info.name == f"replay of {episode}"
+    assert np.array_equal(policy.infer(observation(0)).actions, read_journal(episode).vectors("action")[:3])
+
+
+def test_a_recorded_episode_has_no_further_ones(tmp_path: Path) -> None:
+    episode = record(tmp_path / "episodes", frames=FRAMES)
+    policy = replay.build(Config(path=str(episode), episode=1), robot(), VirtualClock(), FPS)
+    with pytest.raises(PolicyError, match=r"policy\.episode = 1, .*allowed: 0"):
+        policy.connect()
+
+
+def test_the_actions_of_another_robot_are_refused(tmp_path: Path) -> None:
+    episode = record(tmp_path / "episodes", frames=FRAMES)
+    manifest = json.loads((episode / "manifest.json").read_text())
+    manifest["robot"]["name"] = "ur5e"
+    (episode / "manifest.json").write_text(json.dumps(manifest))
+    policy = replay.build(Config(path=str(episode)), robot(), VirtualClock(), FPS)
+    with pytest.raises(PolicyError, match="is of the robot ur5e, the station's is small"):
+        policy.connect()
+
+
+def test_the_same_joints_in_another_order_are_refused(tmp_path: Path) -> None:
+    episode = record(tmp_path / "episodes", frames=FRAMES)
+    manifest = json.loads((episode / "manifest.json").read_text())
+    manifest["robot"]["joint_names"].reverse()
+    (episode / "manifest.json").write_text(json.dumps(manifest))
+    policy = replay.build(Config(path=str(episode)), robot(), VirtualClock(), FPS)
+    with pytest.raises(PolicyError, match="the actions are of the joints"):
+        policy.connect()

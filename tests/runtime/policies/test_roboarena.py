@@ -13,9 +13,15 @@ from websockets.sync.server import ServerConnection
 
 from runtime import codecs
 from runtime.clock import MonotonicClock
-from runtime.errors import ConfigurationError, ContradictionError, PolicyError, PolicyLostError
+from runtime.errors import (
+    ConfigurationError,
+    ContradictionError,
+    PolicyError,
+    PolicyGone,
+    PolicyLostError,
+    PolicyTimeout,
+)
 from runtime.policies import roboarena
-from runtime.policies.link import PolicyGone, PolicyTimeout
 from runtime.policies.roboarena import Config, RoboarenaPolicy
 from runtime.pose_format import PoseFormat
 from runtime.sim.faults import Fault
@@ -138,6 +144,49 @@ def test_four_frames_per_view_are_the_recorded_request() -> None:
         np.testing.assert_array_equal(last[key], recorded[key])
         np.testing.assert_array_equal(first[key], recorded[key][0])
         np.testing.assert_array_equal(second[key], recorded[key][[0, 0, 0, 1]])
+
+
+def test_moments_before_a_request_are_shown_from_the_second_on_although_nobody_asked_then() -> None:
+    asked: list[bytes] = []
+    with (
+        serving(answering(SIX | {"image_resolution": None}, reply_to, asked)) as url,
+        policy_at(url, frame_steps=[23, 16, 8, 0]) as policy,
+    ):
+        assert policy.glances_s == pytest.approx(1 / 15)
+        for run in range(2):
+            for frame in range(48):
+                number = np.uint8(100 * run + frame)
+                pictures = dict.fromkeys(CAMERAS, np.full((24, 32, 3), number, np.uint8))
+                shown = dataclasses.replace(
+                    seen(FRANKA, pictures=pictures), arrived=1000.0 * run + frame / 15
+                )
+                policy.glance(shown)
+                if frame in (0, 23, 47):
+                    policy.infer(shown)
+            policy.reset()
+    messages = [codecs.unpack(request) for request in asked]
+    sent = [message["observation/wrist_image_left"] for message in messages if message["endpoint"] == "infer"]
+    assert [picture.shape for picture in sent[:3]] == [(24, 32, 3), (4, 24, 32, 3), (4, 24, 32, 3)]
+    kept = [picture[..., 0, 0, 0].tolist() for picture in sent]
+    assert kept[:3] == [0, [0, 7, 15, 23], [24, 31, 39, 47]]
+    assert kept[3:] == [100, [100, 107, 115, 123], [124, 131, 139, 147]]
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        (
+            {"frame_steps": [0, 8]},
+            r"frame_steps = \[0, 8\]: allowed are steps before the request, oldest first",
+        ),
+        ({"frame_steps": [8, 8, 0]}, "oldest first, the last 0"),
+        ({"frame_steps": [16, 8]}, "the last 0"),
+        ({"frame_steps": [8, 0], "frames": 4}, "policy.frames = 4 and policy.frame_steps"),
+    ],
+)
+def test_a_history_that_is_none_is_refused(settings: dict[str, Any], says: str) -> None:
+    with pytest.raises(ConfigurationError, match=says):
+        Config(url="ws://127.0.0.1:9", **settings)
 
 
 def test_the_metadata_of_dreamzero_are_understood() -> None:
@@ -449,6 +498,43 @@ def test_each_run_has_a_session_of_its_own_which_is_ended_on_the_server() -> Non
     assert server.heard.frames == {}
 
 
+def test_the_end_of_a_rollout_ends_its_session_on_the_server_once() -> None:
+    with served() as (server, url), policy_at(url) as policy:
+        policy.rest()  # nothing was begun
+        policy.infer(seen(FRANKA))
+        policy.rest()
+        assert server.heard.frames == {}
+        policy.rest()
+        policy.reset()
+        policy.infer(seen(FRANKA))
+    assert [call[0] for call in server.heard.calls] == ["infer", "reset", "infer"]
+    (_, one), (_, ended), (_, other) = server.heard.calls
+    assert one == ended != other
+
+
+def test_no_connection_is_opened_to_end_a_session_and_the_next_request_ends_it() -> None:
+    with served() as (server, url), policy_at(url) as policy:
+        policy.infer(seen(FRANKA))
+        policy._link.drop()
+        policy.rest()
+        assert not policy._link.is_open
+        policy.infer(seen(FRANKA))
+    assert [call[0] for call in server.heard.calls] == ["infer", "reset", "infer"]
+    assert len({session for _, session in server.heard.calls[:2]}) == 1
+
+
+def test_an_end_that_is_not_acknowledged_is_an_error_and_owed() -> None:
+    answers = iter([ROWS, {"type": "error", "message": "no such session"}, "reset successful", ROWS])
+    asked: list[bytes] = []
+    with serving(answering(SIX, lambda m: next(answers), asked)) as url, policy_at(url) as policy:
+        policy.infer(seen(FRANKA))
+        with pytest.raises(PolicyError, match="no such session"):
+            policy.rest()
+        policy.infer(seen(FRANKA))
+    sent = [codecs.unpack(request)["endpoint"] for request in asked]
+    assert sent == ["infer", "reset", "reset", "infer"]
+
+
 def test_a_server_without_sessions_is_told_of_none() -> None:
     with served(session=False) as (server, url), policy_at(url) as policy:
         policy.infer(seen(FRANKA))
@@ -504,6 +590,7 @@ def test_a_connection_that_the_server_ended_while_nobody_asked_is_opened_anew() 
         policy.connect()
         while not policy._link.was_left:
             assert policy._link.is_open
+        server._idle = None  # the next connection is left alone, however slow this machine is
         assert policy.infer(seen(FRANKA)).actions.shape == (24, 8)
     assert [call[0] for call in server.heard.calls] == ["infer"]
 

@@ -19,7 +19,7 @@ STARTED = 1000.0
 CAMERAS = ("observation.images.front", "observation.images.wrist")
 BITS = 16
 
-SETTINGS = RecordingSettings(min_free_bytes=0, queue_frames=64, flush_period_s=0.05)
+SETTINGS = RecordingSettings(min_free_bytes=0, queue_frames=64, flush_period_s=0.05, max_lag_s=10.0)
 
 
 def manifest(**changes: Any) -> dict[str, Any]:

@@ -52,9 +52,51 @@ def test_a_row_keeps_every_field_and_times_count_from_the_start(tmp_path: Path) 
         f"capture_time.{CAMERAS[1]}": pytest.approx(1 / 30 - 0.02),
         f"repeated.{CAMERAS[0]}": False,
         f"repeated.{CAMERAS[1]}": False,
+        "skewed": False,
+        f"lost.{CAMERAS[0]}": False,
+        f"lost.{CAMERAS[1]}": False,
+        f"stale.{CAMERAS[0]}": False,
+        f"stale.{CAMERAS[1]}": False,
     }
     assert found[0]["eef"] is None
     assert found[0][f"repeated.{CAMERAS[0]}"] is True
+
+
+def test_rows_whose_streams_are_too_far_apart_are_flagged(tmp_path: Path) -> None:
+    layout = Layout.of(manifest(max_skew_s=0.05))
+    captured = [
+        {"joints": 1000.0, CAMERAS[0]: 1000.03, CAMERAS[1]: 999.99},
+        {"joints": 1000.0, CAMERAS[0]: 1000.03, CAMERAS[1]: 999.97},
+        {"joints": 1000.0, CAMERAS[0]: math.nan, CAMERAS[1]: 1000.06},
+        {"joints": 1000.0},
+        {},
+    ]
+    writer = TableWriter(tmp_path, "rows", layout)
+    for index, times in enumerate(captured):
+        writer.add(RecordedRow(row(index, captured=times), frozenset()))
+    writer.finish()
+    writer.file.close()
+    found = read_table(tmp_path / "rows.arrow", SCHEMAS["rows"](layout)).table
+    assert found.column("skewed").to_pylist() == [False, True, True, False, False]
+
+
+def test_lost_and_old_pictures_are_flagged_by_camera(tmp_path: Path) -> None:
+    records = [
+        RecordedRow(row(0), frozenset(CAMERAS), frozenset(CAMERAS[1:])),
+        RecordedRow(row(1, stale=frozenset(CAMERAS[:1])), frozenset(CAMERAS[:1])),
+    ]
+    found = written(tmp_path, "rows", *records)
+    flags = {
+        (flag, camera): found.column(f"{flag}.{camera}").to_pylist()
+        for flag in ("lost", "stale")
+        for camera in CAMERAS
+    }
+    assert flags == {
+        ("lost", CAMERAS[0]): [False, False],
+        ("lost", CAMERAS[1]): [True, False],
+        ("stale", CAMERAS[0]): [False, True],
+        ("stale", CAMERAS[1]): [False, False],
+    }
 
 
 def test_an_unknown_capture_time_is_not_a_number(tmp_path: Path) -> None:

@@ -1,19 +1,22 @@
 import os
-import threading
-import time
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 import pytest
 
-from runtime.errors import RecordingError
+from runtime.datasets.remux import remux
+from runtime.recording.backlog import RUN, codings
+from runtime.recording.codecs import CODECS, CodecName
 from runtime.recording.files import AppendFile
+from runtime.recording.fragments import count_frames
 from runtime.recording.settings import RecordingSettings
-from runtime.recording.video import CameraEncoder, FragmentedVideo, PictureQueue
+from runtime.recording.trial import works
+from runtime.recording.video import FragmentedVideo
 
-from .samples import HEIGHT, SETTINGS, WIDTH, decoded, numbered, numbers
+from .samples import HEIGHT, SETTINGS, WIDTH, decoded, number_of, numbered, numbers
 
 SIZE = (HEIGHT, WIDTH)
 
@@ -104,78 +107,6 @@ def test_the_file_grows_by_whole_fragments_while_it_is_written(tmp_path: Path) -
     assert numbers(tmp_path / "a.mp4") == list(range(60))
 
 
-def test_the_queue_holds_a_bounded_number_of_pictures_and_counts_repeats() -> None:
-    queue = PictureQueue(places=2)
-    taken = [queue.put(numbered(k)) for k in range(5)]
-    assert taken == [True, True, False, False, False]
-    assert queue.put(None) is False
-    assert queue.waiting() == 6
-    queue.close()
-    entries = [queue.take() for _ in range(4)]
-    assert [entry if isinstance(entry, int) else "picture" for entry in entries[:3]] == [
-        "picture",
-        "picture",
-        4,
-    ]
-    assert entries[3] is None
-
-
-def test_a_place_is_free_again_once_a_picture_was_taken() -> None:
-    queue = PictureQueue(places=1)
-    assert queue.put(numbered(0))
-    assert not queue.put(numbered(1))
-    queue.take()
-    assert queue.put(numbered(2))
-
-
-def test_a_patient_caller_waits_for_a_place() -> None:
-    queue = PictureQueue(places=1)
-    queue.put(numbered(0))
-    taker = threading.Thread(target=queue.take)
-    taker.start()
-    assert queue.put(numbered(1), patience=60.0)
-    taker.join()
-
-
-def test_an_encoder_thread_writes_what_it_was_given(tmp_path: Path) -> None:
-    encoder = CameraEncoder("front", tmp_path / "a.mp4", SIZE, 30.0, SETTINGS)
-    assert all(encoder.put(numbered(k)) for k in range(20))
-    assert not encoder.put(None)
-    encoder.finish()
-    assert encoder.drain(time.monotonic() + 60)
-    encoder.file.close()
-    assert encoder.failure is None
-    assert encoder.frames == 21
-    assert numbers(tmp_path / "a.mp4") == [*range(20), 19]
-
-
-def test_a_failing_encoder_names_its_camera_and_keeps_what_it_had(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real = FragmentedVideo.encode
-
-    def failing(self: FragmentedVideo, picture: np.ndarray | None) -> None:
-        if self.frames == 20:
-            raise ValueError("no more colours")
-        real(self, picture)
-
-    monkeypatch.setattr(FragmentedVideo, "encode", failing)
-    encoder = CameraEncoder("front", tmp_path / "a.mp4", SIZE, 30.0, SETTINGS)
-    for k in range(30):
-        encoder.put(numbered(k))
-    encoder.finish()
-    assert encoder.drain(time.monotonic() + 60)
-    encoder.file.close()
-    assert "camera front" in str(encoder.failure)
-    assert "no more colours" in str(encoder.failure)
-    assert numbers(tmp_path / "a.mp4") == list(range(20))
-
-
-def test_a_size_that_no_encoder_takes_is_an_error_at_once(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="camera front: no encoder for 65536x2"):
-        CameraEncoder("front", tmp_path / "a.mp4", (2, 65536), 30.0, SETTINGS)
-
-
 def sample_videos() -> list[Path]:
     folder = os.environ.get("EVA_SAMPLE_EPISODE")
     return sorted(Path(folder).glob("videos/*/*/*.mp4")) if folder else []
@@ -198,36 +129,124 @@ def test_real_pictures_keep_at_least_38_db(tmp_path: Path) -> None:
         assert 10 * np.log10(255**2 / np.array(errors)).min() >= 38
 
 
-def test_the_way_of_each_picture_to_the_muxer_is_measured_and_repeats_do_not_count(tmp_path: Path) -> None:
-    encoder = CameraEncoder("front", tmp_path / "a.mp4", SIZE, 30.0, SETTINGS)
-    begun = time.monotonic()
-    for k in range(3):
-        encoder.put(numbered(k), 5.0, captured=begun - 10.0)
-    encoder.put(None)
-    encoder.finish()
-    assert encoder.drain(time.monotonic() + 30.0)
-    taken = encoder.muxed_ms
-    encoder.file.close()
-    assert taken is not None
-    most = (time.monotonic() - begun + 10.0) * 1000
-    assert 10_000 <= taken["p50"] <= taken["p99"] <= taken["max"] <= most
-
-
-def test_pictures_whose_capture_is_unknown_give_no_such_figure(tmp_path: Path) -> None:
-    encoder = CameraEncoder("front", tmp_path / "a.mp4", SIZE, 30.0, SETTINGS)
-    encoder.put(numbered(1), 5.0)
-    encoder.finish()
-    assert encoder.drain(time.monotonic() + 30.0)
-    assert encoder.muxed_ms is None
-    encoder.file.close()
-
-
 def test_each_frame_goes_to_the_muxer_at_once(tmp_path: Path) -> None:
     file = AppendFile(tmp_path / "a.mp4")
     video = FragmentedVideo(file, SIZE, 30.0, SETTINGS)
     for k in range(20):
         video.encode(numbered(k))
-        assert len(video.muxed) == k + 1
+        assert video.muxed == k + 1
     video.close()
     file.close()
-    assert len(video.muxed) == 20
+    assert video.muxed == 20
+
+
+def held(path: Path, counts: list[int], settings: RecordingSettings = SETTINGS) -> Path:
+    """Picture k + 1 and then so many repeats of it, for each k."""
+    file = AppendFile(path)
+    video = FragmentedVideo(file, SIZE, 30.0, settings)
+    for k, count in enumerate(counts):
+        video.encode(numbered(k + 1))
+        video.repeat(count)
+    assert video.frames == sum(counts) + len(counts)
+    video.close()
+    assert video.muxed == video.frames
+    file.close()
+    return path
+
+
+@pytest.mark.parametrize("codec", list(CODECS))
+@pytest.mark.parametrize("counts", [[1, 2, 3], [4, 5, 90, 0, 7], [RUN, RUN + 1, 300]])
+def test_repeats_are_frames_of_their_own_however_they_were_made(
+    tmp_path: Path, codec: CodecName, counts: list[int]
+) -> None:
+    if not works(codec):
+        pytest.skip(f"{codec} does not work on this machine")
+    path = held(tmp_path / "a.mp4", counts, SETTINGS.model_copy(update={"codec": codec}))
+    assert numbers(path) == [k + 1 for k, count in enumerate(counts) for _ in range(count + 1)]
+    times = [pts for _, pts, _ in packets(path)]
+    assert times == [Fraction(k, 30) for k in range(len(times))]
+    assert count_frames(path) == len(times)
+
+
+@pytest.mark.parametrize("codec", sorted(CODECS))
+def test_no_thread_of_an_encoder_is_real_time(tmp_path: Path, codec: CodecName) -> None:
+    if not works(codec):
+        pytest.skip(f"{codec} does not work on this machine")
+    file = AppendFile(tmp_path / "a.mp4")
+    video = FragmentedVideo(file, SIZE, 30.0, SETTINGS.model_copy(update={"codec": codec}))
+    for k in range(3):
+        video.encode(numbered(k))
+    classes = {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")}
+    video.close()
+    file.close()
+    assert classes == {os.SCHED_OTHER}
+
+
+def test_a_long_run_of_repeats_costs_three_codings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = AppendFile(tmp_path / "a.mp4")
+    video = FragmentedVideo(file, SIZE, 30.0, SETTINGS)
+    video.encode(numbered(1))
+    coded = []
+    real = FragmentedVideo._code
+
+    def counted(self: FragmentedVideo, *, key: bool) -> list[Any]:
+        coded.append(key)
+        return real(self, key=key)
+
+    monkeypatch.setattr(FragmentedVideo, "_code", counted)
+    for count in (RUN - 1, RUN, 20_001):
+        coded.clear()
+        video.repeat(count)
+        assert len(coded) == codings(count)
+    video.encode(numbered(2))
+    assert coded[-1], "what follows copies begins a group of its own"
+    video.close()
+    file.close()
+    assert numbers(file.path)[-2:] == [1, 2]
+
+
+def test_a_run_of_copies_survives_being_copied_into_a_dataset(tmp_path: Path) -> None:
+    counts = [3, 40, 5, 0]
+    source = held(tmp_path / "a.mp4", counts)
+    total = sum(counts) + len(counts)
+    remux(source, tmp_path / "b.mp4", total, 30.0)
+    assert numbers(tmp_path / "b.mp4") == numbers(source)
+    coded = []
+    for path in (source, tmp_path / "b.mp4"):
+        with av.open(str(path)) as container:
+            coded.append([bytes(packet) for packet in container.demux(video=0) if packet.size])
+    assert coded[0] == coded[1]
+
+
+def test_a_decoder_that_begins_at_any_key_frame_sees_the_same(tmp_path: Path) -> None:
+    path = held(tmp_path / "a.mp4", [3, 11, 6, 20])
+    shown = numbers(path)
+    for start in (0, 5, 9, 17, 30, 43):
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            container.seek(int(start / 30 / stream.time_base), stream=stream)
+            frames = [frame for frame in container.decode(stream) if frame.time >= start / 30 - 1e-6]
+        assert [number_of(frame.to_ndarray(format="rgb24")) for frame in frames] == shown[start:]
+
+
+def test_pictures_are_scaled_to_the_size_of_the_video(tmp_path: Path) -> None:
+    file = AppendFile(tmp_path / "a.mp4")
+    video = FragmentedVideo(file, (HEIGHT // 2, WIDTH // 2), 30.0, SETTINGS)
+    for k in range(5):
+        video.encode(numbered(k))
+    video.close()
+    file.close()
+    found = decoded(file.path)
+    assert [picture.shape for picture in found] == [(HEIGHT // 2, WIDTH // 2, 3)] * 5
+    doubled = [picture.repeat(2, axis=0).repeat(2, axis=1) for picture in found]
+    assert [number_of(picture) for picture in doubled] == list(range(5))
+
+
+def test_a_longer_group_is_what_was_asked_for(tmp_path: Path) -> None:
+    file = AppendFile(tmp_path / "a.mp4")
+    video = FragmentedVideo(file, SIZE, 30.0, SETTINGS.model_copy(update={"gop": 50}))
+    for k in range(120):
+        video.encode(numbered(k))
+    video.close()
+    file.close()
+    assert [k for k, (key, _, _) in enumerate(packets(file.path)) if key] == [0, 50, 100]

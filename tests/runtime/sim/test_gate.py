@@ -102,6 +102,56 @@ def test_it_is_silent_after_the_deadline_by_our_own_clock(gate: Gate) -> None:
     assert gate.silent(100.31)
 
 
+def test_a_command_that_has_waited_longer_than_the_deadline_is_stale(gate: Gate) -> None:
+    """As after the node stood still: what was sent meanwhile is there at once, oldest first."""
+    ahead = 5e4  # the client's clock is another machine's
+    for tick in range(30):
+        assert gate.judge(command(t=ahead + tick / 10, seq=tick), tick / 10) is not None
+    queued = [gate.judge(command(t=ahead + tick / 10, seq=tick), 5.05) for tick in range(30, 51)]
+    assert [accepted is not None for accepted in queued] == [False] * 18 + [True] * 3
+    assert gate.refused == {"stale": 18}
+    assert gate.ack == 50
+
+
+def test_a_queue_of_stale_commands_ends_no_silence(gate: Gate) -> None:
+    gate.judge(command(t=1.0), 1.0)
+    for tick in range(5):
+        gate.judge(command(t=1.1 + tick / 100), 4.0)
+    assert gate.silent(4.0)
+
+
+@pytest.mark.parametrize("stamps", [[0.0] * 40, [None] * 40, [float("nan")] * 40, list(range(40, 0, -1))])
+def test_a_client_without_a_clock_that_goes_on_is_judged_by_arrival_alone(
+    gate: Gate, stamps: list[Any]
+) -> None:
+    for tick, stamp in enumerate(stamps):
+        assert gate.judge(command(t=stamp), tick / 2) is not None
+    assert gate.refused == {}
+
+
+def test_a_client_whose_clock_jumps_is_understood_at_once(gate: Gate) -> None:
+    clock = [tick / 30 for tick in range(20)]
+    clock += [9e5 + one for one in clock] + [one - 400 for one in clock]
+    for tick, stamp in enumerate(clock):
+        assert gate.judge(command(t=stamp), tick / 30) is not None
+    assert gate.refused == {}
+
+
+def test_what_was_obeyed_last_is_acknowledged_by_its_number(gate: Gate) -> None:
+    assert gate.ack is None
+    gate.judge(command(master="a", seq=7), 0.0)
+    assert gate.ack == 7
+    gate.judge(command(HOME[:3], master="a", seq=8), 0.1)
+    gate.judge(command(master="b", seq=90), 0.2)
+    assert gate.ack == 7
+    gate.judge(command(target="collect_start", master="a", seq=9), 0.3)
+    assert gate.ack == 9
+    gate.judge(command(master="b", seq="x"), 2.0)
+    assert (gate.master, gate.ack) == ("b", None)
+    gate.judge(command(), 4.0)  # an older client does not number
+    assert (gate.master, gate.ack) == ("anonymous", None)
+
+
 def test_the_first_master_rules_until_it_is_silent_for_a_second(gate: Gate) -> None:
     assert gate.judge(command(master="a"), 0.0) is not None
     assert gate.judge(command(master="b"), 0.5) is None

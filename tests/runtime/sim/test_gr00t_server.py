@@ -17,6 +17,7 @@ import zmq
 
 import robots
 from runtime.clock import MonotonicClock
+from runtime.deployment import load
 from runtime.policies import gr00t
 from runtime.session import State
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
@@ -24,6 +25,7 @@ from runtime.sim.script import Script
 from runtime.types import Observation
 from tests.runtime.sim.tabletop_station import HORIZON, TabletopPlan, pick_and_place, planned
 
+ROOT = Path(__file__).parents[3]
 VECTORS = Path(__file__).parents[1] / "vectors"
 
 
@@ -86,8 +88,22 @@ def test_a_trial_through_gr00t_puts_the_block_on_the_plate(tmp_path: Path) -> No
     assert servers[0].failures == []
 
 
+def test_the_deployment_of_the_document_is_answered_by_the_stand_in_that_it_names() -> None:
+    resolved = load(ROOT / "deployments" / "gr00t.toml")
+    settings, robot = resolved.deployment.policy, robots.load(resolved.deployment.robot)
+    server = Gr00tServer(robot, Gr00tBehaviour("n1.7"))
+    with contextlib.closing(server):
+        here = settings.model_copy(update={"url": server.start()["url"]})
+        pictures = {camera.key: np.zeros((8, 8, 3), np.uint8) for camera in robot.cameras}
+        shown = Observation(1, 0.0, {}, robot.poses["home"].astype(np.float32), pictures)
+        with contextlib.closing(gr00t.build(here, robot, MonotonicClock(), 30.0)) as policy:
+            policy.connect()
+            assert policy.infer(shown).actions.shape == (50, robot.dim)
+    assert server.failures == []
+
+
 def test_the_server_of_the_document_is_one(free_port: int) -> None:
-    document = (Path(__file__).parents[3] / "docs" / "policies.md").read_text("utf-8")
+    document = (ROOT / "docs" / "policies.md").read_text("utf-8")
     section = document.partition("\n## GR00T\n")[2].partition("\n## ")[0]
     code = section.partition("```python\n")[2].partition("```")[0].replace(":5555", f":{free_port}")
     assert len(code.splitlines()) <= 34

@@ -25,7 +25,9 @@ from runtime.sim.node import Node, parser
 from runtime.sim.pictures import frame_number
 from runtime.transports import zmq as link
 from runtime.transports.node_messages import NodeMessages
-from runtime.transports.zmq import Config, NodeSink, NodeSource
+from runtime.transports.node_sink import NodeSink
+from runtime.transports.node_source import NodeSource
+from runtime.transports.zmq import Config
 from runtime.types import Float64, Observation, RobotCommand
 
 ROBOT = robots.load("agilex_piper")

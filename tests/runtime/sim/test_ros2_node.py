@@ -12,8 +12,9 @@ import pytest
 import robots
 from runtime.clock import MonotonicClock
 from runtime.errors import SetupError
-from runtime.sim.ros2_node import Ros2Node, main, parser, topics
-from tests.runtime.ros_domain import free_domain
+from runtime.sim.ros2_node import Ros2Node, main, parser
+from runtime.sim.ros_domain import free_domain
+from runtime.sim.ros_robot import topics
 from tests.runtime.sim.conftest import StandIn, Start
 from tests.sources import ROOT
 
@@ -30,7 +31,7 @@ def told(node: StandIn) -> dict[str, Any]:
 
 
 def test_a_robot_without_topics_is_given_some() -> None:
-    pictures, groups = topics(robots.load("ur5e"))
+    pictures, groups = topics(robots.load("ur5e"), 2)
     assert pictures == {
         "cam_wrist": "/wrist_image/image_raw/compressed",
         "cam_high": "/exterior_image/image_raw/compressed",
@@ -52,6 +53,7 @@ def test_a_robot_that_is_none_is_an_error_in_words(capsys: pytest.CaptureFixture
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_pick_and_place_trial_runs_over_ros_2(start: Start, tmp_path: Path) -> None:
     with free_domain() as domain:
         node = start(

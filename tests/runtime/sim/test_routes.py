@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import robots
+from robots.clearance import Clearance
 from runtime.sim import bench
 from runtime.sim.bench import Bench
 from runtime.sim.layout import layout_of
@@ -62,7 +63,7 @@ def test_every_layout_is_reached_slowly_and_above_the_table(seed, q):
     assert (route.rows >= ROBOT.lower).all()
     assert (route.rows <= ROBOT.upper).all()
     assert tips(route, route.rows)[:, 2, 3].min() > 0.012
-    assert 9.0 < len(route.rows) / RATE < 22.0
+    assert 9.0 < len(route.rows) / RATE < 24.0
 
 
 def test_the_arm_on_the_other_side_stays():
@@ -116,6 +117,52 @@ def test_what_neither_arm_reaches_has_no_route():
 def test_the_other_arm_takes_what_the_nearer_one_cannot_bring_home():
     route = planned(block=(-0.02, 0.3, 0.0), plate=(0.3, 0.36))
     assert route.arm.name == RIGHT.name
+
+
+@pytest.mark.parametrize("name", [name for name in robots.names() if len(robots.load(name).arms) > 1])
+def test_arms_leave_each_other_room_wherever_block_and_plate_are(name):
+    robot = robots.load(name)
+    planner, clearance = Planner(robot, RATE, Bench()), Clearance(robot)
+    arms = [f"{arm.name}/" for arm in robot.arms]
+    between = [all(any(part.startswith(arm) for part in pair) for arm in arms) for pair in clearance.pairs]
+    for pose, seed in itertools.product(("ready", "home"), (0, 4, 6, 14)):
+        layout = layout_of(seed)
+        route = planner.pick_and_place(robot.poses[pose], layout.blocks[0], layout.plate, SURE)
+        assert clearance.distances(route.rows[::5])[:, between].min() > 0.025, (pose, seed)
+
+
+def test_an_arm_that_would_run_into_the_other_leaves_it_to_that_one():
+    layout = layout_of(4)  # the left arm is nearer to the block, but the plate is far over on the right
+    route = planned(block=layout.blocks[0], plate=layout.plate)
+    assert route.arm is RIGHT
+    assert route.legs[0].name == "reach"
+
+
+def test_an_arm_that_is_in_the_way_of_the_only_one_that_can_makes_way_first():
+    robot = robots.load("arx_r5")
+    layout = layout_of(0)
+    home, ready = robot.poses["home"], robot.poses["ready"]
+    route = Planner(robot, RATE, Bench()).pick_and_place(home, layout.blocks[0], layout.plate, SURE)
+    left, right = robot.arms
+    assert route.arm is left
+    first = route.legs[0]
+    assert (first.name, first.others) == ("make way", (right,))
+    np.testing.assert_array_equal(np.ptp(first.rows[:, left.slice], axis=0), 0.0)
+    np.testing.assert_allclose(first.end[right.joint_dims], ready[right.joint_dims])
+    rest = np.concatenate([leg.rows for leg in route.legs[1:]])
+    assert np.ptp(rest[:, right.joint_dims], axis=0).max() < 1e-9
+    assert rest[0, gripper_dim(right)] == home[gripper_dim(right)]
+
+
+def test_what_makes_way_rises_from_the_table_first():
+    low = leg(
+        planned(block=(0.0, 0.3, 0.0), plate=(-0.1, 0.38)), "descend"
+    ).end  # the left arm, in the middle
+    route = planned(q=low, block=(-0.06, 0.24, 0.0), plate=(0.21, 0.36))  # only the right arm reaches both
+    assert route.arm is RIGHT
+    assert [leg.name for leg in route.legs[:3]] == ["rise", "make way", "reach"]
+    assert route.legs[0].others == route.legs[1].others == (LEFT,)
+    assert bench.tip_in_world(ROBOT, LEFT, route.legs[0].end)[2, 3] == pytest.approx(CLEAR, abs=0.003)
 
 
 def test_a_grasp_can_be_short_of_the_block():

@@ -17,9 +17,8 @@ from websockets.sync.client import ClientConnection, connect
 import robots
 from runtime import codecs
 from runtime.clock import MonotonicClock
-from runtime.errors import ContradictionError, PolicyError
+from runtime.errors import ContradictionError, PolicyError, PolicyGone
 from runtime.policies import openpi
-from runtime.policies.link import PolicyGone
 from runtime.policies.pictures import fitted, laid_out
 from runtime.sim.bench import Layout
 from runtime.sim.gestures import Gesture

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from runtime.clock import MonotonicClock
-from runtime.errors import PolicyError
+from runtime.errors import PolicyError, PolicyGone
 from runtime.plugins import variants
-from runtime.policies.link import PolicyGone
 from tests.runtime.policies.peers import FRANKA, seen
 
 ARENA = {"cameras": {"cam_high": "first", "cam_right_wrist": "second", "cam_left_wrist": "wrist"}}

@@ -73,7 +73,10 @@ def test_settings_are_json_where_they_are_some_else_words():
     ("words", "says"),
     [
         (["dance"], "invalid choice: 'dance'"),
-        (["run", "--task", "fold"], "run does not take --task fold; it takes --data-dir, --duration, "),
+        (
+            ["run", "--colour", "blue"],
+            "run does not take --colour blue; it takes --arm, --data-dir, --duration, ",
+        ),
         (
             ["stop", "--policy-url", "ws://a:1"],
             "stop does not take --policy-url ws://a:1; it takes --data-dir",

@@ -9,7 +9,7 @@ import pytest
 
 from runtime.clock import VirtualClock
 from runtime.datasets.mapping import ColumnMapping
-from runtime.errors import SetupError, TransportError
+from runtime.errors import RecordingError, SetupError, TransportError
 from runtime.transports import dataset
 from runtime.transports.dataset import Config, DatasetSource
 from runtime.types import Observation, RobotCommand
@@ -137,6 +137,53 @@ def test_a_run_can_begin_again_from_anywhere(stage: Stage) -> None:
     stage.source.begin_run()
     assert stage.shows(stage.at(200.0), 0)
     assert stage.shows(stage.at(200.1), 1)
+
+
+def test_between_two_runs_the_robot_stands_where_they_begin(stage: Stage) -> None:
+    stage.source.begin_run()
+    assert stage.shows(stage.at(100.9), 9)
+    stage.source.end_run()
+    standing = stage.source.receive(0.0)
+    assert stage.shows(standing, 0)
+    assert standing is not None
+    assert not standing.last
+    assert standing.captured["joints"] == pytest.approx(100.9)
+    assert stage.source.receive(0.05) is None
+    stage.source.begin_run()
+    assert stage.shows(stage.source.receive(0.0), 0)
+    assert stage.shows(stage.source.receive(1.0), 1)
+
+
+def test_after_the_last_frame_a_second_run_plays_it_all_again(stage: Stage) -> None:
+    for begin in (100.0, 200.0):
+        stage.clock.sleep_until(begin)
+        stage.source.begin_run()
+        received = [stage.at(begin + k / FPS) for k in range(FRAMES)]
+        assert [stage.shows(observation, k) for k, observation in enumerate(received)] == [True] * FRAMES
+        stage.source.end_run()
+
+
+def test_a_frame_that_breaks_is_named_and_the_next_one_comes(stage: Stage) -> None:
+    stage.source.begin_run()
+    assert stage.shows(stage.at(100.0), 0)
+    whole = stage.source._pictures["cam_wrist"]
+
+    class Broken(type(whole)):  # type: ignore[misc]
+        def __init__(self) -> None:
+            pass
+
+        def __getitem__(self, index: int) -> Any:
+            if index == 1:
+                raise RecordingError("wrist.mp4, frame 1 cannot be decoded")
+            return whole[index]
+
+    stage.source._pictures["cam_wrist"] = Broken()
+    with pytest.raises(TransportError, match=r"wrist\.mp4, frame 1 cannot be decoded"):
+        stage.source.receive(1.0)
+    assert stage.clock.now() == pytest.approx(100.1)  # told when it is due, though decoded ahead
+    assert stage.source.receive(0.0) is None
+    assert stage.shows(stage.source.receive(1.0), 2)
+    stage.source._pictures["cam_wrist"] = whole
 
 
 def test_sequence_numbers_rise_over_setup_and_runs(stage: Stage) -> None:

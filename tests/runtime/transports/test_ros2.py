@@ -168,7 +168,7 @@ def test_joints_of_other_names_are_refused_by_name(domain: int, node: Node) -> N
 
 
 def test_pictures_of_another_type_are_named(domain: int, node: Node) -> None:
-    node("--raw-pictures")
+    node("--other-pictures")
     with listening(domain) as source:
         sentence = said(source, "cam_high")
     assert (

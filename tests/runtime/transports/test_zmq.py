@@ -14,8 +14,11 @@ import robots
 from runtime import codecs
 from runtime.clock import MonotonicClock, VirtualClock
 from runtime.errors import ConfigurationError, TransportError
+from runtime.transports import node_link, node_source
 from runtime.transports import zmq as link
-from runtime.transports.zmq import Config, NodeSink, NodeSource
+from runtime.transports.node_sink import NodeSink
+from runtime.transports.node_source import NodeSource
+from runtime.transports.zmq import Config
 from runtime.types import Observation, RobotCommand
 from tests.processes import eventually
 
@@ -255,10 +258,59 @@ def test_the_newest_counts_by_arrival_when_a_node_restarts_with_a_smaller_clock(
                 if observation.qpos[0] == 2:
                     break
             assert source.faults()["clock_backwards"] == 1
+            assert source.why("clock_backwards").startswith("the node's clock went back")
             assert abs(observation.captured["joints"] - observation.arrived) < 5
             observation = until_heard(second, source, lambda: frame(time.monotonic() % 100, 3))
     assert observation.qpos[0] in (2, 3)
     assert observation.captured["joints"] <= observation.arrived
+
+
+@pytest.mark.parametrize(
+    ("jump", "name"), [(1e6, "clock_forwards"), (0.9, "clock_forwards"), (-0.3, "clock_backwards")]
+)
+def test_a_jump_of_the_nodes_clock_is_named_and_ages_nothing(node: Node, jump: float, name: str) -> None:
+    offset = 0.0
+    with listening(node) as source:
+        joined(node, source)
+        for offset in (0.0, jump):
+            for mark in range(3):
+                node.say(frame(time.monotonic() + offset, mark))
+                observation = source.receive(PATIENCE)
+                assert observation is not None
+                assert 0 <= observation.arrived - observation.captured["joints"] < 0.25
+        assert source.faults() == {name: 1}
+        assert "the node's clock" in source.why(name)
+
+
+def test_why_no_frame_comes_is_said_once_for_each_reason(node: Node) -> None:
+    with listening(node, stalled_after_s=0.05) as source:
+        told: list[str] = []
+
+        def news() -> bool:
+            told.extend(event.text for event in source.news())
+            return bool(told)
+
+        wait_for(news)
+        assert re.fullmatch(
+            rf"waiting for the node at {node.obs}: nothing has come for 0.\d s: see that it runs, and that it "
+            "publishes where transport.sub_endpoint says",
+            told.pop(),
+        )
+        assert source.news() == []
+        until_heard(node, source, lambda: frame(time.monotonic()))
+        wait_for(news)
+        assert "s: it has stopped, or the way to it is cut" in told.pop()
+
+        def unusable() -> bool:
+            node.say(frame(time.monotonic(), images={}))
+            return news()
+
+        wait_for(unusable)
+        assert "usable for" in told[0]
+        assert told.pop().endswith("images lack cam_high, cam_left_wrist, cam_right_wrist; they have none")
+        until_heard(node, source, lambda: frame(time.monotonic()))
+        wait_for(news)
+        assert "it has stopped" in told.pop()
 
 
 FAULTS: list[tuple[str, dict[str, Any], str]] = [
@@ -385,14 +437,17 @@ def test_what_the_node_says_of_itself_is_passed_on(node: Node) -> None:
         "holding": True,
         "refused": {"limits": 4},
         "master": "abc",
+        "ack": 17,
         "hil_error": "no leader",
     }
     with listening(node) as source:
         until_heard(node, source, lambda: frame(time.monotonic(), **said))
         assert source.status.holding is True
-        assert source.status.master == "abc"
+        assert (source.status.master, source.status.ack) == ("abc", 17)
         assert source.status.hil_error == "no leader"
         assert source.faults() == {"node_refused.limits": 4}
+        assert source.why("node_refused.limits") == "commands were beyond the node's own limits"
+        assert source.why("node_refused.of_its_own") == ""
 
 
 def test_two_readers_do_not_steal_each_others_frames(node: Node) -> None:
@@ -451,17 +506,17 @@ def test_an_error_in_the_reader_is_counted_and_the_next_frame_comes(
 
 
 def test_a_socket_that_fails_is_opened_anew(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link, "_REOPEN_S", 0.05)
+    monkeypatch.setattr(node_source, "_REOPEN_S", 0.05)
     with listening(node) as source:
         joined(node, source)
-        drain, failing = link._drain, [True]
+        drain, failing = node_source._drain, [True]
 
         def failed(socket: zmq.Socket[bytes]) -> list[bytes]:
             if failing:
                 raise zmq.ZMQError(failing.pop() and zmq.ENOTSOCK)
             return drain(socket)
 
-        monkeypatch.setattr(link, "_drain", failed)
+        monkeypatch.setattr(node_source, "_drain", failed)
         node.say(frame(time.monotonic(), 1))
         wait_for(lambda: source.faults().get("socket_failed") == 1)
         assert until_heard(node, source, lambda: frame(time.monotonic(), 9)).qpos[0] == 9
@@ -542,6 +597,30 @@ def test_a_command_has_the_fields_of_the_protocol(node: Node) -> None:
     np.testing.assert_array_equal(heard["action"], action)
     assert heard["master"] == sink.master
     assert heard["seq"] >= 1
+
+
+@pytest.mark.parametrize("word", ["collect_start", "collect_stop", "hil_start", "hil_stop"])
+def test_words_of_the_protocol_have_the_form_of_a_command_that_moves_nothing(node: Node, word: str) -> None:
+    """Older nodes read a vector in every message, and some take any for a target."""
+    stands = np.linspace(0, 0.1, 14).astype(np.float32)
+    with commanding(node) as sink:
+        send_until_heard(node, sink, RobotCommand(stands, 1, 1.0))
+        sink.tell(word, {"mode": "relative"})
+        heard = node.hear()
+        while heard is not None and heard["target"] == "real":
+            heard = node.hear()
+    assert heard is not None
+    assert list(heard) == ["t", "action", "target", "mode", "master", "seq"]
+    assert heard["target"] == word
+    np.testing.assert_array_equal(heard["action"], stands)
+
+
+def test_a_link_that_is_cut_without_a_word_is_noticed(node: Node) -> None:
+    with contextlib.closing(node_link.opened(zmq.SUB, node.obs, {})) as socket:
+        assert socket.getsockopt(zmq.TCP_KEEPALIVE) == 1
+        options = (zmq.TCP_KEEPALIVE_IDLE, zmq.TCP_KEEPALIVE_INTVL, zmq.TCP_KEEPALIVE_CNT)
+        first, each, count = (int(socket.getsockopt(option)) for option in options)
+    assert first + each * count <= 5
 
 
 def test_every_sink_has_a_name_of_its_own() -> None:

@@ -15,10 +15,9 @@ import robots
 from runtime import codecs
 from runtime.clock import MonotonicClock
 from runtime.commitment import Commitment
-from runtime.errors import PolicyError, PolicyLostError
+from runtime.errors import PolicyError, PolicyLostError, PolicyTimeout
 from runtime.messages import ChunkMerged
 from runtime.policies import openpi
-from runtime.policies.link import PolicyTimeout
 from runtime.policies.openpi import OpenpiPolicy
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.openpi_server import Behaviour, OpenpiServer

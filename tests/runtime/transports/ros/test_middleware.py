@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import os
+import socket
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -218,3 +220,24 @@ def test_a_domain_has_one_network_in_a_process(domain: int) -> None:
         pytest.raises(TransportError, match="in use in this process over another network"),
     ):
         DdsMiddleware(domain, "127.0.0.1")
+
+
+def test_its_sockets_keep_as_much_as_the_kernel_permits_until_it_is_read(domain: int) -> None:
+    permitted = int(Path("/proc/sys/net/core/rmem_max").read_text("ascii"))
+    before = set(receive_buffers())
+    with contextlib.closing(dds(domain)) as made:
+        made.subscribe(Topic("/picture", "Image", SENSOR_QUALITY), Inbox())
+        kept = [size for number, size in receive_buffers().items() if number not in before]
+    assert 2 * min(16_000_000, permitted) <= max(kept)  # the kernel says twice what it was asked for
+
+
+def receive_buffers() -> dict[str, int]:
+    """Bytes of the receive buffer of each UDP socket of this process, by its name in /proc."""
+    sizes = {}
+    for link in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):  # none of ours any more, or no socket
+            name = os.readlink(link)
+            with socket.socket(fileno=os.dup(int(link.name))) as found:
+                if name.startswith("socket:") and found.type == socket.SOCK_DGRAM:
+                    sizes[name] = found.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    return sizes

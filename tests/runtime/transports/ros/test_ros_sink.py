@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -145,36 +144,11 @@ def test_a_sink_that_is_not_connected_says_so(monkeypatch: pytest.MonkeyPatch) -
         sink.tell("scene_reset", {})
 
 
-def test_a_middleware_that_cannot_say_who_hears_ends_no_command(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    sink, wall, clock = connected(monkeypatch)
-
-    def fail() -> Mapping[str, Match]:
-        raise TransportError("nobody can say")
-
-    monkeypatch.setattr(wall, "matches", fail)
-    clock.advance(3.0)
-    sink.send(command(time=clock.now()))
-    assert len(wall.sent) == 4
-    assert [record.message for record in caplog.records] == ["nobody can say"]
-
-
-def test_who_does_not_hear_is_said_when_it_changes(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    sink, wall, clock = connected(monkeypatch)
-    wall.found = {LEFT: Match(0), RIGHT: Match(0, "a subscriber of it is incompatible in its reliability")}
-    caplog.set_level(logging.INFO)
-    for _ in range(100):
-        clock.advance(0.1)
-        sink.send(command(time=clock.now()))
-    said = [record.message for record in caplog.records]
-    assert sorted(said) == [
-        "a subscriber of it is incompatible in its reliability",
-        f"nobody listens to {LEFT}",
-    ]
-    wall.found = {}
-    clock.advance(3.0)
-    sink.send(command(time=clock.now()))
-    assert {record.message for record in caplog.records[2:]} == {f"{LEFT} is heard", f"{RIGHT} is heard"}
+def test_who_does_not_hear_is_known_by_topic(monkeypatch: pytest.MonkeyPatch) -> None:
+    sink, wall, _ = connected(monkeypatch)
+    assert sink.unheard() == {}
+    why = "a subscriber of it is incompatible in its reliability"
+    wall.found = {LEFT: Match(0), RIGHT: Match(1, why)}
+    assert sink.unheard() == {LEFT: "", RIGHT: why}
+    sink.close()
+    assert sink.unheard() == {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,10 +13,11 @@ from runtime.errors import ConfigurationError, TransportError
 from runtime.transports import ros2
 from runtime.transports.ros import cdr
 from runtime.transports.ros.messages import Image, JointState, Message, PoseStamped
-from runtime.transports.ros.middleware import Deliver, Match, Middleware, Publish, Topic
+from runtime.transports.ros.middleware import Match
 from runtime.transports.ros.source import RosSource
 from runtime.transports.ros.topics import GroupTopics, Topics
 from runtime.types import Observation
+from tests.runtime.transports.ros.hand import Hand
 
 ROBOT = robots.load("ur5e")
 NAMES = ROBOT.groups[0].joints
@@ -26,27 +26,6 @@ TOPICS = Topics(
     groups={"arm": GroupTopics(state="/state", command="/command", eef="/pose")},
 )
 WALL = 1_800_000_000.0
-
-
-class Hand(Middleware):
-    """A middleware whose messages come from the test's own hand."""
-
-    def __init__(self) -> None:
-        self.deliver: dict[str, Deliver] = {}
-        self.found: dict[str, Match] = {}
-        self.closed = False
-
-    def subscribe(self, topic: Topic, deliver: Deliver) -> None:
-        self.deliver[topic.name] = deliver
-
-    def advertise(self, topic: Topic) -> Publish:
-        raise AssertionError("a source publishes nothing")
-
-    def matches(self) -> Mapping[str, Match]:
-        return self.found
-
-    def close(self) -> None:
-        self.closed = True
 
 
 class Bench:
@@ -175,6 +154,27 @@ def test_who_is_at_the_other_side_is_said_with_it(bench: Bench) -> None:
         "waiting for cam_wrist (/wrist): nothing for 2.0 s: nobody publishes it; waiting for cam_high (/high): "
         f"nothing for 2.0 s: {refusal}; waiting for arm joints (/state): nothing for 2.0 s"
     ]
+
+
+def test_what_all_have_in_common_is_said_once(bench: Bench) -> None:
+    bench.hand.found = {topic: Match(0, "no master is there") for topic in ("/high", "/wrist", "/state")}
+    bench.clock.advance(2.0)
+    assert bench.source.receive(0.0) is None
+    assert bench.news() == ["waiting for cam_wrist, cam_high, arm joints: no master is there"]
+
+
+def test_a_cause_that_is_found_later_is_told_later_and_once(bench: Bench) -> None:
+    bench.hand.found = {"/high": Match(0), "/wrist": Match(1), "/state": Match(1)}
+    bench.clock.advance(2.0)
+    assert bench.source.receive(0.0) is None
+    assert "(/high): nothing for 2.0 s: nobody publishes it" in " ".join(bench.news())
+    bench.hand.found["/high"] = Match(0, "/high is published as something else")
+    for _ in range(20):
+        bench.clock.advance(0.1)
+        assert bench.source.receive(0.0) is None
+    (said,) = bench.news()
+    assert said.startswith("waiting for cam_high (/high): nothing for ")
+    assert said.endswith(": /high is published as something else")
 
 
 def test_wrong_names_are_counted_and_named_as_the_reason(bench: Bench) -> None:

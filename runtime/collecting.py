@@ -1,0 +1,360 @@
+"""Main's side of collecting demonstrations: the arm switch, what leads, what was collected, how people judged it."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from runtime.clock import Clock
+from runtime.errors import RuntimeFault
+from runtime.family import Plan
+from runtime.inference import Inference
+from runtime.leaders.relay import Relay
+from runtime.messages import EpisodeClosed, Event
+from runtime.page import Page
+from runtime.recording.labels import Label, append, newest
+from runtime.recording.schema import Schema
+from runtime.requests import DiscardRequest, LabelRequest, RunRequest
+from runtime.run import Run
+from runtime.setup import SetUp
+from runtime.transitions import Happening, State
+
+IDLE_S = 300.0  # of nothing, after which the arm falls
+_REMEMBERED = 64  # episodes that may be spoken of before they are on disk
+NODE_SILENT_S = 2.0  # for a node to report an action
+# What takes the arm away, whatever state it finds the station in.
+DISARMING = frozenset(
+    {
+        Happening.HELD,
+        Happening.RUN_FAILED,
+        Happening.LEASE_ENDED,
+        Happening.LINK_LOST,
+        Happening.ESTOPPED,
+        Happening.FAMILY_DIED,
+        Happening.DISPLACED,
+    }
+)
+_NOT_YET = "nobody has armed it since it was set up"
+_NOT_SET_UP = "the station is not set up to collect"
+
+
+class Collecting:
+    """At most one episode is open; `armed` is a person's word that the next may begin."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        page: Page,
+        clock: Clock,
+        inference: Inference,
+        setup: SetUp,
+        opened: Callable[[], Run | None],
+        say: Callable[[Event], None],
+    ) -> None:
+        self._plan = plan
+        self._settings = plan.deployment.collection
+        self._data = plan.deployment.data
+        self._page, self._clock = page, clock
+        self._inference, self._setup = inference, setup
+        self._opened = opened  # the run that is open
+        self._say = say
+        self.set_up = False
+        self.armed = False
+        self.why_not = _NOT_SET_UP
+        self.task = ""  # of the newest episode, where its command said one
+        self.last: dict[str, Any] | None = None
+        self._asked: deque[str] = deque(maxlen=_REMEMBERED)  # uuids of the newest episodes
+        self._touched = clock.now()
+        self._reported_at: float | None = None  # when the node's newest action was captured
+        self._reported: list[float] = []  # these times, for their rate
+        self._seen: dict[str, Any] | None = None  # the fingerprint as it was last known
+
+    # --- the arm ---------------------------------------------------------------------------------------------
+
+    @property
+    def declared(self) -> bool:
+        """Whether the deployment says how to collect."""
+        return self._settings is not None
+
+    @property
+    def _relay(self) -> Relay | None:
+        policy = self._inference.policy
+        return policy if isinstance(policy, Relay) else None
+
+    @property
+    def _node_leads(self) -> bool:
+        return self._settings is not None and self._settings.source == "node"
+
+    @property
+    def run(self) -> Run | None:
+        """The open run that collects."""
+        run = self._opened()
+        return run if run is not None and run.mode == "collect" else None
+
+    @property
+    def _newest(self) -> str:
+        """The uuid of the newest demonstration since the station started, "" where there was none."""
+        return self._asked[-1] if self._asked else ""
+
+    @property
+    def unled(self) -> str:
+        """Why the leader cannot be followed just now; "" where it can, or nobody can know before it is asked to."""
+        relay = self._relay
+        return "" if relay is None else relay.silence()
+
+    def begin_setup(self, collects: bool) -> None:
+        """A set-up begins, to collect or with a policy."""
+        self.disarm("a set-up has begun")
+        self.set_up = collects
+        self.why_not = _NOT_YET if collects else _NOT_SET_UP
+
+    def arm(self) -> None:
+        """Switch it on."""
+        self.armed, self.why_not = True, ""
+        self._event("collect_armed", "armed: the next demonstration may begin")
+
+    def disarm(self, why: str) -> None:
+        """Switch it off; nothing where it is off."""
+        if self.armed:
+            self.armed, self.why_not = False, why
+            self._event("collect_disarmed", f"disarmed: {why}")
+
+    def touch(self) -> None:
+        """A person has done something."""
+        self._touched = self._clock.now()
+
+    def noticed(self, happening: Happening, reason: str) -> None:
+        """What happens to a station takes the arm away."""
+        if happening in DISARMING:
+            self.disarm(reason)
+
+    def look(self, state: State) -> tuple[Happening, str] | None:
+        """Once per pump: what is to be told to the session; an arm that nobody uses falls by itself."""
+        now, run = self._clock.now(), self.run
+        self._hear_node()
+        if self.set_up and state is State.READY:
+            self._aim()
+        if run is not None:
+            self.touch()
+            return self._missed(run, state)
+        if self.armed and now - self._touched > IDLE_S:
+            self.disarm(f"nobody has done anything for {IDLE_S / 60:g} minutes")
+        if self.armed and (why := self.unled):
+            self.disarm(why)
+            self._event("leader_lost", why)
+        return None
+
+    def _aim(self) -> None:
+        """Where the first action would have the robot, as the leader moves on."""
+        relay = self._relay
+        if relay is not None:
+            qpos = np.array(self._page.observation.read()["qpos"], np.float64)
+            self._setup.first_action = relay.aim(qpos)
+
+    # --- what the node reports ---------------------------------------------------------------------------------
+
+    def _hear_node(self) -> None:
+        if not self._node_leads:
+            return
+        record = self._page.observation.read()
+        at = float(record["joints_captured"])
+        if record["has"][3] and at != self._reported_at:  # reported_action
+            self._reported_at = at
+            self._reported = [*self._reported[-39:], at]
+
+    def _missed(self, run: Run, state: State) -> tuple[Happening, str] | None:
+        """A node that was told to drive, and reports no action."""
+        if not self._node_leads or run.begun is None or state is not State.RUNNING:
+            return None
+        since = max(self._reported_at or -math.inf, run.followed)
+        silent = self._clock.now() - since
+        if silent <= NODE_SILENT_S:
+            return None
+        never = self._reported_at is None or self._reported_at < run.begun
+        why = (
+            f"the node reports no action within {NODE_SILENT_S:g} s: does it have a leader, and is that connected?"
+            if never
+            else f"the node has reported no action for {silent:.1f} s"
+        )
+        self._event("node_silent", why)
+        return (Happening.RUN_FAILED if never else Happening.HELD), why
+
+    # --- episodes --------------------------------------------------------------------------------------------
+
+    def manifest(self, asked: RunRequest) -> dict[str, Any]:
+        """What the manifest of a demonstration says otherwise than that of a run with a policy."""
+        assert self._settings is not None
+        info = self._setup.info
+        return {
+            "kind": "demonstration",
+            "session": asked.session.model_dump() if asked.session else {},
+            "collection": self._settings.described(self._plan.cameras),
+            "policy": {"kind": "teleop", "name": info.name if info else ""},
+            **({} if asked.task is None else {"task": asked.task}),
+        }
+
+    def begun(self, episode: str, asked: RunRequest) -> None:
+        """An episode is asked for."""
+        self.task = asked.task or ""
+        if episode:
+            self._asked.append(episode)
+
+    def closed(self, message: EpisodeClosed) -> None:
+        """An episode is on disk."""
+        if self._settings is None or message.uuid not in self._asked:
+            return
+        label = newest(self._data, message.uuid)
+        self.last = {
+            "uuid": message.uuid,
+            "rows": message.rows,
+            "result": label.result if label else None,
+            "discarded": label.discarded if label else False,
+        }
+        seconds = message.rows / self._plan.fps
+        if seconds < self._settings.min_length_s:
+            allowed = f"shorter than {self._settings.min_length_s:g} s (collection.min_length_s)"
+            self._event("episode_short", f"episode {message.uuid} has {seconds:.1f} s, {allowed}")
+
+    def label(self, asked: LabelRequest, by: str) -> Mapping[str, Any]:
+        """Write down how an episode went."""
+        episode, before = self._named(asked.episode)
+        return self._write(
+            episode, replace(before, time=time.time(), by=by, result=asked.result, note=asked.note)
+        )
+
+    def discard(self, asked: DiscardRequest, by: str) -> Mapping[str, Any]:
+        """Mark an episode as one that is never published; its files stay."""
+        episode, before = self._named(asked.episode)
+        return self._write(episode, replace(before, time=time.time(), by=by, discarded=True))
+
+    def _write(self, episode: str, label: Label) -> Mapping[str, Any]:
+        append(self._data, episode, label)
+        if self.last is not None and self.last["uuid"] == episode:
+            self.last |= {"result": label.result, "discarded": label.discarded}
+        data = {
+            "episode": episode,
+            "result": label.result,
+            "note": label.note,
+            "discarded": label.discarded,
+            "by": label.by,
+        }
+        how = "discarded" if label.discarded else str(label.result)
+        self._say(Event("labelled", f"episode {episode}: {how}", self._clock.now(), data=data))
+        return data
+
+    def _named(self, given: str | None) -> tuple[str, Label]:
+        """The episode that is spoken of, and what was last said of it; RuntimeFault where it is none of ours."""
+        run = self.run
+        if given is None:
+            episode = run.uuid if run is not None else self._newest
+            if run is None and self._opened() is not None:
+                raise RuntimeFault("the open run is no demonstration: name the episode")
+            if not episode:
+                raise RuntimeFault(
+                    "no demonstration has been collected since the station started: name the episode"
+                )
+        else:
+            episode = given
+            if run is not None and run.uuid == given:
+                raise RuntimeFault(f"episode {given} is the open one: leave `episode` out, or stop first")
+            if given not in self._asked:
+                self._require_demonstration(given)
+        before = newest(self._data, episode)
+        return episode, before or Label(0.0, "")
+
+    def _require_demonstration(self, episode: str) -> None:
+        newest(self._data, episode)  # refuses what is no uuid, before it becomes a path
+        path = self._plan.deployment.episodes_dir / episode / "manifest.json"
+        try:
+            kind = json.loads(path.read_text("utf-8")).get("kind")
+        except (OSError, ValueError, AttributeError) as error:
+            raise RuntimeFault(f"episode = {episode!r}: there is no such episode here ({error})") from None
+        if kind != "demonstration":
+            raise RuntimeFault(f"episode = {episode!r} is a {kind}; allowed: demonstrations")
+
+    # --- for pages -------------------------------------------------------------------------------------------
+
+    def shown(self) -> dict[str, Any] | None:
+        """For the snapshot; None where the deployment says nothing of collecting."""
+        if self._settings is None:
+            return None
+        settings, run, cameras = self._settings, self.run, self._plan.cameras
+        described = settings.described(cameras)
+        return {
+            "source": settings.source,
+            "mode": settings.mode,
+            "set_up": self.set_up,
+            "armed": self.armed,
+            "why_not": self.why_not,
+            "leader": self._leader(),
+            "task": self.task or self._inference.asking.task,
+            "episode": run.uuid if run is not None else None,
+            "last": self.last,
+            "dataset": settings.dataset,
+            "cameras": described["cameras"],
+            "primary_camera": described["primary_camera"],
+            "min_length_s": settings.min_length_s,
+            "setup": self._fingerprint(),
+        }
+
+    def _fingerprint(self) -> dict[str, Any] | None:
+        """What the next episode would look like, in the words of its manifest; None before every picture was seen."""
+        assert self._settings is not None
+        record, robot = self._page.observation.read(), self._plan.robot
+        described = self._settings.described(self._plan.cameras)
+        cameras = {}
+        for key in described["cameras"]:
+            number = int(record["picture_number"][self._page.layout.cameras.index(key)])
+            size = self._page.pictures[key].shape(number) if number else None
+            if size is None:
+                return self._seen
+            cameras[key] = {"width": size[1], "height": size[0]}
+        schema = Schema.of({"collection": described})
+        self._seen = {
+            "robot": robot.name,
+            "groups": [group.name for group in robot.groups],
+            "joints": list(robot.joint_names),
+            "cameras": cameras,
+            "fps": self._plan.fps,
+            "streams": schema.streams(
+                qvel=bool(record["has"][0]), effort=bool(record["has"][1]), posed=bool(robot.eef_dim)
+            ),
+        }
+        return self._seen
+
+    def _leader(self) -> dict[str, Any]:
+        assert self._settings is not None
+        now, relay = self._clock.now(), self._relay
+        if self._node_leads:
+            return self._node(now)
+        kind = "" if self._settings.leader is None else self._settings.leader.kind
+        newest_pose = None if relay is None else relay.leader.newest
+        if relay is None or newest_pose is None:
+            return {"kind": kind, "rate": 0.0, "age_s": None, "state": "absent"}
+        state = "silent" if relay.silence() else "alive"
+        return {
+            "kind": kind,
+            "rate": relay.leader.rate,
+            "age_s": now - newest_pose.arrived,
+            "state": state,
+        }
+
+    def _node(self, now: float) -> dict[str, Any]:
+        at, run = self._reported_at, self.run
+        age = None if at is None else now - at
+        alive = age is not None and age <= NODE_SILENT_S
+        times = self._reported
+        rate = (len(times) - 1) / max(times[-1] - times[0], 1e-9) if alive and len(times) > 1 else 0.0
+        asked = run is not None and run.begun is not None
+        state = "alive" if alive else "silent" if asked else "unknown"
+        return {"kind": "node", "rate": rate, "age_s": age, "state": state}
+
+    def _event(self, kind: str, text: str) -> None:
+        self._say(Event(kind, text, self._clock.now()))

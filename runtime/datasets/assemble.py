@@ -1,0 +1,368 @@
+"""Makes a new dataset of episodes of others, in either version: convert, merge, split and delete all do that."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from runtime.datasets import layout
+from runtime.datasets.catalog import Catalog, info_of, own_line
+from runtime.datasets.columns import column_statistics
+from runtime.datasets.cut import NotCopyableError, cut, encode
+from runtime.datasets.entries import entry, statistic_lines, task_lines
+from runtime.datasets.features import arrow_schema, differences, stored
+from runtime.datasets.layout import Line
+from runtime.datasets.parquet_lists import EPISODES_FOLDER
+from runtime.datasets.pictures import StoredPictures
+from runtime.datasets.reader import Dataset, open_dataset
+from runtime.datasets.renaming import Names
+from runtime.datasets.rows import numbers, write_table
+from runtime.datasets.sides import FOLDER, side_file, side_files
+from runtime.datasets.staging import Draft
+from runtime.datasets.stats import Statistic, picture_statistic, video_statistic
+from runtime.errors import RecordingError
+from runtime.recording.files import disk_fault
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_PLACED = ("episode_index", "index", "task_index")  # columns that depend on where an episode is
+_OURS = {layout.INFO, layout.EPISODES, layout.TASKS, layout.EPISODES_STATS, layout.STATS, layout.TASKS_V30}
+_OURS |= {layout.EVA_EPISODES}
+COPIED_FROM = (
+    "copied_from"  # in our line about an episode: the dataset it was copied from, absent where published
+)
+
+Tell = Callable[[str], None]  # hears how far it is
+
+
+def silent(progress: str) -> None:
+    """For those who do not want to know."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One episode of a source."""
+
+    source: Source
+    index: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Source:
+    """A dataset that episodes are taken from, with what its metadata say beside the list of episodes."""
+
+    dataset: Dataset
+    names: Names
+    tasks: tuple[str, ...]  # in the order of their numbers
+    statistics: Mapping[int, Mapping[str, Statistic]]
+    eva: Mapping[int, Line]
+
+    @classmethod
+    def open(cls, root: Path, names: Names | None = None) -> Source:
+        """Raises RecordingError where there is no dataset, or it cannot be renamed so."""
+        dataset = open_dataset(root)
+        names = names or Names({})
+        names.require(dataset.features)
+        eva = layout.read_lines(root / layout.EVA_EPISODES)
+        statistics = statistic_lines(root, dataset.info)
+        tasks = sorted(task_lines(root, dataset.info), key=lambda line: int(line["task_index"]))
+        return cls(
+            dataset,
+            names,
+            tuple(str(line["task"]) for line in tasks),
+            {line["episode_index"]: names.keys(line["stats"]) for line in statistics},
+            {line["episode_index"]: line for line in eva},
+        )
+
+    @property
+    def features(self) -> Mapping[str, Mapping[str, Any]]:
+        """The features under their new names."""
+        return self.names.keys(self.dataset.features)
+
+    def parts(self, indices: Sequence[int] | None = None) -> list[Part]:
+        """Its episodes, all or those of `indices`; raises RecordingError for one that is not there."""
+        if indices is None:
+            return [Part(self, listed.index) for listed in self.dataset.episodes]
+        return [Part(self, self.dataset.entry(index).index) for index in indices]
+
+
+@dataclass(frozen=True, slots=True)
+class Assembled:
+    """What came of it. `encoded` are videos whose pictures were coded again, `left_out` is what was not taken along."""
+
+    dataset: Path
+    version: str
+    episodes: int
+    frames: int
+    encoded: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def assemble(
+    target: Path,
+    version: str,
+    parts: Sequence[Part],
+    *,
+    reencode: bool = False,
+    replacing: bool = False,
+    tell: Tell = silent,
+) -> Assembled:
+    """Write the dataset `target` with `parts` as its episodes 0, 1, ...; it appears whole or not at all.
+
+    Rows, statistics and tasks are those of the sources; coded pictures are copied, one video per episode. Where they
+    cannot be, `reencode` allows to code them again. `replacing`: in place of the dataset that is there. Raises
+    RecordingError where the parts do not belong together.
+    """
+    if version not in layout.WRITABLE_VERSIONS:
+        raise RecordingError(f"version is {version!r}, written are {layout.WRITABLE_VERSIONS}")
+    if not parts:
+        raise RecordingError(f"{target} would have no episode")
+    _require_same(parts)
+    with Draft(Path(target), replacing) as draft:
+        try:
+            made = _Assembly(draft.folder, version, parts, reencode, not replacing).write(tell)
+        except OSError as error:
+            raise disk_fault("assembling", draft.folder, error) from error
+        draft.place()
+    return replace(made, dataset=Path(target))
+
+
+def _require_same(parts: Sequence[Part]) -> None:
+    first = parts[0].source
+    for source in _sources(parts)[1:]:
+        one, other = first.dataset, source.dataset
+        found = [
+            f"{name} is {stated!r}, there {given!r}"
+            for name, stated, given in (
+                ("robot_type", one.info.get("robot_type"), other.info.get("robot_type")),
+                ("fps", one.fps, other.fps),
+            )
+            if stated != given
+        ]
+        found += differences(first.features, source.features)
+        found += [
+            f"video {key!r} is {mine}, there {theirs}"
+            for key in layout.video_keys(first.features)
+            if (mine := _codec(first, key)) != (theirs := _codec(source, key))
+        ]
+        if found:
+            raise RecordingError(f"{one.root} and {other.root} do not belong together: {'; '.join(found)}")
+    uuids = Counter(part.source.eva[part.index]["uuid"] for part in parts if part.index in part.source.eva)
+    twice = [uuid for uuid, count in uuids.items() if count > 1]
+    if twice:
+        raise RecordingError(f"the same episode would be there twice: {twice}")
+
+
+def _codec(source: Source, key: str) -> Any:
+    info = source.features.get(key, {}).get("info") or {}
+    return {name: info.get(name) for name in ("video.codec", "video.pix_fmt")}
+
+
+def _sources(parts: Sequence[Part]) -> list[Source]:
+    return list({id(part.source): part.source for part in parts}.values())
+
+
+class _Assembly:
+    """One new dataset on its way into the folder `root`."""
+
+    def __init__(
+        self, root: Path, version: str, parts: Sequence[Part], reencode: bool, copying: bool
+    ) -> None:
+        self._root = root
+        self._copying = copying
+        self._parts = parts
+        self._reencode = reencode
+        self._sources = _sources(parts)
+        first = self._sources[0]
+        self._features = {key: dict(feature) for key, feature in first.features.items()}
+        self._tasks = tuple(dict.fromkeys(task for source in self._sources for task in source.tasks))
+        self._fps = first.dataset.fps
+        self._info = info_of(
+            first.dataset.info if len(self._sources) == 1 else {},
+            robot=first.dataset.info.get("robot_type"),
+            fps=self._fps,
+            features=self._features,
+            version=version,
+        )
+        self._encoded: list[str] = []
+        self._left_out: dict[str, None] = {}  # in order, each once
+
+    def write(self, tell: Tell) -> Assembled:
+        lines, statistics, eva, first = [], [], [], 0
+        for index, part in enumerate(self._parts):
+            tell(f"episode {index + 1} of {len(self._parts)}")
+            line = self._line(part, index, first)
+            lines.append(line)
+            statistics.append({"episode_index": index, "stats": self._episode(part, line, first)})
+            told = part.source.eva.get(part.index)
+            if told is not None:
+                origin = {COPIED_FROM: part.source.dataset.root.absolute().name} if self._copying else {}
+                eva.append(told | {"episode_index": index} | origin)
+                self._sides(part, str(told["uuid"]))
+            first += line["length"]
+        tasks = tuple({"task_index": number, "task": task} for number, task in enumerate(self._tasks))
+        catalog = Catalog(self._root, self._info, tuple(lines), tasks, tuple(statistics), tuple(eva))
+        catalog = replace(catalog, info={**self._info, **catalog.totals()})
+        for name, content in (catalog.documents_before_data() | catalog.documents_after_data()).items():
+            path = self._root / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        self._others()
+        return Assembled(
+            self._root,
+            catalog.version,
+            len(lines),
+            first,
+            tuple(self._encoded),
+            tuple(self._left_out),
+        )
+
+    def _line(self, part: Part, index: int, first: int) -> Line:
+        listed = part.source.dataset.entry(part.index)
+        return own_line(self._info, index, list(listed.tasks), listed.length, first)
+
+    def _episode(self, part: Part, line: Line, first: int) -> dict[str, Statistic]:
+        """Write rows and videos of one episode; its statistics."""
+        placed = entry(self._root, self._info, line)
+        table = self._table(part, line, first)
+        placed.data.parent.mkdir(parents=True, exist_ok=True)
+        write_table(table, placed.data)
+        statistics = {
+            key: statistic
+            for key, statistic in part.source.statistics.get(part.index, {}).items()
+            if key in self._features and key not in _PLACED
+        }
+        for key, span in placed.videos.items():
+            span.path.parent.mkdir(parents=True, exist_ok=True)
+            self._video(part, key, span.path, placed.length)
+            if key not in statistics:
+                statistics[key] = video_statistic(span.path, placed.length)
+        for key in layout.image_keys(self._features):
+            if key not in statistics:
+                rows = StoredPictures(f"{placed.data}, {key!r}", table.column(key).to_pylist(), self._root)
+                statistics[key] = picture_statistic(rows)
+        return statistics | _completed(statistics, self._computed(table))
+
+    def _computed(self, table: pa.Table) -> dict[str, Statistic]:
+        columns = {
+            key: numbers(table, key).reshape(table.num_rows, -1)
+            for key, feature in stored(self._features).items()
+            if feature["dtype"] not in ("string", "image")
+        }
+        plain = {key: rows.reshape(-1) if rows.shape[1] == 1 else rows for key, rows in columns.items()}
+        return column_statistics(plain, {key: self._features[key] for key in plain})
+
+    def _table(self, part: Part, line: Line, first: int) -> pa.Table:
+        """The rows of an episode in their new place, exactly the declared columns."""
+        import pyarrow as pa
+
+        source, index = part.source, part.index
+        table = source.dataset.table(index)
+        table = table.rename_columns([source.names.new(name) for name in table.column_names])
+        columns = stored(self._features)
+        missing = [key for key in columns if key not in table.column_names]
+        if missing:
+            raise RecordingError(
+                f"{source.dataset.root}, episode {index} lacks the columns {missing}, it has {table.column_names}"
+            )
+        for name in table.column_names:
+            if name not in columns:
+                self._left_out[f"column {name!r}: it is declared nowhere"] = None
+        rows, schema = table.num_rows, arrow_schema(self._features)
+        fresh = {
+            "episode_index": np.full(rows, line["episode_index"], np.int64),
+            "index": np.arange(first, first + rows, dtype=np.int64),
+            "task_index": self._task_numbers(part, numbers(table, "task_index")),
+        }
+        arrays = []
+        for field in schema:
+            if field.name in fresh:
+                arrays.append(pa.array(fresh[field.name], field.type))
+            else:
+                arrays.append(self._cast(part, table.column(field.name), field))
+        return pa.Table.from_arrays(arrays, schema=schema)
+
+    def _task_numbers(self, part: Part, given: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        known = part.source.dataset.tasks
+        unknown = sorted(set(given.tolist()) - set(known))
+        if unknown:
+            raise RecordingError(
+                f"{part.source.dataset.root}, episode {part.index}: task_index {unknown} is no task, "
+                f"there are {sorted(known)}"
+            )
+        numbered = {number: self._tasks.index(task) for number, task in known.items()}
+        return np.array([numbered[number] for number in given.tolist()], np.int64)
+
+    def _cast(self, part: Part, column: pa.ChunkedArray, field: pa.Field) -> pa.Array:
+        import pyarrow as pa
+
+        array = column.combine_chunks()
+        root, where = part.source.dataset.root, f"episode {part.index}, column {field.name!r}"
+        if pa.types.is_struct(field.type):
+            pictures = StoredPictures(f"{root}, {where}", array.to_pylist(), root)
+            return pa.array([pictures.row(k) for k in range(len(pictures))], field.type)
+        nested = pa.types.is_list(array.type) or pa.types.is_fixed_size_list(array.type)
+        if nested and not (pa.types.is_list(field.type) or pa.types.is_fixed_size_list(field.type)):
+            if len(array.flatten()) != len(array):
+                raise RecordingError(f"{root}, {where} has other than one value per row, declared is one")
+            array = array.flatten()
+        try:
+            return array.cast(field.type)
+        except pa.ArrowException as error:
+            raise RecordingError(
+                f"{root}, {where} is {array.type}, declared {field.type}: {error}"
+            ) from error
+
+    def _video(self, part: Part, key: str, target: Path, frames: int) -> None:
+        span = part.source.dataset.entry(part.index).videos[part.source.names.old(key)]
+        try:
+            cut(span, target, frames, self._fps)
+        except NotCopyableError as error:
+            if not self._reencode:
+                raise RecordingError(
+                    f"{error}. Code its pictures again with --reencode: they lose a little"
+                ) from error
+            encode(span, target, frames, self._fps)
+            self._encoded.append(f"{key} of episode {part.index} of {part.source.dataset.root}")
+
+    def _sides(self, part: Part, uuid: str) -> None:
+        for kind, path in side_files(part.source.dataset.root, uuid).items():
+            target = side_file(self._root, kind, uuid)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, target)
+
+    def _others(self) -> None:
+        """What is of no episode and not of the format: files of a single source go along, the rest is told."""
+        for source in self._sources:
+            root = source.dataset.root
+            for path in sorted([*root.glob("*"), *(root / "meta").glob("*")]):
+                name = str(path.relative_to(root))
+                if path.name.startswith(".") or name in _OURS or name in _folders(source):
+                    continue
+                if name == layout.MODALITY:
+                    if source is self._sources[0] and source.names.empty:
+                        shutil.copyfile(path, self._root / name)
+                elif len(self._sources) == 1 and path.is_file():
+                    shutil.copyfile(path, self._root / name)
+                else:
+                    self._left_out[str(path)] = None
+
+
+def _folders(source: Source) -> set[str]:
+    """The folders of a dataset whose contents belong to episodes."""
+    root = source.dataset.root
+    listed = source.dataset.episodes
+    files = [path for one in listed for path in (one.data, *(span.path for span in one.videos.values()))]
+    return {"meta", FOLDER, EPISODES_FOLDER, *(path.relative_to(root).parts[0] for path in files)}
+
+
+def _completed(given: Mapping[str, Statistic], computed: Mapping[str, Statistic]) -> dict[str, Statistic]:
+    """The figures that are given, and of each column those that are not."""
+    return {key: {**statistic, **given.get(key, {})} for key, statistic in computed.items()}

@@ -1,0 +1,127 @@
+"""What the metadata of a dataset list of its episodes and tasks, whichever version wrote them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from runtime.datasets import layout, parquet_lists
+from runtime.datasets.layout import Info, Line
+from runtime.errors import RecordingError
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Where the pictures of one episode and camera lie."""
+
+    path: Path
+    start: float | None = None  # time of the first one [s]; None: the file holds this episode alone
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeEntry:
+    """One episode as the metadata list it."""
+
+    index: int
+    length: int  # rows
+    tasks: tuple[str, ...]
+    data: Path  # parquet
+    shared: bool  # `data` holds rows of other episodes too
+    videos: Mapping[str, Span]  # by video key
+
+
+def episode_lines(root: Path, info: Info) -> list[Line]:
+    """The list of episodes as stored, in order of their indices; only those that info.json counts."""
+    v30 = info["codebase_version"] == layout.V30
+    name = parquet_lists.EPISODES_FOLDER if v30 else layout.EPISODES
+    lines = parquet_lists.read_episodes(root) if v30 else layout.read_lines(root / name)
+    return committed(root / name, lines, info)
+
+
+def committed(path: Path, lines: list[Line], info: Info) -> list[Line]:
+    """Those of `lines` that info.json counts, by episode; raises RecordingError for one that is of no episode."""
+    try:
+        counted = [line for line in lines if int(line["episode_index"]) < int(info["total_episodes"])]
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordingError(f"{path}: a line says no episode_index: {error!r}") from error
+    return sorted(counted, key=lambda line: int(line["episode_index"]))
+
+
+def task_lines(root: Path, info: Info) -> list[Line]:
+    """The list of tasks as {"task_index", "task"}, as stored."""
+    if info["codebase_version"] == layout.V30:
+        return parquet_lists.read_tasks(root)
+    lines = layout.read_lines(root / layout.TASKS)
+    for line in lines:
+        if not isinstance(line.get("task_index"), int) or not isinstance(line.get("task"), str):
+            raise RecordingError(f"{root / layout.TASKS}: {line} is no task")
+    return lines
+
+
+def statistic_lines(root: Path, info: Info) -> list[Line]:
+    """Statistics by episode as {"episode_index", "stats"}; [] for v2.0, which has none."""
+    if info["codebase_version"] == layout.V30:
+        return committed(root / parquet_lists.EPISODES_FOLDER, parquet_lists.read_statistics(root), info)
+    return committed(root / layout.EPISODES_STATS, layout.read_lines(root / layout.EPISODES_STATS), info)
+
+
+def entry(root: Path, info: Info, line: Line) -> EpisodeEntry:
+    """What a line of the list of episodes says; raises RecordingError where it lacks anything."""
+    v30 = info["codebase_version"] == layout.V30
+    try:
+        index = int(line["episode_index"])
+        return EpisodeEntry(
+            index=index,
+            length=int(line["length"]),
+            tasks=tuple(str(task) for task in line.get("tasks") or ()),
+            data=_data_v30(root, info, line) if v30 else _file_v2(root, info, line, "data_path", ""),
+            shared=v30,
+            videos={
+                key: _span_v30(root, info, line, key)
+                if v30
+                else Span(_file_v2(root, info, line, "video_path", key))
+                for key in layout.video_keys(info["features"])
+            },
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        where = root / (parquet_lists.EPISODES_FOLDER if v30 else layout.EPISODES)
+        raise RecordingError(f"{where}: {_short(line)} is no episode: {error!r}") from error
+
+
+def _short(line: Line) -> dict[str, Any]:
+    return {key: line[key] for key in list(line)[:6]}
+
+
+def _file_v2(root: Path, info: Info, line: Line, template: str, key: str) -> Path:
+    index = int(line["episode_index"])
+    default = layout.DATA_PATH if template == "data_path" else layout.VIDEO_PATH
+    return layout.resolve(
+        root,
+        info.get(template) or default,
+        episode_chunk=index // int(info.get("chunks_size") or layout.CHUNKS_SIZE),
+        episode_index=index,
+        episode_file=line.get("file_stem") or f"episode_{index:06d}",
+        video_key=key,
+    )
+
+
+def _data_v30(root: Path, info: Info, line: Line) -> Path:
+    return layout.resolve(
+        root,
+        info.get("data_path") or layout.DATA_PATH_V30,
+        chunk_index=int(line["data/chunk_index"]),
+        file_index=int(line["data/file_index"]),
+    )
+
+
+def _span_v30(root: Path, info: Info, line: Line, key: str) -> Span:
+    path = layout.resolve(
+        root,
+        info.get("video_path") or layout.VIDEO_PATH_V30,
+        video_key=key,
+        chunk_index=int(line[f"videos/{key}/chunk_index"]),
+        file_index=int(line[f"videos/{key}/file_index"]),
+    )
+    return Span(path, float(line[f"videos/{key}/from_timestamp"]))

@@ -1,0 +1,185 @@
+"""An episode of a dataset as an episode of a lab: the same numbers and pictures in a folder like those of its own.
+
+The dataset stays the authority: its pictures are coded again for the folder, its numbers are copied.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import robots
+from runtime.datasets import layout
+from runtime.datasets.identities import uuids_of
+from runtime.datasets.mapping import ColumnMapping, video_key
+from runtime.datasets.pictures import PictureSequence
+from runtime.datasets.reader import Dataset, RecordedEpisode
+from runtime.errors import RecordingError
+from runtime.recording.base import IMPORTED, ExecutedTick, Outcome, Row
+from runtime.recording.episode import EpisodeJournal
+from runtime.recording.files import disk_fault, sync_folder
+from runtime.recording.settings import RecordingSettings
+from runtime.types import Float32
+
+STATES = ("observation.state", "observation.qpos")  # measured joints, the first that there is
+ACTION = "action"
+
+
+@dataclass(frozen=True, slots=True)
+class Whose:
+    """What a dataset does not say itself: `state`, the column of measured joints; `robot`, whose numbers they are."""
+
+    state: str = ""
+    robot: str = ""
+
+    def names(self, dataset: Dataset) -> list[str]:
+        """Of the numbers of the state; RecordingError where the robot has not as many."""
+        feature = dataset.features[self.state]
+        width, names = int(feature["shape"][0]), feature.get("names")
+        if self.robot:
+            joints = list(robots.load(self.robot).joint_names)
+            if len(joints) != width:
+                raise RecordingError(
+                    f"{dataset.root}: {self.state} has {width} numbers, {self.robot} has {len(joints)} joints"
+                )
+            return joints
+        if isinstance(names, Mapping) and len(names) == 1:  # {"motors": [...]}, as some have it
+            names = next(iter(names.values()))
+        told = [str(name) for name in names] if isinstance(names, list) else []
+        return told if len(told) == width else [f"{self.state}[{k}]" for k in range(width)]
+
+
+def whose(dataset: Dataset, state: str = "", robot: str = "") -> Whose:
+    """Checked: the column is there, the robot is known; RecordingError names what there is."""
+    vectors = [name for name, feature in dataset.features.items() if _is_vector(feature)]
+    found = state or next((name for name in STATES if name in vectors), "")
+    if found not in vectors:
+        raise RecordingError(
+            f"{dataset.root} has no column {found or ' or '.join(STATES)} of measured joints: name one of "
+            f"{', '.join(vectors) or 'none, it has no vectors'}"
+        )
+    if robot and robot not in robots.names():
+        raise RecordingError(f"robot {robot!r} does not exist; there are: {', '.join(robots.names())}")
+    return Whose(found, robot)
+
+
+def bring(dataset: Dataset, index: int, episodes: Path, told: Whose) -> tuple[str, bool]:
+    """Make the folder of episode `index` in `episodes`; its uuid, and whether it was not there. RecordingError.
+
+    It appears whole or not at all. The dataset lies in the data folder that `episodes` is in.
+    """
+    uuid = uuids_of(dataset.root)[index]
+    folder, drafts = episodes / uuid, episodes.parent / f".{IMPORTED}"
+    if folder.exists():
+        return uuid, False
+    try:
+        shutil.rmtree(drafts / uuid, ignore_errors=True)  # what a crash left
+        made = _recorded(dataset, index, uuid, drafts, told, os.path.relpath(dataset.root, episodes.parent))
+        episodes.mkdir(parents=True, exist_ok=True)
+        os.rename(made, folder)
+        sync_folder(episodes)
+    except OSError as error:
+        raise disk_fault("importing into", folder, error) from error
+    finally:
+        shutil.rmtree(drafts / uuid, ignore_errors=True)
+    return uuid, True
+
+
+def _recorded(dataset: Dataset, index: int, uuid: str, root: Path, told: Whose, name: str) -> Path:
+    keys = [*layout.video_keys(dataset.features), *layout.image_keys(dataset.features)]
+    cameras = {key.removeprefix(video_key("")).replace("/", "."): key for key in keys}
+    action = ACTION if _is_vector(dataset.features.get(ACTION, {})) else None
+    episode = dataset.episode(index, ColumnMapping(state=told.state, action=action, videos=cameras))
+    settings = RecordingSettings(min_free_bytes=0)
+    with ExitStack() as stack:
+        pictures = {camera: stack.enter_context(episode.pictures(camera)) for camera in cameras}
+        manifest = _manifest(dataset, episode, uuid, told, name, _sizes(pictures, settings))
+        journal = EpisodeJournal(root, settings, patient=True)
+        journal.begin(manifest)
+        try:
+            for row in range(episode.length):
+                journal.append(_row(episode, row, {camera: each[row] for camera, each in pictures.items()}))
+                journal.append(_tick(episode, row))
+        except BaseException as error:
+            journal.end(Outcome("failed", f"the import of row {row} failed: {error}", time.time()))
+            raise
+        journal.end(Outcome("finished", f"imported: episode {index} of {name}", time.time()))
+    if losses := journal.losses():
+        raise RecordingError(f"{dataset.root}, episode {index}: {'; '.join(loss.text for loss in losses)}")
+    return root / uuid
+
+
+def _manifest(
+    dataset: Dataset, episode: RecordedEpisode, uuid: str, told: Whose, name: str, sizes: Mapping[str, Any]
+) -> dict[str, Any]:
+    joints = told.names(dataset)
+    own = str(dataset.info.get("robot_type") or "")
+    return {
+        "format": 1,
+        "uuid": uuid,
+        "station": IMPORTED,  # nobody can be told to go there
+        "kind": IMPORTED,
+        "mode": "observe",
+        "task": episode.task,
+        "robot": {
+            "name": told.robot or own,
+            "joint_names": joints,
+            "eef_names": [],
+            "dim": len(joints),
+            "eef_dim": 0,
+        },
+        "fps": dataset.fps,
+        "control_rate": dataset.fps,
+        "cameras": sizes,
+        "streams": {},
+        "capture_streams": [],
+        "started_wall": time.time(),
+        "started_monotonic": 0.0,
+        "configuration": {},
+        "imported": {"dataset": name, "index": episode.index, "state": told.state, "robot": told.robot},
+    }
+
+
+def _sizes(pictures: Mapping[str, PictureSequence], settings: RecordingSettings) -> dict[str, Any]:
+    given = {camera: (each[0].shape[0], each[0].shape[1]) for camera, each in pictures.items()}
+    sizes = settings.sizes(given)
+    return {camera: {"width": width, "height": height} for camera, (height, width) in sizes.items()}
+
+
+def _row(episode: RecordedEpisode, row: int, pictures: Mapping[str, Any]) -> Row:
+    return Row(
+        index=row,
+        step=row,
+        tick_time=row / episode.fps,
+        sequence=row + 1,
+        qpos=episode.qpos[row],
+        action=_action(episode, row),
+        captured={},
+        pictures=pictures,
+        control_source="unknown",
+    )
+
+
+def _tick(episode: RecordedEpisode, row: int) -> ExecutedTick:
+    at = row / episode.fps
+    return ExecutedTick(row, at, at, row + 1, "unknown", episode.qpos[row], None, _action(episode, row))
+
+
+def _action(episode: RecordedEpisode, row: int) -> Float32:
+    """NaN where the dataset has none, or one of other numbers than the joints."""
+    if episode.action is None or episode.action.shape != episode.qpos.shape:
+        return np.full_like(episode.qpos[row], np.nan)
+    return np.asarray(episode.action[row], np.float32)
+
+
+def _is_vector(feature: Mapping[str, Any]) -> bool:
+    shape = list(feature.get("shape") or ())
+    return str(feature.get("dtype")).startswith("float") and len(shape) == 1 and int(shape[0]) > 1

@@ -1,0 +1,174 @@
+"""What is done to whole datasets: export to the other version, merge, split, delete episodes, repair."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+
+from runtime.datasets import layout
+from runtime.datasets.assemble import Assembled, Part, Source, Tell, assemble, silent
+from runtime.datasets.consistency import check
+from runtime.datasets.entries import episode_lines
+from runtime.datasets.renaming import Names
+from runtime.datasets.staging import LOCK, locked, recover, remove_drafts
+from runtime.errors import RecordingError
+from runtime.recording.files import disk_fault
+
+
+def convert(
+    dataset: Path,
+    target: Path,
+    version: str,
+    *,
+    rename: Mapping[str, str] | None = None,
+    reencode: bool = False,
+    tell: Tell = silent,
+) -> Assembled:
+    """Write `dataset` as the new dataset `target` of `version`, v2.1 or v3.0; features may get new names."""
+    with _undisturbed([dataset]):
+        source = Source.open(Path(dataset), Names(dict(rename or {})))
+        return assemble(target, version, source.parts(), reencode=reencode, tell=tell)
+
+
+def merge(
+    datasets: Sequence[Path],
+    target: Path,
+    version: str | None = None,
+    *,
+    reencode: bool = False,
+    tell: Tell = silent,
+) -> Assembled:
+    """Write the episodes of `datasets`, in this order, as the new dataset `target`.
+
+    `version` is that of the first, or the one it can be written as, where None. Raises RecordingError with every
+    difference where they do not belong together.
+    """
+    if not datasets:
+        raise RecordingError("no datasets to merge")
+    with _undisturbed(datasets):
+        sources = [Source.open(Path(dataset)) for dataset in datasets]
+        parts = [part for source in sources for part in source.parts()]
+        return assemble(target, version or _kept(sources[0]), parts, reencode=reencode, tell=tell)
+
+
+def split(
+    dataset: Path,
+    targets: Mapping[Path, Sequence[int]],
+    version: str | None = None,
+    *,
+    reencode: bool = False,
+    tell: Tell = silent,
+) -> list[Assembled]:
+    """Write the episodes with these indices as new datasets; an episode may be in several, or in none.
+
+    Raises RecordingError for a target that is there, or an episode that is not, before anything is written.
+    """
+    if not targets:
+        raise RecordingError(f"{dataset} is to be split into nothing")
+    with _undisturbed([dataset]):
+        source = Source.open(Path(dataset))
+        wanted = {target: source.parts(_each_once(indices)) for target, indices in targets.items()}
+        for target in wanted:
+            if target.exists() and any(target.iterdir()):
+                raise RecordingError(f"{target} is there already and not empty")
+        made = version or _kept(source)
+        done = []
+        for target, parts in wanted.items():
+            said = partial(_of_part, tell, target.name)
+            done.append(assemble(target, made, parts, reencode=reencode, tell=said))
+        return done
+
+
+def _of_part(tell: Tell, name: str, progress: str) -> None:
+    tell(f"{name}: {progress}")
+
+
+def delete(
+    dataset: Path,
+    indices: Sequence[int],
+    *,
+    reencode: bool = False,
+    known: str = "",
+    tell: Tell = silent,
+) -> Assembled:
+    """Take episodes out of `dataset`; those behind them move up. It is the old one or the new one at any moment.
+
+    With `known`, the `fingerprint` of the dataset that the indices are about, they are never taken from another one.
+    Raises RecordingError where an episode is not there, or none would be left.
+    """
+    root = Path(dataset)
+    _require_dataset(root)
+    with locked(root):
+        recover(root)
+        if known and fingerprint(root) != known:
+            raise RecordingError(
+                f"{root} has other episodes now than when this was asked for: nothing was deleted; look again"
+            )
+        source = Source.open(root)
+        gone = {part.index for part in source.parts(_each_once(indices))}
+        left: list[Part] = [part for part in source.parts() if part.index not in gone]
+        if not gone:
+            raise RecordingError(f"no episodes of {root} to delete")
+        return assemble(root, _kept(source), left, reencode=reencode, replacing=True, tell=tell)
+
+
+def fingerprint(dataset: Path) -> str:
+    """What changes with every episode that comes, goes or is written anew at another length; RecordingError."""
+    root = Path(dataset)
+    info = layout.read_info(root)
+    told = [
+        [line["episode_index"], line["length"], list(line.get("tasks") or ())]
+        for line in episode_lines(root, info)
+    ]
+    ours = [[line["episode_index"], line["uuid"]] for line in layout.read_lines(root / layout.EVA_EPISODES)]
+    return hashlib.sha256(json.dumps([told, ours], ensure_ascii=True).encode()).hexdigest()
+
+
+def repair(dataset: Path) -> list[str]:
+    """Take back what was cut off by a crash; what `check` then still finds, which cannot be repaired here."""
+    root = Path(dataset)
+    remove_drafts(root)
+    _require_dataset(root)
+    with locked(root):
+        recover(root)
+    return check(root)
+
+
+def _require_dataset(root: Path) -> None:
+    if not root.is_dir():
+        raise RecordingError(f"there is no dataset folder {root}")
+
+
+def _kept(source: Source) -> str:
+    """The version of a dataset, or the one that v2.0 is written as."""
+    version = source.dataset.version
+    return version if version in layout.WRITABLE_VERSIONS else layout.DEFAULT_VERSION
+
+
+def _each_once(indices: Sequence[int]) -> Sequence[int]:
+    twice = sorted({index for index in indices if list(indices).count(index) > 1})
+    if twice:
+        raise RecordingError(f"episodes {twice} are named twice")
+    return indices
+
+
+@contextmanager
+def _undisturbed(datasets: Sequence[Path]) -> Iterator[None]:
+    """Keep publishers out of `datasets` meanwhile; one that nobody publishes to has no lock, and gets none."""
+    with ExitStack() as stack:
+        for path in sorted({Path(dataset).absolute() / LOCK for dataset in datasets}):
+            if not path.exists():
+                continue
+            try:
+                descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+                stack.callback(os.close, descriptor)
+                fcntl.flock(descriptor, fcntl.LOCK_SH)
+            except OSError as error:
+                raise disk_fault("locking", path, error) from error
+        yield

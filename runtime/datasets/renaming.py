@@ -1,0 +1,48 @@
+"""New names for the columns of a dataset of other people, so that training code finds what it looks for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+from runtime.datasets.features import INDEX_COLUMNS
+from runtime.errors import RecordingError
+
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True, slots=True)
+class Names:
+    """New name by old one; whatever is not in it keeps its name."""
+
+    new_by_old: Mapping[str, str]
+
+    @property
+    def empty(self) -> bool:
+        """Whether everything keeps its name."""
+        return not self.new_by_old
+
+    def new(self, old: str) -> str:
+        """The new name of `old`."""
+        return self.new_by_old.get(old, old)
+
+    def old(self, new: str) -> str:
+        """The name that `new` had."""
+        return next((old for old, name in self.new_by_old.items() if name == new), new)
+
+    def keys(self, mapping: Mapping[str, Value]) -> dict[str, Value]:
+        """`mapping` under the new names, in its order."""
+        return {self.new(key): value for key, value in mapping.items()}
+
+    def require(self, features: Mapping[str, object]) -> None:
+        """Raise RecordingError where such features cannot be renamed so."""
+        for old, new in self.new_by_old.items():
+            if old not in features:
+                raise RecordingError(f"there is no feature {old!r} to rename, there are {sorted(features)}")
+            if old in INDEX_COLUMNS or new in INDEX_COLUMNS:
+                raise RecordingError(f"{old!r} cannot be renamed {new!r}: {sorted(INDEX_COLUMNS)} are fixed")
+            if not new or "/" in new:
+                raise RecordingError(f"{new!r} is no name of a feature: it is empty or has a slash")
+        if len(self.keys(features)) != len(features):
+            raise RecordingError(f"two features would have the same name: {dict(self.new_by_old)}")

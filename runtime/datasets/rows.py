@@ -1,0 +1,79 @@
+"""The parquet files of rows: reads one episode's from a file that may hold many, writes one episode's."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from runtime.errors import RecordingError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+EPISODE = "episode_index"
+
+
+def read_rows(path: Path, episode: int | None, left_out: Collection[str] = ()) -> pa.Table:
+    """The rows of `episode`, or all (None), without the columns in `left_out`.
+
+    Only the row groups that may hold the episode are read. Raises RecordingError naming the file.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    if not path.is_file():
+        raise RecordingError(f"there is no {path}, though the metadata list it")
+    try:
+        with pq.ParquetFile(path) as file:
+            names = file.schema_arrow.names
+            wanted = [name for name in names if name not in left_out] if left_out else None
+            if episode is None:
+                return file.read(columns=wanted)
+            if EPISODE not in names:
+                raise RecordingError(
+                    f"{path} holds several episodes but has no column {EPISODE}, only {names}"
+                )
+            table = file.read_row_groups(_groups(file.metadata, episode), columns=wanted)
+    except (OSError, pa.ArrowException) as error:
+        raise RecordingError(f"{path} cannot be read: {error}") from error
+    import pyarrow.compute as pc
+
+    return table.filter(pc.equal(table.column(EPISODE), episode))
+
+
+def numbers(table: pa.Table, name: str) -> np.ndarray[Any, Any]:
+    """Column `name` as an array [N] or [N * W], whatever lists it is nested in."""
+    import pyarrow as pa
+
+    column = table.column(name).combine_chunks()
+    while pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
+        column = column.flatten()
+    return np.asarray(column.to_numpy(zero_copy_only=False))
+
+
+def write_table(table: pa.Table, path: Path) -> None:
+    """Write `table` to `path`; raises RecordingError."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        pq.write_table(table, path)
+    except (OSError, pa.ArrowException) as error:
+        raise RecordingError(f"{path} cannot be written: {error}") from error
+
+
+def _groups(metadata: pq.FileMetaData, episode: int) -> list[int]:
+    """The row groups that may hold rows of the episode, by the statistics that the file keeps."""
+    chosen = []
+    for number in range(metadata.num_row_groups):
+        group = metadata.row_group(number)
+        columns = (group.column(k) for k in range(group.num_columns))
+        column = next(column for column in columns if column.path_in_schema == EPISODE)
+        known = column.statistics
+        if known is None or not known.has_min_max or known.min <= episode <= known.max:
+            chosen.append(number)
+    return chosen

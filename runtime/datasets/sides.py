@@ -1,0 +1,81 @@
+"""Files that travel with a dataset and that no loader reads: the action streams, annotations and reviews by episode."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from uuid import UUID
+
+from runtime.datasets.catalog import Catalog
+from runtime.datasets.layout import read_lines
+from runtime.datasets.staging import locked, recover
+from runtime.errors import RecordingError
+from runtime.recording.files import write_whole
+
+FOLDER = (
+    "eva"  # beside data, videos and meta: LeRobot takes every parquet file below data/ and meta/episodes/
+)
+STREAMS = "streams"
+SUFFIXES = {STREAMS: ".parquet", "annotations": ".jsonl", "reviews": ".jsonl"}
+
+
+def side_file(root: Path, kind: str, uuid: str) -> Path:
+    """Where what is said of the episode `uuid` lies; RecordingError for a kind or a uuid that is none."""
+    if kind not in SUFFIXES:
+        raise RecordingError(f"{kind!r} is no kind of side file, there are {sorted(SUFFIXES)}")
+    try:
+        name = str(UUID(uuid))
+    except ValueError:
+        raise RecordingError(f"{uuid!r} is no uuid of an episode") from None
+    return root / FOLDER / kind / f"{name}{SUFFIXES[kind]}"
+
+
+def side_files(root: Path, uuid: str) -> dict[str, Path]:
+    """The side files of one episode that there are, by kind."""
+    there = {kind: side_file(root, kind, uuid) for kind in SUFFIXES}
+    return {kind: path for kind, path in there.items() if path.is_file()}
+
+
+def read_sides(given: Mapping[str, Path]) -> dict[str, bytes]:
+    """What publication is given of an episode by kind ("annotations", "reviews"); JSON Lines are checked."""
+    return {kind: _content(kind, Path(path)) for kind, path in given.items()}
+
+
+def attach(dataset: Path, uuid: str, kind: str, source: Path | None) -> Path:
+    """Put the file `source` beside the published episode `uuid`, in place of an older one; None removes it.
+
+    Raises RecordingError where the episode is not in the dataset, or the file is not JSON Lines.
+    """
+    root = Path(dataset)
+    target = side_file(root, kind, uuid)
+    if not root.is_dir():
+        raise RecordingError(f"there is no dataset folder {root}")
+    content = None if source is None else _content(kind, Path(source))
+    with locked(root):
+        recover(root)
+        if Catalog.read(root).index_of(uuid) is None:
+            raise RecordingError(f"{root} has no episode {uuid}")
+        if content is None:
+            target.unlink(missing_ok=True)
+        else:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(target, content)
+    return target
+
+
+def _content(kind: str, source: Path) -> bytes:
+    if kind not in SUFFIXES or kind == STREAMS:
+        attached = sorted(set(SUFFIXES) - {STREAMS})
+        raise RecordingError(f"{kind!r} cannot be attached, only {attached}")
+    if not source.is_file():
+        raise RecordingError(f"there is no file {source} with {kind}")
+    lines = read_lines(source)
+    return b"".join(json.dumps(line, ensure_ascii=False).encode() + b"\n" for line in lines)
+
+
+def strays(root: Path, uuids: set[str]) -> Iterator[str]:
+    """Side files of episodes that are not in the dataset, one sentence each."""
+    for path in sorted((root / FOLDER).glob("*/*")):
+        if path.parent.name in SUFFIXES and path.stem not in uuids and not path.name.startswith("."):
+            yield f"{path} is of an episode that is not in the dataset"

@@ -1,0 +1,43 @@
+"""Whether commands reach anybody: what a transport knows of who listens, told when it changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from runtime.errors import RuntimeFault
+from runtime.page import Page
+from runtime.transports.base import Sink
+
+_EVERY_S = 2.0
+UNHEARD, HEARD = "commands_unheard", "commands_heard"
+Say = Callable[[str, str, Mapping[str, object]], None]
+
+
+class Hearing:
+    """Asks the sink now and then who does not take commands; the event has all of them under `unheard`."""
+
+    def __init__(self, page: Page, sink: Sink, say: Say) -> None:
+        self._page, self._sink, self._say = page, sink, say
+        self._next = float("-inf")
+        self._told: dict[str, str] = {}
+
+    def look(self, now: float) -> None:
+        """One tick; a main that was started anew is told again."""
+        if self._page.last_beat("main") == 0.0:
+            self._told, self._next = {}, now
+            return
+        if now < self._next:
+            return
+        self._next = now + _EVERY_S
+        try:
+            unheard = self._sink.unheard()
+        except RuntimeFault as error:  # commands go out all the same
+            unheard = {"": str(error)}
+        if unheard == self._told:
+            return
+        self._told = unheard
+        if unheard:
+            said = [why or f"nobody listens to {place}" for place, why in sorted(unheard.items())]
+            self._say(UNHEARD, "; ".join(said), {"unheard": unheard})
+        else:
+            self._say(HEARD, "all commands are heard", {"unheard": {}})

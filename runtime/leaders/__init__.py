@@ -1,0 +1,1 @@
+"""What a person holds to drive the robot: one module per way to hear of it."""

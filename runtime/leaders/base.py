@@ -1,0 +1,113 @@
+"""What a leader is: a device that a person moves, and whose joints the robot is to follow."""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from runtime.clock import Clock
+from runtime.errors import CodecError
+from runtime.types import Float64
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from robots import Robot
+
+_RATE_WINDOW = 40  # arrivals
+_SILENT_S = 2.0  # after which there is no rate any more
+
+
+@dataclass(frozen=True, slots=True)
+class LeaderPose:
+    """Where the leader was: `joints` float64 [D] in the robot's order and units, NaN where it has no such joint."""
+
+    joints: Float64
+    arrived: float  # our monotonic clock [s]
+
+
+class Leader(ABC):
+    """One leader; its messages come on a thread of their own, whoever asks gets the newest at once."""
+
+    def __init__(self, robot: Robot, clock: Clock) -> None:
+        self._robot = robot
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._newest: LeaderPose | None = None
+        self._arrivals: deque[float] = deque(maxlen=_RATE_WINDOW)
+        self._refused = ""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What it is and where, for sentences."""
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Begin to listen; a leader that is not there yet is found by itself. Raises RuntimeFault."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop listening; safe to call twice."""
+
+    @property
+    def newest(self) -> LeaderPose | None:
+        """Where it was last, None where it has not said so since it was connected."""
+        with self._lock:
+            return self._newest
+
+    @property
+    def rate(self) -> float:
+        """Poses per second [Hz]; 0 after 2 s of silence."""
+        with self._lock:
+            times = list(self._arrivals)
+        if len(times) < 2 or self._clock.now() - times[-1] > _SILENT_S:
+            return 0.0
+        return (len(times) - 1) / max(times[-1] - times[0], 1e-9)
+
+    @property
+    def refused(self) -> str:
+        """Why its newest message could not be used, "" where it could."""
+        with self._lock:
+            return self._refused
+
+    def _forget(self) -> None:
+        with self._lock:
+            self._newest, self._refused = None, ""
+            self._arrivals.clear()
+
+    def _take(self, joints: Float64, arrived: float) -> None:
+        with self._lock:
+            self._newest, self._refused = LeaderPose(joints, arrived), ""
+            self._arrivals.append(arrived)
+
+    def _refuse(self, why: str) -> None:
+        with self._lock:
+            self._refused = why
+
+
+def joints_of(state: Mapping[str, object], robot: Robot) -> Float64:
+    """Joints [D] of the groups in `state`, NaN for those that are absent; CodecError names what does not fit."""
+    known = [group.name for group in robot.groups]
+    unknown = [str(name) for name in state if name not in known]
+    if unknown or not state:
+        raise CodecError(
+            f"the leader's groups are {', '.join(map(str, state)) or 'none'}; {robot.name} has {', '.join(known)}"
+        )
+    parts = []
+    for group in robot.groups:
+        given = state.get(group.name)
+        part = np.full(group.dof, np.nan) if given is None else np.asarray(given, np.float64)
+        if part.shape != (group.dof,):
+            raise CodecError(
+                f"the leader's {group.name} has the shape {list(part.shape)}; expected [{group.dof}]"
+            )
+        if given is not None and not np.isfinite(part).all():
+            raise CodecError(f"the leader's {group.name} is {part.tolist()}; expected finite numbers")
+        parts.append(part)
+    return np.concatenate(parts)

@@ -1,0 +1,133 @@
+"""A leader as a source of actions: where it is becomes a few equal rows, asked for like any policy's.
+
+So that what a person wants takes the same way as what a policy wants: timeline, locks, safety, record.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from runtime.clock import Clock
+from runtime.errors import PolicyError, PolicyLostError
+from runtime.leaders.base import Leader, LeaderPose
+from runtime.policies.base import Policy, PolicyInfo
+from runtime.timeline import difference
+from runtime.types import ActionChunk, Conditioning, Float64, Observation
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+Following = Literal["absolute", "relative"]
+_FOUND_S = 5.0  # for a leader to say something when the station is set up
+_LOOK_S = 0.02
+_SPARE_ROWS = 2  # beyond the age limit: silence is told by its age, not by starvation
+
+
+class Relay(Policy):
+    """Follows a leader: to where it is ("absolute"), or by as much as it moved since the engagement ("relative").
+
+    The engagement is the first question after a reset. Grippers are absolute in either; joints of groups that the
+    leader does not have stay where the robot had them then.
+    """
+
+    sees_pictures = False
+
+    def __init__(
+        self, leader: Leader, robot: Robot, mode: Following, max_age: float, rate: float, clock: Clock
+    ) -> None:
+        self.leader = leader
+        self.mode = mode
+        self._max_age = max_age
+        self._rows = math.ceil(max_age * rate) + _SPARE_ROWS
+        self._clock = clock
+        self._dim = robot.dim
+        self._grippers = np.isin(np.arange(robot.dim), robot.gripper_dims)
+        self._endless = tuple(np.flatnonzero(np.isinf(robot.lower) & np.isinf(robot.upper)).tolist())
+        self._last: Float64 | None = None  # where the leader was at the question before
+        self._wanted: Float64 = np.zeros(robot.dim)
+
+    def connect(self) -> PolicyInfo:
+        """Listen, and wait for the leader to say where it is; PolicyLostError where it does not."""
+        self.leader.connect()
+        deadline = self._clock.now() + _FOUND_S
+        while self.leader.newest is None:
+            if self._clock.now() > deadline:
+                raise PolicyLostError(self.silence() or f"{self.leader.name} says nothing")
+            self._clock.sleep_until(self._clock.now() + _LOOK_S)
+        return PolicyInfo(self.leader.name, action_space="joint")
+
+    def silence(self) -> str:
+        """Why the leader cannot be followed just now, "" where it can."""
+        newest, why = self.leader.newest, self.leader.refused
+        because = f": {why}" if why else ""
+        if newest is None:
+            return f"{self.leader.name} has said nothing{because}"
+        age = self._clock.now() - newest.arrived
+        if age > self._max_age:
+            allowed = f"allowed {self._max_age:g} (collection.max_age_s)"
+            return f"{self.leader.name} has said nothing for {age:.2f} s, {allowed}{because}"
+        return ""
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        """Rows float32 [H, D], all equal; PolicyLostError where the leader is silent for too long."""
+        if observation.qpos.shape != (self._dim,):
+            raise PolicyError(f"the observation has joints of shape {list(observation.qpos.shape)}")
+        pose = self._pose()
+        if self._last is None:
+            self._wanted = np.asarray(observation.qpos, np.float64).copy()
+        target = self._follow(pose)
+        return ActionChunk(np.tile(target, (self._rows, 1)).astype(np.float32))
+
+    def aim(self, qpos: Float64) -> Float64 | None:
+        """Where the robot at `qpos` [D] would go first; None where the leader is silent, or leads from where it is."""
+        if self.mode == "relative" or self.silence():
+            return None
+        joints = self._pose().joints
+        return np.where(np.isnan(joints), qpos, joints)
+
+    def _pose(self) -> LeaderPose:
+        newest, why = self.leader.newest, self.silence()
+        if newest is None or why:
+            raise PolicyLostError(why)
+        return newest
+
+    def _follow(self, pose: LeaderPose) -> Float64:
+        joints, last = pose.joints, self._last
+        self._last = joints
+        has = ~np.isnan(joints)
+        placed = has & (self._grippers if self.mode == "relative" else True)
+        if last is not None:
+            # Step by step, so that an angle that wraps can be turned on and on.
+            moved = np.nan_to_num(difference(joints, last, self._endless))
+            self._wanted = self._wanted + np.where(placed, 0.0, moved)
+        self._wanted = np.where(placed, joints, self._wanted)
+        return self._wanted
+
+    def reset(self) -> None:
+        """The next question engages anew."""
+        self._last = None
+
+    def close(self) -> None:
+        self.leader.close()
+
+
+class NodeLed(Policy):
+    """The robot's own node reads the leader and drives: nobody is asked here, what it applied is recorded."""
+
+    answers = False
+    sees_pictures = False
+
+    def connect(self) -> PolicyInfo:
+        return PolicyInfo("the node's own leader")
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        raise PolicyError("the node drives the robot by its own leader: there is nothing to ask")
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+    def close(self) -> None:
+        """Nothing to release."""

@@ -1,0 +1,167 @@
+"""A leader on ROS topics, whichever generation: a sensor_msgs/JointState for each group of the robot that it leads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from pydantic import Field
+
+from runtime.clock import Clock
+from runtime.errors import CodecError, ConfigurationError
+from runtime.leaders.base import Leader
+from runtime.section import Section
+from runtime.transports.ros.messages import JointState, Wire
+from runtime.transports.ros.middleware import Match, Middleware, Quality
+from runtime.transports.ros.reading import JointOrder, Names
+from runtime.transports.ros.source import Heard, subscriptions
+from runtime.transports.ros.topics import Part
+from runtime.types import Float64
+
+if TYPE_CHECKING:
+    from robots import Group, Robot
+
+NODE = "eva_web_leader"
+TABLE = "collection.leader"
+
+
+class LedGroup(Section):
+    """Where the leader of one group speaks."""
+
+    topic: Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$")]
+    """sensor_msgs/JointState, its gripper among the numbers."""
+    joints: list[str] | None = None
+    """What the messages call the group's joints, in its order, where that is not what the robot's description does."""
+
+
+class LedGroups(Section):
+    """What both generations of ROS have in common."""
+
+    groups: dict[str, LedGroup] = Field(min_length=1)
+    """By the robot's groups; one that is absent is not led."""
+    joint_names: Names = "check"
+    """"check" takes joints by their names, in any order; "ignore" takes the first numbers as they come."""
+
+
+class RosLeader(Leader):
+    """Listens to a topic for each group, or to one for several.
+
+    A pose is new when each topic has said something new, and as old as the oldest of them.
+
+    A message with the stamp of the one before says nothing new: a publisher that repeats itself is silent. Messages
+    without a stamp are all new.
+    """
+
+    def __init__(
+        self,
+        config: LedGroups,
+        robot: Robot,
+        clock: Clock,
+        quality: Quality,
+        wire: Wire,
+        open_middleware: Callable[[], Middleware],
+    ) -> None:
+        super().__init__(robot, clock)
+        self._groups = _known(config.groups, robot)
+        self._parts = {name: _part(self._groups[name], led) for name, led in config.groups.items()}
+        self._names, self._quality, self._wire, self._open = (
+            config.joint_names,
+            quality,
+            wire,
+            open_middleware,
+        )
+        self._middleware: Middleware | None = None
+        self._begin()
+
+    @property
+    def name(self) -> str:
+        return f"the leader on {', '.join(part.topic for part in self._parts.values())}"
+
+    def connect(self) -> None:
+        self.close()
+        self._forget()
+        self._begin()
+        self._middleware = self._open()
+        for heard in subscriptions(tuple(self._parts.values()), lambda _: self._quality):
+            self._middleware.subscribe(heard.topic, self._taker(heard))
+
+    def close(self) -> None:
+        if self._middleware is not None:
+            self._middleware.close()
+            self._middleware = None
+
+    @property
+    def refused(self) -> str:
+        """Why a message could not be used, else which topics say nothing new and why, "" where all do."""
+        if said := super().refused:
+            return said
+        waiting = [part.topic for group, part in self._parts.items() if group not in self._fresh]
+        if self._middleware is None or not waiting:
+            return ""
+        matches = self._middleware.matches()
+        return "; ".join(_silence(topic, matches.get(topic, Match(0))) for topic in waiting)
+
+    def _begin(self) -> None:
+        self._orders = {
+            name: JointOrder(part, self._names, f"{TABLE}.groups") for name, part in self._parts.items()
+        }
+        self._stamps: dict[str, int] = {}  # by topic
+        self._fresh: dict[str, tuple[Float64, float]] = {}  # by group: joints, and when they arrived
+
+    def _taker(self, heard: Heard) -> Callable[[bytes], None]:
+        topic = heard.topic.name
+
+        def take(payload: bytes) -> None:
+            arrived = self._clock.now()
+            try:
+                message = self._wire.decode("JointState", payload)
+                assert isinstance(message, JointState)
+                if message.stamp and message.stamp == self._stamps.get(topic):
+                    return
+                self._stamps[topic] = message.stamp
+                said = {part.of: self._orders[part.of].read(message)[0] for part in heard.parts}
+            except CodecError as error:
+                self._refuse(f"{topic}: {error}")
+                return
+            for group, position in said.items():
+                self._said(group, position, arrived)
+
+        return take
+
+    def _said(self, group: str, position: Float64, arrived: float) -> None:
+        self._fresh[group] = position, arrived
+        if len(self._fresh) < len(self._parts):
+            return
+        joints = np.full(self._robot.dim, np.nan)
+        for name, (numbers, _) in self._fresh.items():
+            joints[self._groups[name].slice] = numbers
+        oldest = min(when for _, when in self._fresh.values())
+        self._fresh.clear()
+        self._take(joints, oldest)
+
+
+def _silence(topic: str, match: Match) -> str:
+    if match.peers:
+        return f"{topic} says nothing new"
+    return match.refused or f"nobody publishes {topic}"
+
+
+def _known(led: Mapping[str, LedGroup], robot: Robot) -> dict[str, Group]:
+    groups = {group.name: group for group in robot.groups}
+    unknown = [name for name in led if name not in groups]
+    if unknown:
+        raise ConfigurationError(
+            f"{TABLE}.groups: {', '.join(unknown)} not of {robot.name}; allowed: {', '.join(groups)}"
+        )
+    return groups
+
+
+def _part(group: Group, led: LedGroup) -> Part:
+    names = group.joints if led.joints is None else tuple(led.joints)
+    if len(names) != group.dof or len(set(names)) != len(names):
+        raise ConfigurationError(
+            f"{TABLE}.groups.{group.name}.joints = {list(names)}; "
+            f"allowed: {group.dof} different names, in the order of {', '.join(group.joints)}"
+        )
+    return Part("joints", group.name, led.topic, "JointState", names)

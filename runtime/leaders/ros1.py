@@ -1,0 +1,28 @@
+"""A leader on ROS 1 topics, through rospy in a process of its own."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from runtime.clock import Clock
+from runtime.leaders.ros import NODE, TABLE, LedGroups, RosLeader
+from runtime.transports import ros1
+from runtime.transports.ros import packed
+from runtime.transports.ros.middleware import Quality
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+_NEWEST = Quality(depth=1)
+
+
+class Config(ros1.Link, LedGroups):
+    """A leader whose arms publish on ROS 1 topics."""
+
+    table: ClassVar[str] = TABLE
+    kind: Literal["ros1"] = "ros1"
+
+
+def build(config: Config, robot: Robot, clock: Clock) -> RosLeader:
+    """The leader, not yet connected; ConfigurationError names a group or joint that is not the robot's."""
+    return RosLeader(config, robot, clock, _NEWEST, packed, lambda: ros1.middleware(config, NODE))

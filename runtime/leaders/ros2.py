@@ -1,0 +1,41 @@
+"""A leader on ROS 2 topics, over DDS without a ROS installation, or through rclpy."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from pydantic import model_validator
+
+from runtime.clock import Clock
+from runtime.errors import ConfigurationError
+from runtime.leaders.ros import NODE, TABLE, LedGroups, RosLeader
+from runtime.transports import ros2
+from runtime.transports.ros import cdr
+from runtime.transports.ros.middleware import SENSOR_QUALITY, Quality
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+
+class Config(ros2.Link, LedGroups):
+    """A leader whose arms publish on ROS 2 topics."""
+
+    table: ClassVar[str] = TABLE
+    kind: Literal["ros2"] = "ros2"
+    qos: Quality = Quality()
+    """Of all its topics, where it is not as usual: best effort."""
+
+    @model_validator(mode="after")
+    def _only_news(self) -> Config:
+        if self.qos.durability != "volatile":
+            raise ConfigurationError(
+                f'{TABLE}.qos.durability = "{self.qos.durability}": an old pose would count as a new one; '
+                'allowed: "volatile"'
+            )
+        return self
+
+
+def build(config: Config, robot: Robot, clock: Clock) -> RosLeader:
+    """The leader, not yet connected; ConfigurationError names a group or joint that is not the robot's."""
+    quality = config.qos.otherwise(SENSOR_QUALITY)
+    return RosLeader(config, robot, clock, quality, cdr, lambda: ros2.middleware(config, NODE))

@@ -1,0 +1,141 @@
+"""A leader over ZMQ: it publishes where it is, we subscribe; single frames, openpi arrays.
+
+A message is a map: `t`, its own clock [s], and `state`, joints by the robot's groups, as an execution node says them.
+The wire has no authentication, so beyond this machine it must be asked for.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import zmq
+from pydantic import model_validator
+
+from runtime import codecs
+from runtime.clock import Clock
+from runtime.errors import CodecError, ConfigurationError, TransportError
+from runtime.leaders.base import Leader, joints_of
+from runtime.section import Section
+from runtime.transports import node_link
+from runtime.transports.node_settings import Endpoint
+from runtime.transports.zmq import is_loopback
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+_WAKE_MS = 50  # how soon the reader notices that it is to end
+_REOPEN_S = 0.5
+_LIMIT = 64 * 1024  # bytes of a message
+
+
+class Config(Section):
+    """A leader that publishes its joints over ZMQ."""
+
+    kind: Literal["zmq"] = "zmq"
+    endpoint: Endpoint = "tcp://127.0.0.1:5560"
+    """Where the leader publishes."""
+    insecure_link: bool = False
+    """Allow an endpoint beyond this machine although anybody on that network can drive the robot."""
+
+    @model_validator(mode="after")
+    def _stay_on_this_machine(self) -> Config:
+        if not self.insecure_link and not is_loopback(self.endpoint):
+            raise ConfigurationError(
+                f"collection.leader.endpoint = {self.endpoint!r} leaves this machine over a plain link; "
+                "allowed: a loopback address, or insecure_link = true on a network you trust"
+            )
+        return self
+
+
+def build(config: Config, robot: Robot, clock: Clock) -> ZmqLeader:
+    """The leader, not yet connected."""
+    return ZmqLeader(config.endpoint, robot, clock)
+
+
+class ZmqLeader(Leader):
+    """One SUB socket that keeps the newest message alone, read by a thread.
+
+    A message whose `t` is that of the one before says nothing new: a publisher that repeats itself is silent.
+    """
+
+    def __init__(self, endpoint: str, robot: Robot, clock: Clock) -> None:
+        super().__init__(robot, clock)
+        self._endpoint = endpoint
+        self._thread: threading.Thread | None = None
+        self._ending = threading.Event()
+        self._stamp = math.nan
+
+    @property
+    def name(self) -> str:
+        return f"the leader at {self._endpoint}"
+
+    def connect(self) -> None:
+        self.close()
+        self._forget()
+        self._stamp = math.nan
+        self._ending.clear()
+        try:
+            socket = self._subscribed()
+        except zmq.ZMQError as error:
+            raise TransportError(f"cannot listen to {self.name}: {error}") from error
+        self._thread = threading.Thread(target=self._read, args=(socket,), name="leader", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def _subscribed(self) -> zmq.Socket[bytes]:
+        options: dict[int, int | bytes] = {
+            zmq.CONFLATE: 1,
+            zmq.MAXMSGSIZE: _LIMIT,
+            zmq.SUBSCRIBE: b"",
+        }
+        return node_link.opened(zmq.SUB, self._endpoint, options)
+
+    def _read(self, socket: zmq.Socket[bytes] | None) -> None:
+        """The thread: nothing that happens in it may end it, because nobody else listens to the leader."""
+        while not self._ending.is_set():
+            try:
+                if socket is None:
+                    socket = self._subscribed()
+                if socket.poll(_WAKE_MS):
+                    self.hear(socket.recv())
+            except zmq.ZMQError as error:
+                self._refuse(f"the socket failed and is opened anew: {error}")
+                if socket is not None:
+                    socket.close()
+                    socket = None
+                self._ending.wait(_REOPEN_S)
+        if socket is not None:
+            socket.close()
+
+    def hear(self, payload: bytes) -> None:
+        """Take one message; one that cannot be used is remembered as the reason for which nothing comes."""
+        try:
+            stamp, joints = self._understood(payload)
+        except CodecError as error:
+            self._refuse(str(error))
+            return
+        if stamp != self._stamp:
+            self._stamp = stamp
+            self._take(joints, self._clock.now())
+
+    def _understood(self, payload: bytes) -> tuple[float, np.ndarray]:
+        message = codecs.unpack(payload, _LIMIT)
+        if not isinstance(message, dict):
+            raise CodecError(f"the leader's message is a {type(message).__name__}; expected a map")
+        stamp, state = message.get("t"), message.get("state")
+        if isinstance(stamp, bool) or not isinstance(stamp, int | float) or not math.isfinite(stamp):
+            raise CodecError(f"the leader's t is {stamp!r:.80}; expected seconds of its clock")
+        if not isinstance(state, Mapping) or not all(
+            isinstance(part, np.ndarray) and part.dtype.kind == "f" for part in state.values()
+        ):
+            raise CodecError("the leader's state is no map of float arrays by group")
+        return float(stamp), joints_of(state, self._robot)

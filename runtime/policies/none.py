@@ -1,0 +1,43 @@
+"""No policy: for a station that only collects what a person does."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from runtime.clock import Clock
+from runtime.errors import PolicyError
+from runtime.policies.base import Policy, PolicyInfo
+from runtime.section import Section
+from runtime.types import ActionChunk, Conditioning, Observation
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+_NONE = "this deployment has no [policy]: it is set up to collect (setup with collect = true), or given one"
+
+
+class Config(Section):
+    """No policy; what a deployment with a [collection] has where it names none."""
+
+    kind: Literal["none"] = "none"
+
+
+def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> NoPolicy:
+    """What refuses to be asked."""
+    return NoPolicy()
+
+
+class NoPolicy(Policy):
+    """Refuses by name."""
+
+    def connect(self) -> PolicyInfo:
+        raise PolicyError(_NONE)
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        raise PolicyError(_NONE)
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+    def close(self) -> None:
+        """Nothing to release."""

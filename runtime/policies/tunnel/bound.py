@@ -1,0 +1,30 @@
+"""Becomes another program that ends when the process that started it does, however that ends.
+
+A program of its own, run by its path: `bound.py PARENT PROGRAM ARGUMENTS...`. It imports nothing of ours, so that it
+is at once the program it is to become.
+"""
+
+import ctypes
+import os
+import signal
+import sys
+
+_PR_SET_PDEATHSIG = 1
+
+
+def main() -> None:
+    """Ask for SIGTERM at the parent's death, and become the program; never returns."""
+    parent, program = int(sys.argv[1]), sys.argv[2:]
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0):
+        sys.exit(f"no signal at the station's death: {os.strerror(ctypes.get_errno())}")
+    if os.getppid() != parent:
+        sys.exit("the station ended before its tunnel began")
+    try:
+        os.execv(program[0], program)
+    except OSError as error:
+        sys.exit(f"{program[0]} cannot be started: {error.strerror}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""The command line of a tunnel: a list of arguments that no shell sees."""
+
+from __future__ import annotations
+
+import math
+import os
+from urllib.parse import urlsplit
+
+from runtime.errors import ConfigurationError
+from runtime.policies.reach import Place
+from runtime.policies.tunnel.settings import TunnelSettings, is_host
+
+_USUAL_PORTS = {"ws": 80, "wss": 443}
+# Goes on until its input ends, in every shell, and says again what it is told.
+_ECHO = "cat"
+# No question, nothing but the one forwarding; what is given here comes before ssh's configuration.
+_ALWAYS = (
+    "BatchMode=yes",
+    "NumberOfPasswordPrompts=0",
+    "ExitOnForwardFailure=yes",
+    "ControlMaster=no",  # a master belongs to others: the tunnel would end with theirs
+    "ControlPath=none",
+    "PermitLocalCommand=no",
+    "RemoteCommand=none",
+    "UpdateHostKeys=no",
+    "TCPKeepAlive=yes",
+    "ServerAliveCountMax=3",
+    "ConnectionAttempts=1",
+    "LogLevel=INFO",  # below it nothing is said of a far end that refuses
+)
+
+
+def far_end(url: str) -> Place:
+    """Host and port of a policy server as they are seen from the tunnel's far end; ConfigurationError for others."""
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname or "", parts.port or _USUAL_PORTS.get(parts.scheme, 0)
+    except ValueError as error:
+        raise ConfigurationError(f"policy.url = {url!r}: {error}; allowed: SCHEME://HOST:PORT") from None
+    if not is_host(host) or not port:
+        raise ConfigurationError(
+            f"policy.url = {url!r} has no host and port that a tunnel could lead to; allowed: SCHEME://HOST:PORT as "
+            "they are seen from policy.tunnel.host"
+        )
+    return host, port
+
+
+def command(ssh: str, settings: TunnelSettings, port: int, far: Place) -> list[str]:
+    """What to start, with the near end at `port` on the loopback and the far end leading to `far`."""
+    options = [
+        *_ALWAYS,
+        f"StrictHostKeyChecking={'yes' if settings.host_keys == 'strict' else 'accept-new'}",
+        f"ServerAliveInterval={settings.alive_interval}",
+        f"ConnectTimeout={math.ceil(settings.connect_deadline)}",
+    ]
+    if settings.known_hosts_file is not None:
+        options.append(f'UserKnownHostsFile="{_at_home(settings.known_hosts_file)}"')
+    given = [ssh, "-T", "-a", "-x"]
+    if not settings.session:
+        given += ["-N", "-n"]
+    if settings.ssh_config is not None:
+        given += ["-F", _at_home(settings.ssh_config)]
+    for option in options:
+        given += ["-o", option]
+    if settings.user is not None:
+        given += ["-l", settings.user]
+    if settings.port is not None:
+        given += ["-p", str(settings.port)]
+    if settings.identity_file is not None:
+        given += ["-i", _at_home(settings.identity_file), "-o", "IdentitiesOnly=yes"]
+    if settings.jump:
+        given += ["-J", ",".join(settings.jump)]
+    host = f"[{far[0]}]" if ":" in far[0] else far[0]
+    given += ["-L", f"127.0.0.1:{port}:{host}:{far[1]}", "--", settings.host]
+    return [*given, _ECHO] if settings.session else given
+
+
+def require_files(settings: TunnelSettings) -> None:
+    """ConfigurationError for a file that is named and cannot be read: ssh goes on without it, and fails later."""
+    files = ("identity_file", "known_hosts_file", "ssh_config")
+    for name in files:
+        given = getattr(settings, name)
+        # A file of known hosts may be about to be made.
+        if given in (None, "none") or (name == "known_hosts_file" and settings.host_keys == "accept-new"):
+            continue
+        path = _at_home(given)
+        if not os.path.isfile(path):
+            raise ConfigurationError(
+                f"policy.tunnel.{name} = {given!r}: there is no such file on this machine"
+            )
+        if not os.access(path, os.R_OK):
+            raise ConfigurationError(
+                f"policy.tunnel.{name} = {given!r} cannot be read by this station's account"
+            )
+
+
+def _at_home(path: str) -> str:
+    return os.path.expanduser(path)

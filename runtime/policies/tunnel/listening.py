@@ -1,0 +1,43 @@
+"""Whether a process listens on a loopback port, read off the kernel's tables: nobody has to be connected to.
+
+A connection would go through to the policy server, and would not tell our own process from another one on the port.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from pathlib import Path
+
+_LISTEN = "0A"
+_LOOPBACK = int.from_bytes(socket.inet_aton("127.0.0.1"), sys.byteorder)
+
+
+def listens(pid: int, port: int) -> bool:
+    """Whether the process `pid`, and no other, takes connections on 127.0.0.1:`port`."""
+    sockets = _sockets(pid)
+    return any(f"socket:[{inode}]" in sockets for inode in _listeners(pid, port)) if sockets else False
+
+
+def _listeners(pid: int, port: int) -> list[str]:
+    """Inodes of the sockets that listen there, in the process's own network namespace."""
+    here = f"{_LOOPBACK:08X}:{port:04X}"
+    try:
+        rows = [line.split() for line in Path(f"/proc/{pid}/net/tcp").read_text("ascii").splitlines()[1:]]
+    except OSError:  # it has ended
+        return []
+    return [row[9] for row in rows if row[1] == here and row[3] == _LISTEN]
+
+
+def _sockets(pid: int) -> set[str]:
+    found = set()
+    try:
+        for entry in os.scandir(f"/proc/{pid}/fd"):
+            try:
+                found.add(os.readlink(entry.path))
+            except OSError:  # closed since
+                continue
+    except OSError:  # it has ended
+        return set()
+    return found

@@ -1,0 +1,181 @@
+"""A policy whose server is reached through a tunnel: another policy, led to the tunnel's near end."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import threading
+from collections.abc import Iterator
+
+from runtime.errors import (
+    ConfigurationError,
+    PolicyError,
+    PolicyLostError,
+    PortClosedError,
+    TunnelError,
+    UnreachableError,
+)
+from runtime.policies.base import Policy, PolicyInfo
+from runtime.policies.reach import Place
+from runtime.policies.tunnel.command import command, far_end, require_files
+from runtime.policies.tunnel.keeper import Keeper, Status
+from runtime.policies.tunnel.process import Ssh, free_port
+from runtime.policies.tunnel.sentences import unreached
+from runtime.policies.tunnel.settings import TunnelSettings
+from runtime.section import Section
+from runtime.types import ActionChunk, Conditioning, Observation
+
+_SLACK_S = 3.0  # of the keeper's own deadline, which says more
+_HEARD_S = 0.3  # how soon ssh is known to have ended, or to have said what it was refused
+
+
+def through_tunnel(policy: Policy, config: Section) -> Policy:
+    """`policy`, through the tunnel that its section has, or as it is where that has none.
+
+    Starts nothing. ConfigurationError where ssh is not installed, or policy.url is nowhere that a tunnel could lead.
+    """
+    settings, url = getattr(config, "tunnel", None), getattr(config, "url", "")
+    if settings is None:
+        return policy
+    far, ssh = far_end(url), shutil.which("ssh")
+    if ssh is None:
+        raise ConfigurationError(
+            "policy.tunnel needs the program ssh, which is not installed (on Debian: apt-get install openssh-client)"
+        )
+    return TunnelledPolicy(policy, settings, far, ssh)
+
+
+class TunnelledPolicy(Policy):
+    """The tunnel is made by `connect` and kept until `close`; while it is down, errors say so and why.
+
+    Each ssh has a near end of its own, so that no two stations and nobody else can be in its way.
+    """
+
+    def __init__(self, policy: Policy, settings: TunnelSettings, far: Place, ssh: str) -> None:
+        self._policy = policy
+        self._settings = settings
+        self._far = far
+        self._ssh = ssh
+        self._turning = threading.Lock()  # between two keepers: held for a moment
+        self._keeper: Keeper | None = None
+        self.observation_eef, self.sees_poses = policy.observation_eef, policy.sees_poses
+        self.glances_s = policy.glances_s
+        policy.dial = self._near_end
+
+    def connect(self) -> PolicyInfo:
+        """Make the tunnel, then reach the server; a tunnel that there was is replaced."""
+        require_files(self._settings)
+        keeper = self._new_keeper()
+        status = keeper.wait(
+            lambda now: now.up or now.closed or now.failures > 0, self._settings.connect_deadline + _SLACK_S
+        )
+        if not status.up:
+            keeper.close()  # else it would go on knocking while nobody waits for it
+            raise self._ended(status) if status.closed else TunnelError(self._absence(status))
+        with self._telling():
+            return self._policy.connect()
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        """As the policy; PolicyLostError with the tunnel's own reason where it is down, until it is up again."""
+        if self._keeper is None:
+            raise self._never()
+        with self._telling():
+            return self._policy.infer(observation, conditioning)
+
+    def glance(self, observation: Observation) -> None:
+        """As the policy."""
+        self._policy.glance(observation)
+
+    def reset(self) -> None:
+        """As the policy."""
+        with self._telling():
+            self._policy.reset()
+
+    def rest(self) -> None:
+        """As the policy."""
+        with self._telling():
+            self._policy.rest()
+
+    def close(self) -> None:
+        """As the policy; the tunnel ends."""
+        with self._turning:
+            if self._keeper is not None:
+                self._keeper.close()
+            self._policy.close()
+
+    def _new_keeper(self) -> Keeper:
+        with self._turning:
+            if self._keeper is not None:
+                self._keeper.close()
+            self._keeper = Keeper(self._settings.where, self._start, self._settings.connect_deadline)
+            self._keeper.begin()
+            return self._keeper
+
+    def _start(self) -> Ssh:
+        port = free_port()
+        return Ssh(command(self._ssh, self._settings, port, self._far), port, self._settings.session)
+
+    def _near_end(self) -> Place:
+        """Where the policy connects to, looked at anew each time: nobody on a port that was ours is taken for it."""
+        keeper = self._keeper
+        if keeper is None:
+            raise self._never()
+        status = keeper.status
+        if status.up and not keeper.holds(status.port):
+            status = keeper.wait(lambda now: not now.up, _HEARD_S)
+        if status.closed:
+            raise self._ended(status)
+        if not status.up or not keeper.holds(status.port):
+            raise TunnelError(self._down(keeper, status))
+        return "127.0.0.1", status.port
+
+    @contextlib.contextmanager
+    def _telling(self) -> Iterator[None]:
+        """Say of an error that has to do with the tunnel that it does."""
+        keeper = self._keeper
+        before = keeper.status if keeper else None
+        try:
+            yield
+        except TunnelError:
+            raise
+        except PolicyError as error:
+            lost = isinstance(error, PolicyLostError) or isinstance(error.__cause__, OSError)
+            if keeper is None or before is None or not lost:
+                raise
+            status = keeper.wait(lambda now: not now.up or _happened(before, now), _HEARD_S)
+            if status.closed:
+                raise
+            if not status.up:
+                raise TunnelError(self._down(keeper, status)) from error
+            if status.failures > before.failures:
+                where = self._settings.where
+                raise TunnelError(f"the tunnel to {where} broke and is up again: {status.why}") from error
+            if status.refusals > before.refusals:
+                closed = "Connection refused" in status.refusal
+                raise (PortClosedError if closed else UnreachableError)(self._unreached(status)) from error
+            raise type(error)(f"{error} (through the tunnel to {self._settings.where})") from error
+
+    def _never(self) -> PolicyError:
+        return PolicyError(f"there is no tunnel to {self._settings.where}; connect first")
+
+    def _ended(self, status: Status) -> PolicyError:
+        return PolicyError(f"{self._absence(status)}; connect first")
+
+    def _absence(self, status: Status) -> str:
+        return f"there is no tunnel to {self._settings.where}: {status.why}"
+
+    def _down(self, keeper: Keeper, status: Status) -> str:
+        return (
+            f"the tunnel to {self._settings.where} is down since {keeper.lasts(status):.0f} s: {status.why}"
+        )
+
+    def _unreached(self, status: Status) -> str:
+        host, port = self._far
+        return (
+            f"the tunnel to {self._settings.where} is up, but {host} port {port} was not reached from there "
+            f"({status.refusal}): {unreached(status.refusal)}"
+        )
+
+
+def _happened(before: Status, now: Status) -> bool:
+    return now.failures > before.failures or now.refusals > before.refusals

@@ -1,0 +1,117 @@
+"""One ssh: started for one near end, and all that it says."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+
+from runtime.policies.tunnel.listening import listens
+
+_BOUND = Path(__file__).with_name("bound.py")
+_PATIENCE_S = 2.0  # after it was told to end
+_LINES, _WIDTH = 20, 300  # of what it says, kept
+_WORD = b"eva-tunnel"  # that the far end says again
+_REFUSED = re.compile(r"channel \d+: open failed: (.+)")
+
+
+def free_port() -> int:
+    """A loopback port that nobody listens on; somebody may before it is used."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return int(taken.getsockname()[1])
+
+
+class Ssh:
+    """A process of its own session, which ends with the thread that started it, and with this process in any case.
+
+    With `echoes` it says again what it is told, once it is connected; where it does not, its near end is of no use.
+    """
+
+    def __init__(self, command: Sequence[str], port: int, echoes: bool = False) -> None:
+        self.port = port
+        self.said: deque[str] = deque(maxlen=_LINES)
+        self.refusal = ""  # why the far end did not make the newest connection that it did not make
+        self.refusals = 0  # of this ssh
+        self._echoed = not echoes
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", "-S", str(_BOUND), str(os.getpid()), *command],
+            stdin=subprocess.PIPE if echoes else subprocess.DEVNULL,  # its end is that of a session, too
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=os.environ | {"SSH_ASKPASS_REQUIRE": "never"},
+            start_new_session=True,  # without a terminal: nobody can be asked
+        )
+        self._pipes = [pipe for pipe in (self._process.stdout, self._process.stderr) if pipe is not None]
+        self._rests = {pipe.fileno(): b"" for pipe in self._pipes}
+        for pipe in self._pipes:
+            os.set_blocking(pipe.fileno(), False)
+        if self._process.stdin is not None:
+            self._pipes.append(self._process.stdin)
+            with contextlib.suppress(BrokenPipeError):  # it has ended, which is noticed
+                os.write(self._process.stdin.fileno(), _WORD + b"\n")
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def look(self) -> int | None:
+        """Take in what it said; its exit code, None while it lives."""
+        code = self._process.poll()  # first, so that all it said is there to be read when it has ended
+        for pipe in self._rests:
+            self._read(pipe)
+            if code is not None and self._rests[pipe]:
+                self._take(pipe, b"\n")
+        return code
+
+    def listens(self) -> bool:
+        """Whether its near end takes connections, and its far end answers."""
+        return self._echoed and listens(self.pid, self.port)
+
+    def end(self) -> None:
+        """End it and what it started, wait for that; nobody else's."""
+        if self._process.poll() is None:  # not reaped: the number of its session is still its own
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.pid, signal.SIGTERM)
+            try:
+                self._process.wait(_PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                os.killpg(self.pid, signal.SIGKILL)
+                self._process.wait()
+        for pipe in self._pipes:
+            pipe.close()
+        self._pipes.clear()
+        self._rests.clear()
+
+    def _read(self, pipe: int) -> None:
+        while True:
+            try:
+                piece = os.read(pipe, 4096)
+            except BlockingIOError:
+                return
+            if not piece:
+                return
+            self._take(pipe, piece)
+
+    def _take(self, pipe: int, piece: bytes) -> None:
+        *lines, rest = (self._rests[pipe] + piece).split(b"\n")
+        self._rests[pipe] = rest[-_WIDTH:]
+        for line in lines:
+            if line == _WORD:
+                self._echoed = True
+                continue
+            text = "".join(c if c.isprintable() else " " for c in line.decode("utf-8", "replace")).strip()[
+                :_WIDTH
+            ]
+            refused = _REFUSED.fullmatch(text)
+            if refused:
+                self.refusal, self.refusals = refused[1], self.refusals + 1
+            elif text:
+                self.said.append(text)

@@ -1,0 +1,110 @@
+"""What a checkpoint says of the SSH tunnel through which its policy server is reached."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
+
+from runtime.section import Section
+
+# Nothing here begins with "-", which ssh would take for an option, or means something to a shell, which ssh itself
+# starts for a jump.
+_NAME = r"[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,252}[A-Za-z0-9_])?"
+_USER = r"[A-Za-z0-9_][A-Za-z0-9._@+-]{0,63}"
+_JUMP = re.compile(rf"(?:{_USER}@)?(?P<host>{_NAME}|\[[0-9A-Fa-f:.]+\])(?::(?P<port>[0-9]{{1,5}}))?")
+
+
+def is_host(name: str) -> bool:
+    """Whether it is a name, an alias of ssh's configuration, or an address, and nothing else."""
+    if re.fullmatch(_NAME, name):
+        return True
+    try:
+        ipaddress.IPv6Address(name)
+    except ValueError:
+        return False
+    return "%" not in name
+
+
+def _host(name: str) -> str:
+    if not is_host(name):
+        raise ValueError(
+            "must be a host's name, its address, or its alias in ssh's configuration, as in gpu-1.lab"
+        )
+    return name
+
+
+def _user(name: str) -> str:
+    if not re.fullmatch(_USER, name):
+        raise ValueError("must be an account's name: letters, digits and . _ @ + -, with no - first")
+    return name
+
+
+def _jump(hop: str) -> str:
+    found = _JUMP.fullmatch(hop)
+    host = found["host"].strip("[]") if found else ""
+    if not found or not is_host(host) or not 1 <= int(found["port"] or 22) <= 65535:
+        raise ValueError("must be a host as in gateway.lab, user@gateway.lab or user@gateway.lab:2222")
+    return hop
+
+
+def _path(path: str) -> str:
+    if "PRIVATE KEY" in path or "\n" in path:
+        raise PydanticCustomError(
+            "secret", "must be the path of a file: a key itself would end up in every recording's manifest"
+        )
+    if not path.startswith(("/", "~/")):
+        raise ValueError("must be a path from the root or from home, as in ~/.ssh/id_lab")
+    if not path.isprintable() or any(character in path for character in '"\\%$'):
+        raise ValueError(
+            'must be a path without " \\ % $ and control characters, which mean something to ssh'
+        )
+    return path
+
+
+def _configuration(path: str) -> str:
+    return path if path == "none" else _path(path)
+
+
+File = Annotated[str, AfterValidator(_path)]
+
+
+class TunnelSettings(Section):
+    """An SSH tunnel to the policy server, by the system's ssh; policy.url is then as seen from its far end."""
+
+    host: Annotated[str, AfterValidator(_host)]
+    """Where the tunnel leads: a name, an address, or an alias of ssh's configuration."""
+    user: Annotated[str, AfterValidator(_user)] | None = None
+    """Account there; as ssh's configuration has it where it is not given."""
+    port: int | None = Field(default=None, ge=1, le=65535)
+    """Port of the SSH server; as ssh's configuration has it where it is not given, else 22."""
+    identity_file: File | None = None
+    """Path of the private key on the station's machine, and then no other is tried; those of ssh's configuration and
+    of the agent where it is not given."""
+    jump: list[Annotated[str, AfterValidator(_jump)]] = Field(default_factory=list)
+    """Hosts on the way, as user@host:port, in their order. What is said here of keys and hosts is not for them: it
+    comes from ssh's configuration."""
+    host_keys: Literal["strict", "accept-new"] = "strict"
+    """"strict": the host's key has to be known; "accept-new": one that is seen for the first time is believed and
+    kept. A key that has changed is refused in any case."""
+    known_hosts_file: File | None = None
+    """Path of the known keys, where it is not ssh's own."""
+    ssh_config: Annotated[str, AfterValidator(_configuration)] | None = None
+    """Path of ssh's configuration in the place of ~/.ssh/config; "none" reads none."""
+    session: bool = True
+    """Whether the command `cat` is run there, which ends with the tunnel. Without a session OpenSSH's server collects
+    what it sends, and answers come some 40 ms later; false for accounts that may run nothing."""
+    alive_interval: int = Field(default=5, ge=1, le=3600)
+    """Silence of the host after which it is asked whether it is there [s]; three times without an answer end the
+    tunnel, and another is made."""
+    connect_deadline: float = Field(default=10.0, ge=1, le=600)
+    """For the tunnel to be up [s], at set-up and whenever it is made again."""
+
+    @property
+    def where(self) -> str:
+        """The far end in sentences."""
+        user, host = f"{self.user}@" if self.user else "", f"[{self.host}]" if ":" in self.host else self.host
+        return f"{user}{host if self.port is None else f'{host}:{self.port}'}"

@@ -1,0 +1,128 @@
+"""python -m runtime.preflight DEPLOYMENT: asks the deployment's policy once without a robot, and says what is wrong.
+
+Nothing is sent to any robot. Exit codes: 0 all is well, 1 it is not, 2 the deployment is wrong or misspelt.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from runtime import deployment, log
+from runtime.deployment import Resolved
+from runtime.errors import ConfigurationError, RuntimeFault
+from runtime.family import Lifeline, plan
+from runtime.preflight.course import Course, patience
+from runtime.preflight.report import Report
+from runtime.preflight.verdict import Stage, Verdict
+
+_LOOK_S = 0.2
+_LONGEST_S = 3600.0
+_BACKGROUND_NICE = 5  # stations of the same machine come first
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Fly once and print what was found."""
+    parser = _parser()
+    given = parser.parse_args(arguments)
+    if given.given == (given.deployment is not None) or (given.given and given.assignments):
+        parser.error("give one of the two: a deployment file, or --given")
+    if given.given:
+        return _for_a_parent()
+    report = preflight(lambda: deployment.load(given.deployment, given.assignments), given.deadline)
+    print(json.dumps(report.plain(), indent=1) if given.json else "\n".join(report.lines()))
+    return exit_code(report)
+
+
+def preflight(resolved: Any, deadline: float | None = None) -> Report:
+    """The report about what `resolved()` returns, within `deadline` seconds, None: the policy's own deadlines."""
+    try:
+        made = plan(resolved())
+    except RuntimeFault as fault:
+        return Report(Verdict.MISCONFIGURED, Stage.RESOLVE, str(fault), Verdict.MISCONFIGURED.advice)
+    return Course(made).run(patience(made.deployment) if deadline is None else deadline)
+
+
+def exit_code(report: Report) -> int:
+    """For a shell."""
+    return 2 if report.verdict is Verdict.MISCONFIGURED else 0 if report.ok else 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m runtime.preflight", description=__doc__)
+    parser.add_argument("deployment", type=Path, nargs="?", help="a TOML file; deployments/ has examples")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
+    parser.add_argument(
+        "--deadline",
+        type=_seconds,
+        metavar="S",
+        help="for everything; without it what the policy's own deadlines come to",
+    )
+    parser.add_argument("--json", action="store_true", help="say it as JSON")
+    parser.add_argument(
+        "--given", action="store_true", help="for a parent process: see runtime.preflight.child"
+    )
+    return parser
+
+
+def _seconds(text: str) -> float:
+    seconds = float(text)
+    if not 0 < seconds <= _LONGEST_S:
+        raise argparse.ArgumentTypeError(f"{text} was given; allowed: above 0, at most {_LONGEST_S:g}")
+    return seconds
+
+
+def _for_a_parent() -> int:
+    """What is asked is one line of JSON on standard input, the answer one on standard output; we end with the input.
+
+    The line: "tree" (a resolved deployment) or "deployment" (a file); "changes", tables that go on top as those of a
+    set-up; "deadline_s" or null.
+    """
+    os.nice(_BACKGROUND_NICE)
+    log.start("preflight")
+    asked = json.loads(_line())
+    threading.Thread(target=_end_with_parent, name="lifeline", daemon=True).start()
+    report = preflight(lambda: _asked_for(asked), asked.get("deadline_s"))
+    print(json.dumps(report.plain()), flush=True)
+    os._exit(exit_code(report))  # a policy's own threads are not waited for
+
+
+def _asked_for(asked: Mapping[str, Any]) -> Resolved:
+    if "tree" in asked:
+        base = deployment.resolve(asked["tree"], {}, "the station's deployment")
+    elif "deployment" in asked:
+        base = deployment.load(Path(asked["deployment"]))
+    else:
+        raise ConfigurationError(
+            f"preflight: given {', '.join(asked) or 'nothing'}; needed: tree or deployment"
+        )
+    return deployment.changed(base, asked.get("changes", {}), "the checkpoint")
+
+
+def _line() -> bytes:
+    """The first line of standard input; what comes after it stays there."""
+    said = b""
+    while not said.endswith(b"\n"):
+        one = os.read(0, 1)
+        if not one:
+            raise SystemExit("preflight --given: standard input ended before its line")
+        said += one
+    return said
+
+
+def _end_with_parent() -> None:
+    lifeline = Lifeline()
+    while not lifeline.cut:
+        time.sleep(_LOOK_S)
+    os._exit(3)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

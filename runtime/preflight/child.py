@@ -1,0 +1,184 @@
+"""Preflights in processes of their own: nothing that one meets can delay or end whoever wants it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from runtime.deployment import Resolved, changed
+from runtime.errors import RuntimeFault
+from runtime.preflight.course import patience
+from runtime.requests import PreflightRequest
+
+_GRACE_S = 180.0  # beyond the deadline, for a process that may have kinematics to compile
+_KEPT = 20  # reports, of which the oldest is forgotten first
+Spawn = Callable[[], "subprocess.Popen[bytes]"]
+
+
+@dataclass(slots=True)
+class Flight:
+    """One preflight: under way as long as `told` is empty, then a report, or a `failure` without one."""
+
+    id: str
+    about: str
+    child: subprocess.Popen[bytes]
+    ends: float  # on time.monotonic, when it is killed
+    told: dict[str, Any] = field(default_factory=dict)
+    failure: str = ""
+    over: threading.Event = field(default_factory=threading.Event)
+
+    def plain(self) -> dict[str, Any]:
+        """As an answer: `running`, `report` or null, and why there is none."""
+        return {"running": not self.over.is_set(), "report": self.told or None, "failure": self.failure}
+
+
+class Preflights:
+    """One at a time; `look` is cheap, and returns each that has ended once. Not for several threads."""
+
+    def __init__(self, spawn: Spawn | None = None, now: Callable[[], float] = time.monotonic) -> None:
+        self._spawn = spawn or _spawn
+        self._now = now
+        self._flight: Flight | None = None
+        self._kept: dict[str, Flight] = {}
+
+    @property
+    def under_way(self) -> str:
+        """What is being looked at, "" where nothing is."""
+        return self._flight.about if self._flight else ""
+
+    def start(self, asked: PreflightRequest, resolved: Resolved) -> float:
+        """Begin; after how many seconds it is over at the latest, compiling included.
+
+        RuntimeFault where another is under way, or its process cannot be started.
+
+        What is asked for is not checked here: that it is no valid deployment is what the report says.
+        """
+        if asked.id in self._kept:  # asked again: the answer to the first one was lost
+            return max(0.0, self._kept[asked.id].ends - self._now())
+        if self._flight is not None:
+            raise RuntimeFault(f"a preflight of {self._flight.about} is under way: wait for it")
+        deadline = asked.deadline_s or _patience(resolved, asked)
+        line = {"tree": dict(resolved.tree), "changes": asked.changes, "deadline_s": deadline}
+        try:
+            child = self._spawn()
+        except OSError as error:
+            raise RuntimeFault(f"the process of a preflight cannot be started: {error}") from error
+        longest = deadline + _GRACE_S
+        self._flight = flight = Flight(asked.id, asked.about, child, self._now() + longest)
+        self._kept[asked.id] = flight
+        for old in list(self._kept)[:-_KEPT]:
+            del self._kept[old]
+        threading.Thread(target=_attend, args=(flight, line), name="preflight", daemon=True).start()
+        return longest
+
+    def look(self) -> Flight | None:
+        """The one that has ended since the last look; ends one whose time is over."""
+        flight = self._flight
+        if flight is None:
+            return None
+        if flight.over.is_set():
+            self._flight = None
+            return flight
+        if self._now() > flight.ends and not flight.failure:
+            self._end(flight, "it did not end in time")
+        return None
+
+    def cancel(self, why: str) -> None:
+        """End what is under way, if anything is."""
+        if self._flight is not None and not self._flight.failure:
+            self._end(self._flight, f"cancelled: {why}")
+
+    def report(self, id: str) -> dict[str, Any]:
+        """The preflight of that id, as by `Flight.plain`; RuntimeFault where it is not known (any more)."""
+        if id not in self._kept:
+            raise RuntimeFault(
+                f"preflight {id!r:.80} is not known here; the last {_KEPT} since the start are kept"
+            )
+        return self._kept[id].plain()
+
+    def close(self) -> None:
+        """End what is under way, and wait for it."""
+        flight = self._flight
+        if flight is not None:
+            self.cancel("the station ends")
+            flight.over.wait(2.0)
+
+    def _end(self, flight: Flight, why: str) -> None:
+        flight.failure = why
+        flight.child.kill()
+
+
+def _patience(resolved: Resolved, asked: PreflightRequest) -> float:
+    """What the policy's own deadlines come to; where it is no deployment, its process says so at once."""
+    try:
+        return patience(changed(resolved, asked.changes, "preflight").deployment)
+    except RuntimeFault:
+        return 30.0
+
+
+def _spawn() -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "runtime.preflight", "--given"],
+        stdin=subprocess.PIPE,  # its end is ours
+        stdout=subprocess.PIPE,
+    )
+
+
+def fly(asked: Mapping[str, Any], longest: float) -> dict[str, Any]:
+    """The report about what is asked as by `python -m runtime.preflight --given`; waits for it at most so long [s].
+
+    RuntimeFault where its process ends without one.
+    """
+    child = _spawn()
+    late = threading.Timer(longest, child.kill)
+    late.start()
+    try:
+        report, failure = _told(child, asked)
+    finally:
+        late.cancel()
+    if failure:
+        raise RuntimeFault(f"preflight: {failure}")
+    return report
+
+
+def _attend(flight: Flight, asked: Mapping[str, Any]) -> None:
+    """Whatever becomes of the child, the flight is over at its end."""
+    report: dict[str, Any] = {}
+    failure = "the station failed to read what its process said: see the station's log"
+    try:
+        report, failure = _told(flight.child, asked)
+    finally:
+        if not flight.failure:
+            flight.told, flight.failure = report, failure
+        flight.over.set()
+
+
+def _told(child: subprocess.Popen[bytes], asked: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    """The report of the child, and why there is none; returns when it has ended."""
+    assert child.stdin is not None
+    assert child.stdout is not None
+    with contextlib.suppress(BrokenPipeError):  # it has ended without listening; its code says so below
+        child.stdin.write(json.dumps(asked).encode() + b"\n")
+        child.stdin.flush()
+    said = child.stdout.read()  # not communicate(), which would close its standard input
+    code = child.wait()
+    child.stdout.close()
+    with contextlib.suppress(BrokenPipeError):  # the same once more, for what was still in its buffer
+        child.stdin.close()
+    report = _report(said)
+    return report, "" if report else f"its process ended with {code} and said nothing"
+
+
+def _report(said: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(said)
+    except ValueError:
+        return {}
+    return dict(found) if isinstance(found, Mapping) else {}

@@ -1,0 +1,268 @@
+"""The way of a preflight: connect, reset, ask twice, reset, each step by what a set-up uses."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import numpy as np
+
+from runtime.asking import Answered, Asking
+from runtime.clock import Clock, MonotonicClock
+from runtime.config import Deployment
+from runtime.errors import RuntimeFault
+from runtime.family import Plan
+from runtime.kinematics.base import Kinematics
+from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.loading import Loading
+from runtime.policies.base import Policy, PolicyInfo
+from runtime.preflight.report import Call, Chunk, Report
+from runtime.preflight.subject import Subject
+from runtime.preflight.verdict import Stage, Verdict, stage_of, verdict_of
+from runtime.recording import trial
+from runtime.runner import LockstepRunner
+from runtime.setup import check_info, first_action
+from runtime.tuning import strategy_of
+from runtime.types import ActionChunk, Conditioning, Observation
+
+_ROOM_S = 10.0  # beside the deadlines of the policy's own calls: kinematics, a slow machine
+_TOLERANCE = 1e-6
+_LOOK_S = 0.2
+Result = TypeVar("Result")
+
+
+class Timed(Policy):
+    """A policy whose calls are counted and timed; `under_way` names the one that has not come back."""
+
+    def __init__(self, policy: Policy, clock: Clock) -> None:
+        self._policy = policy
+        self._clock = clock
+        self.observation_eef = policy.observation_eef
+        self.sees_poses = policy.sees_poses
+        self.calls: list[Call] = []
+        self.under_way = ""
+        self.since = clock.now()
+        self.info: PolicyInfo | None = None
+
+    def connect(self) -> PolicyInfo:
+        """As the policy's."""
+        self.info = self._call("connect", self._policy.connect)
+        return self.info
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        """As the policy's."""
+        note = (
+            "" if any(call.name == "infer" for call in self.calls) else "the first: it may compile the model"
+        )
+        return self._call("infer", lambda: self._policy.infer(observation, conditioning), note)
+
+    def reset(self) -> None:
+        """As the policy's."""
+        self._call("reset", self._policy.reset)
+
+    def close(self) -> None:
+        """As the policy's."""
+        self._policy.close()
+
+    def _call(self, name: str, call: Callable[[], Result], note: str = "") -> Result:
+        self.under_way, self.since = name, self._clock.now()
+        ok = False
+        try:
+            result = call()
+            ok = True
+        finally:
+            self.calls.append(Call(name, 1000.0 * (self._clock.now() - self.since), ok, note))
+        self.under_way = ""
+        return result
+
+
+class Course:
+    """One preflight of one plan; `run` once. It has no transport: no action can go anywhere."""
+
+    def __init__(self, plan: Plan, clock: Clock | None = None) -> None:
+        self._plan = plan
+        self._clock = clock or MonotonicClock()
+        self._begun = self._clock.now()
+        self._policy: Timed | None = None
+        self._answered: Answered | None = None
+        self._notes: list[str] = []
+        self._loading: float | None = None  # since when the compiler of kinematics has been at work
+        self._loaded = 0.0  # how long it was [s]
+
+    def run(self, deadline: float) -> Report:
+        """Everything within `deadline` seconds; what has not come back by then is cut off, and is a timeout.
+
+        Time in which kinematics are compiled here does not count: it says nothing of the policy.
+        """
+        ended: list[RuntimeFault | BaseException | None] = []
+        way = threading.Thread(target=lambda: ended.append(self._outcome()), name="preflight", daemon=True)
+        way.start()
+        while way.is_alive() and (left := deadline - self._spent()) > 0:
+            way.join(min(left, _LOOK_S))
+        if not ended:
+            return self._overdue(deadline)
+        error = ended[0]
+        if error is None:
+            return self._report(Verdict.OK, Stage.SPACE, self._sentence())
+        if not isinstance(error, RuntimeFault):
+            raise error
+        verdict = verdict_of(error)
+        return self._report(verdict, self._stage(verdict), str(error))
+
+    @property
+    def _call(self) -> str:
+        """What was, or is, under way: "connect" until the policy is asked, "" after an answer has come back."""
+        policy = self._policy
+        if policy is None:
+            return ""
+        return policy.under_way or ("" if self._asked else "connect")
+
+    @property
+    def _asked(self) -> bool:
+        return self._policy is not None and any(call.name == "infer" for call in self._policy.calls)
+
+    def _stage(self, verdict: Verdict) -> Stage:
+        return Stage.RESOLVE if self._policy is None else stage_of(verdict, self._call)
+
+    def _outcome(self) -> BaseException | None:
+        try:
+            self._go()
+        except BaseException as error:  # for the thread that waits for us, whatever it is
+            return error
+        finally:
+            if self._policy is not None:
+                self._policy.close()
+        return None
+
+    def _go(self) -> None:
+        plan, runner = self._plan, LockstepRunner(0)
+        if plan.deployment.recording.enabled:
+            trial.require(plan.deployment.recording)
+        strategy = strategy_of(plan)
+        policy = self._policy = Timed(plan.new_policy(self._clock), self._clock)
+        info = runner.submit(policy.connect).result()
+        check_info(info, plan, strategy.query.continues)
+        kinematics = Loading(ChainForward(plan.robot), self._kinematics, runner.aside)
+        spaces, subject = plan.spaces(kinematics), Subject(plan, self._clock)
+        asking = Asking(policy, plan.deployment.task, spaces, subject, runner, self._clock)
+        for _ in range(2):  # the first resets before it asks
+            answered = self._answered = asking.ask(k_max=strategy.parameters.k_max).result()
+        asking.note(answered)
+        self._notes += [note.text for note in asking.notes]
+        runner.submit(policy.reset).result()  # what it was shown was no robot: nobody shall go on from it
+
+    def _kinematics(self) -> Kinematics:
+        self._loading = begun = self._clock.now()
+        try:
+            return self._plan.kinematics()
+        finally:
+            self._loaded, self._loading = self._loaded + self._clock.now() - begun, None
+
+    def _spent(self) -> float:
+        now, loading = self._clock.now(), self._loading
+        return now - self._begun - self._loaded - (now - loading if loading is not None else 0.0)
+
+    def _overdue(self, deadline: float) -> Report:
+        policy = self._policy
+        what = "before the policy was there"
+        if policy is not None:
+            waited = self._clock.now() - policy.since
+            what = f"while the policy's {policy.under_way} was under way for {waited:.1f} s"
+            what = what if policy.under_way else "between two calls of the policy"
+        report = self._report(
+            Verdict.TIMEOUT, self._stage(Verdict.TIMEOUT), f"no end within {deadline:g} s, {what}"
+        )
+        if policy is not None:
+            policy.close()
+        return report
+
+    def _report(self, verdict: Verdict, stage: Stage, sentence: str) -> Report:
+        plan, policy = self._plan, self._policy
+        settings = plan.deployment
+        info = policy.info if policy else None
+        chunk = self._chunk(self._answered) if self._answered else None
+        return Report(
+            verdict=verdict,
+            stage=stage,
+            sentence=sentence,
+            advice=verdict.advice,
+            kind=settings.policy.kind,
+            endpoint=str(getattr(settings.policy, "url", "")),
+            name=info.name if info else "",
+            robot=plan.robot.name,
+            control_rate=plan.rate,
+            task=settings.task,
+            seconds=self._clock.now() - self._begun,
+            calls=tuple(policy.calls) if policy else (),
+            chunk=chunk,
+            metadata=dict(info.metadata) if info else {},
+            notes=(*self._notes, *(self._remarks(info, chunk) if chunk else ())),
+        )
+
+    def _sentence(self) -> str:
+        assert self._answered is not None
+        rows, columns = self._answered.chunk.actions.shape
+        first = self._chunk(self._answered)
+        return (
+            f"{rows} rows of {columns} numbers in {self._latency:.0f} ms, the first at most "
+            f"{first.first_away:.3f} rad from the pose {self._plan.deployment.setup.pose!r} ({first.first_joint})"
+        )
+
+    @property
+    def _latency(self) -> float:
+        """Of the last answer [ms]."""
+        return [call.ms for call in self._policy.calls if call.name == "infer"][-1] if self._policy else 0.0
+
+    def _chunk(self, answered: Answered) -> Chunk:
+        plan, chunk, made = self._plan, answered.chunk, answered.made
+        first = first_action(made.meant, np.asarray(answered.observation.qpos, np.float64), plan)
+        beyond = (plan.limits.outside(made.rows) > _TOLERANCE).any(axis=1)
+        rate = chunk.rate or plan.rate
+        return Chunk(
+            rows=len(chunk.actions),
+            width=chunk.actions.shape[1],
+            space=chunk.space,
+            mode=chunk.mode,
+            rate=rate,
+            seconds=len(chunk.actions) / rate,
+            command_rows=len(made.rows),
+            joints=made.rows.shape[1],
+            first_away=first["distance"],
+            first_joint=first["joint"],
+            beyond_limits=int(beyond.sum()),
+        )
+
+    def _remarks(self, info: PolicyInfo | None, chunk: Chunk) -> list[str]:
+        settings, made = self._plan.deployment, []
+        if chunk.first_away > settings.safety.first_action_far:
+            made.append(
+                f"the first action is far from the pose {settings.setup.pose!r}; it was asked with grey pictures, so "
+                "that may mean nothing"
+            )
+        if chunk.beyond_limits:
+            made.append(
+                f"{chunk.beyond_limits} of {chunk.command_rows} rows leave the joint limits: safety would hold a robot "
+                "there"
+            )
+        if info is not None and info.horizon is not None and info.horizon != chunk.rows:
+            made.append(f"the server says {info.horizon} rows per answer and gave {chunk.rows}")
+        answers = [call.ms for call in self._policy.calls if call.name == "infer"] if self._policy else []
+        if len(answers) > 1 and answers[1] > 1000.0 * chunk.seconds:
+            made.append(
+                f"an answer takes {answers[1]:.0f} ms and is {1000.0 * chunk.seconds:.0f} ms of motion: the robot will "
+                "stand and wait"
+            )
+        return made
+
+
+def patience(settings: Deployment) -> float:
+    """How long a preflight may take where nobody says so [s]: what the policy's own deadlines come to."""
+    policy = settings.policy.model_dump()
+    return _ROOM_S + _deadlines(policy) + float(policy.get("inference_deadline", 0.0))  # it is asked twice
+
+
+def _deadlines(table: Mapping[str, Any]) -> float:
+    """The sum of all deadlines in a table and in those within it, such as that of a tunnel."""
+    own = [float(value) for key, value in table.items() if key.endswith("_deadline") and value is not None]
+    return sum(own) + sum(_deadlines(value) for value in table.values() if isinstance(value, Mapping))

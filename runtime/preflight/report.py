@@ -1,0 +1,156 @@
+"""What a preflight has found, for programs and for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from runtime.preflight.verdict import Stage, Verdict
+
+_LONGEST_TEXT, _LONGEST_LIST, _DEEPEST = 300, 40, 6  # of what a server says of itself
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """One call to the policy: connect, reset or infer, how long it took [ms], whether it came back well."""
+
+    name: str
+    ms: float
+    ok: bool
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """The last answer: rows and numbers per row as the server gave them, at `rate` [Hz], `seconds` of motion.
+
+    `command_rows` of `joints` numbers at the control rate is what they became. `first_away` [rad] is how far the first
+    one is from the robot's pose, by the joint `first_joint`; `beyond_limits` how many rows leave the joint limits.
+    """
+
+    rows: int
+    width: int
+    space: str
+    mode: str
+    rate: float
+    seconds: float
+    command_rows: int
+    joints: int
+    first_away: float
+    first_joint: str
+    beyond_limits: int
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """How it ended, in which stage, and everything that was measured until then.
+
+    `endpoint` is the policy's address, "" for one without a server; `name` is what it calls itself. `metadata` are as
+    a page can show them: long values are cut. `notes` are sentences about what works and is worth knowing.
+    """
+
+    verdict: Verdict
+    stage: Stage
+    sentence: str
+    advice: str = ""
+    kind: str = ""
+    endpoint: str = ""
+    name: str = ""
+    robot: str = ""
+    control_rate: float = 0.0
+    task: str = ""
+    seconds: float = 0.0
+    calls: tuple[Call, ...] = ()
+    chunk: Chunk | None = None
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether a set-up could go on from here."""
+        return self.verdict is Verdict.OK
+
+    @property
+    def warm_up_ms(self) -> float | None:
+        """How long the first answer took, which may compile a model."""
+        return self._inferred(0)
+
+    @property
+    def latency_ms(self) -> float | None:
+        """How long the second answer took: what a run can expect."""
+        return self._inferred(1)
+
+    def _inferred(self, number: int) -> float | None:
+        answers = [call.ms for call in self.calls if call.name == "infer" and call.ok]
+        return answers[number] if number < len(answers) else None
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON may carry it."""
+        told = asdict(self)
+        return {
+            **told,
+            "verdict": str(self.verdict),
+            "stage": str(self.stage),
+            "calls": list(told["calls"]),
+            "notes": list(self.notes),
+            "metadata": shown(self.metadata),
+            "ok": self.ok,
+            "warm_up_ms": self.warm_up_ms,
+            "latency_ms": self.latency_ms,
+        }
+
+    def lines(self) -> list[str]:
+        """For a terminal."""
+        made = [f"{self.verdict}  at {self.stage}", self.sentence]
+        made += [self.advice] if self.advice else []
+        made += [f"policy    {self._policy()}"] if self.kind else []
+        made += [f"{call.name:<9} {call.ms:.0f} ms{_how(call)}" for call in self.calls]
+        made += [f"chunk     {words(self.chunk)}"] if self.chunk else []
+        made += [f"metadata  {key} = {value}" for key, value in shown(self.metadata).items()]
+        return made + [f"note      {note}" for note in self.notes]
+
+    def _policy(self) -> str:
+        return ", ".join(filter(None, [self.kind, self.name, self.endpoint, f"for {self.robot}"]))
+
+
+def words(chunk: Chunk) -> str:
+    """The chunk in a line."""
+    return (
+        f"[{chunk.rows}, {chunk.width}] {chunk.mode} {chunk.space} at {chunk.rate:g} Hz, {chunk.seconds:.2f} s; "
+        f"{chunk.command_rows} rows of {chunk.joints} joints at the control rate"
+    )
+
+
+def shown(value: Any, depth: int = 0) -> Any:
+    """What a server said, as JSON may carry it and a person may read it: cut where it is long or deep."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, bool | int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    if isinstance(value, np.ndarray):
+        return f"array {list(value.shape)} {value.dtype}"
+    if isinstance(value, bytes | bytearray):
+        return f"{len(value)} bytes"
+    if isinstance(value, Mapping | list | tuple) and depth >= _DEEPEST:
+        return "..."
+    if isinstance(value, Mapping):
+        kept = {
+            str(key)[:_LONGEST_TEXT]: shown(one, depth + 1)
+            for key, one in list(value.items())[:_LONGEST_LIST]
+        }
+        return kept | ({"...": f"{len(value) - _LONGEST_LIST} more"} if len(value) > _LONGEST_LIST else {})
+    if isinstance(value, list | tuple):
+        more = [f"... {len(value) - _LONGEST_LIST} more"] if len(value) > _LONGEST_LIST else []
+        return [shown(one, depth + 1) for one in value[:_LONGEST_LIST]] + more
+    text = str(value)
+    return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."
+
+
+def _how(call: Call) -> str:
+    return f"  ({call.note})" if call.note else "" if call.ok else "  (failed)"

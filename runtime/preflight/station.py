@@ -1,0 +1,105 @@
+"""What a station answers about preflights: one is begun, how it went, which server its policy has.
+
+Nothing moves, and nobody needs the lease; a run or a set-up is never disturbed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from runtime.clock import Clock
+from runtime.deployment import changed, server_of
+from runtime.errors import RuntimeFault
+from runtime.family import Plan
+from runtime.messages import Ack, Command, Event
+from runtime.plugins import variants
+from runtime.preflight.child import Preflights
+from runtime.requests import PolicyServerRequest, PreflightReportRequest, PreflightRequest, read
+from runtime.transitions import State
+
+PREFLIGHT_QUERIES = ("preflight", "preflight_report", "policy_server")
+_AT_WORK = (State.SETTING_UP, State.RUNNING, State.HOLDING)
+
+
+class PreflightDesk:
+    """Main's: `in_force` is the plan as it was last set up, `own` the deployment's, which is what is asked about."""
+
+    def __init__(
+        self,
+        in_force: Callable[[], Plan],
+        own: Plan,
+        state: Callable[[], State],
+        say: Callable[[Event], None],
+        clock: Clock,
+        preflights: Preflights | None = None,
+    ) -> None:
+        self._in_force, self._own = in_force, own
+        self._state, self._say, self._clock = state, say, clock
+        self._preflights = preflights or Preflights()
+
+    def handle(self, command: Command, boot: str) -> Ack:
+        """The answer to one of PREFLIGHT_QUERIES."""
+        answer = {
+            "preflight": self._begin,
+            "preflight_report": self._report,
+            "policy_server": self._server,
+        }[command.kind]
+        try:
+            return Ack(command.uuid, "done", boot=boot, data=answer(command))
+        except RuntimeFault as fault:
+            return Ack(command.uuid, "refused", str(fault), boot=boot)
+
+    def look(self) -> None:
+        """Say what has ended; cheap."""
+        ended = self._preflights.look()
+        if ended is not None:
+            verdict = ended.told.get("verdict") or ended.failure
+            self._note(f"preflight of {ended.about}: {verdict}", {"id": ended.id})
+
+    def cancel(self, why: str) -> None:
+        """The policy's server is wanted for something that counts."""
+        self._preflights.cancel(why)
+
+    def close(self) -> None:
+        """End what is under way."""
+        self._preflights.close()
+
+    def _begin(self, command: Command) -> dict[str, Any]:
+        asked = read("preflight", PreflightRequest, command.args)
+        self._require_free(asked)
+        longest = self._preflights.start(asked, self._own.resolved)
+        self._note(f"preflight of {asked.about} by {command.user or command.holder}", {"id": asked.id})
+        return {"id": asked.id, "longest_s": longest}
+
+    def _require_free(self, asked: PreflightRequest) -> None:
+        """A server that serves one at a time would be taken from a station that is ready to run with it."""
+        state = self._state()
+        if state in _AT_WORK:
+            raise RuntimeFault(
+                f"preflight is not allowed while {state}: the station's machine and policy are at work; allowed while "
+                f"{', '.join(other for other in State if other not in _AT_WORK)}"
+            )
+        if state is not State.READY:
+            return
+        settings = changed(self._own.resolved, asked.changes, "preflight").deployment
+        exclusive = getattr(variants("runtime.policies")[settings.policy.kind], "EXCLUSIVE", False)
+        if exclusive and server_of(settings) == server_of(self._in_force().deployment):
+            raise RuntimeFault(
+                f"preflight: the station is ready to run with this server, and a server of policy.kind = "
+                f"{settings.policy.kind!r} has one client's checkpoint at a time: set up with the checkpoint instead"
+            )
+
+    def _report(self, command: Command) -> dict[str, Any]:
+        return self._preflights.report(read("preflight_report", PreflightReportRequest, command.args).id)
+
+    def _server(self, command: Command) -> dict[str, Any]:
+        """The server of the policy that is in force, or that a preflight with this `policy` would ask."""
+        asked = read("policy_server", PolicyServerRequest, command.args)
+        settings = self._in_force().deployment
+        if asked.policy is not None:
+            settings = changed(self._own.resolved, {"policy": asked.policy}, "policy_server").deployment
+        return {"server": server_of(settings), "state": str(self._state())}
+
+    def _note(self, text: str, data: dict[str, Any]) -> None:
+        self._say(Event("preflight", text, self._clock.now(), data=data))

@@ -1,0 +1,61 @@
+"""A robot that is not there: it stands at its pose and sees grey."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.clock import Clock
+from runtime.family import Plan
+from runtime.types import Float64, Observation, UInt8
+
+_HEIGHT, _WIDTH = 480, 640  # of cameras for which the deployment says no size
+_GREY, _GRAIN = 128, 12  # noise: what a camera sees in the dark is never all the same
+
+
+class Subject:
+    """Shows a policy the robot of a plan at rest in the pose of its set-up, with pictures of grey noise.
+
+    Every observation is new, of this moment. It measures no poses: those of its joints are taken.
+    """
+
+    simulated = False
+
+    def __init__(self, plan: Plan, clock: Clock) -> None:
+        self._plan = plan
+        self._clock = clock
+        self._begun = clock.now()
+        self._number = 0
+        self._pictures = pictures(plan)
+
+    def now(self, prompt: str, pictures: bool = True) -> Observation:
+        """The robot now."""
+        self._number += 1
+        robot, now = self._plan.robot, self._clock.now()
+        streams = ("joints", *self._pictures)
+        return Observation(
+            sequence=self._number,
+            arrived=now,
+            captured=dict.fromkeys(streams, now),
+            qpos=np.array(robot.poses[self._plan.deployment.setup.pose], np.float32),
+            pictures=self._pictures,
+            qvel=np.zeros(robot.dim, np.float32),
+            effort=np.zeros(robot.dim, np.float32),
+            step=round((now - self._begun) * self._plan.rate),
+            prompt=prompt,
+        )
+
+    def commanded(self) -> tuple[int, Float64] | None:
+        """It was never told anything."""
+        return None
+
+
+def pictures(plan: Plan) -> dict[str, UInt8]:
+    """Grey noise [H, W, 3] for each camera of the deployment, in the size that it says, the same on every call."""
+    noise = np.random.default_rng(0)
+    made: dict[str, UInt8] = {}
+    for key in plan.cameras:
+        width, height = getattr(plan.deployment.cameras.get(key), "size", None) or (_WIDTH, _HEIGHT)
+        grain = noise.integers(-_GRAIN, _GRAIN + 1, (height, width, 3))
+        made[key] = (_GREY + grain).astype(np.uint8)
+        made[key].flags.writeable = False
+    return made

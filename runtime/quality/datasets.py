@@ -1,0 +1,220 @@
+"""Episodes of LeRobot datasets as a source of checks, ours and those of others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.dataset as pads
+
+import robots
+from robots import RobotError
+from runtime.datasets import layout
+from runtime.datasets.mapping import ColumnMapping, video_key
+from runtime.datasets.pictures import Stretch
+from runtime.datasets.reader import Dataset
+from runtime.errors import RecordingError
+from runtime.quality.block import BLOCK_ROWS, Block, Bools, Joints, Numbers, Source, Vector
+from runtime.quality.joints import known_joints, unknown_joints
+from runtime.quality.luma import Film, StoredFilm, VideoFilm
+from runtime.types import EEF_WIDTH, Float64
+
+STATES = ("observation.state", "observation.qpos")  # the first that there is
+ACTION = "action"
+CAPTURE, REPEATED, LOST = "capture_time.", "repeated.", "lost."
+_POSES = ("eef_state", "eef_action")  # ours: of others nobody knows what stands for an orientation
+_SPARSE = ("joint_velocity", "joint_effort")  # NaN in a row where the robot gave none
+_INDEX = "frame_index"
+
+
+class DatasetSource(Source):
+    """Episode `index` of a dataset; `state` names the column of measured joints, the usual ones where it is "".
+
+    `robot` is whose joints these are, in its order; "" where only the dataset knows.
+    """
+
+    def __init__(self, dataset: Dataset, index: int, state: str = "", robot: str = "") -> None:
+        self._dataset = dataset
+        self._robot = robot
+        self._entry = dataset.entry(index)
+        self._features = dataset.features
+        self._state = self._found(state)
+        ours = layout.read_lines(dataset.root / layout.EVA_EPISODES)
+        uuid = next((str(line.get("uuid", "")) for line in ours if line.get("episode_index") == index), "")
+        self.name = uuid or f"{dataset.root.name}#{index}"
+        self.fps = dataset.fps
+        self.frames = self._entry.length
+        self.remarks = ()
+        self.ends = {}  # an episode whose video was lost is never published
+        self.schema: Mapping[str, Any] = {}
+        self._keys = self._cameras()
+        self.cameras = {camera: self._size(key) for camera, key in self._keys.items()}
+        self.vectors = {name: self._vector(name) for name in self._features if self._is_vector(name)}
+        self.started = "tick_time" if "tick_time" in self._features else ""
+
+    def _found(self, state: str) -> str:
+        """The column of measured joints, "" where there is none; RecordingError where the one asked for is not."""
+        if state and not (state in self._features and self._is_vector(state)):
+            vectors = [name for name in self._features if self._is_vector(name)]
+            raise RecordingError(
+                f"{self._dataset.root} has no column {state!r} of vectors, there are {vectors}"
+            )
+        return state or next(
+            (name for name in STATES if name in self._features and self._is_vector(name)), ""
+        )
+
+    def _is_vector(self, name: str) -> bool:
+        feature = self._features[name]
+        shape = feature.get("shape")
+        numeric = str(feature.get("dtype")).startswith("float")
+        return numeric and isinstance(shape, list | tuple) and len(shape) == 1 and tuple(shape) != (1,)
+
+    def _vector(self, name: str) -> Vector:
+        feature = self._features[name]
+        width = int(feature["shape"][0])
+        names = _names(feature.get("names"))
+        told = names if len(names) == width else tuple(f"number {k}" for k in range(width))
+        poses = name in _POSES and width % EEF_WIDTH == 0
+        role = (
+            "state" if name == self._state else "action" if name == ACTION else "poses" if poses else "other"
+        )
+        return Vector(width, told, role, name in _SPARSE)
+
+    def _cameras(self) -> dict[str, str]:
+        """The feature of each camera's pictures, by the camera's key."""
+        stored = [*layout.video_keys(self._features), *layout.image_keys(self._features)]
+        return {key.removeprefix(video_key("")): key for key in stored}
+
+    def _size(self, key: str) -> tuple[int, int] | None:
+        feature = self._features[key]
+        shape, names = feature.get("shape"), feature.get("names")
+        if not (isinstance(shape, list | tuple) and len(shape) == 3):
+            return None
+        if isinstance(names, list) and "height" in names and "width" in names:
+            return int(shape[names.index("height")]), int(shape[names.index("width")])
+        return int(shape[0]), int(shape[1])
+
+    def blocks(self) -> Iterator[Block]:
+        path = self._entry.data
+        if not path.is_file():
+            raise RecordingError(f"there is no {path}, though the metadata list it")
+        first = 0
+        try:
+            table = pads.dataset(str(path), format="parquet")
+            there = set(table.schema.names)
+            absent = [name for name in self.vectors if name not in there]
+            if absent:
+                raise RecordingError(f"{path} has no column {absent}, though the metadata declare it")
+            wanted = [name for name in self._wanted() if name in there]
+            chosen = pads.field("episode_index") == self._entry.index if self._entry.shared else None
+            scanned = table.scanner(
+                columns=wanted, filter=chosen, batch_size=BLOCK_ROWS, batch_readahead=1, use_threads=False
+            )
+            for batch in scanned.to_batches():
+                if batch.num_rows:
+                    yield self._block(batch, first)
+                    first += batch.num_rows
+        except (OSError, pa.ArrowException) as error:
+            raise RecordingError(f"{path} cannot be read on after row {first - 1}: {error}") from error
+        if first != self._entry.length:
+            raise RecordingError(f"{path} holds {first} rows of it, the metadata say {self._entry.length}")
+
+    def _wanted(self) -> list[str]:
+        scalars = [_INDEX, "timestamp", "tick_time", "control_source"]
+        ours = [name for name in self._features if name.startswith((CAPTURE, REPEATED, LOST))]
+        return [*self.vectors, *scalars, *ours]
+
+    def _block(self, batch: Any, first: int) -> Block:
+        columns = {name: batch.column(name) for name in batch.schema.names}
+        plain = {
+            name: _scalars(columns[name])
+            for name in columns
+            if name in ("timestamp", "tick_time") or name.startswith((CAPTURE, REPEATED, LOST))
+        }
+        sources = columns.get("control_source")
+        return Block(
+            first=first,
+            rows=batch.num_rows,
+            index=_scalars(columns[_INDEX]).astype(np.int64) if _INDEX in columns else None,
+            clocks={name: plain[name] for name in ("timestamp", "tick_time") if name in plain},
+            vectors={name: _lists(columns[name], vector) for name, vector in self.vectors.items()},
+            captured={name.removeprefix(CAPTURE): plain[name] for name in plain if name.startswith(CAPTURE)},
+            repeated=_marks(plain, REPEATED),
+            lost=_marks(plain, LOST),
+            simulated=None
+            if sources is None
+            else np.array([one == "sim" for one in sources.to_pylist()], np.bool_),
+        )
+
+    def film(self, camera: str, sampling: int) -> Film:
+        key = self._keys[camera]
+        if key not in self._entry.videos:
+            any_vector = self._state or next(iter(self.vectors), STATES[0])
+            mapping = ColumnMapping(state=any_vector, action=None, videos={camera: key})
+            return StoredFilm(self._dataset.episode(self._entry.index, mapping).pictures(camera), sampling)
+        span = self._entry.videos[key]
+        stretch = None if span.start is None else Stretch(span.start, self._entry.length, self.fps)
+        return VideoFilm(span.path, sampling, stretch)
+
+    def joints(self) -> tuple[Joints | None, str]:
+        if not self._state:
+            there = ", ".join(self.vectors) or "none"
+            return (
+                None,
+                f"motion is not checked: no column of measured joints, there are {there} (say it with --state)",
+            )
+        names = self.vectors[self._state].names
+        robot = self._robot or str(self._dataset.info.get("robot_type") or "")
+        if self._robot:
+            names = tuple(robots.load(self._robot).joint_names)
+        try:
+            return known_joints(robot, names), ""
+        except RobotError as error:
+            return unknown_joints(names), f"limits are not checked: {error}"
+
+
+def _marks(columns: Mapping[str, Float64], prefix: str) -> dict[str, Bools]:
+    """Truths by camera, out of the columns of that prefix."""
+    return {
+        name.removeprefix(prefix): values == 1.0
+        for name, values in columns.items()
+        if name.startswith(prefix)
+    }
+
+
+def _names(given: Any) -> tuple[str, ...]:
+    """The names of a feature's numbers, as a list or in a table of one."""
+    if isinstance(given, Mapping):
+        given = next((value for value in given.values() if isinstance(value, list)), [])
+    return tuple(map(str, given)) if isinstance(given, list) else ()
+
+
+def _scalars(column: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Numbers as float64 [N], also out of lists of one; NaN where there is none."""
+    while pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
+        column = pa.array([None if one is None or len(one) != 1 else one[0] for one in column.to_pylist()])
+    return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), np.float64)
+
+
+def _lists(column: Any, vector: Vector) -> Numbers:
+    """Lists as float32 [N, W]; rows of another width are malformed and 0."""
+    rows = len(column)
+    missing = ~np.asarray(column.is_valid().to_numpy(zero_copy_only=False), np.bool_)
+    values = np.zeros((rows, vector.width), np.float32)
+    if pa.types.is_fixed_size_list(column.type):
+        lengths = np.full(rows, column.type.list_size)
+    elif pa.types.is_list(column.type) or pa.types.is_large_list(column.type):
+        lengths = np.asarray(column.value_lengths().fill_null(0).to_numpy(zero_copy_only=False), np.int64)
+    else:
+        return Numbers(values, missing, ~missing)
+    malformed = ~missing & (lengths != vector.width)
+    good = ~missing & ~malformed
+    flat = column.filter(pa.array(good)).flatten()
+    if flat.null_count:
+        flat = flat.fill_null(float("nan"))
+    values[good] = flat.to_numpy(zero_copy_only=False).astype(np.float32).reshape(-1, vector.width)
+    if vector.sparse:
+        missing = missing | (good & np.isnan(values).all(axis=1))
+    return Numbers(values, missing, malformed)

@@ -1,0 +1,86 @@
+"""Looks an episode through: rows and pictures once, in step with each other, in memory that does not grow with it."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+
+from runtime.datasets.reader import Dataset, open_dataset
+from runtime.errors import RecordingError
+from runtime.quality.block import Source
+from runtime.quality.datasets import DatasetSource
+from runtime.quality.journals import JournalSource
+from runtime.quality.motion import Motion
+from runtime.quality.pictures import Pictures
+from runtime.quality.report import Flag, Flags, Report
+from runtime.quality.settings import QualitySettings
+from runtime.quality.times import Times
+from runtime.quality.values import Values
+
+
+def inspect(folder: Path, settings: QualitySettings | None = None) -> Report:
+    """The report on the episode in a folder of ours; damage is a flag, RecordingError where there is no manifest."""
+    return examine(JournalSource(folder), settings or QualitySettings())
+
+
+def inspect_dataset(
+    dataset: Dataset | Path,
+    index: int,
+    settings: QualitySettings | None = None,
+    *,
+    state: str = "",
+    robot: str = "",
+) -> Report:
+    """The report on episode `index` of a LeRobot dataset; RecordingError where the dataset has no such episode."""
+    opened = open_dataset(dataset) if isinstance(dataset, Path) else dataset
+    return examine(DatasetSource(opened, index, state, robot), settings or QualitySettings())
+
+
+def examine(source: Source, settings: QualitySettings) -> Report:
+    """All checks of one episode, wherever it comes from."""
+    flags = Flags(settings.most_flags)
+    for kind, severity, sentence in source.remarks:
+        flags.add(Flag(kind, severity, -1, -1, "", sentence))
+    joints, unknown = source.joints()
+    if unknown:
+        flags.unchecked.append(unknown)
+    times = Times(source, settings, flags)
+    values = Values(source, joints, settings, flags)
+    motion = Motion(source, joints, settings, flags) if joints is not None else None
+    cameras = {camera: Pictures(source, camera, settings, flags) for camera in source.cameras}
+    rows, whole = 0, True
+    with ExitStack() as stack:
+        for camera in cameras.values():
+            stack.callback(camera.release)
+        try:
+            for block in source.blocks():
+                rows = block.first + block.rows
+                times.add(block)
+                values.add(block)
+                moving = motion.add(block) if motion is not None else np.ones(block.rows, np.bool_)
+                for name, camera in cameras.items():
+                    camera.add(block.first, moving, block.repeated.get(name), block.lost.get(name))
+        except RecordingError as error:
+            whole = False
+            flags.add(Flag("unreadable", "error", max(0, rows - 1), max(0, rows - 1), "", str(error)))
+        for part in (times, values, motion):
+            if part is not None:
+                part.close()
+        for camera in cameras.values():
+            camera.close(rows, whole)
+    _length(source, rows, settings, flags)
+    figures = {"tracking_lag_s": motion.lag_s if motion else None, "largest_skew_s": times.largest_skew}
+    return flags.report(source.name, rows, source.fps, figures)
+
+
+def _length(source: Source, rows: int, settings: QualitySettings, flags: Flags) -> None:
+    given = source.schema.get("min_length_s")
+    bound = float(given) if isinstance(given, int | float) and given >= 0 else settings.min_length_s
+    seconds = rows / source.fps
+    if not rows:
+        flags.add(Flag("too_short", "error", -1, -1, "", "nothing was recorded: it has no rows", 0.0, bound))
+    elif seconds < bound:
+        text = f"it is {seconds:.2f} s long, at least {bound:g} s are wanted"
+        flags.add(Flag("too_short", "warning", 0, rows - 1, "", text, seconds, bound))

@@ -1,0 +1,51 @@
+"""Pictures that a camera gave and its video does not have: of some rows, or of all from one on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.quality.block import Bools, VideoEnd
+from runtime.quality.report import Flag, Flags, Run, Runs, Severity, span
+from runtime.quality.settings import QualitySettings
+
+
+class Losses:
+    """What one camera has lost; rows beyond the end of its video are one flag."""
+
+    def __init__(
+        self, camera: str, fps: float, settings: QualitySettings, flags: Flags, end: VideoEnd | None
+    ) -> None:
+        self._camera = camera
+        self._fps = fps
+        self._settings = settings
+        self._flags = flags
+        self._end = end
+        self._runs = Runs(self._lost)
+
+    def add(self, first: int, lost: Bools) -> None:
+        """The rows from `first` on whose picture is not in the video."""
+        self._runs.add(first, lost & ~self.beyond(first, len(lost)))
+
+    def beyond(self, first: int, rows: int) -> Bools:
+        """Which of these rows [N] are past the end of the video."""
+        return np.arange(first, first + rows) >= (np.inf if self._end is None else self._end.row)
+
+    def close(self, rows: int) -> None:
+        """The episode has ended with so many rows."""
+        self._runs.close()
+        if self._end is None:
+            return
+        told = f"the video of {self._camera} ended: {self._end.reason}"
+        if self._end.row < rows:
+            text = f"from frame {self._end.row} on {told}"
+            self._flags.add(Flag("video_lost", "error", self._end.row, rows - 1, self._camera, text))
+        else:
+            text = f"after the last frame {told}"
+            self._flags.add(Flag("video_lost", "warning", -1, -1, self._camera, text))
+
+    def _lost(self, run: Run) -> None:
+        seconds, bound = run.frames / self._fps, self._settings.picture_age_s
+        severity: Severity = "error" if seconds > bound else "warning"
+        where = span(run.first, run.last)
+        text = f"{where}: what {self._camera} gave for {seconds:.1f} s is not in its video, the picture before is"
+        self._flags.add(Flag("lost", severity, run.first, run.last, self._camera, text, seconds, bound))

@@ -1,0 +1,251 @@
+"""Checks of one camera's pictures: there, of their size, on time, neither black nor empty, and new."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from runtime.errors import RecordingError
+from runtime.quality.block import Bools, Source
+from runtime.quality.losses import Losses
+from runtime.quality.luma import Film, Shot
+from runtime.quality.report import Flag, Flags, Run, Runs, Severity, span
+from runtime.quality.settings import QualitySettings
+from runtime.types import Float32, Float64
+
+CHANGED = 10.0  # times `same`: a difference that only motion makes
+
+
+class Pictures:
+    """Decodes the pictures of one camera alongside its rows and judges them."""
+
+    def __init__(self, source: Source, camera: str, settings: QualitySettings, flags: Flags) -> None:
+        end = source.ends.get(camera)
+        self._camera = camera
+        self._fps = source.fps
+        self._size = source.cameras[camera]
+        self._settings = settings
+        self._flags = flags
+        self._film: Film | None = None
+        self._shots: Iterator[Shot] = iter(())
+        self._shown = 0  # pictures that were taken
+        self._before: Float32 | None = None
+        self._repeats = _Repeats(camera, self._fps, settings, flags)
+        self._losses = Losses(camera, self._fps, settings, flags, end)
+        self._runs = {
+            "black": Runs(self._black),
+            "uniform": Runs(self._uniform),
+            "video_time": Runs(self._off_time),
+            "no_picture": Runs(self._absent),
+        }
+        self._strange: tuple[int, int] | None = None
+        if end is not None and end.row == 0:
+            return  # there need not be a file
+        try:
+            self._film = source.film(camera, settings.sampling)
+            self._shots = iter(self._film)
+        except RecordingError as error:
+            self._say("video", "error", -1, -1, str(error))
+
+    def add(
+        self, first: int, moving: Bools, repeated: Bools | None = None, lost: Bools | None = None
+    ) -> None:
+        """Judge the pictures of the next rows."""
+        rows = len(moving)
+        nobody = np.zeros(rows, np.bool_)
+        repeated, lost = nobody if repeated is None else repeated, nobody if lost is None else lost
+        beyond = self._losses.beyond(first, rows)
+        self._losses.add(first, lost)
+        figures = np.full((rows, 4), np.nan)  # mean, standard deviation, change, time off the grid
+        keys = np.zeros(rows, np.bool_)
+        for row in np.flatnonzero(~beyond).tolist():
+            shot = self._next(first + row)
+            if shot is None:
+                break
+            figures[row] = self._figures(shot, first + row)
+            keys[row] = shot.key
+        mean, deviation, change, off = figures.T
+        there = np.isfinite(mean)
+        if self._film is not None:
+            self._runs["no_picture"].add(first, ~there & ~beyond)
+        black = there & (mean <= self._settings.black)
+        self._runs["black"].add(first, black, -np.nan_to_num(mean))
+        uniform = there & ~black & (deviation <= self._settings.uniform)
+        self._runs["uniform"].add(first, uniform, -np.nan_to_num(deviation))
+        self._runs["video_time"].add(first, np.nan_to_num(off) > 0.5 / self._fps, np.nan_to_num(off))
+        self._repeats.add(first, change, keys, black | uniform, moving, repeated & ~beyond, lost)
+
+    def _next(self, frame: int) -> Shot | None:
+        try:
+            shot = next(self._shots, None)
+        except RecordingError as error:
+            self._say("undecodable", "error", frame, frame, str(error))
+            self._shots = iter(())
+            return None
+        self._shown += shot is not None
+        return shot
+
+    def _figures(self, shot: Shot, frame: int) -> tuple[float, float, float, float]:
+        size = (shot.height, shot.width)
+        if self._size is not None and size != self._size and size != self._strange:
+            self._strange = size
+            told = f"{self._camera} is {size[1]}x{size[0]}, declared is {self._size[1]}x{self._size[0]}"
+            self._say("dimensions", "error", frame, frame, f"from frame {frame} on {told}")
+        before, self._before = self._before, shot.luma
+        change = np.nan
+        if before is not None:
+            alike = before.shape == shot.luma.shape
+            change = float(np.abs(shot.luma - before).mean()) if alike else np.inf
+        off = 0.0 if shot.time is None else abs(shot.time - frame / self._fps)
+        return float(shot.luma.mean()), float(shot.luma.std()), change, off
+
+    def close(self, rows: int, whole: bool) -> None:
+        """So many rows there were; `whole` where all of them could be read, so that more pictures would be too many."""
+        for runs in self._runs.values():
+            runs.close()
+        self._losses.close(rows)
+        self._repeats.close(self._shown)
+        if self._film is None:
+            return
+        ended = self._losses.beyond(rows, 1).all()
+        if whole and not ended and self._next(self._shown) is not None:
+            text = f"{self._camera} has more pictures than there are rows, {self._shown - 1}"
+            self._say("video_length", "info", -1, -1, text)
+
+    def release(self) -> None:
+        """Close the video, however the check ended."""
+        if self._film is not None:
+            self._film.close()
+
+    def _black(self, run: Run) -> None:
+        text = (
+            f"{span(run.first, run.last)}: {self._camera} is black, mean brightness {-run.value:.1f} of 255"
+        )
+        self._say("black", self._lasting(run), run.first, run.last, text, -run.value, self._settings.black)
+
+    def _uniform(self, run: Run) -> None:
+        text = f"{span(run.first, run.last)}: {self._camera} shows nothing, brightness varies by {-run.value:.2f}"
+        self._say(
+            "uniform", self._lasting(run), run.first, run.last, text, -run.value, self._settings.uniform
+        )
+
+    def _lasting(self, run: Run) -> Severity:
+        return "error" if run.frames / self._fps > self._settings.picture_age_s else "warning"
+
+    def _off_time(self, run: Run) -> None:
+        text = f"{span(run.first, run.last)}: {self._camera} is shown {run.value:.3f} s off its row"
+        self._say("video_time", "error", run.first, run.last, text, run.value, 0.5 / self._fps)
+
+    def _absent(self, run: Run) -> None:
+        text = f"{span(run.first, run.last)}: {self._camera} has no picture, only {self._shown}"
+        self._say("video_length", "error", run.first, run.last, text, float(self._shown), float(run.last + 1))
+
+    def _say(
+        self,
+        kind: str,
+        severity: Severity,
+        first: int,
+        last: int,
+        text: str,
+        value: float | None = None,
+        bound: float | None = None,
+    ) -> None:
+        self._flags.add(Flag(kind, severity, first, last, self._camera, text, value, bound))
+
+
+class _Repeats:
+    """Pictures that are the one before again: said so by the recorder, or seen so while the robot moved.
+
+    A picture that stays the same is no proof where the robot stands. One that is coded by itself after such as are
+    not differs from them also where it shows the same: it neither begins nor ends anything.
+    """
+
+    def __init__(self, camera: str, fps: float, settings: QualitySettings, flags: Flags) -> None:
+        self._camera = camera
+        self._fps = fps
+        self._settings = settings
+        self._flags = flags
+        self._repeated = self._skipped = 0
+        self._spans = {"repeated": [-1, -1], "skipped": [-1, -1]}
+        self._said = Runs(self._no_new)
+        self._seen = Runs(self._stands)
+        self._last: Float64 = np.full(2, np.nan)  # changes of the two pictures before
+        self._key = False  # whether the picture before was coded by itself
+
+    def add(
+        self,
+        first: int,
+        change: Float64,
+        keys: Bools,
+        dull: Bools,
+        moving: Bools,
+        repeated: Bools,
+        lost: Bools,
+    ) -> None:
+        """`dull` pictures are black or empty, and `lost` ones repeated for want of another: both is said elsewhere."""
+        said = repeated | lost
+        self._count("repeated", first, repeated & ~lost)
+        self._said.add(first, repeated & ~lost)
+        neutral = keys & ~np.concatenate([[self._key], keys[:-1]])
+        same = change <= self._settings.same
+        self._seen.add(first, (same | neutral) & moving & ~said & ~dull, same.astype(np.float64))
+        # A camera of half the rate shows each picture twice: it changes, stays, changes.
+        changes = np.concatenate([self._last, change])
+        much = changes > CHANGED * self._settings.same
+        twice = much[:-2] & (changes[1:-1] <= self._settings.same) & much[2:]
+        self._count("skipped", first - 1, twice & ~said)
+        self._last, self._key = changes[-2:], bool(keys[-1])
+
+    def _count(self, what: str, first: int, marked: Bools) -> None:
+        frames = np.flatnonzero(marked)
+        if len(frames):
+            known = self._spans[what]
+            self._spans[what] = [
+                known[0] if known[0] >= 0 else first + int(frames[0]),
+                first + int(frames[-1]),
+            ]
+        if what == "repeated":
+            self._repeated += len(frames)
+        else:
+            self._skipped += len(frames)
+
+    def close(self, shown: int) -> None:
+        self._said.close()
+        self._seen.close()
+        for what, count, text in (
+            ("repeated", self._repeated, "are the one before again: no new one came in time"),
+            (
+                "skipped",
+                self._skipped,
+                "are the one before again, and nobody said so: the camera is slower than the rows",
+            ),
+        ):
+            share = count / shown if shown else 0.0
+            if count:
+                many = share > self._settings.repeated_share
+                if what == "skipped" and not many:
+                    continue  # single ones prove nothing
+                first, last = self._spans[what]
+                sentence = f"{count} of {shown} pictures of {self._camera} {text}"
+                severity: Severity = "warning" if many else "info"
+                bound = self._settings.repeated_share
+                self._flags.add(
+                    Flag("duplicate", severity, first, last, self._camera, sentence, share, bound)
+                )
+
+    def _no_new(self, run: Run) -> None:
+        seconds, bound = run.frames / self._fps, self._settings.picture_age_s
+        if seconds > bound:
+            text = f"{span(run.first, run.last)}: {self._camera} gave no new picture for {seconds:.1f} s"
+            self._frozen("error", run, text, seconds, bound)
+
+    def _stands(self, run: Run) -> None:
+        seconds, bound = run.frames / self._fps, self._settings.frozen_s
+        if seconds > bound:
+            where = span(run.first, run.last)
+            text = f"{where}: {self._camera} shows one picture for {seconds:.1f} s while the robot moves"
+            self._frozen("warning", run, text, seconds, bound)
+
+    def _frozen(self, severity: Severity, run: Run, text: str, seconds: float, bound: float) -> None:
+        self._flags.add(Flag("frozen", severity, run.first, run.last, self._camera, text, seconds, bound))

@@ -1,0 +1,186 @@
+"""What the checks say of an episode: flags with their frames, and whether it is clean."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Severity = Literal["info", "warning", "error"]
+SEVERITIES: tuple[Severity, ...] = ("info", "warning", "error")
+FORMAT = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Flag:
+    """One finding in the frames `first` to `last`, both included; -1 both where it is about no frame.
+
+    `stream` is a column or a camera, "" for the episode. `value` is the worst that was found, `bound` what is
+    allowed, both in the unit that `text` names; None where the finding is no number.
+    """
+
+    kind: str
+    severity: Severity
+    first: int
+    last: int
+    stream: str
+    text: str
+    value: float | None = None
+    bound: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Count:
+    """How often a kind was found, and in how many frames, also beyond what a report lists."""
+
+    flags: int
+    frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """All findings on one episode. `unchecked` are sentences about what could not be judged, and why."""
+
+    episode: str  # its uuid, or DATASET#index
+    frames: int
+    fps: float
+    flags: tuple[Flag, ...]
+    counts: Mapping[str, Count]
+    unchecked: tuple[str, ...] = ()
+    figures: Mapping[str, float | None] = field(default_factory=dict)
+
+    @property
+    def clean(self) -> bool:
+        """Whether nothing but remarks was found."""
+        return self.worst in ("", "info")
+
+    @property
+    def worst(self) -> Severity | Literal[""]:
+        """The highest severity, "" where there is no flag."""
+        found = {flag.severity for flag in self.flags}
+        return next((severity for severity in reversed(SEVERITIES) if severity in found), "")
+
+    def document(self) -> dict[str, Any]:
+        """As JSON; numbers that are not finite become null."""
+        return {
+            "format": FORMAT,
+            "episode": self.episode,
+            "frames": self.frames,
+            "fps": self.fps,
+            "clean": self.clean,
+            "worst": self.worst,
+            "flags": [{name: _plain(value) for name, value in asdict(flag).items()} for flag in self.flags],
+            "counts": {kind: asdict(count) for kind, count in self.counts.items()},
+            "unchecked": list(self.unchecked),
+            "figures": {name: _plain(value) for name, value in self.figures.items()},
+        }
+
+
+def _plain(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+class Flags:
+    """Collects flags in constant memory: of each kind and stream at most `most` are kept, all are counted."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._kept: list[Flag] = []
+        self._seen: Counter[tuple[str, str]] = Counter()
+        self._counts: dict[str, Count] = {}
+        self.unchecked: list[str] = []
+
+    def add(self, flag: Flag) -> None:
+        """Take one finding."""
+        place = (flag.kind, flag.stream)
+        self._seen[place] += 1
+        if self._seen[place] <= self._most:
+            self._kept.append(flag)
+        before = self._counts.get(flag.kind, Count(0, 0))
+        frames = 0 if flag.first < 0 else flag.last - flag.first + 1
+        self._counts[flag.kind] = Count(before.flags + 1, before.frames + frames)
+
+    def report(self, episode: str, frames: int, fps: float, figures: Mapping[str, float | None]) -> Report:
+        """What was found, worst first within the order of the frames."""
+        order = sorted(
+            self._kept,
+            key=lambda flag: (flag.first, -SEVERITIES.index(flag.severity), flag.kind, flag.stream),
+        )
+        return Report(
+            episode,
+            frames,
+            fps,
+            tuple(order),
+            dict(sorted(self._counts.items())),
+            tuple(self.unchecked),
+            figures,
+        )
+
+
+class Run(NamedTuple):
+    """Consecutive frames that have something in common; `value` is the worst of them, at frame `at`."""
+
+    first: int
+    last: int
+    value: float
+    at: int
+
+    @property
+    def frames(self) -> int:
+        return self.last - self.first + 1
+
+
+class Runs:
+    """Joins marked frames of consecutive blocks into runs and gives each, once it has ended, to `ended`.
+
+    Runs that are at most `apart` unmarked frames apart are one.
+    """
+
+    def __init__(self, ended: Callable[[Run], None], apart: int = 0) -> None:
+        self._ended = ended
+        self._apart = apart
+        self._open: Run | None = None
+
+    def add(self, first: int, marked: NDArray[np.bool_], values: ArrayLike | None = None) -> None:
+        """The frames from `first` on; `values` says how bad each is, larger is worse."""
+        frames = np.flatnonzero(marked)
+        if not len(frames):
+            if self._open is not None and first + len(marked) - self._open.last > self._apart + 1:
+                self.close()
+            return
+        worst = np.ones(len(marked)) if values is None else np.asarray(values, np.float64)
+        breaks = np.flatnonzero(np.diff(frames) > self._apart + 1)
+        for part in np.split(frames, breaks + 1):
+            at = int(part[np.argmax(worst[part])])
+            self._take(Run(first + int(part[0]), first + int(part[-1]), float(worst[at]), first + at))
+
+    def _take(self, new: Run) -> None:
+        known = self._open
+        if known is None or new.first - known.last > self._apart + 1:
+            self.close()
+            self._open = new
+            return
+        worse = new if new.value > known.value else known
+        self._open = Run(known.first, new.last, worse.value, worse.at)
+
+    def close(self) -> None:
+        """The episode has ended."""
+        if self._open is not None:
+            known, self._open = self._open, None
+            self._ended(known)
+
+
+def span(first: int, last: int) -> str:
+    """Frames as a person names them."""
+    return f"frame {first}" if first == last else f"frames {first} to {last}"
+
+
+def listed(names: Sequence[str], most: int = 4) -> str:
+    """Names in a sentence, at most some of them."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")

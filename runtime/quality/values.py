@@ -1,0 +1,158 @@
+"""Checks of numbers: there, of the declared width, finite, unit quaternions, and no jumps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.quality.block import Block, Joints, Numbers, Source, Vector
+from runtime.quality.report import Flag, Flags, Run, Runs, Severity, listed, span
+from runtime.quality.settings import QualitySettings
+from runtime.types import EEF_WIDTH, Float32
+
+MOVING = ("state", "action")
+
+
+class Values:
+    """Judges every column of vectors, block by block.
+
+    Numbers that are not finite count as 0 and are unknown to all other checks; their rows are flagged and stay.
+    """
+
+    def __init__(
+        self, source: Source, joints: Joints | None, settings: QualitySettings, flags: Flags
+    ) -> None:
+        self._columns = [
+            _Column(name, vector, source.fps, joints, settings, flags)
+            for name, vector in source.vectors.items()
+        ]
+
+    def add(self, block: Block) -> None:
+        """Judge the next rows."""
+        for column in self._columns:
+            column.add(block.first, block.vectors[column.name])
+
+    def close(self) -> None:
+        """The episode has ended."""
+        for column in self._columns:
+            column.close()
+
+
+class _Column:
+    def __init__(
+        self,
+        name: str,
+        vector: Vector,
+        fps: float,
+        joints: Joints | None,
+        settings: QualitySettings,
+        flags: Flags,
+    ) -> None:
+        self.name = name
+        self._vector = vector
+        self._fps = fps
+        self._settings = settings
+        self._flags = flags
+        self._broken: set[int] = set()  # dimensions of the open run of numbers that are not finite
+        self._speeds = self._allowed(joints)
+        self._before = np.full(vector.width, np.nan, np.float32)
+        self._fastest = 0  # the dimension of the worst jump
+        self._runs = {
+            "missing": Runs(self._missing),
+            "dimensions": Runs(self._malformed),
+            "not_finite": Runs(self._not_finite),
+            "quaternion": Runs(self._no_rotation),
+            "jump": Runs(self._jump),
+        }
+        self._worst: dict[int, int] = {}
+
+    def _allowed(self, joints: Joints | None) -> np.ndarray[tuple[int], np.dtype[np.float64]] | None:
+        """How fast each number may change [1/s]; infinite where any change is right. None: it is not judged."""
+        width, settings = self._vector.width, self._settings
+        if self._vector.role == "poses":
+            bound = np.full(width, np.inf)
+            bound[np.arange(width) % EEF_WIDTH < 3] = settings.eef_speed
+            return bound
+        if self._vector.role not in MOVING:
+            return None
+        if joints is None or len(joints.names) != width:
+            return np.full(width, settings.joint_speed)
+        known = np.isfinite(joints.velocity)
+        bound = np.where(known, joints.velocity * settings.speed_factor, settings.joint_speed)
+        return np.where(joints.ordinary, bound, np.inf)
+
+    def add(self, first: int, numbers: Numbers) -> None:
+        finite = np.isfinite(numbers.values)
+        there = ~(numbers.missing | numbers.malformed)
+        broken = there & ~finite.all(axis=1)
+        self._runs["missing"].add(first, numbers.missing)
+        self._runs["dimensions"].add(first, numbers.malformed)
+        if not broken.any():
+            self._runs["not_finite"].add(first, broken)
+        for row in np.flatnonzero(broken):  # rare: one at a time, to say which numbers
+            self._runs["not_finite"].add(first + int(row), np.ones(1, np.bool_))
+            self._broken |= set(np.flatnonzero(~finite[row]).tolist())
+        usable = np.where(finite & there[:, None], numbers.values, np.nan).astype(np.float32)
+        if self._vector.role == "poses":
+            self._rotations(first, usable)
+        if self._speeds is not None:
+            self._jumps(first, usable)
+
+    def _rotations(self, first: int, values: Float32) -> None:
+        arms = values.reshape(len(values), -1, EEF_WIDTH)
+        off = np.abs(np.linalg.norm(arms[:, :, 3:7], axis=2) - 1.0).max(axis=1)
+        self._runs["quaternion"].add(
+            first, np.nan_to_num(off) > self._settings.quaternion_error, np.nan_to_num(off)
+        )
+
+    def _jumps(self, first: int, values: Float32) -> None:
+        assert self._speeds is not None
+        steps = np.abs(np.diff(np.concatenate([self._before[None], values]), axis=0)) * self._fps
+        excess = np.nan_to_num(steps / self._speeds, nan=0.0)
+        worst = excess.max(axis=1)
+        for row in np.flatnonzero(worst > 1.0):
+            self._worst[first + int(row)] = int(np.argmax(excess[row]))
+        self._runs["jump"].add(first, worst > 1.0, worst)
+        self._before = values[-1]
+
+    def close(self) -> None:
+        for runs in self._runs.values():
+            runs.close()
+
+    def _missing(self, run: Run) -> None:
+        severity: Severity = "info" if self._vector.sparse else "error" if self._moves else "warning"
+        self._say("missing_values", severity, run, f"{self.name} was not recorded", None, None)
+
+    def _malformed(self, run: Run) -> None:
+        self._say(
+            "dimensions", "error", run, f"{self.name} has another width than {self._vector.width}", None, None
+        )
+
+    def _not_finite(self, run: Run) -> None:
+        names = listed([self._vector.names[dim] for dim in sorted(self._broken)])
+        self._broken = set()
+        severity: Severity = "error" if self._moves else "warning"
+        text = f"{self.name} is not finite in {names}: it counts as 0"
+        self._say("not_finite", severity, run, text, float(run.frames), 0.0)
+
+    def _no_rotation(self, run: Run) -> None:
+        text = f"{self.name}: the length of a quaternion is {run.value:.3f} off 1"
+        self._say("quaternion", "error", run, text, run.value, self._settings.quaternion_error)
+
+    def _jump(self, run: Run) -> None:
+        assert self._speeds is not None
+        dim = self._worst[run.at]
+        self._worst = {frame: other for frame, other in self._worst.items() if frame > run.last}
+        bound = float(self._speeds[dim])
+        unit = "m/s" if self._vector.role == "poses" else "rad/s"
+        text = f"{self.name}: {self._vector.names[dim]} jumps, at {run.value * bound:.2f} {unit}"
+        self._say("jump", "warning", run, text, run.value * bound, bound)
+
+    @property
+    def _moves(self) -> bool:
+        return self._vector.role in MOVING
+
+    def _say(
+        self, kind: str, severity: Severity, run: Run, text: str, value: float | None, bound: float | None
+    ) -> None:
+        sentence = f"{span(run.first, run.last)}: {text}"
+        self._flags.add(Flag(kind, severity, run.first, run.last, self.name, sentence, value, bound))

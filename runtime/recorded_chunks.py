@@ -1,0 +1,90 @@
+"""The chunks of an episode: what the policy answered, together with where control put it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.messages import ChunkMerged, PolicyAnswer
+from runtime.recording.base import Journal, RawChunk
+from runtime.types import Float32, UInt8
+
+_KEPT = 256  # of either half, until the other comes
+
+
+class RecordedChunks:
+    """Writes each chunk of one episode once both halves are known, in whichever order they come; RecordingError."""
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self._answers: dict[int, PolicyAnswer] = {}
+        self._merged: dict[int, ChunkMerged] = {}
+
+    def answered(self, answer: PolicyAnswer) -> None:
+        """A chunk as the policy gave it."""
+        merged = self._merged.pop(answer.chunk_id, None)
+        if merged is not None:
+            self._write(answer, merged)
+            return
+        self._answers[answer.chunk_id] = answer
+        if len(self._answers) > _KEPT:  # the oldest never came to control
+            self._write(self._answers.pop(next(iter(self._answers))), None)
+
+    def merged(self, merged: ChunkMerged) -> None:
+        """Where control put a chunk."""
+        answer = self._answers.pop(merged.chunk_id, None)
+        if answer is not None:
+            self._write(answer, merged)
+        elif len(self._merged) < _KEPT:
+            self._merged[merged.chunk_id] = merged
+
+    def rest(self) -> None:
+        """Write the chunks that never came to control."""
+        for answer in list(self._answers.values()):
+            self._write(answer, None)
+
+    def _write(self, answer: PolicyAnswer, merged: ChunkMerged | None) -> None:
+        targets = np.full(len(answer.actions), -1, np.int64)
+        if merged is not None:
+            # A row of the policy counts for the first step that was made from it.
+            for step, row in zip(merged.targets[::-1], answer.source_rows[::-1], strict=True):
+                targets[row] = step
+        metres, radians, flags = _met(answer)
+        self._journal.append(
+            RawChunk(
+                chunk_id=answer.chunk_id,
+                observation_step=answer.observation_step,
+                arrival_step=merged.arrival_step if merged else -1,
+                actions=answer.actions,
+                target_steps=targets,
+                space="eef" if answer.space == "eef" else "joint",
+                delay=merged.delay if merged else -1,
+                mistimed=merged.mistimed if merged else 0,
+                inference_ms=answer.inference_ms,
+                strategy=merged.strategy if merged else "",
+                overlap=merged.overlap if merged else 0,
+                ik_position_error=metres,
+                ik_rotation_error=radians,
+                ik_flags=flags,
+                eef=answer.eef,
+            )
+        )
+
+
+def _met(answer: PolicyAnswer) -> tuple[Float32 | None, Float32 | None, UInt8 | None]:
+    """How each row [H, arms] of the policy was met: the worst error [m, rad] and all flags of the steps made of it.
+
+    NaN and no flag for a row that no step was made of, None for a chunk of joints.
+    """
+    errors, flags = (answer.position_error, answer.rotation_error), answer.ik_flags
+    if errors[0] is None or errors[1] is None or flags is None:
+        return None, None, None
+    shape = (len(answer.actions), flags.shape[1])
+    made: list[Float32] = []
+    for error in errors:
+        assert error is not None
+        worst = np.full(shape, np.nan, np.float32)
+        np.fmax.at(worst, answer.source_rows, error.astype(np.float32))
+        made.append(worst)
+    gathered = np.zeros(shape, np.uint8)
+    np.bitwise_or.at(gathered, answer.source_rows, flags)
+    return made[0], made[1], gathered

@@ -1,0 +1,82 @@
+"""The video encoders that a recording may use: their presets, and how each is made to keep nothing back.
+
+A frame has to reach the file at once and in the order of the rows: no B-frames, no look-ahead, closed groups.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any, Literal
+
+CodecName = Literal["libx264", "libx265", "libsvtav1", "h264_nvenc"]
+PIXELS = "yuv420p"
+_X26 = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow")
+# x264's look-ahead would halve the size of still scenes, and keep each frame for as many periods; without force-cfr it
+# keeps one more to learn its duration. x265 without it keeps none.
+_X264_AT_ONCE = "scenecut=0:bframes=0:open-gop=0:rc-lookahead=0:mbtree=0:force-cfr=1"
+_X265_AT_ONCE = (
+    "scenecut=0:bframes=0:open-gop=0:rc-lookahead=0:cutree=0:frame-threads=1:pools=none:wpp=0:log-level=error"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Codec:
+    """One encoder: `coded` is the format it writes, `largest_crf` the end of its scale of quality."""
+
+    coded: str
+    presets: tuple[str, ...]
+    preset: str
+    crf: int
+    largest_crf: int
+    tag: str | None = None  # where browsers want another one than the muxer's
+
+
+CODECS: Mapping[str, Codec] = {
+    "libx264": Codec("h264", _X26, "veryfast", 23, 51),
+    "libx265": Codec("hevc", _X26, "ultrafast", 28, 51, "hvc1"),
+    "libsvtav1": Codec("av1", tuple(str(n) for n in range(4, 11)), "10", 35, 63),
+    "h264_nvenc": Codec("h264", tuple(f"p{n}" for n in range(1, 8)), "p4", 23, 51),
+}
+
+
+def options(name: str, preset: str, crf: int, gop: int) -> dict[str, str]:
+    """What the encoder is told."""
+    chosen = {"preset": preset, "crf": str(crf), "forced-idr": "1"}
+    if name == "libx264":
+        return {**chosen, "x264-params": f"keyint={gop}:min-keyint=1:{_X264_AT_ONCE}"}
+    if name == "libx265":
+        return {**chosen, "x265-params": f"keyint={gop}:min-keyint=1:{_X265_AT_ONCE}"}
+    if name == "libsvtav1":
+        low_delay = f"keyint={gop}:pred-struct=1:lookahead=0:scd=0:lp=1"
+        return {"preset": preset, "crf": str(crf), "svtav1-params": low_delay}
+    return {
+        "preset": preset,
+        "rc": "vbr",
+        "cq": str(crf),
+        "forced-idr": "1",
+        "tune": "ll",
+        "delay": "0",
+        "zerolatency": "1",
+        "rc-lookahead": "0",
+        "bf": "0",
+    }
+
+
+def set_up(
+    context: Any, name: str, size: tuple[int, int], rate: Fraction, told: Mapping[str, str], gop: int
+) -> None:
+    """Make an encoder's context ready for pictures of (height, width) at `rate`."""
+    if name == "libsvtav1":
+        os.environ.setdefault("SVT_LOG", "1")  # errors alone: it describes itself at length
+    context.height, context.width = size
+    context.pix_fmt = PIXELS
+    context.time_base = 1 / rate
+    context.thread_count = 1
+    context.gop_size = gop
+    context.max_b_frames = 0
+    context.options = dict(told)
+    if (tag := CODECS[name].tag) is not None:
+        context.codec_tag = tag

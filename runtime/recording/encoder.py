@@ -1,0 +1,137 @@
+"""The encoder thread of one camera; what goes wrong with it costs this camera's video and nothing else."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from pathlib import Path
+
+import av
+
+from runtime.errors import RecordingError
+from runtime.recording.backlog import Picture, PictureQueue, codings
+from runtime.recording.files import AppendFile
+from runtime.recording.settings import RecordingSettings
+from runtime.recording.spread import Spread
+from runtime.recording.video import FragmentedVideo
+from runtime.types import UInt8
+
+
+class CameraEncoder:
+    """Encodes one camera's pictures on a thread of its own; `put` never waits for it unless told to."""
+
+    def __init__(
+        self, camera: str, path: Path, size: tuple[int, int], fps: float, settings: RecordingSettings
+    ) -> None:
+        self.camera = camera
+        self.path = path
+        self.failure: RecordingError | None = None
+        self.file = AppendFile(path)
+        self._fps = fps
+        self._most_behind = max(2, round(settings.give_up_s * fps))  # frames
+        self._abandoned = False
+        self._captured: deque[float] = (
+            deque()
+        )  # of the frames in the encoder [s, monotonic]; NaN for a repeat
+        self._muxed = Spread()
+        self._queue = PictureQueue(settings.queue_frames, settings.max_lag_s)
+        try:
+            self._video = FragmentedVideo(self.file, size, fps, settings)
+        except (av.FFmpegError, ValueError) as error:
+            self.file.close()
+            raise RecordingError(
+                f"camera {camera}: no encoder {settings.codec} for {size[1]}x{size[0]}: {error}"
+            ) from error
+        except RecordingError:
+            self.file.close()
+            raise
+        self._thread = threading.Thread(target=self._run, name=f"encoder {camera}", daemon=True)
+        self._thread.start()
+
+    @property
+    def frames(self) -> int:
+        """Frames encoded so far; all of them are in the file once the encoder has drained without failure."""
+        return self._video.frames
+
+    @property
+    def muxed_ms(self) -> dict[str, float] | None:
+        """From the capture of a picture until its packet went to the muxer; None where that is not known."""
+        return self._muxed.milliseconds()
+
+    def put(self, picture: UInt8 | None, patience: float = 0.0, captured: float = math.nan) -> bool:
+        """Queue the next row's picture, which must not change any more; False where it became a repeat.
+
+        `captured` is when it was taken, on the monotonic clock of this machine. An encoder that has failed takes
+        nothing, and one that is too far behind fails.
+        """
+        if self.failure is not None:
+            return False
+        taken = self._queue.put(picture, patience, captured)
+        if not patience and not taken and (waiting := self._queue.waiting()) > self._most_behind:
+            self._give_up(
+                f"the encoder is {waiting} frames ({waiting / self._fps:.1f} s) behind and is given up"
+            )
+        return taken
+
+    def finish(self) -> None:
+        """Ask the thread to encode what waits and to end."""
+        self._queue.close()
+
+    def drain(self, deadline: float) -> bool:
+        """Wait for the thread's end until `deadline` (time.monotonic); False where it is still at work."""
+        self._thread.join(max(0.0, deadline - time.monotonic()))
+        return not self._thread.is_alive()
+
+    def abandon(self) -> None:
+        """Give up on a thread that does not end; it writes no more than the frame it is at."""
+        self._abandoned = True
+        waiting = self._queue.waiting()
+        self._give_up(f"the encoder did not end in time, {waiting} frames not encoded into {self.path}")
+
+    def cancel(self) -> None:
+        """End the thread and close the file, for a recording that never began."""
+        self._queue.close(discard=True)
+        self._thread.join()
+        self.file.close()
+
+    def _give_up(self, why: str) -> None:
+        if self.failure is None:
+            self.failure = RecordingError(f"camera {self.camera}: {why}")
+        self._queue.close(discard=True)
+
+    def _run(self) -> None:
+        try:
+            while (entry := self._queue.take()) is not None:
+                self._encode(entry)
+            if not self._abandoned:
+                self._video.close()
+        except RecordingError as error:
+            self.failure = self.failure or type(error)(f"camera {self.camera}: {error}")
+        except Exception as error:  # whatever it was: the recording has to say so, and whose it was
+            failure = RecordingError(f"camera {self.camera}: the encoder failed: {error!r}")
+            self._salvage(failure)
+            self.failure = self.failure or failure
+        finally:
+            self._queue.close(discard=True)
+
+    def _encode(self, entry: Picture | int) -> None:
+        begun = time.monotonic()
+        if isinstance(entry, int):
+            self._captured.extend([math.nan] * entry)
+            self._video.repeat(entry)
+            self._queue.coded(codings(entry), time.monotonic() - begun)
+        else:
+            self._captured.append(entry.captured)
+            self._video.encode(entry.pixels)
+            self._queue.coded(1, time.monotonic() - begun)
+        while self._captured and len(self._captured) > self._video.frames - self._video.muxed:
+            self._muxed.add(self._video.muxed_at - self._captured.popleft())
+
+    def _salvage(self, failure: RecordingError) -> None:
+        """Write the frames that the failed encoder still holds, where it can."""
+        try:
+            self._video.close()
+        except Exception as error:
+            failure.add_note(f"its last frames are lost: {error!r}")

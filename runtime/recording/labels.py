@@ -1,0 +1,84 @@
+"""What people say of collected episodes: labels/<uuid>.jsonl in the data folder, one line each; the newest counts."""
+
+from __future__ import annotations
+
+import json
+import os
+import uuid
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from runtime.errors import RecordingError
+
+Result = Literal["success", "partial", "fail"]
+FOLDER = "labels"
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """One line: `time` is Unix time [s]; `result` None where nobody has said yet; what is discarded stays so."""
+
+    time: float
+    by: str
+    result: Result | None = None
+    note: str = ""
+    discarded: bool = False
+
+
+def labels(data: Path, episode: str) -> list[Label]:
+    """All of an episode, the oldest first; a line that was torn by a kill, or is none, is left out."""
+    try:
+        content = _file(data, episode).read_text("utf-8", "replace")
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise RecordingError(f"the labels of {episode} cannot be read: {error}") from error
+    return [label for line in content.splitlines() if (label := _read(line)) is not None]
+
+
+def newest(data: Path, episode: str) -> Label | None:
+    """The one that counts."""
+    said = labels(data, episode)
+    return said[-1] if said else None
+
+
+def append(data: Path, episode: str, label: Label) -> None:
+    """Write one line, which is on the disk when this returns; RecordingError where it cannot be."""
+    path = _file(data, episode)
+    line = json.dumps(asdict(label), ensure_ascii=False).encode() + b"\n"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a+b", buffering=0) as file:
+            end = file.seek(0, os.SEEK_END)
+            if end:
+                file.seek(end - 1)
+                line = line if file.read(1) == b"\n" else b"\n" + line
+            try:
+                if file.write(line) != len(line):
+                    raise OSError("the disk took only a part of the line")
+                os.fsync(file.fileno())
+            except OSError:
+                file.truncate(end)
+                raise
+    except OSError as error:
+        raise RecordingError(f"the label of {episode} is not on disk: {error}") from error
+
+
+def _file(data: Path, episode: str) -> Path:
+    try:
+        named = str(uuid.UUID(episode))
+    except ValueError:
+        raise RecordingError(f"episode = {episode!r:.80}; allowed: the uuid of an episode") from None
+    return data / FOLDER / f"{named}.jsonl"
+
+
+def _read(line: str) -> Label | None:
+    try:
+        row: Any = json.loads(line)
+        label = Label(
+            float(row["time"]), str(row["by"]), row["result"], str(row["note"]), row["discarded"] is True
+        )
+    except (ValueError, KeyError, TypeError):
+        return None
+    return label if label.result is None or label.result in get_args(Result) else None

@@ -1,0 +1,43 @@
+"""How durations are spread, in constant memory: a histogram whose buckets are one per cent wide."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+_LEAST, _MOST = 1e-4, 1e5  # [s]; what is outside counts as this
+_STEP = math.log(1.01)
+_BUCKETS = math.ceil(math.log(_MOST / _LEAST) / _STEP) + 1
+
+
+class Spread:
+    """Counts durations [s]; numbers that are not finite do not count."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(_BUCKETS, dtype=np.int64)
+        self._longest = -math.inf
+
+    def add(self, seconds: float) -> None:
+        """One more."""
+        if not math.isfinite(seconds):
+            return
+        within = min(max(seconds, _LEAST), _MOST)
+        self._counts[int(math.log(within / _LEAST) / _STEP)] += 1
+        self._longest = max(self._longest, seconds)
+
+    def milliseconds(self) -> dict[str, float] | None:
+        """p50 and p99, to one per cent, and the exact max; None where nothing was counted."""
+        total = int(self._counts.sum())
+        if not total:
+            return None
+        return {
+            "p50": self._quantile(0.50, total) * 1000.0,
+            "p99": self._quantile(0.99, total) * 1000.0,
+            "max": self._longest * 1000.0,
+        }
+
+    def _quantile(self, share: float, total: int) -> float:
+        """The middle of the bucket that holds it, no more than the longest."""
+        bucket = int(np.searchsorted(np.cumsum(self._counts), share * total))
+        return min(_LEAST * math.exp((min(bucket, _BUCKETS - 1) + 0.5) * _STEP), self._longest)

@@ -1,0 +1,59 @@
+"""Whether this machine has the video encoder that a deployment asks for: found out by coding a few pictures."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import av
+import numpy as np
+from av.video.frame import PictureType
+
+from runtime.errors import ConfigurationError
+from runtime.recording.codecs import CODECS, PIXELS, options, set_up
+from runtime.recording.ordinary import ordinary_threads
+from runtime.recording.settings import RecordingSettings
+
+_SIZE = (192, 256)  # height and width; hardware encoders refuse smaller ones
+_PICTURES = 4
+
+
+def require(settings: RecordingSettings) -> None:
+    """ConfigurationError naming the encoder, and those that work, where this machine cannot code as it is asked to."""
+    name = settings.codec
+    try:
+        with ordinary_threads():
+            _code(name, settings.chosen_preset, settings.chosen_crf, settings.gop or 1)
+    except (av.FFmpegError, ValueError) as error:
+        others = ", ".join(other for other in CODECS if other != name and works(other))
+        why = getattr(error, "strerror", None) or str(error)
+        raise ConfigurationError(
+            f"recording.codec = {name!r} does not work on this machine: {why}; allowed here: {others or 'none'}"
+        ) from error
+
+
+def works(name: str) -> bool:
+    """Whether this machine can use that encoder as it is by default."""
+    codec = CODECS[name]
+    try:
+        with ordinary_threads():
+            _code(name, codec.preset, codec.crf, 1)
+    except (av.FFmpegError, ValueError):
+        return False
+    return True
+
+
+def _code(name: str, preset: str, crf: int, gop: int) -> None:
+    rate = Fraction(30)
+    context: Any = av.CodecContext.create(name, "w")
+    context.framerate = rate
+    set_up(context, name, _SIZE, rate, options(name, preset, crf, gop), gop)
+    coded = 0
+    for number in range(_PICTURES):
+        frame = av.VideoFrame.from_ndarray(np.full((*_SIZE, 3), 40 * number, np.uint8), format="rgb24")
+        frame = frame.reformat(format=PIXELS)
+        frame.pts, frame.time_base, frame.pict_type = number, 1 / rate, PictureType.NONE
+        coded += len(context.encode(frame))
+    coded += len(context.encode(None))
+    if coded != _PICTURES:
+        raise ValueError(f"it made {coded} frames of {_PICTURES}")

@@ -1,0 +1,59 @@
+"""What the rows of an episode show of each camera: a picture once, and how old the newest one is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from runtime.messages import Event
+from runtime.recording.settings import RecordingSettings
+from runtime.silences import Silences
+from runtime.types import Observation, UInt8
+
+
+class Shown:
+    """Follows the cameras of one episode row by row."""
+
+    def __init__(self, cameras: Sequence[str], settings: RecordingSettings) -> None:
+        self._cameras = tuple(cameras)
+        self._settings = settings
+        self._captured: dict[str, float] = {}  # of the newest picture that a row has
+        self._began: float | None = None
+        self._silences = Silences(cameras)
+        self.stale: frozenset[str] = frozenset()  # cameras whose newest picture is too old for the newest row
+
+    def sizes(self, seen: Observation) -> dict[str, dict[str, int]]:
+        """How large each video is, and the pictures of its camera where they are scaled for it."""
+        pictures = {camera: seen.pictures[camera] for camera in self._cameras}
+        given = {camera: (picture.shape[0], picture.shape[1]) for camera, picture in pictures.items()}
+        sizes = {}
+        for camera, (height, width) in self._settings.sizes(given).items():
+            sizes[camera] = {"width": width, "height": height}
+            if (height, width) != given[camera]:
+                sizes[camera] |= {"captured_width": given[camera][1], "captured_height": given[camera][0]}
+        return sizes
+
+    def pictures(self, seen: Observation | None) -> Mapping[str, UInt8 | None]:
+        """The observation's pictures; None for a camera whose picture an earlier row has already."""
+        pictures: dict[str, UInt8 | None] = {}
+        for camera in self._cameras:
+            picture = None if seen is None else seen.pictures.get(camera)
+            captured = math.nan if seen is None else seen.captured.get(camera, math.nan)
+            if captured == self._captured.get(camera):
+                picture = None
+            if picture is not None:
+                self._captured[camera] = captured
+            pictures[camera] = picture
+        return pictures
+
+    def look(self, now: float, row: int) -> list[Event]:
+        """Judge the age of what row `row` shows at `now` [s]; cameras that fall silent or are back are events."""
+        self._began = now if self._began is None else self._began
+        ages = {camera: now - self._captured.get(camera, self._began) for camera in self._cameras}
+        old = {camera: age for camera, age in ages.items() if age > self._settings.max_picture_age_s}
+        self.stale = frozenset(old)
+        return self._silences.look(now, row, old)
+
+    def rest(self, now: float) -> list[Event]:
+        """What is left to be said of the cameras when the episode ends."""
+        return self._silences.rest(now)

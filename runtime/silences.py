@@ -1,0 +1,67 @@
+"""What is said of cameras that stop giving pictures: each time while that is seldom, else now and then how often."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from runtime.messages import Event
+
+QUIET_S = 5.0  # from one pictures_stopped of a camera to its next
+
+
+@dataclass(slots=True)
+class _Camera:
+    silent: bool = False
+    row: int = 0  # of its newest change
+    said: bool = False  # its silence was, and not yet that it is back
+    unsaid: int = 0  # how often it fell silent since something was said
+    unsaid_from: int = 0  # the row of the first of these
+    spoken: float = -math.inf  # when that was
+
+
+class Silences:
+    """Follows the cameras of one episode row by row.
+
+    A camera is said to have stopped, and to be back, at most once in QUIET_S. What comes meanwhile is counted, and said
+    when that time is over: as what the camera does then, since its own row, with the number.
+    """
+
+    def __init__(self, cameras: Iterable[str]) -> None:
+        self._cameras = {name: _Camera() for name in sorted(cameras)}
+
+    def look(self, now: float, row: int, silent: Mapping[str, float]) -> list[Event]:
+        """What is to be said at row `row`, made at `now` [s]; `silent` has the age [s] of each picture too old."""
+        events = []
+        for name, camera in self._cameras.items():
+            if (name in silent) != camera.silent:
+                camera.silent, camera.row = name in silent, row
+                if camera.silent:
+                    camera.unsaid_from = camera.unsaid_from if camera.unsaid else row
+                    camera.unsaid += 1
+            if (camera.said and not camera.silent) or (camera.unsaid and now - camera.spoken >= QUIET_S):
+                events.append(_say(name, camera, now, silent.get(name)))
+        return events
+
+    def rest(self, now: float) -> list[Event]:
+        """What was counted and not said yet, at the end of the episode."""
+        return [_say(name, camera, now, None) for name, camera in self._cameras.items() if camera.unsaid]
+
+
+def _say(name: str, camera: _Camera, now: float, age: float | None) -> Event:
+    data: dict[str, object] = {"camera": name, "row": camera.row}
+    if camera.silent:
+        since = "gives no new picture" if age is None else f"has given no new picture for {age:.1f} s"
+        text = f"camera {name} {since}: rows from {camera.row} on repeat its last one"
+    else:
+        text = f"camera {name} gives pictures again, from row {camera.row} on"
+    if more := camera.unsaid - camera.silent:
+        text += (
+            f"; it had stopped {more} {'time' if more == 1 else 'times'} more since row {camera.unsaid_from}"
+        )
+        data |= {"more": more, "since_row": camera.unsaid_from}
+    if camera.unsaid:
+        camera.spoken = now
+    camera.said, camera.unsaid = camera.silent, 0
+    return Event("pictures_stopped" if camera.silent else "pictures_back", text, now, data=data)

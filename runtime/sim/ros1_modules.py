@@ -1,0 +1,61 @@
+"""Lends this Python the rospy of another one, such as Debian's: it is written in Python alone.
+
+A folder of links to rospy's packages is put behind everything else that is imported, so that nothing of the other
+Python but these comes along.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from runtime.errors import SetupError
+
+_PACKAGES = (
+    "catkin", "catkin_pkg", "defusedxml", "genmsg", "genpy", "geometry_msgs", "pyparsing", "roscpp", "rosgraph",
+    "rosgraph_msgs", "roslib", "rospkg", "rospy", "sensor_msgs", "std_msgs", "std_srvs", "yaml",
+)  # fmt: skip
+_NEEDED = {"rospy", "sensor_msgs", "geometry_msgs"}
+_FIND = (
+    "import importlib.util as u, json, sys; "
+    "print(json.dumps({n: s.origin for n in sys.argv[1:] for s in [u.find_spec(n)] if s and s.origin}))"
+)
+
+
+@contextmanager
+def lent(python: str) -> Iterator[None]:
+    """rospy can be imported within; SetupError where that Python has none."""
+    wanted = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
+    found = _places(python, wanted)
+    missing = _NEEDED & set(wanted) - found.keys()
+    if missing:
+        raise SetupError(
+            f"{python} lacks {', '.join(sorted(missing))}; install them: apt-get install python3-rospy "
+            "python3-sensor-msgs, or name another one with --python"
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        for origin in found.values():
+            place = Path(origin).parent if Path(origin).name == "__init__.py" else Path(origin)
+            (Path(folder) / place.name).symlink_to(place)
+        sys.path.append(folder)
+        try:
+            yield
+        finally:
+            sys.path.remove(folder)
+
+
+def _places(python: str, names: Iterable[str]) -> dict[str, str]:
+    try:
+        done = subprocess.run(
+            [python, "-c", _FIND, *names], capture_output=True, text=True, timeout=20, check=True
+        )
+    except (OSError, subprocess.SubprocessError) as error:
+        raise SetupError(f"{python} cannot be asked for its rospy: {error}") from error
+    found: dict[str, str] = json.loads(done.stdout)
+    return found

@@ -1,0 +1,34 @@
+"""A ROS domain of one's own for a while: real UDP on loopback, on ports that nobody else uses meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+from collections.abc import Iterator
+
+from runtime.errors import SetupError
+
+_DOMAINS = range(1, 100)  # beyond, ports reach into those that the system gives to anybody
+_FIRST, _EACH = 7400, 250  # RTPS 2.5, section 9.6.2
+
+
+@contextlib.contextmanager
+def free_domain() -> Iterator[int]:
+    """A domain id; a TCP port among the domain's is held as a sign that it is taken."""
+    start = os.getpid()
+    for offset in _DOMAINS:
+        domain = _DOMAINS[(start * 7 + offset) % len(_DOMAINS)]
+        first = _FIRST + _EACH * domain
+        with contextlib.ExitStack() as held:
+            try:
+                mark = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
+                mark.bind(("127.0.0.1", first + _EACH - 1))
+                for port in (first + 10, first + 11, first + 12, first + 13):
+                    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                        probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            yield domain
+            return
+    raise SetupError(f"the ROS domains {_DOMAINS[0]} to {_DOMAINS[-1]} of this machine are all in use")

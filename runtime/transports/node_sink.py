@@ -1,0 +1,92 @@
+"""Commands to an execution node over ZMQ."""
+
+from __future__ import annotations
+
+import contextlib
+import uuid
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import zmq
+
+from runtime import codecs
+from runtime.clock import Clock
+from runtime.errors import TransportError
+from runtime.transports import node_link
+from runtime.transports.base import Sink
+from runtime.types import Float32, RobotCommand
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+_QUEUED_COMMANDS = 2
+_QUEUED_BYTES = 8 * 1024  # with the kernel: what a node that stands still finds when it goes on
+# Words that any node may know. Their message has the form of a command, which older nodes insist on.
+_FORMED = frozenset({"collect_start", "collect_stop", "hil_start", "hil_stop"})
+
+
+class NodeSink(Sink):
+    """One PUB socket; what cannot leave at once is dropped, and nothing waits for a node that is away.
+
+    Each says who sends it (`master`, one id per sink) and its number (`seq`); older nodes ignore both.
+    """
+
+    def __init__(self, endpoint: str, robot: Robot, clock: Clock) -> None:
+        self._endpoint = endpoint
+        self._dim = robot.dim
+        self._clock = clock
+        self._socket: zmq.Socket[bytes] | None = None
+        self._sequence = 0
+        self._newest: Float32 = np.zeros(robot.dim, np.float32)  # the command sent last
+        self.master = uuid.uuid4().hex
+
+    def connect(self) -> None:
+        """Open the socket; a node that is not there yet is found by itself when it comes."""
+        self.close()
+        options: dict[int, int | bytes] = {
+            zmq.SNDHWM: _QUEUED_COMMANDS,
+            zmq.SNDBUF: _QUEUED_BYTES,
+            # Without this a node that comes back is given the commands of the moment it went away.
+            zmq.IMMEDIATE: 1,
+        }
+        try:
+            self._socket = node_link.opened(zmq.PUB, self._endpoint, options)
+        except zmq.ZMQError as error:
+            raise TransportError(f"cannot reach the node at {self._endpoint}: {error}") from error
+
+    def send(self, command: RobotCommand) -> None:
+        """Hand over one absolute target; TransportError for a vector that no node may be given."""
+        action = np.asarray(command.action, dtype=np.float32)
+        if action.shape != (self._dim,) or not np.isfinite(action).all():
+            raise TransportError(
+                f"a command of shape {list(action.shape)} {action.tolist()} was to be sent; "
+                f"allowed: {self._dim} finite numbers"
+            )
+        self._send({"t": float(command.time), "action": action, "target": "real"})
+        self._newest = action
+
+    def tell(self, word: str, data: Mapping[str, Any]) -> None:
+        """Hand over the control word `word`: it stands where a command says its target, its fields beside it.
+
+        Words that older nodes know come with a vector, as those want it: the newest command, 0 where there was none.
+        """
+        taken = sorted({"t", "target", "action", "master", "seq"} & set(data))
+        if taken or word in ("real", "sim"):
+            raise TransportError(f"the control word {word!r} with {taken} would be taken for a command")
+        form = {"action": self._newest} if word in _FORMED else {}
+        self._send({"t": self._clock.now(), **form, "target": word, **data})
+
+    def _send(self, message: dict[str, Any]) -> None:
+        if self._socket is None:
+            raise TransportError(f"the link to {self._endpoint} is not connected; connect it before sending")
+        self._sequence += 1
+        message |= {"master": self.master, "seq": self._sequence}
+        with contextlib.suppress(zmq.Again):  # the newest command counts; the next one comes in a tick
+            self._socket.send(codecs.pack(message), zmq.NOBLOCK)
+
+    def close(self) -> None:
+        """Close the socket; what has not left yet is forgotten."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None

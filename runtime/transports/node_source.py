@@ -1,0 +1,316 @@
+"""Observations of an execution node over ZMQ: the newest by arrival, on our clock, every fault by name."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+import zmq
+
+from runtime.clock import Clock, ClockMap
+from runtime.errors import TransportError
+from runtime.messages import Event
+from runtime.transports import node_link
+from runtime.transports.base import Source
+from runtime.transports.freshness import FROZEN_S, Freshness
+from runtime.transports.node_messages import (
+    MESSAGE_LIMIT,
+    MessageRefused,
+    NodeFrame,
+    NodeMessages,
+    NodeStatus,
+)
+from runtime.types import Observation, UInt8
+
+if TYPE_CHECKING:
+    from robots import Robot
+    from runtime.transports.node_settings import NodeSettings
+
+log = logging.getLogger(__name__)
+# Reasons of the nodes that are known; others say theirs in their own words.
+_REFUSED = {
+    "node_refused.stale": "commands came too late for the node: this machine, or the way to it, is too slow",
+    "node_refused.limits": "commands were beyond the node's own limits",
+    "node_refused.dimension": "commands had another number of joints than the node",
+    "node_refused.not_finite": "commands had numbers that are none",
+    "node_refused.malformed": "commands could not be read by the node",
+    "node_refused.collecting": "a person drives the robot: the node takes no commands",
+}
+_QUEUED_FRAMES = 4
+_WAKE_MS = 50  # how soon the reader notices that it is to end
+_REOPEN_S = 1.0
+_BACKWARDS_S = 0.1  # one socket keeps its messages in order, so an earlier stamp is another clock
+
+
+class NodeSource(Source):
+    """One SUB socket, emptied all the time by a thread of its own, so that no frame grows old in a queue.
+
+    Newest is newest by arrival: a node that restarts has a smaller clock, and its frames count at once.
+    `Observation.sequence` counts the usable frames since connect, whatever the node's own numbers do. What
+    goes wrong in the thread is counted, and where the socket itself fails another one is opened.
+    """
+
+    _told: str  # the reason for which no frame comes that was said last
+
+    def __init__(self, config: NodeSettings, robot: Robot, clock: Clock) -> None:
+        self._endpoint = config.sub_endpoint
+        self._detect_frozen = config.detect_frozen
+        self._simulated = config.simulated
+        self._stalled_after = config.stalled_after_s
+        self._clock = clock
+        self._messages = NodeMessages(
+            robot, config.encoding, frozenset(config.disabled_cameras), MESSAGE_LIMIT
+        )
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+        self._ending = threading.Event()
+        self._newest: tuple[int, float, Mapping[str, float], NodeFrame] | None = None
+        self._forget()
+
+    def connect(self) -> None:
+        """Start to listen; a node that is not there yet is found by itself when it comes."""
+        self.close()
+        self._forget()
+        self._ending.clear()
+        try:
+            socket = self._subscribed()
+        except zmq.ZMQError as error:
+            raise TransportError(f"cannot listen to the node at {self._endpoint}: {error}") from error
+        self._thread = threading.Thread(target=self._read, args=(socket,), name="node-source", daemon=True)
+        self._thread.start()
+
+    def receive(self, timeout: float) -> Observation | None:
+        """The newest complete frame not yet delivered, as RGB; None after `timeout` seconds without one."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._newest is not None, timeout)
+            newest, self._newest = self._newest, None
+        return None if newest is None else _observation(*newest)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def faults(self) -> dict[str, int]:
+        """Refused messages by reason, `frames_lost` (gaps in the node's own numbers), jumps of the node's clock.
+
+        `frozen_<camera>` counts how often that camera's picture stayed the same for too long.
+        `truth_ignored` is 1 where a node that is not declared simulated says what only a simulated one can know.
+        `drives_unusable` counts messages whose drive state could not be read.
+        Commands that the node itself refused appear as `node_refused.<reason>`.
+        """
+        with self._changed:
+            refused = {f"node_refused.{reason}": n for reason, n in self._status.refused.items()}
+            return dict(self._faults) | refused
+
+    def why(self, fault: str) -> str:
+        """The newest sentence of a fault; of what the node refused, what that means."""
+        if fault == "node_refused.other_master":
+            return f"several clients command the node, which obeys {self._status.master} alone"
+        if fault in _REFUSED:
+            return _REFUSED[fault]
+        with self._changed:
+            return self._sentences.get(fault, "")
+
+    def news(self) -> list[Event]:
+        """Why no usable frame comes, once for each reason."""
+        now = self._clock.now()
+        with self._changed:
+            silent = now - self._usable_at
+            refused = self._refused if self._heard_at > self._usable_at else None
+            reason = "" if silent <= self._stalled_after else refused[0] if refused else "silent"
+            fresh = reason not in ("", self._told)
+            self._told = reason
+        if not fresh:
+            return []
+        return [Event("source_waiting", self._waiting(silent, refused and refused[1]), now)]
+
+    @property
+    def last_fault(self) -> str:
+        """The sentence of the newest fault; empty where there was none."""
+        return self._last_fault
+
+    @property
+    def status(self) -> NodeStatus:
+        """What the node said of itself in its newest usable message."""
+        return self._status
+
+    def _forget(self) -> None:
+        self._map = ClockMap(tolerance=_BACKWARDS_S)
+        self._freshness = Freshness()
+        self._faults: Counter[str] = Counter()
+        self._sentences: dict[str, str] = {}  # by fault, the newest
+        self._last_fault = ""
+        self._status = NodeStatus()
+        self._count = 0
+        self._peer_sequence: int | None = None
+        self._newest = None
+        self._usable_at = self._heard_at = self._clock.now()
+        self._refused: tuple[str, str] | None = None  # the newest message that was, and why
+        self._told = ""
+
+    def _waiting(self, silent: float, refusal: str | None) -> str:
+        what = f"waiting for the node at {self._endpoint}: nothing"
+        if refusal:
+            return f"{what} usable for {silent:.1f} s: {refusal}"
+        if self._count:
+            return f"{what} for {silent:.1f} s: it has stopped, or the way to it is cut"
+        return (
+            f"{what} has come for {silent:.1f} s: see that it runs, and that it publishes where "
+            "transport.sub_endpoint says"
+        )
+
+    def _subscribed(self) -> zmq.Socket[bytes]:
+        """A socket that hears the node; raises ZMQError."""
+        options: dict[int, int | bytes] = {
+            zmq.RCVHWM: _QUEUED_FRAMES,
+            zmq.MAXMSGSIZE: MESSAGE_LIMIT,
+            zmq.SUBSCRIBE: b"",
+        }
+        return node_link.opened(zmq.SUB, self._endpoint, options)
+
+    def _read(self, socket: zmq.Socket[bytes] | None) -> None:
+        """The thread: nothing that happens in it may end it, because nobody else listens to the node."""
+        while not self._ending.is_set():
+            try:
+                if socket is None:
+                    socket = self._subscribed()
+                if socket.poll(_WAKE_MS):
+                    self._take(_drain(socket), self._clock.now())
+            except zmq.ZMQError as error:
+                self._blame("socket_failed", f"the socket failed and is opened anew: {error}")
+                if socket is not None:
+                    socket.close()
+                    socket = None
+                self._ending.wait(_REOPEN_S)
+            except Exception as error:
+                self._blame_ourselves(error)
+                self._ending.wait(_WAKE_MS / 1000)  # so that an error that stays does not spin
+        if socket is not None:
+            socket.close()
+
+    def _take(self, payloads: list[memoryview], arrived: float) -> None:
+        """Keep the newest usable message; a partial or broken one never displaces an older complete one."""
+        self._heard_at = arrived
+        for payload in reversed(payloads):
+            try:
+                frame = self._messages.read(payload)
+            except MessageRefused as error:
+                self._blame(error.fault, str(error))
+                self._refused = error.fault, str(error)
+            else:
+                self._keep(frame, arrived)
+                return
+
+    def _keep(self, frame: NodeFrame, arrived: float) -> None:
+        for fault, text in frame.remarks:
+            self._blame(fault, text)
+        if frame.truth is not None and not self._simulated:
+            self._ignore_truth()
+            frame = replace(frame, truth=None)
+        captured = self._captured(frame, arrived)
+        with self._changed:
+            self._count_lost(frame.sequence)
+            self._count += 1
+            self._usable_at = arrived
+            self._status = frame.status
+            self._newest = (self._count, arrived, captured, frame)
+            self._changed.notify_all()
+
+    def _ignore_truth(self) -> None:
+        """Said once: every message of such a node has it."""
+        if "truth_ignored" not in self._faults:
+            text = "it says the truth of a bench, but transport.simulated is false"
+            self._blame("truth_ignored", text)
+
+    def _captured(self, frame: NodeFrame, arrived: float) -> dict[str, float]:
+        """The time of each stream: the message's, but for pictures that are no new ones."""
+        time = self._mapped(frame.stamp, arrived)
+        times = dict.fromkeys(["joints", *(["eef"] if frame.eef is not None else []), *frame.pictures], time)
+        if self._detect_frozen:
+            times |= self._freshness.captured(frame.pictures, time)
+            for camera in self._freshness.newly_frozen(time):
+                self._blame(f"frozen_{camera}", f"{camera} shows the same picture for over {FROZEN_S:g} s")
+        return times
+
+    def _mapped(self, stamp: float, arrived: float) -> float:
+        """The node's stamp on our clock; where its clock jumps, that is said and the map begins anew."""
+        restarts, leaps = self._map.restarts, self._map.leaps
+        time = self._map.map(stamp, arrived)
+        if self._map.restarts > restarts:
+            self._blame(
+                "clock_backwards", "the node's clock went back: it was started anew, or its clock was set"
+            )
+        if self._map.leaps > leaps:
+            self._blame("clock_forwards", "the node's clock leapt ahead: it was set")
+        return time
+
+    def _count_lost(self, sequence: int | None) -> None:
+        if sequence is not None and self._peer_sequence is not None and sequence > self._peer_sequence + 1:
+            self._faults["frames_lost"] += sequence - self._peer_sequence - 1
+            self._sentences["frames_lost"] = (
+                "the node's numbers have gaps: this machine, or the way, is too slow for it"
+            )
+        self._peer_sequence = sequence
+
+    def _blame(self, fault: str, text: str) -> None:
+        with self._changed:
+            self._faults[fault] += 1
+            self._sentences[fault] = text
+            self._last_fault = f"{self._endpoint}: {text}"
+
+    def _blame_ourselves(self, error: Exception) -> None:
+        text = f"reading failed: {type(error).__name__}: {error}"
+        if not self._last_fault.endswith(text):  # once, not thirty times a second
+            log.error("%s: %s", self._endpoint, text, exc_info=error)
+        self._blame("reader_failed", text)
+
+
+def _drain(socket: zmq.Socket[bytes]) -> list[memoryview]:
+    """Everything that has arrived by now, oldest first; bounded, so that a flood cannot keep us here.
+
+    Messages stay where ZMQ has received them: what is read of one is copied out of it anyway.
+    """
+    payloads: list[memoryview] = []
+    with contextlib.suppress(zmq.Again):
+        while len(payloads) < 4 * _QUEUED_FRAMES:
+            payloads.append(socket.recv(zmq.NOBLOCK, copy=False).buffer)
+    return payloads
+
+
+def _observation(
+    sequence: int, arrived: float, captured: Mapping[str, float], frame: NodeFrame
+) -> Observation:
+    pictures = frame.pictures
+    if frame.encoding == "bgr":
+        pictures = {key: _swapped(picture) for key, picture in pictures.items()}
+    return Observation(
+        sequence=sequence,
+        arrived=arrived,
+        captured=MappingProxyType(captured),
+        qpos=frame.qpos,
+        pictures=MappingProxyType(pictures),
+        eef=frame.eef,
+        reported_action=frame.action,
+        reported_action_eef=frame.action_eef,
+        truth=frame.truth,
+        drives=frame.drives,
+    )
+
+
+def _swapped(bgr: UInt8) -> UInt8:
+    """RGB from BGR, ten times as fast as numpy would; imported here, as control locks all that it imports."""
+    import cv2
+
+    rgb = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+    rgb.flags.writeable = False
+    return rgb

@@ -1,0 +1,341 @@
+"""One ROS 1 node for a process that cannot have rospy itself: `PYTHON THIS_FILE OPTIONS`, run by its path.
+
+It is run by whatever Python has rospy, so it knows the standard library (Python 3.8 and later) and ROS alone, and is
+never imported. Messages pass as the bytes that they are on the wire. What goes over the two sockets is said in
+runtime/transports/ros/rospy_process.py. The node lives until its parent closes them, or until the master is another.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import signal
+import socket
+import struct
+import sys
+import tempfile
+import threading
+import time
+import xmlrpc.client
+from typing import Any
+
+MESSAGE, WORD = 1, 2
+HEAD = struct.Struct("<BxHI")  # kind, topic, size
+COMMAND = struct.Struct("<BxHd")  # kind, topic, when it was made on the machine's monotonic clock [s]
+LARGEST_COMMAND = 1 << 20
+ANSWER_S = 2.0  # of the master and of other nodes
+LOOK_S, MASTER_S, WHY_S = 0.2, 1.0, 2.0  # how often peers are counted, the master asked, absence explained
+LEAVE_S = 1.0
+LONGEST_SAYING, SAYINGS_KEPT = 300, 100
+BUFFER = {"Image": 1 << 24, "CompressedImage": 1 << 22}
+BUFFER_OF_NUMBERS = 1 << 18
+LOGGING = "version: 1\ndisable_existing_loggers: false\n"
+
+
+class Unanswered(Exception):
+    """Somebody did not answer as the ROS master and nodes do."""
+
+
+class _Bounded(xmlrpc.client.Transport):
+    """HTTP that does not wait for ever."""
+
+    def make_connection(self, host: Any) -> Any:
+        connection = super().make_connection(host)
+        connection.timeout = ANSWER_S
+        return connection
+
+
+def ask(address: str, method: str, *arguments: Any, default: Any = None) -> Any:
+    """What the master or a node answers; `default`, where there is one, for what it does not know."""
+    try:
+        with xmlrpc.client.ServerProxy(address, transport=_Bounded()) as proxy:
+            code, said, value = getattr(proxy, method)("/eva_web", *arguments)
+    except OSError as error:
+        raise Unanswered(error.strerror or str(error) or type(error).__name__) from error
+    except Exception as error:
+        raise Unanswered(f"what answers there is none: {type(error).__name__}: {str(error)[:200]}") from error
+    if code == 1:
+        return value
+    if default is None:
+        raise Unanswered(said)
+    return default
+
+
+class Parent:
+    """The process that this one works for; what is told to it is whole, whoever tells."""
+
+    def __init__(self, telling: socket.socket, commands: socket.socket) -> None:
+        self._telling, self.commands = telling, commands
+        self._lock = threading.Lock()
+
+    def message(self, index: int, payload: bytes) -> None:
+        """Hand over a message; waits while the parent is behind, so that nothing piles up here."""
+        self._send(HEAD.pack(MESSAGE, index, len(payload)), payload)
+
+    def word(self, **fields: Any) -> None:
+        payload = json.dumps(fields).encode()
+        self._send(HEAD.pack(WORD, 0, len(payload)), payload)
+
+    def _send(self, head: bytes, payload: bytes) -> None:
+        with self._lock:
+            try:
+                sent = self._telling.sendmsg([head, payload])
+                if sent < len(head) + len(payload):
+                    self._telling.sendall((head + payload)[sent:])
+            except OSError:  # it has ended, and so this has no purpose
+                os._exit(0)
+
+
+class Sayings(logging.Handler):
+    """What rospy warns of, for the parent's log, once each."""
+
+    def __init__(self, parent: Parent) -> None:
+        super().__init__(logging.WARNING)
+        self._parent, self._said = parent, set()  # type: ignore[var-annotated]
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage().strip().splitlines()
+        line = (text[-1] if "Traceback" in " ".join(text) else " ".join(text))[:LONGEST_SAYING]
+        if line and line not in self._said and len(self._said) < SAYINGS_KEPT:
+            self._said.add(line)
+            self._parent.word(log=line)
+
+
+class Topics:
+    """What the node listens to and speaks on, by the parent's numbers."""
+
+    def __init__(self, parent: Parent) -> None:
+        self._parent = parent
+        self.open: dict[int, tuple[str, Any, Any]] = {}  # name, class of messages, Subscriber or Publisher
+        self._counts: dict[int, int] = {}
+        self.stale = 0  # commands that were too old to be published
+
+    def subscribe(self, index: int, name: str, kind: str, queue: int) -> None:
+        import rospy
+
+        made, size = raw(kind), BUFFER.get(kind.rpartition("/")[2], BUFFER_OF_NUMBERS)
+        self.open[index] = (name, made, None)
+        subscriber = rospy.Subscriber(
+            name, made, lambda message: self._parent.message(index, message._buff),
+            queue_size=queue, buff_size=size, tcp_nodelay=True,
+        )  # fmt: skip
+        self.open[index] = (name, made, subscriber)
+
+    def advertise(self, index: int, name: str, kind: str, queue: int) -> None:
+        import rospy
+
+        made = raw(kind)
+        self.open[index] = (name, made, rospy.Publisher(name, made, queue_size=queue, tcp_nodelay=True))
+        self._counts[index] = 0
+
+    def publish(self, index: int, payload: bytes) -> None:
+        """Publish a message, counted in its header as rospy counts."""
+        self._counts[index] = (self._counts[index] + 1) % (1 << 32)
+        _, made, publisher = self.open[index]
+        message = made()
+        message._buff = struct.pack("<I", self._counts[index]) + payload[4:]
+        publisher.publish(message)
+
+    def publishes(self, index: int) -> bool:
+        return index in self._counts
+
+    def peers(self, index: int) -> int:
+        """How many are connected; one that has refused, or is just being called, is none."""
+        opened = self.open[index][2]
+        if opened is None:
+            return 0
+        found = list(opened.impl.connections)
+        return sum(1 for one in found if self.publishes(index) or (one.socket is not None and one.md5sum))
+
+
+def raw(kind: str) -> Any:
+    """A class of rospy's for messages that stay bytes, which says of itself what messages of `kind` say."""
+    import importlib
+
+    import rospy
+
+    package, _, name = kind.partition("/")
+    real = getattr(importlib.import_module(f"{package}.msg"), name)
+    fields = {"_type": kind, "_md5sum": real._md5sum, "_full_text": real._full_text}
+    return type(name, (rospy.AnyMsg,), fields)
+
+
+class Watch:
+    """Tells the parent who is at the other side of each topic; ends the process when the master is another."""
+
+    def __init__(self, parent: Parent, topics: Topics, master: str, address: str) -> None:
+        import rospy
+
+        self._parent, self._topics, self._master, self._address = parent, topics, master, address
+        self._name = rospy.get_name()
+        self._uri = ask(master, "lookupNode", self._name)
+        self._identity = self._who()
+        self._trouble = ""
+        self._refused: dict[int, str] = {}
+        self._told: dict[str, Any] = {}
+
+    def run(self) -> None:
+        look_at = why_at = 0.0
+        while True:
+            now = time.monotonic()
+            if now >= look_at:
+                look_at = now + MASTER_S
+                self._look()
+            if now >= why_at:
+                why_at = now + WHY_S
+                self._explain()
+            self._tell()
+            time.sleep(LOOK_S)
+
+    def _who(self) -> list[Any]:
+        return [ask(self._master, "getParam", "/run_id", default=""), ask(self._master, "getPid")]
+
+    def _look(self) -> None:
+        try:
+            who, uri = self._who(), ask(self._master, "lookupNode", self._name, default="")
+        except Unanswered as error:
+            self._trouble = f"the ROS master at {self._master} does not answer: {error}"
+            return
+        self._trouble = ""
+        if who != self._identity or uri != self._uri:
+            self._parent.word(
+                anew=f"the ROS master at {self._master} is another than before, and does not know us"
+            )
+            os._exit(0)
+
+    def _explain(self) -> None:
+        """Say of each topic without a peer what the master knows of others."""
+        lonely = [index for index in list(self._topics.open) if not self._topics.peers(index)]
+        self._refused = {}
+        if not lonely or self._trouble:
+            return
+        with contextlib.suppress(Unanswered):  # the next look says it
+            publishers, subscribers, _ = ask(self._master, "getSystemState")
+            for index in lonely:
+                spoken = self._topics.publishes(index)
+                name = self._topics.open[index][0]
+                others = [
+                    n for t, nodes in (subscribers if spoken else publishers) if t == name for n in nodes
+                ]
+                others = [node for node in others if node != self._name]
+                if others:
+                    self._refused[index] = self._absence(index, others[0], spoken)
+
+    def _absence(self, index: int, node: str, spoken: bool) -> str:
+        """Why a node that the master has on the topic is not connected."""
+        name, made, _ = self._topics.open[index]
+        verb = "subscribes to" if spoken else "publishes"
+        try:
+            uri = ask(self._master, "lookupNode", node)
+        except Unanswered as error:
+            return f"the master says that {node} {verb} {name}, and not where that is: {error}"
+        try:
+            said = ask(uri, "getSubscriptions" if spoken else "getPublications")
+        except Unanswered as error:
+            return (
+                f"{node}, which {verb} {name}, is not to be reached at {uri}: {error}; does it still run, and is its "
+                "ROS_IP or ROS_HOSTNAME an address that is known here?"
+            )
+        kinds = [kind for topic, kind in said if topic == name]
+        if kinds and kinds[0] not in (made._type, "*"):
+            told = "subscribed to" if spoken else "published"
+            return f"{name} is {told} as {kinds[0]} by {node}; expected {made._type}"
+        if not kinds:
+            return f"the master says that {node} {verb} {name}, but {node} does not any more"
+        return (
+            f"{node} {verb} {name} and is not connected; it has to reach {self._address} (transport.address), and to "
+            f"have the same definition of {made._type}"
+        )
+
+    def _tell(self) -> None:
+        """The parent hears what has changed."""
+        found = {
+            str(index): [self._topics.peers(index), self._refused.get(index, "")]
+            for index in list(self._topics.open)
+        }
+        status = {"peers": found, "trouble": self._trouble, "stale": self._topics.stale}
+        if status != self._told:
+            self._told = status
+            self._parent.word(**status)
+
+
+def obey(parent: Parent, topics: Topics, life: float) -> None:
+    """Do what the parent says until it has ended; a command that is older than `life` seconds is left undone."""
+    while True:
+        packet = parent.commands.recv(LARGEST_COMMAND)
+        if not packet:
+            return
+        if packet[0] == WORD:
+            asked = json.loads(packet[1:])
+            act = topics.advertise if asked.pop("publish") else topics.subscribe
+            try:
+                act(**asked)
+            except Exception as error:  # rospy's own, of a name or a definition
+                parent.word(unopened=[asked["index"], f"{asked['name']} cannot be opened: {error}"])
+            continue
+        _, index, made = COMMAND.unpack_from(packet)
+        if time.monotonic() - made > life:
+            topics.stale += 1
+        elif index in topics.open:
+            topics.publish(index, packet[COMMAND.size :])
+
+
+def begin(options: dict[str, Any], parent: Parent) -> None:
+    """Become a node; ends the process with a word where that cannot be."""
+    master = options["master"]
+    try:
+        ask(master, "getPid")  # init_node would wait for a master for ever
+    except Unanswered as error:
+        parent.word(failed=str(error))
+        sys.exit(1)
+    import rospy
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "logging.yaml")
+        with open(path, "w") as file:
+            file.write(LOGGING)
+        os.environ.update(ROS_PYTHON_LOG_CONFIG_FILE=path, ROS_LOG_DIR=folder)
+        rospy.init_node(
+            options["name"], argv=[], disable_signals=True, disable_rostime=True, disable_rosout=True
+        )
+    for name in ("rospy", "rosout"):
+        logging.getLogger(name).addHandler(Sayings(parent))
+
+
+def leave() -> None:
+    """Take leave of the master, and end whether or not it answers."""
+    import rospy
+
+    ending = threading.Thread(target=rospy.signal_shutdown, args=("the parent has ended",), daemon=True)
+    ending.start()
+    ending.join(LEAVE_S)
+    os._exit(0)
+
+
+def main() -> None:
+    """Run for the parent, or say whether that would be possible."""
+    for kind in ("sensor_msgs/JointState", "geometry_msgs/PoseStamped"):
+        raw(kind)
+    options = json.loads(sys.argv[1])
+    if options.get("check"):
+        return
+    for number in (signal.SIGINT, signal.SIGTERM):  # the parent's end is this one's, and nothing before
+        signal.signal(number, signal.SIG_IGN)
+    parent = Parent(socket.socket(fileno=options["telling"]), socket.socket(fileno=options["commands"]))
+    begin(options, parent)
+    topics = Topics(parent)
+    try:
+        watch = Watch(parent, topics, options["master"], options["address"])
+    except Unanswered as error:
+        parent.word(failed=str(error))
+        os._exit(1)
+    parent.word(ready=True)
+    threading.Thread(target=watch.run, name="watch", daemon=True).start()
+    obey(parent, topics, options["life"])
+    leave()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""What a deployment says of a robot's topics, whichever generation of ROS they are of."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field, model_validator
+
+from runtime.errors import ConfigurationError
+from runtime.pose_format import PoseFormat
+from runtime.section import Section
+from runtime.transports.base import Capabilities
+from runtime.transports.ros.reading import Names
+from runtime.transports.ros.source import Terms
+from runtime.transports.ros.topics import Outlet, Part, Target, TopicPlan, Topics
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+
+class RosSettings(Section):
+    """What both generations of ROS have in common."""
+
+    topics: Topics = Topics()
+    """Topics that are not those of the robot's description."""
+    disabled_cameras: list[str] = Field(default_factory=list)
+    """Observation keys of cameras that this deployment does without."""
+    eef: bool = False
+    """Listen to the poses that the robot measures of its end effectors; frames wait for them."""
+    eef_commands: bool = False
+    """Publish poses to the robot's `eef_command` topics; needs publication.space = "eef"."""
+    commands_to: list[Target] = Field(default_factory=lambda: ["robot"], min_length=1, max_length=2)  # type: ignore[arg-type]
+    """Who is told: the robot, a simulation beside it on the robot's `simulation` topics, or both."""
+    max_skew_s: float = Field(default=0.1, gt=0, le=5)
+    """How far apart in time the messages of one observation may be [s]."""
+    stalled_after_s: float = Field(default=0.5, gt=0)
+    """Silence of a topic after which it is named [s]."""
+    stamps: Literal["header", "arrival"] = "header"
+    """When a message was made: what its header says, or its arrival, for drivers that do not stamp."""
+    joint_names: Names = "check"
+    """"check" takes joints by their names, in any order; "ignore" takes the first numbers as they come."""
+    detect_frozen: bool = True
+    """A picture exactly like the one before counts as no newer; off for simulated cameras that may stand still."""
+
+    @model_validator(mode="after")
+    def _command_each_once(self) -> RosSettings:
+        """Each target is told once."""
+        if len(set(self.commands_to)) != len(self.commands_to):
+            raise ConfigurationError(
+                f"transport.commands_to = {self.commands_to}; allowed: each at most once"
+            )
+        return self
+
+    @property
+    def terms(self) -> Terms:
+        """How messages are taken."""
+        return Terms(
+            self.max_skew_s,
+            self.stalled_after_s,
+            self.joint_names,
+            self.stamps == "header",
+            self.detect_frozen,
+        )
+
+    @property
+    def offers(self) -> Capabilities:
+        """What it can do: a robot hangs on it."""
+        spaces = frozenset({"joint", "eef"}) if self.eef_commands else frozenset({"joint"})
+        return Capabilities(moves_robot=True, measures_eef=self.eef, spaces=spaces, poses=(PoseFormat(),))
+
+    def streams(self, robot: Robot, version: Literal[1, 2]) -> tuple[tuple[Part, ...], tuple[Outlet, ...]]:
+        """What is listened to and what is spoken on, the simulation's topics first."""
+        plan = TopicPlan(robot, version, self.topics, self.disabled_cameras)
+        parts = plan.parts(self.eef)
+        chosen: list[Target] = [target for target in ("simulation", "robot") if target in self.commands_to]
+        return parts, plan.outlets(chosen, self.eef_commands)
+
+
+def camera_keys(parts: tuple[Part, ...]) -> tuple[str, ...]:
+    """Keys of the cameras among what is listened to."""
+    return tuple(part.of for part in parts if part.kind == "camera")

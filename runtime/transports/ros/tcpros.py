@@ -1,0 +1,181 @@
+"""ROS 1's topics through rospy in a process of its own, which is started again when it ends or the master is another.
+
+A master that was restarted knows nobody, and no node of ROS 1 tells it of itself again. So a new child registers
+anew; nodes that are as old as the first master have to be restarted too. A master that is not there yet is waited
+for, and named meanwhile.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import uuid
+from collections.abc import Mapping
+from typing import Any
+
+from runtime.errors import RuntimeFault
+from runtime.transports.ros.messages import PACKAGES
+from runtime.transports.ros.middleware import Deliver, Match, Middleware, Publish, Topic
+from runtime.transports.ros.rospy_process import RospyProcess, Site, require
+
+log = logging.getLogger(__name__)
+_PAUSES_S = (0.2, 0.5, 1.0, 2.0)  # between two tries to start it again; the last one for all that follow
+
+
+class TcpRosMiddleware(Middleware):
+    """One node at a time; one thread hears it and replaces it."""
+
+    def __init__(self, site: Site, name: str) -> None:
+        """Become a node behind the caller's back, as soon as the master answers; SetupError without rospy."""
+        require(site.python)
+        self._site, self._name = site, name
+        self._topics: list[tuple[Topic, Deliver | None]] = []  # None: one that is spoken on
+        self._peers: dict[int, tuple[int, str]] = {}
+        self._unopened: dict[int, str] = {}
+        self._trouble = ""  # why there is no child, or no master
+        self._farewell = ""  # why the child ended
+        self._stale = self._lost = 0
+        self._lock = threading.Lock()
+        self._ending = threading.Event()
+        self._child: RospyProcess | None = None
+        self._thread = threading.Thread(target=self._live, name="rospy", daemon=True)
+        self._thread.start()
+
+    def subscribe(self, topic: Topic, deliver: Deliver) -> None:
+        """Hear the topic from the middleware's one thread."""
+        self._open(topic, deliver)
+
+    def advertise(self, topic: Topic) -> Publish:
+        """Commands for a child that has ended or takes no more are left out: they would be old when it is back."""
+        index = self._open(topic, None)
+
+        def publish(payload: bytes) -> None:
+            child = self._child
+            if child is None or not child.publish(index, payload):
+                self._lost += 1
+                if self._lost.bit_count() == 1:  # 1, 2, 4, 8, ...
+                    log.warning(
+                        "commands did not leave, %d so far: %s", self._lost, self._trouble or "behind"
+                    )
+
+        return publish
+
+    def matches(self) -> Mapping[str, Match]:
+        """As the child told it last, and why nobody is there where that is known."""
+        with self._lock:
+            found = {}
+            for index, (topic, _) in enumerate(self._topics):
+                peers, refused = self._peers.get(index, (0, ""))
+                why = "" if peers else self._unopened.get(index) or self._trouble or refused
+                found[topic.name] = Match(peers, why)
+            return found
+
+    @property
+    def pid(self) -> int | None:
+        """The process of rospy, None while there is none."""
+        child = self._child
+        return None if child is None else child.pid
+
+    def close(self) -> None:
+        """End the child, then the thread."""
+        self._ending.set()
+        child = self._child
+        if child is not None:
+            child.interrupt()
+        self._thread.join()
+
+    def _open(self, topic: Topic, deliver: Deliver | None) -> int:
+        with self._lock:
+            self._topics.append((topic, deliver))
+            index = len(self._topics) - 1
+            if self._child is not None:
+                self._request(self._child, index)
+            return index
+
+    def _request(self, child: RospyProcess, index: int) -> None:
+        topic, deliver = self._topics[index]
+        kind = f"{PACKAGES[topic.message]}/{topic.message}"
+        child.ask(
+            publish=deliver is None, index=index, name=topic.name, kind=kind, queue=topic.quality.depth or 1
+        )
+
+    def _start(self) -> RospyProcess:
+        # A master that is told of a second node of a name ends the first one.
+        return RospyProcess(self._site, f"{self._name}_{uuid.uuid4().hex[:12]}")
+
+    def _live(self) -> None:
+        """The thread: hears one child after the other."""
+        child = self._begun(0.0)
+        while child is not None:
+            self._farewell = ""
+            child.hear(self._deliver, self._obey)
+            with self._lock:
+                self._child = None
+                self._peers = {}
+            code = child.end()
+            if self._ending.is_set():
+                return
+            self._complain(self._farewell or f"the process of rospy has ended ({code}); starting it again")
+            child = self._begun(_PAUSES_S[0])
+
+    def _begun(self, pause: float) -> RospyProcess | None:
+        """A child that knows all topics, after `pause` [s] and as many more as it takes; None where none is wanted."""
+        later = iter(_PAUSES_S)
+        while not self._ending.wait(pause):
+            pause = next(later, _PAUSES_S[-1])
+            try:
+                child = self._start()
+            except RuntimeFault as error:
+                self._complain(str(error))
+                continue
+            with self._lock:
+                self._trouble, self._stale, self._unopened = "", 0, {}
+                self._child = child
+                for index in range(len(self._topics)):
+                    self._request(child, index)
+            if self._ending.is_set():  # whoever ended it did not see the child
+                child.interrupt()
+            log.info("rospy is a node of the master at %s", self._site.master)
+            return child
+        return None
+
+    def _complain(self, sentence: str) -> None:
+        if sentence != self._trouble:
+            log.warning("%s", sentence)
+        self._trouble = sentence
+
+    def _deliver(self, index: int, payload: bytes) -> None:
+        deliver = self._topics[index][1]
+        if deliver is None or self._ending.is_set():
+            return
+        try:
+            deliver(payload)
+        except Exception:  # of one message: nobody else would hear the next
+            log.exception("reading %s failed", self._topics[index][0].name)
+
+    def _obey(self, word: dict[str, Any]) -> None:
+        """What the child says beside messages."""
+        if "peers" in word:
+            self._take_status(word)
+        elif "log" in word:
+            log.warning("rospy: %s", word["log"])
+        elif "unopened" in word:
+            index, sentence = word["unopened"]
+            log.error("%s", sentence)
+            with self._lock:
+                self._unopened[index] = sentence
+        elif "anew" in word:
+            self._farewell = f"{word['anew']}; starting rospy again"
+
+    def _take_status(self, word: dict[str, Any]) -> None:
+        with self._lock:
+            self._peers = {int(index): (peers, refused) for index, (peers, refused) in word["peers"].items()}
+        if word["trouble"] != self._trouble:
+            self._trouble = word["trouble"]
+            if self._trouble:
+                log.warning("%s; what is connected goes on, nobody new is found", self._trouble)
+            else:
+                log.info("the ROS master at %s answers again", self._site.master)
+        if word["stale"] > self._stale:
+            self._stale = word["stale"]
+            log.warning("%d commands were too old to be published", self._stale)

@@ -1,0 +1,129 @@
+"""A robot's own ROS 1 topics through rospy, which runs in a process of its own, in the Python that has it.
+
+ROS 1 knows no protection: whoever reaches the master or a node can command the robot, so beyond this machine it must
+be asked for.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from typing import TYPE_CHECKING, ClassVar, Literal
+from urllib.parse import urlsplit
+
+from pydantic import Field, model_validator
+
+from runtime.clock import Clock
+from runtime.errors import ConfigurationError
+from runtime.section import Section
+from runtime.transports.base import Capabilities
+from runtime.transports.ros import packed
+from runtime.transports.ros.middleware import COMMAND_QUALITY, Middleware, Quality
+from runtime.transports.ros.rospy_process import Site, require
+from runtime.transports.ros.settings import RosSettings, camera_keys
+from runtime.transports.ros.sink import RosSink
+from runtime.transports.ros.source import Heard, RosSource, subscriptions
+from runtime.transports.ros.tcpros import TcpRosMiddleware
+from runtime.transports.ros.topics import Part
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+NODE = "eva_web"
+_NUMBERS = Quality(depth=50)  # queue_size: a driver at 200 Hz loses none while this machine is busy
+_PICTURES = Quality(depth=1)
+REAL_TIME = True  # what is at its other end goes on by itself
+
+
+class Link(Section):
+    """Where ROS 1 is, and who reaches whom."""
+
+    table: ClassVar[str] = "transport"  # of a deployment, for sentences
+    python: str = Field(default="/usr/bin/python3", min_length=1)
+    """The Python that has rospy; it needs nothing of ours."""
+    master: str = "http://127.0.0.1:11311"
+    """The robot's ROS_MASTER_URI."""
+    address: str = "127.0.0.1"
+    """The address under which the robot's nodes reach this machine (ROS_IP)."""
+    insecure_link: bool = False
+    """Allow a master or an address beyond this machine although anybody who reaches it can command the robot."""
+
+    @model_validator(mode="after")
+    def _stay_on_this_machine(self) -> Link:
+        host = _host(self.table, self.master)
+        try:
+            here = ipaddress.ip_address(self.address).is_loopback
+        except ValueError as error:
+            raise ConfigurationError(
+                f"{self.table}.address = {self.address!r} is no IP address; allowed: one of this machine's, which the "
+                "robot's nodes can reach"
+            ) from error
+        master_here = host == "localhost" or host.startswith("127.") or host == "::1"
+        if not (here and master_here) and not self.insecure_link:
+            what = f"address = {self.address!r}" if master_here else f"master = {self.master!r}"
+            raise ConfigurationError(
+                f"{self.table}.{what} leaves this machine without protection; allowed: 127.0.0.1, or insecure_link = "
+                "true on a network you trust"
+            )
+        if here and not master_here:
+            raise ConfigurationError(
+                f"{self.table}.master = {self.master!r} with address = {self.address!r}: the robot's nodes do not "
+                "reach this machine there; allowed: this machine's address in the robot's network"
+            )
+        return self
+
+
+class Config(Link, RosSettings):
+    """A robot's ROS 1 topics."""
+
+    kind: Literal["ros1"] = "ros1"
+
+
+def capabilities(config: Config) -> Capabilities:
+    """A robot hangs on it; SetupError where rospy is not installed."""
+    require(config.python)
+    return config.offers
+
+
+def cameras(config: Config, robot: Robot) -> tuple[str, ...]:
+    """Keys of the robot's cameras that this deployment has; ConfigurationError where any topic is not known."""
+    parts, _ = config.streams(robot, 1)
+    return camera_keys(parts)
+
+
+def source(config: Config, robot: Robot, clock: Clock) -> RosSource:
+    """The robot's topics as observations; ConfigurationError names a topic that is not known."""
+    parts, _ = config.streams(robot, 1)
+    opener = lambda: middleware(config, f"{NODE}_source")  # noqa: E731
+    return RosSource(robot, _heard(parts), config.terms, clock, packed, opener)
+
+
+def sink(config: Config, robot: Robot, clock: Clock) -> RosSink:
+    """Commands to the robot's topics; ConfigurationError names a topic that is not known."""
+    _, outlets = config.streams(robot, 1)
+    opener = lambda: middleware(config, f"{NODE}_commands")  # noqa: E731
+    return RosSink(robot, outlets, lambda _: COMMAND_QUALITY, clock, packed, opener)
+
+
+def middleware(config: Link, name: str) -> Middleware:
+    """A node, as soon as the master is there; SetupError where rospy is not installed."""
+    return TcpRosMiddleware(Site(config.python, config.master, config.address), name)
+
+
+def _heard(parts: tuple[Part, ...]) -> tuple[Heard, ...]:
+    pictured = {part.topic for part in parts if part.kind == "camera"}
+    return subscriptions(parts, lambda topic: _PICTURES if topic in pictured else _NUMBERS)
+
+
+def _host(table: str, master: str) -> str:
+    """The host of a master's URI; ConfigurationError where it is none."""
+    try:
+        parts = urlsplit(master)
+        fits = parts.scheme == "http" and parts.hostname and parts.port and parts.path in ("", "/")
+    except ValueError:
+        fits = False
+    if not fits or not re.fullmatch(r"[A-Za-z0-9_.:\[\]/-]+", master):
+        raise ConfigurationError(
+            f"{table}.master = {master!r} is no ROS_MASTER_URI; allowed: one like http://10.0.0.7:11311"
+        )
+    return str(parts.hostname)

@@ -1,0 +1,53 @@
+"""A live camera that looks at a stand-in server, for as long as a test does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from runtime.cameras import mjpeg, rtsp
+from runtime.cameras.base import Condition
+from runtime.cameras.live import LiveCamera
+from runtime.clock import MonotonicClock
+from runtime.sim.camera_server import CameraServer
+from runtime.sim.mjpeg_server import MjpegServer
+from runtime.sim.rtsp_server import RtspServer
+
+CLOCK = MonotonicClock()
+KINDS = {"rtsp": (RtspServer, rtsp), "mjpeg": (MjpegServer, mjpeg)}
+both = pytest.mark.parametrize("kind", KINDS)
+
+
+@contextmanager
+def looking(module: ModuleType, url: str, **settings: Any) -> Iterator[LiveCamera]:
+    config = module.Config(url=url, **{"open_s": 1.5, "read_s": 0.5, **settings})
+    camera = LiveCamera("wrist", config.kind, config, module.address(config), CLOCK)
+    camera.start()
+    try:
+        yield camera
+    finally:
+        camera.close()
+
+
+@contextmanager
+def watched(kind: str, fault: str = "", **settings: Any) -> Iterator[tuple[CameraServer, LiveCamera]]:
+    made, module = KINDS[kind]
+    server = made()
+    server.fault = fault
+    try:
+        with looking(module, server.start(), **settings) as camera:
+            yield server, camera
+    finally:
+        server.close()
+
+
+def live(camera: LiveCamera) -> bool:
+    return camera.health().condition is Condition.LIVE
+
+
+def lost(camera: LiveCamera) -> bool:
+    return camera.health().condition is Condition.LOST

@@ -1,0 +1,130 @@
+"""A lockstep station that collects: a leader in the test's hand, or a robot that drives itself when it is told to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from runtime import deployment, family
+from runtime.clock import Clock
+from runtime.errors import PolicyLostError
+from runtime.leaders.base import Leader
+from runtime.transports.base import Capabilities
+from runtime.types import Float64, Observation
+from tests.runtime.station import MOVED, STANDS, Station, StubPlan, StubRobot, on_time, plan
+
+
+class HeldLeader(Leader):
+    """Is where the test put it; `silent` says nothing any more."""
+
+    def __init__(self, robot: Any, clock: Clock) -> None:
+        super().__init__(robot, clock)
+        self.joints: Float64 | None = STANDS.copy()
+        self.silent = False
+        self.connected = 0
+
+    @property
+    def name(self) -> str:
+        return "the leader in the test"
+
+    def connect(self) -> None:
+        self.connected += 1
+        self._forget()
+        if self.joints is None:
+            raise PolicyLostError(f"{self.name} says nothing")
+        self.speak()
+
+    def close(self) -> None:
+        pass
+
+    def speak(self) -> None:
+        """Say where it is."""
+        if not self.silent and self.joints is not None:
+            self._take(self.joints.copy(), self._clock.now())
+
+
+class SelfDriven(StubRobot):
+    """A robot whose node drives it while it collects, and reports what it applied."""
+
+    collects = False
+    leaderless = False
+    words: list[str]
+
+    def receive(self, timeout: float) -> Observation | None:
+        if self.collects:
+            self.position[list(MOVED)] += 0.002
+        seen = super().receive(timeout)
+        if seen is None or not self.collects or self.leaderless:
+            return seen
+        return replace(seen, reported_action=(self.position + 0.01).astype(np.float32))
+
+    def tell(self, word: str, data: Mapping[str, Any]) -> None:
+        self.told.append((word, dict(data)))
+        self.collects = word == "collect_start"
+
+
+@dataclass(frozen=True, slots=True)
+class CollectPlan(StubPlan):
+    """A plan whose leader, or whose self-driven robot, is the test's."""
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return replace(StubPlan.capabilities.fget(self), leads=True)  # type: ignore[attr-defined]
+
+    def leader(self, clock: Clock) -> HeldLeader:
+        self.built["leader"] = HeldLeader(self.robot, clock)
+        if "mute" in self.built:
+            self.built["leader"].joints = None
+        return self.built["leader"]
+
+    def _robot(self, config: object, robot: object, clock: object) -> StubRobot:
+        if "robot" not in self.built:
+            source = self.deployment.collection.source if self.deployment.collection else ""
+            self.built["robot"] = (SelfDriven if source == "node" else StubRobot)(self, clock)
+        return self.built["robot"]
+
+
+class CollectStation(Station):
+    """Moves its leader, which speaks once per tick, by `turn` per tick on two joints."""
+
+    def __init__(self, made: StubPlan) -> None:
+        super().__init__(made)
+        self.made = made
+        self.turn = 0.0
+
+    @property
+    def leader(self) -> HeldLeader:
+        return self.made.built["leader"]
+
+    def tick(self) -> None:
+        if "leader" in self.made.built and self.leader.joints is not None:
+            self.leader.joints[list(MOVED)] += self.turn
+            self.leader.speak()
+        super().tick()
+
+    @property
+    def collect(self) -> Any:
+        return self.main.snapshot()["collect"]
+
+    def armed(self, **arguments: Any) -> CollectStation:
+        self.ready(collect=True, **arguments)
+        self.command("arm")
+        return self
+
+
+def collecting(data: Path, source: str = "relay", **changes: Any) -> CollectStation:
+    """A station with a [collection] of that source; `changes` are keys of it, or other tables by their name."""
+    tables = {
+        name: changes.pop(name) for name in ("safety", "recording", "setup", "faults") if name in changes
+    }
+    leader = {"leader": {"kind": "zmq"}} if source == "relay" else {}
+    on_top: dict[str, Any] = {"collection": {"source": source, **leader, **changes}}
+    if source == "node":  # a recording drives no robot, and its deployment is refused
+        on_top["transport"] = {"kind": "zmq"}
+    resolved = deployment.changed(plan(data, **tables).resolved, on_top, "test")
+    robot = family.plan(resolved).robot
+    return CollectStation(CollectPlan(resolved, robot, {}, STANDS, on_time, "joint", "", True, False))

@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from runtime.policies.watchdog import Watchdog
+
+SOON = 0.02
+LONG = 60.0
+PATIENCE = 20.0
+
+
+class Watched:
+    """A watchdog and what it did."""
+
+    def __init__(self) -> None:
+        self.cut = threading.Event()
+        self.cuts = 0
+        self.dog = Watchdog("watched", self._count)
+
+    def _count(self) -> None:
+        self.cuts += 1
+        self.cut.set()
+
+
+@pytest.fixture
+def watched() -> Watched:
+    return Watched()
+
+
+def threads() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "watched"]
+
+
+def test_what_takes_too_long_is_cut_once_and_knows_it(watched: Watched) -> None:
+    with watched.dog.watching(SOON) as was_cut:
+        assert watched.cut.wait(PATIENCE)
+    assert was_cut()
+    assert watched.cuts == 1
+
+
+def test_what_is_done_in_time_is_never_cut_and_the_next_one_is_after_its_own_time(watched: Watched) -> None:
+    with watched.dog.watching(LONG) as was_cut:
+        assert not was_cut()
+    with watched.dog.watching(SOON) as was_cut:
+        assert watched.cut.wait(PATIENCE), "it slept on until the first deadline"
+    assert watched.cuts == 1
+
+
+def test_a_deadline_that_was_kept_does_not_cut_what_comes_after_it(watched: Watched) -> None:
+    with watched.dog.watching(SOON):
+        pass
+    with watched.dog.watching(LONG) as was_cut:
+        assert not watched.cut.wait(5 * SOON)
+        assert not was_cut()
+
+
+def test_a_later_one_does_not_take_an_earlier_cut_for_its_own(watched: Watched) -> None:
+    with watched.dog.watching(SOON):
+        assert watched.cut.wait(PATIENCE)
+    with watched.dog.watching(LONG) as was_cut:
+        assert not was_cut()
+
+
+def test_it_is_one_thread_for_all_and_none_after_the_end(watched: Watched) -> None:
+    for _ in range(5):
+        with watched.dog.watching(LONG):
+            assert len(threads()) == 1
+    thread = threads()[0]
+    watched.dog.end()
+    thread.join(PATIENCE)
+    assert not threads()
+    assert watched.cuts == 0
+
+
+def test_it_watches_again_after_its_end(watched: Watched) -> None:
+    with watched.dog.watching(LONG):
+        watched.dog.end()
+    with watched.dog.watching(SOON) as was_cut:
+        assert watched.cut.wait(PATIENCE)
+        assert was_cut()
+    watched.dog.end()
+
+
+@pytest.fixture(autouse=True)
+def _end(watched: Watched) -> object:
+    yield
+    watched.dog.end()
