@@ -7,8 +7,21 @@ import importlib
 import sys
 from pathlib import Path
 
-_BENCHMARKS = ("ik", "latency", "live", "loop", "measures", "moving_target", "strategies")
+_BENCHMARKS = (
+    "ik",
+    "latency",
+    "live",
+    "loop",
+    "measures",
+    "moving_target",
+    "recording",
+    "replay",
+    "results",
+    "strategies",
+    "wires",
+)
 _SETTABLE = ("latency", "loop")
+_LONG = ("recording",)
 _SECONDS = 20.0
 
 
@@ -28,12 +41,18 @@ def main() -> int:
         dest="assignments",
         help=f"on top of the deployment, for {' and '.join(_SETTABLE)}: control.realtime=off",
     )
+    parser.add_argument(
+        "--long", action="store_true", help=f"more and longer cases, for {' and '.join(_LONG)}"
+    )
     given = parser.parse_args()
     if given.assignments and given.name not in _SETTABLE:
         parser.error(f"--set is for {' and '.join(_SETTABLE)}")
+    if given.long and given.name not in _LONG:
+        parser.error(f"--long is for {' and '.join(_LONG)}")
     module = importlib.import_module(f"benchmarks.{given.name}")
     seconds = given.seconds or getattr(module, "SECONDS", _SECONDS)
-    report = module.measure(seconds, *([given.assignments] if given.assignments else []))
+    options = {"long": True} if given.long else {}
+    report = module.measure(seconds, *([given.assignments] if given.assignments else []), **options)
     print(report.json() if given.json == "-" else report.table())
     if given.json not in (None, "-"):
         report.write(Path(given.json))

@@ -16,7 +16,7 @@ ROBOT = "agilex_piper"
 _ROOT = Path(__file__).parents[1]
 _POLICY = ("--robot", ROBOT, "--port", "0", "--latency-ms", "80")
 # A machine that stalls must not end the run that measures how it stalls: what is late is only late here.
-_PATIENT = (
+PATIENT = (
     "safety.joint_age_s=10.0",
     "safety.picture_age_s=10.0",
     "safety.following_error=3.0",
@@ -65,7 +65,7 @@ def _up(lab: Any, given: argparse.Namespace) -> None:
         f'transport.sub_endpoint="{node["obs_endpoint"]}"',
         f'transport.pub_endpoint="{node["action_endpoint"]}"',
         f'policy.url="{policy["url"]}"',
-        *_PATIENT,
+        *PATIENT,
         *given.assignments,
     ]
     url = lab.up([Bench(_ROOT / "deployments" / "tabletop.toml", assignments)])

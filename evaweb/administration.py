@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 from django.contrib.admin import AdminSite
@@ -9,7 +11,19 @@ from django.contrib.auth.backends import BaseBackend
 from django.contrib.auth.forms import AuthenticationForm
 from django.http import HttpRequest
 
+from evaweb.errors import NotAllowed
 from evaweb.roles import Role, role_of
+from evaweb.sight import sight_of
+
+# Pages that say which checkpoint a trial, a recording, a command or a job is about.
+_TELLING = (
+    "trials_trial_",
+    "trials_score_",
+    "stations_command_",
+    "episodes_episode_",
+    "jobs_job_",
+    "autocomplete",
+)
 
 
 class LabAdminSite(AdminSite):
@@ -22,6 +36,22 @@ class LabAdminSite(AdminSite):
     def has_permission(self, request: HttpRequest) -> bool:
         """Whether this user is an admin."""
         return bool(request.user.is_active and is_admin(request.user))
+
+    def admin_view(self, view: Callable[..., Any], cacheable: bool = False) -> Callable[..., Any]:
+        """With pages that would tell what is hidden from this administrator closed to them."""
+        inner = super().admin_view(view, cacheable)
+
+        @wraps(inner)
+        def seen(request: HttpRequest, *given: Any, **named: Any) -> Any:
+            match = request.resolver_match
+            name = str(match.url_name or "") if match else ""
+            if name.startswith(_TELLING) and self.has_permission(request):
+                hidden = sight_of(request.user)
+                if not hidden.clear:
+                    raise NotAllowed(f"this page tells which checkpoint a trial is of, and {hidden.plans}")
+            return inner(request, *given, **named)
+
+        return seen
 
 
 class RoleBackend(BaseBackend):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from enum import StrEnum
 from typing import Any
 
 from django.db import transaction
 
 from evaweb.errors import NotAllowed
+
+log = logging.getLogger(__name__)
 
 
 class Role(StrEnum):
@@ -44,3 +47,17 @@ def grant(*, user: Any, role: Role) -> None:
     user.save(update_fields=["is_superuser", "is_staff"])
     groups = user.groups.model.objects  # models cannot be imported before the apps are ready
     user.groups.set([groups.get_or_create(name=role.value)[0]])  # also where somebody has removed the group
+
+
+def known_person(name: str) -> Any:
+    """The account of that name; one that is gone is made again, deactivated and without a password."""
+    from django.contrib.auth import get_user_model  # models cannot be imported before the apps are ready
+
+    person, made = get_user_model().objects.get_or_create(
+        username=name or "unknown", defaults={"is_active": False}
+    )
+    if made:
+        person.set_unusable_password()
+        person.save()
+        log.warning("user %s was not in the database: made, deactivated", person.get_username())
+    return person

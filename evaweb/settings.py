@@ -20,7 +20,6 @@ ALLOWED_HOSTS = environment.words("EVA_ALLOWED_HOSTS", ("127.0.0.1", "localhost"
 CSRF_TRUSTED_ORIGINS = environment.words("EVA_TRUSTED_ORIGINS")
 
 INSTALLED_APPS = [
-    "daphne",
     "evaweb.apps.LabAdminConfig",
     "django.contrib.auth",
     "django.contrib.contenttypes",
@@ -32,7 +31,13 @@ INSTALLED_APPS = [
     "evaweb.stations",
     "evaweb.jobs",
     "evaweb.episodes",
+    "evaweb.reviews",
     "evaweb.trials",
+    "evaweb.collect",
+    "evaweb.plans",
+    "evaweb.datasets",
+    "evaweb.results",
+    "evaweb.preflights",
     "evaweb.console",
     "evaweb.api",
     "evaweb.lab",
@@ -68,7 +73,8 @@ TEMPLATES = [
                 "django.template.context_processors.request",
                 "django.contrib.auth.context_processors.auth",
                 "django.contrib.messages.context_processors.messages",
-            ]
+            ],
+            "builtins": ["evaweb.sight_tags"],  # no template names a checkpoint in another way
         },
     }
 ]

@@ -34,6 +34,10 @@ urlpatterns = [
     path("api/v1/", rest),
     path("", include("evaweb.console.urls")),
     path("", include("evaweb.stations.urls")),
+    path("", include("evaweb.datasets.urls")),
     path("", include("evaweb.episodes.urls")),
     path("", include("evaweb.trials.urls")),
+    path("", include("evaweb.results.urls")),
+    path("", include("evaweb.plans.urls")),
+    path("", include("evaweb.preflights.urls")),
 ]

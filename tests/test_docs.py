@@ -146,7 +146,7 @@ def test_every_key_of_a_page_is_in_the_operators_document():
 
 def test_every_address_of_the_interface_is_in_its_document():
     described = set(re.findall(r'"(/api/v1/[^"]*)": \{', text("docs/openapi.json")))
-    parameters = {"{name}": "NAME", "{id}": "ID", "{uuid}": "UUID"}
+    parameters = {f"{{{name}}}": name.upper() for name in ("name", "id", "uuid", "version", "checkpoint")}
     for address in described:
         shown = address
         for given, word in parameters.items():

@@ -32,14 +32,14 @@ class Paging(Schema):
     limit: Annotated[int, Field(ge=1, le=LARGEST_PAGE)] = 100
     offset: Annotated[int, Field(ge=0, le=2**53)] = 0
 
-    def of(self, rows: QuerySet[Any], shape: Any) -> dict[str, Any]:
-        """The page of `rows`, each through `shape.of`."""
+    def of(self, rows: QuerySet[Any], shape: Any, *seen: Any) -> dict[str, Any]:
+        """The page of `rows`, each through `shape.of`, which is also given what is `seen` of them."""
         found = rows[self.offset : self.offset + self.limit]
         return {
             "total": rows.count(),
             "limit": self.limit,
             "offset": self.offset,
-            "items": [shape.of(row) for row in found],
+            "items": [shape.of(row, *seen) for row in found],
         }
 
 

@@ -10,7 +10,22 @@ from django.http import Http404, HttpRequest, HttpResponse
 from ninja import NinjaAPI
 from ninja.errors import AuthenticationError, HttpError, ValidationError, ValidationErrorContext
 
-from evaweb.api import accounts, checkpoints, episodes, jobs, scenes, stations, statistics, trials
+from evaweb.api import (
+    accounts,
+    checkpoints,
+    collecting,
+    datasets,
+    episodes,
+    jobs,
+    plans,
+    preflights,
+    results,
+    reviews,
+    scenes,
+    stations,
+    statistics,
+    trials,
+)
 from evaweb.api.auth import Bearer, Session
 from evaweb.api.questions import only_known
 from evaweb.errors import EvaError
@@ -46,12 +61,18 @@ api = _Api(
 )
 api.add_decorator(only_known)
 api.add_router("", accounts.router)
+api.add_router("", plans.router)
 api.add_router("/stations", stations.router)
 api.add_router("/trials", trials.router)
 api.add_router("/statistics", statistics.router)
 api.add_router("/episodes", episodes.router)
+api.add_router("/datasets", datasets.router)
+api.add_router("", reviews.router)
 api.add_router("/scenes", scenes.router)
 api.add_router("/checkpoints", checkpoints.router)
+api.add_router("/preflights", preflights.router)
+api.add_router("", collecting.router)
+api.add_router("", results.router)
 api.add_router("/jobs", jobs.router)
 
 

@@ -9,6 +9,7 @@ from django.http import HttpRequest
 from ninja import Query, Router, Schema
 
 from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.sight import sight_for
 from evaweb.trials import selectors
 from evaweb.trials.models import Checkpoint
 
@@ -21,8 +22,16 @@ class CheckpointOut(Schema):
     id: int
     name: str
     description: str
+    digest: str
+    parent: str | None
+    tags: list[str]
     active: bool
     created_at: datetime
+
+    @staticmethod
+    def resolve_parent(checkpoint: Checkpoint) -> str | None:
+        """The name of the one it was trained on from; null where that is hidden."""
+        return checkpoint.parent.name if checkpoint.parent else None
 
     @staticmethod
     def of(checkpoint: Checkpoint) -> Checkpoint:
@@ -33,9 +42,13 @@ class CheckpointOut(Schema):
 @router.get(
     "", response={200: Page[CheckpointOut], **FAILURES}, summary="Checkpoints", url_name="checkpoints"
 )
-def checkpoints(request: HttpRequest, paging: Query[Paging], inactive: bool = False) -> Any:
-    """Those offered to operators; with `inactive` also the ones that are switched off."""
-    return paging.of(selectors.checkpoint_list(all_of_them=inactive), CheckpointOut)
+def checkpoints(request: HttpRequest, paging: Query[Paging], inactive: bool = False, tag: str = "") -> Any:
+    """Those offered to operators; with `inactive` also the ones that are switched off, with `tag` those that have it.
+
+    None of a blind plan behind which who asks has not looked.
+    """
+    rows = selectors.checkpoint_list(all_of_them=inactive, tag=tag, sight=sight_for(request))
+    return paging.of(rows, CheckpointOut)
 
 
 @router.get(
@@ -43,4 +56,4 @@ def checkpoints(request: HttpRequest, paging: Query[Paging], inactive: bool = Fa
 )
 def checkpoint(request: HttpRequest, name: str) -> Any:
     """By its name, which may contain slashes, or by its id."""
-    return selectors.checkpoint_get(name=name)
+    return selectors.checkpoint_get(name=name, sight=sight_for(request))

@@ -18,13 +18,19 @@ from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.streaming import file_answer
 from evaweb.errors import NotFound
 from evaweb.roles import Role, require
+from evaweb.sight import Sight, sight_for
 from evaweb.stations.selectors import station_get
 
 router = Router(tags=["episodes"])
+_WITH = ("station", "trial__checkpoint", "trial__handout")
 
 
 class EpisodeOut(Schema):
-    """One recorded run or demonstration; `trial` is the id of the trial that it was recorded for."""
+    """One recorded run or demonstration; `trial` is the id of the trial that it was recorded for.
+
+    While it is hidden from who asks which checkpoint made it, the trial's code stands for the checkpoint, and what
+    else would tell is empty.
+    """
 
     uuid: UUID
     station: str
@@ -49,14 +55,17 @@ class EpisodeOut(Schema):
     published_at: datetime | None
 
     @staticmethod
-    def of(episode: Episode) -> dict[str, Any]:
+    def of(episode: Episode, sight: Sight) -> dict[str, Any]:
         """With the names of its station and its trial."""
         own = [name for name in EpisodeOut.model_fields if name not in ("station", "trial")]
-        trial = getattr(episode, "trial", None)
+        trial, hidden = getattr(episode, "trial", None), sight.hides_episode(episode)
         return {
             **{name: getattr(episode, name) for name in own},
             "station": episode.station.name,
             "trial": trial.pk if trial else None,
+            "checkpoint": sight.policy_of(episode) if hidden else episode.checkpoint,
+            "strategy": "" if hidden else episode.strategy,
+            "reason": sight.told(episode.reason) if hidden else episode.reason,
         }
 
 
@@ -68,13 +77,14 @@ class EpisodeDetail(EpisodeOut):
     policy: dict[str, Any]
 
     @staticmethod
-    def of(episode: Episode) -> dict[str, Any]:
+    def of(episode: Episode, sight: Sight) -> dict[str, Any]:
         """With all that is known of it."""
+        hidden = sight.hides_episode(episode)
         return {
-            **EpisodeOut.of(episode),
-            "configuration_hash": episode.configuration_hash,
-            "control": episode.control,
-            "policy": episode.policy,
+            **EpisodeOut.of(episode, sight),
+            "configuration_hash": "" if hidden else episode.configuration_hash,
+            "control": {} if hidden else episode.control,
+            "policy": {} if hidden else episode.policy,
         }
 
 
@@ -90,7 +100,7 @@ class Filters(Schema):
 @router.get("", response={200: Page[EpisodeOut], **FAILURES}, summary="Episodes", url_name="episodes")
 def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging]) -> Any:
     """The newest first."""
-    rows = Episode.objects.select_related("station", "trial").order_by("-started_at", "-created_at", "pk")
+    rows = Episode.objects.select_related(*_WITH).order_by("-started_at", "-created_at", "pk")
     if filters.station:
         rows = rows.filter(station=station_get(name=filters.station))
     wanted = {
@@ -98,7 +108,11 @@ def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging
         "status": filters.status and filters.status.value,
         "dataset": filters.dataset,
     }
-    return paging.of(rows.filter(**{name: value for name, value in wanted.items() if value}), EpisodeOut)
+    return paging.of(
+        rows.filter(**{name: value for name, value in wanted.items() if value}),
+        EpisodeOut,
+        sight_for(request),
+    )
 
 
 @router.get(
@@ -106,7 +120,7 @@ def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging
 )
 def episode(request: HttpRequest, uuid: UUID) -> Any:
     """By its uuid."""
-    return EpisodeDetail.of(_found(uuid))
+    return EpisodeDetail.of(_found(uuid), sight_for(request))
 
 
 _TABLE = {"schema": {"type": "string", "format": "binary"}}
@@ -121,7 +135,9 @@ _TABLE = {"schema": {"type": "string", "format": "binary"}}
 )
 def episode_export(request: HttpRequest, uuid: UUID) -> Any:
     """Raw, smoothed and executed, step by step, with manifest and outcome in its metadata."""
-    path = table_file(_found(uuid).uuid)
+    found = _found(uuid)
+    sight_for(request).require_episode(found)
+    path = table_file(found.uuid)
     return async_to_sync(file_answer)(request, path, CONTENT_TYPE, path.name)
 
 
@@ -134,11 +150,11 @@ def episode_export(request: HttpRequest, uuid: UUID) -> Any:
 def episode_export_asked(request: HttpRequest, uuid: UUID) -> Any:
     """For an episode that its station has not exported; the job says how far it is."""
     require(request.auth, Role.OPERATOR)
-    return Status(202, services.export_asked(episode=_found(uuid)))
+    return Status(202, JobOut.of(services.export_asked(episode=_found(uuid)), sight_for(request)))
 
 
 def _found(uuid: UUID) -> Episode:
-    found = Episode.objects.select_related("station", "trial").filter(pk=uuid).first()
+    found = Episode.objects.select_related(*_WITH).filter(pk=uuid).first()
     if found is None:
         raise NotFound(f"episode {uuid} does not exist")
     return found

@@ -6,16 +6,24 @@ from datetime import datetime
 from typing import Any
 
 from django.http import HttpRequest
-from ninja import Query, Router, Schema
+from ninja import Query, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.jobs import services
 from evaweb.jobs.models import Job, JobStatus
+from evaweb.jobs.selectors import job_get
+from evaweb.roles import Role, require
+from evaweb.sight import HIDDEN, Sight, sight_for
 
 router = Router(tags=["jobs"])
 
 
 class JobOut(Schema):
-    """One piece of work; `error` is that of the last attempt."""
+    """One piece of work; `error` is that of the last attempt.
+
+    Progress, error and result may tell which checkpoint was worked on: who has not looked behind a blind plan is
+    told only that there are some.
+    """
 
     id: int
     kind: str
@@ -31,9 +39,13 @@ class JobOut(Schema):
     finished_at: datetime | None
 
     @staticmethod
-    def of(job: Job) -> Job:
-        """As it is."""
-        return job
+    def of(job: Job, sight: Sight) -> dict[str, Any]:
+        """As it is, or without what may tell."""
+        own = {name: getattr(job, name) for name in JobOut.model_fields}
+        if sight.clear:
+            return own
+        covered = {name: HIDDEN if own[name] else "" for name in ("progress", "error")}
+        return own | covered | {"result": {}}
 
 
 @router.get("", response={200: Page[JobOut], **FAILURES}, summary="Jobs", url_name="jobs")
@@ -47,4 +59,13 @@ def jobs(
     """The newest first."""
     rows = Job.objects.order_by("-created_at", "-pk")
     wanted = {"status": status and status.value, "kind": kind, "key": key}
-    return paging.of(rows.filter(**{name: value for name, value in wanted.items() if value}), JobOut)
+    return paging.of(
+        rows.filter(**{name: value for name, value in wanted.items() if value}), JobOut, sight_for(request)
+    )
+
+
+@router.post("/{id}/retry", response={202: JobOut, **FAILURES}, summary="Try again", url_name="job-retry")
+def retry(request: HttpRequest, id: int) -> Any:
+    """Ask anew for what a failed job was about; operators."""
+    require(request.auth, Role.OPERATOR)
+    return Status(202, JobOut.of(services.try_again(job=job_get(id=id)), sight_for(request)))

@@ -32,6 +32,7 @@ class MilestoneOut(Schema):
     text: str
     points: int
     required: bool
+    time_limit_s: float | None
     truth: str
 
 
@@ -45,6 +46,7 @@ class SceneOut(Schema):
     criterion: str
     layout: str
     time_limit_s: float | None
+    ordered: bool
     active: bool
     positions: list[PositionOut]
     milestones: list[MilestoneOut]

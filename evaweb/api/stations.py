@@ -14,8 +14,11 @@ from pydantic import AfterValidator, ValidationError, field_validator
 
 from evaweb.api.answers import FAILURES, Failure
 from evaweb.api.trials import TrialDetail
+from evaweb.collect.bench import session_command
+from evaweb.collect.selectors import session_get
 from evaweb.errors import EvaError, StationGone
-from evaweb.stations import commands, leases, selectors, stops
+from evaweb.sight import Sight, sight_for
+from evaweb.stations import commands, leases, selectors, stops, veil
 from evaweb.stations.holders import who
 from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
 from evaweb.stations.wire import wire_to
@@ -89,7 +92,11 @@ class StationOut(Schema):
 
 
 class StationDetail(StationOut):
-    """With the runtime's newest snapshot, or why there is none, and the trial that is not finished."""
+    """With the runtime's newest snapshot, or why there is none, and the trial that is not finished.
+
+    While the station has to do with a blind plan the snapshot is without what tells which checkpoint it is set up for,
+    and says so: "veiled".
+    """
 
     snapshot: dict[str, Any] | None
     gone: str
@@ -117,8 +124,8 @@ def _no_trial(args: dict[str, Any]) -> dict[str, Any]:
 class CommandIn(Schema):
     """A discrete verb; boot and sequence are those of the snapshot that it was decided by.
 
-    With `trial`, set-up and run get their arguments from the trial; `checkpoint`, by name or id, is for a set-up
-    without one.
+    With `trial`, set-up and run get their arguments from the trial, with `session` from what is collected;
+    `checkpoint`, by name or id, is for a set-up without one.
     """
 
     uuid: UUID
@@ -130,10 +137,14 @@ class CommandIn(Schema):
     sequence: Annotated[int, Field(ge=0, le=2**53)] = 0
     trial: int | None = None
     checkpoint: str | int | None = None
+    session: UUID | None = None
 
 
 class CommandOut(Schema):
-    """What became of a command: 200 accepted or done, 409 refused or failed, 504 nobody knows."""
+    """What became of a command: 200 accepted or done, 409 refused or failed, 504 nobody knows.
+
+    Of a trial of a blind plan `reason` and `data` are without what tells which checkpoint it is of.
+    """
 
     uuid: UUID
     status: CommandStatus
@@ -189,8 +200,10 @@ def station(request: HttpRequest, name: str) -> Any:
         snapshot = wire_to(name).status()
     except StationGone as fault:
         gone = str(fault)
-    unfinished = trial_selectors.trial_open(found)
-    trial = TrialDetail.of(trial_selectors.trial_get(id=unfinished.pk)) if unfinished else None
+    seen, unfinished = sight_for(request), trial_selectors.trial_open(found)
+    if snapshot is not None and seen.veils(name, snapshot):
+        snapshot = veil.state(snapshot, seen)
+    trial = TrialDetail.of(trial_selectors.trial_get(id=unfinished.pk), seen) if unfinished else None
     return {**StationOut.of(found), "snapshot": snapshot, "gone": gone, "trial": trial}
 
 
@@ -226,12 +239,18 @@ def lease(request: HttpRequest, name: str, given: LeaseIn) -> Any:
 )
 def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
     """Set-up, run, stop, modes, strategy, motions, grippers; the same uuid again gets the first answer."""
-    found = selectors.station_get(name=name)
-    order = given.model_dump(exclude={"trial", "checkpoint"})
-    if given.trial is not None and given.checkpoint is not None:
-        raise EvaError("trial and checkpoint: a trial has its own checkpoint, name one of them")
-    if given.checkpoint is not None:
-        checkpoint = trial_selectors.checkpoint_get(name=given.checkpoint)
+    found, seen = selectors.station_get(name=name), sight_for(request)
+    order = given.model_dump(exclude={"trial", "checkpoint", "session"})
+    named = [name for name in ("trial", "checkpoint", "session") if getattr(given, name) is not None]
+    if len(named) > 1:
+        raise EvaError(f"{' and '.join(named)}: each has its own arguments, name one of them")
+    if given.session is not None:
+        session = session_get(uuid=given.session)
+        if session.station_id != found.pk:
+            raise EvaError(f"session {session} is one of {session.station.name}, not of {found.name}")
+        row = session_command(user=request.auth, session=session, **order)
+    elif given.checkpoint is not None:
+        checkpoint = trial_selectors.checkpoint_get(name=given.checkpoint, sight=seen)
         row = checkpoint_command(user=request.auth, station=found, checkpoint=checkpoint, **order)
     elif given.trial is None:
         row = commands.issue(user=request.auth, station=found, **order)
@@ -240,7 +259,7 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
         if trial.station_id != found.pk:
             raise EvaError(f"trial {trial.pk} is one of {trial.station.name}, not of {found.name}")
         row = trial_command(user=request.auth, trial=trial, **order)
-    return Status(_HTTP[CommandStatus(row.status)], _command_out(row))
+    return Status(_HTTP[CommandStatus(row.status)], _command_out(row, seen))
 
 
 @router.post(
@@ -267,10 +286,10 @@ def prepare(request: HttpRequest, name: str, given: TrialIn) -> Any:
         station=selectors.station_get(name=name),
         scene=scene,
         position=trial_selectors.position_get(scene=scene, number=given.position),
-        checkpoint=trial_selectors.checkpoint_get(name=given.checkpoint),
+        checkpoint=trial_selectors.checkpoint_get(name=given.checkpoint, sight=sight_for(request)),
         seed=given.seed,
     )
-    return Status(201, TrialDetail.of(trial_selectors.trial_get(id=made.pk)))
+    return Status(201, TrialDetail.of(trial_selectors.trial_get(id=made.pk), sight_for(request)))
 
 
 def _request_of(given: LeaseIn) -> int:
@@ -279,8 +298,14 @@ def _request_of(given: LeaseIn) -> int:
     return given.request
 
 
-def _command_out(row: Command) -> dict[str, Any]:
-    return {"uuid": row.pk, **{name: getattr(row, name) for name in ("status", "reason", "allowed", "data")}}
+def _command_out(row: Command, sight: Sight) -> dict[str, Any]:
+    answer = {
+        "uuid": row.pk,
+        **{name: getattr(row, name) for name in ("status", "reason", "allowed", "data")},
+    }
+    if sight.veils_events(row.station.name) or sight.veils(row.station.name, row.args):
+        answer |= {"reason": sight.told(row.reason), "data": veil.answer(row.data)}
+    return answer
 
 
 def _note_estop(request: HttpRequest, name: str, why: str, uuid: UUID, answer: stops.Answer) -> None:

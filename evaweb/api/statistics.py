@@ -8,8 +8,9 @@ from django.http import HttpRequest, HttpResponse
 from ninja import Query, Router, Schema
 
 from evaweb.api.answers import FAILURES
-from evaweb.api.tables import Format, csv_answer
+from evaweb.api.tables import Format, table_answer
 from evaweb.api.trials import Filters
+from evaweb.sight import sight_for
 from evaweb.trials import selectors
 from evaweb.trials.selectors import StatisticsRow
 
@@ -75,9 +76,10 @@ METHOD = (
     url_name="statistics",
 )
 def statistics(request: HttpRequest, filters: Query[Filters], format: Format = "json") -> Any:
-    """Counts, success rate with its Wilson 95 % interval, mean score, median duration; CSV with `format=csv`."""
-    rows = [StatisticsOut.of(row) for row in selectors.statistics(filters.chosen())]
-    if format == "csv":
-        answer: HttpResponse = csv_answer(request, "statistics", list(StatisticsOut.model_fields), [rows])
+    """Counts, success rate with its Wilson 95 % interval, mean score, median duration; also CSV and Parquet."""
+    rows = [StatisticsOut.of(row) for row in selectors.statistics(filters.chosen(), sight_for(request))]
+    if format != "json":
+        columns = {name: field.annotation for name, field in StatisticsOut.model_fields.items()}
+        answer: HttpResponse = table_answer(request, "statistics", columns, [rows], format)
         return answer
     return {"method": METHOD, "items": rows}

@@ -11,7 +11,8 @@ from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema
 
 from evaweb.api.answers import FAILURES, Page, Paging
-from evaweb.api.tables import Format, csv_answer
+from evaweb.api.tables import Format, table_answer
+from evaweb.sight import Sight, code_of, sight_for
 from evaweb.trials import selectors, services
 from evaweb.trials.models import Score, Trial, TrialStatus
 from evaweb.trials.selectors import TrialFilters
@@ -35,7 +36,11 @@ class Filters(Schema):
 
 
 class TrialOut(Schema):
-    """One attempt, flat; success, score, note and rater are those of the newest score."""
+    """One attempt, flat; success, score, note and rater are those of the newest score.
+
+    `code` is what a trial of a plan was handed out under, "" for others. While it is hidden from who asks which
+    `checkpoint` it is of, the code stands there too.
+    """
 
     id: int
     uuid: UUID
@@ -45,6 +50,7 @@ class TrialOut(Schema):
     scene: str
     position: int
     checkpoint: str
+    code: str
     number: int
     attempt: int
     status: TrialStatus
@@ -67,9 +73,9 @@ class TrialOut(Schema):
     episode: UUID | None
 
     @staticmethod
-    def of(trial: Trial) -> dict[str, Any]:
+    def of(trial: Trial, sight: Sight) -> dict[str, Any]:
         """Flat, the same for JSON and CSV."""
-        plain = ("id", "uuid", "number", "attempt", "status", "reason", "duration_s", "instruction", "seed")
+        plain = ("id", "uuid", "number", "attempt", "status", "duration_s", "instruction", "seed")
         times = ("time_limit_s", "prepared_at", "started_at", "ended_at")
         newest = ("success", "score", "note", "failure", "source", "scored_at")
         return {
@@ -80,7 +86,9 @@ class TrialOut(Schema):
             "station": trial.station.name,
             "scene": trial.scene.name,
             "position": trial.position.number,
-            "checkpoint": trial.checkpoint.name,
+            "checkpoint": sight.label(trial),
+            "code": code_of(trial),
+            "reason": sight.reason(trial),
             "operator": trial.operator.get_username(),
             "rater": trial.verdict.rater.get_username() if trial.verdict else None,
             "episode": trial.episode_id,
@@ -95,6 +103,7 @@ class OutcomeOut(Schema):
     points: int
     required: bool
     reached: bool
+    at_s: float | None
 
 
 class ScoreOut(Schema):
@@ -131,10 +140,10 @@ class TrialDetail(TrialOut):
     voided_at: datetime | None
 
     @staticmethod
-    def of(trial: Trial) -> dict[str, Any]:
+    def of(trial: Trial, sight: Sight) -> dict[str, Any]:
         """With all that is known of it."""
         return {
-            **TrialOut.of(trial),
+            **TrialOut.of(trial, sight),
             "scores": [ScoreOut.of(score) for score in trial.scores.all()],
             "truth": trial.truth,
             "voided_by": trial.voided_by.get_username() if trial.voided_by else None,
@@ -149,6 +158,10 @@ class ScoreIn(Schema):
     """
 
     milestones: Annotated[dict[str, bool], Field(default_factory=dict)]
+    times: Annotated[
+        dict[str, float | None],
+        Field(default_factory=dict, description="When each was reached, s after the start of the run"),
+    ]
     success: bool | None = None
     note: str = ""
     failure: str = ""
@@ -162,24 +175,29 @@ class Reason(Schema):
     reason: str = ""
 
 
-COLUMNS = [*TrialOut.model_fields, "milestones_reached", "milestones_missed"]
+COLUMNS: dict[str, Any] = {
+    **{name: field.annotation for name, field in TrialOut.model_fields.items()},
+    "milestones_reached": str,
+    "milestones_missed": str,
+}
 
 
 @router.get("", response={200: Page[TrialOut], **FAILURES}, summary="Trials", url_name="trials")
 def trials(
     request: HttpRequest, filters: Query[Filters], paging: Query[Paging], format: Format = "json"
 ) -> Any:
-    """The newest first, in pages; with `format=csv` all that fit, the oldest first."""
-    if format == "csv":
-        pages = selectors.trials_in_pages(filters.chosen())
-        return csv_answer(request, "trials", COLUMNS, _csv_pages(pages))
-    return paging.of(selectors.trial_list(filters.chosen()), TrialOut)
+    """The newest first, in pages; with `format=csv` or `parquet` all that fit, the oldest first."""
+    seen = sight_for(request)
+    if format != "json":
+        pages = selectors.trials_in_pages(filters.chosen(), sight=seen)
+        return table_answer(request, "trials", COLUMNS, _csv_pages(pages, seen), format)
+    return paging.of(selectors.trial_list(filters.chosen(), seen), TrialOut, seen)
 
 
 @router.get("/{int:id}", response={200: TrialDetail, **FAILURES}, summary="One trial", url_name="trial")
 def trial(request: HttpRequest, id: int) -> Any:
     """With every score it was ever given."""
-    return TrialDetail.of(selectors.trial_get(id=id))
+    return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
 
 
 @router.post("/{int:id}/score", response={200: TrialDetail, **FAILURES}, summary="Score it", url_name="score")
@@ -187,14 +205,14 @@ def score(request: HttpRequest, id: int, given: ScoreIn) -> Any:
     """Add a score, or a correction; operators."""
     found = selectors.trial_get(id=id)
     services.trial_score(user=request.auth, trial=found, **given.model_dump())
-    return TrialDetail.of(selectors.trial_get(id=id))
+    return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
 
 
 @router.post("/{int:id}/void", response={200: TrialDetail, **FAILURES}, summary="Void it", url_name="void")
 def void(request: HttpRequest, id: int, given: Reason) -> Any:
     """Take it out of the count, with a reason; operators. Its repetition is another attempt."""
     services.trial_void(user=request.auth, trial=selectors.trial_get(id=id), reason=given.reason)
-    return TrialDetail.of(selectors.trial_get(id=id))
+    return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
 
 
 @router.post(
@@ -203,18 +221,18 @@ def void(request: HttpRequest, id: int, given: Reason) -> Any:
 def abandon(request: HttpRequest, id: int, given: Reason) -> Any:
     """Give up a trial that never ran; operators."""
     services.trial_abandon(user=request.auth, trial=selectors.trial_get(id=id), reason=given.reason)
-    return TrialDetail.of(selectors.trial_get(id=id))
+    return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
 
 
-def _csv_pages(pages: Iterator[list[Trial]]) -> Iterator[list[dict[str, Any]]]:
+def _csv_pages(pages: Iterator[list[Trial]], sight: Sight) -> Iterator[list[dict[str, Any]]]:
     for page in pages:
-        yield [_csv_row(trial) for trial in page]
+        yield [_csv_row(trial, sight) for trial in page]
 
 
-def _csv_row(trial: Trial) -> dict[str, Any]:
+def _csv_row(trial: Trial, sight: Sight) -> dict[str, Any]:
     outcomes = list(trial.verdict.outcomes.all()) if trial.verdict else []
     return {
-        **TrialOut.of(trial),
+        **TrialOut.of(trial, sight),
         "milestones_reached": "; ".join(outcome.text for outcome in outcomes if outcome.reached),
         "milestones_missed": "; ".join(outcome.text for outcome in outcomes if not outcome.reached),
     }

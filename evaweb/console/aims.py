@@ -26,7 +26,7 @@ from evaweb.stations.wire import StationWire
 from runtime import messages
 from runtime.bus import CodecError
 
-_TIMEOUT_S = 1.0
+_TIMEOUT_S = 3.0  # the first one may have to wait until the station's kinematics are loaded
 _DIGITS = 5  # of a matrix in the answer: a hundredth of a millimetre
 _threads = ThreadPoolExecutor(8, "aim")
 Say = Callable[[dict[str, Any]], None]

@@ -13,6 +13,7 @@ from channels.db import database_sync_to_async
 from django.db import Error
 from django.db.models import Count, Max, Q
 
+from evaweb.collect.models import Demonstration, SessionEvent
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.stations.models import Lease, LeaseRequest
@@ -55,6 +56,12 @@ def marks(station: str) -> Marks:
             Max("previewed_at"),
             Max("published_at"),
             open=Count("pk", Q(status=EpisodeStatus.RECORDING)),
+        ),
+        "collect": (
+            SessionEvent.objects.filter(session__station__name=station).aggregate(Max("id")),
+            Demonstration.objects.filter(session__station__name=station).aggregate(
+                Max("labelled_at"), count=Count("pk"), discarded=Count("pk", Q(discarded=True))
+            ),
         ),
         "job": Job.objects.aggregate(
             Max("id"),

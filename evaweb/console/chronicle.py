@@ -16,15 +16,17 @@ from typing import Any
 from django.db import Error, close_old_connections
 from django.db.models import Q
 
+from evaweb.collect import following as collect
 from evaweb.console.feed import Feeds, History, feeds
 from evaweb.episodes import services as episodes
+from evaweb.preflights.services import preflights_settled
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Station
 from evaweb.trials import services as trials
 
 log = logging.getLogger(__name__)
 # The kinds of events that change rows; all others are only shown.
-NOTED = ("state", "command", "truth", "episode_closed")
+NOTED = ("state", "command", "truth", "episode_closed", "labelled")
 _TURN_S = 1.0
 _SWEEP_S = 5.0  # how often what was lost on the way is looked for
 
@@ -39,6 +41,7 @@ class Scribe:
         self._news = threading.Event()
         self._written = ("", 0)  # boot and number of the last event
         self._lease: tuple[Any, ...] = ()
+        self._collects: bool | None = None  # as the row says, None where nobody has looked
         self._swept = 0.0
         self._failing = False
         self._thread = threading.Thread(target=self._run, name=f"{station} chronicle", daemon=True)
@@ -87,11 +90,15 @@ class Scribe:
         state, history = self._feed.state, self._feed.history
         lease = self._lease_of(state)
         behind = bool(history.boot) and self._written != (history.boot, history.newest)
-        if not (sweep or behind or lease != self._lease):
+        collects = state.get("collect") is not None if state else self._collects
+        if not (sweep or behind or lease != self._lease or collects != self._collects):
             return
         station = Station.objects.filter(name=self._station).first()
         if station is None:
             return
+        if collects is not None and collects != self._collects:
+            Station.objects.filter(pk=station.pk).update(collects=collects)
+            self._collects = collects
         if lease:
             leases.notice(station=station, boot=state["boot"], held=state["lease"])
             self._lease = lease
@@ -102,6 +109,7 @@ class Scribe:
         if sweep and self._feed.link.ok:
             for row in commands.unsettled(station=station):
                 commands.settle(row=row)
+            preflights_settled(station=station)
             self._swept = time.monotonic()
 
     @staticmethod
@@ -161,6 +169,8 @@ def _hand_on(station: Station, boot: str, event: Mapping[str, Any]) -> None:
         if event["kind"] == "episode_closed":
             episodes.episode_closed(station=station, data=event["data"])
         trials.run_changed(station=station, event=event, boot=boot)
+        if event["kind"] in collect.TOLD:
+            collect.demonstration_told(event=event)
     except Error:
         raise
     except Exception:

@@ -29,6 +29,7 @@ from evaweb.console.mailbox import Mailbox
 from evaweb.console.requests import Aim, BadRequest, Credit, EStop, Events, Renew, Request, Stop, Watch
 from evaweb.errors import NotFound, StationGone
 from evaweb.roles import Role, role_of
+from evaweb.sight import Sight, sight_of
 from evaweb.stations import commands, leases, stops
 from evaweb.stations.looks import facts_of
 from evaweb.stations.models import Station
@@ -92,7 +93,7 @@ class StationConsumer(AsyncWebsocketConsumer):
 
     async def _admit(self, name: str) -> None:
         try:
-            station, role, facts = await _in_database(_facts_of, name, self._user)
+            station, role, facts, sight = await _in_database(_facts_of, name, self._user)
         except NotFound as error:
             await self.close(NO_STATION, str(error)[:120])
             return
@@ -102,7 +103,7 @@ class StationConsumer(AsyncWebsocketConsumer):
         self._say({"type": "hello", **hello, "facts": facts})
         room = self._room = hub().room(station.name, station.robot)
         self._aims = Aims(station, self._username, role, self._say, lambda: room.looks)
-        self._mailbox = room.join(self._outbox.put_nowait)
+        self._mailbox = room.join(self._outbox.put_nowait, self._user, sight)
         self._tasks = [asyncio.create_task(work) for work in (self._write(), self._follow_login(role))]
         for task in self._tasks:
             task.add_done_callback(_finished)
@@ -223,9 +224,9 @@ class StationConsumer(AsyncWebsocketConsumer):
                 await self.send(bytes_data=message)
 
 
-def _facts_of(name: str, user: Any) -> tuple[Station, Role, dict[str, Any]]:
+def _facts_of(name: str, user: Any) -> tuple[Station, Role, dict[str, Any], Sight]:
     station = station_get(name=name)
-    return station, role_of(user), facts_of(station.robot)
+    return station, role_of(user), facts_of(station.robot), sight_of(user)
 
 
 async def _in_database(work: Any, *arguments: Any, **named: Any) -> Any:

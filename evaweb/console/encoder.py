@@ -15,6 +15,7 @@ from evaweb.console.chunks import chunk_part
 from evaweb.console.parts import Part
 from evaweb.console.recent import Recent
 from evaweb.errors import NotFound
+from evaweb.stations import veil
 from evaweb.stations.looks import Looks, looks_of
 
 log = logging.getLogger(__name__)
@@ -22,10 +23,14 @@ _VECTORS = ("measured", "raw", "planned", "commanded", "simulated")  # of the jo
 
 
 class Encoder:
-    """Makes parts of what a feed tells; `looks` is the robot as the station has it, None where it is not drawn."""
+    """Makes parts of what a feed tells; `looks` is the robot as the station has it, None where it is not drawn.
 
-    def __init__(self, robot: str) -> None:
+    `veiled`: for those who are not to know which policy it is; snapshots come to it covered already.
+    """
+
+    def __init__(self, robot: str, *, veiled: bool = False) -> None:
         self._robot = robot
+        self._veiled = veiled
         self._groups: tuple[str, ...] | None = None  # None: nobody has said yet
         self.looks = _looks(robot, None)
         self._recent = Recent()
@@ -36,6 +41,10 @@ class Encoder:
         if stream == "state":
             self._follow(content.get("facts"))
             return [parts.facts(stream, content, now)]
+        if stream == "chunk" and self._veiled:
+            return [parts.facts("chunk", {"chunk": 0}, now)]
+        if stream == "joints" and self._veiled:
+            return self._joints(veil.joints(content), now)
         if stream == "joints":
             return self._joints(content, now)
         if stream == "chunk":

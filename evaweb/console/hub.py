@@ -8,11 +8,13 @@ from collections.abc import Iterable
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from evaweb.console import changes, parts
+from evaweb.console import changes, parts, sights
 from evaweb.console.encoder import Encoder
 from evaweb.console.feed import Feeds, History, Link, feeds
 from evaweb.console.mailbox import Deliver, Mailbox
 from evaweb.console.parts import Part
+from evaweb.sight import EVERYTHING, Sight
+from evaweb.stations import veil
 from evaweb.stations.looks import Looks
 
 _FLUSH_S = 1 / 40  # frames leave at most so often
@@ -20,13 +22,23 @@ _CHANGES_S = 1.0
 
 
 class Room:
-    """The pages that watch one station; all but `hear` belongs to the event loop."""
+    """The pages that watch one station; all but `hear` belongs to the event loop.
+
+    Who is not to know which checkpoint the station is set up for is shown other parts than the others. What is hidden
+    from whom is looked up each second; a page that has just come is shown nothing before that, and events wait for it,
+    because a trial may have been handed out since.
+    """
 
     def __init__(self, station: str, robot: str, loop: asyncio.AbstractEventLoop, heard: Feeds) -> None:
         self.station = station
         self._loop = loop
         self._feed = heard.of(station)
         self._encoder = Encoder(robot)
+        self._covering = Encoder(robot, veiled=True)
+        self._covered: dict[str, Part] = {}  # the newest, for those who are not to know
+        self._covers = False  # whether anybody is to be shown these
+        self._state: dict[str, Any] = {}
+        self._unseen = History()  # of which nobody has said yet who may see it
         self._viewers: set[Mailbox] = set()
         self._newest: dict[str, Part] = {}
         self._link: Link | None = None
@@ -35,6 +47,8 @@ class Room:
         self._flushed = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._changes: asyncio.Task[None] | None = None
+        self._looking: asyncio.Task[None] | None = None
+        self._look_again = False
 
     @property
     def looks(self) -> Looks | None:
@@ -45,11 +59,13 @@ class Room:
     def empty(self) -> bool:
         return not self._viewers
 
-    def join(self, deliver: Deliver) -> Mailbox:
-        """A mailbox for one more page."""
+    def join(self, deliver: Deliver, user: Any, sight: Sight) -> Mailbox:
+        """A mailbox for one more page, of `user`, from whom `sight` hides what it hides now."""
         first = not self._viewers
-        mailbox = Mailbox(deliver)
+        mailbox = Mailbox(deliver, user)
+        mailbox.sight = sight
         self._viewers.add(mailbox)
+        self._judge(mailbox)
         if first:
             self._feed.join(self.hear, pictures=True)
             self._changes = self._loop.create_task(self._follow_changes())
@@ -61,43 +77,102 @@ class Room:
     def leave(self, mailbox: Mailbox) -> None:
         """The page is gone; with the last one nothing is heard any more."""
         self._viewers.discard(mailbox)
+        self._count_covered()
         if self._viewers:
             return
         self._feed.leave(self.hear)
-        for pending in (self._timer, self._changes):
+        for pending in (self._timer, self._changes, self._looking):
             if pending is not None:
                 pending.cancel()
-        self._timer = self._changes = None
+        self._timer = self._changes = self._looking = None
 
     def watch(self, mailbox: Mailbox, streams: Iterable[str]) -> None:
         """Show a page these streams, at once with what there is."""
-        mailbox.watch(streams, self._newest.values())
+        mailbox.watch(streams, self._shown_to(mailbox).values())
         self.ring()
 
     def hear(self, stream: str, content: Any) -> None:
         """What the feed has to tell, in its thread."""
         encoded = self._encoder.encode(stream, content)
+        covered = encoded if stream.startswith("camera/") else self._cover(stream, content)
         if not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._take, stream, content, encoded)
+            self._loop.call_soon_threadsafe(self._take, stream, content, encoded, covered)
+
+    def _cover(self, stream: str, content: Any) -> list[Part]:
+        """The same for those who are not to know, as long as there are any."""
+        if not self._covers:
+            return []
+        said = veil.state(content, EVERYTHING) if stream == "state" else content
+        return self._covering.encode(stream, said)
 
     def ring(self) -> None:
         """Something is waiting: send it soon, together with what comes until then."""
         if self._timer is None:
             self._timer = self._loop.call_at(self._flushed + _FLUSH_S, self._flush)
 
-    def _take(self, stream: str, content: Any, encoded: list[Part]) -> None:
+    def _take(self, stream: str, content: Any, encoded: list[Part], covered: list[Part]) -> None:
         if stream == "link":
             self._link = content
             for viewer in self._viewers:
                 viewer.put_link(content)
         elif stream == "events":
-            self._history = content
-        for part in encoded:
-            self._newest[part.stream] = part
+            self._unseen = content
+            self._look()
+        elif stream == "state":
+            self._state = content
             for viewer in self._viewers:
+                self._judge(viewer)
+        for newest, fresh in ((self._newest, encoded), (self._covered, covered)):
+            newest.update((part.stream, part) for part in fresh)
+        for viewer in self._viewers:
+            for part in covered if viewer.veiled else encoded:
                 viewer.put(part)
         if self._viewers:
             self.ring()
+
+    # --- who may see what ------------------------------------------------------------------------------------
+
+    def _shown_to(self, viewer: Mailbox) -> dict[str, Part]:
+        return self._covered if viewer.veiled else self._newest
+
+    def _judge(self, viewer: Mailbox) -> None:
+        """Whether the page is shown the station as it is now; where that changes it is told, and shown anew."""
+        veiled = viewer.sight.veils(self.station, self._state)
+        viewer.covers = viewer.sight.veils_events(self.station)
+        if veiled is not viewer.veiled:
+            viewer.veiled = veiled
+            viewer.put_changed(["sight"])
+            self._count_covered()
+            viewer.watch(viewer.watched, self._shown_to(viewer).values())
+
+    def _count_covered(self) -> None:
+        """Covered parts are made while somebody is shown them; what is left of before is old."""
+        before, self._covers = self._covers, any(viewer.veiled for viewer in self._viewers)
+        if self._covers and not before:
+            self._covered.clear()
+
+    def _look(self) -> None:
+        """Ask the database what is hidden from whom; events that came before wait for the answer."""
+        if self._looking is None and self._viewers:
+            self._looking = self._loop.create_task(self._looked())
+        else:
+            self._look_again = True
+
+    async def _looked(self) -> None:
+        again = True
+        try:
+            while again:
+                self._look_again = False
+                heard, viewers = self._unseen, list(self._viewers)
+                found = await sights.look({viewer.user.pk: viewer.user for viewer in viewers})
+                for viewer in viewers:
+                    viewer.sight = found.get(viewer.user.pk, viewer.sight)
+                    self._judge(viewer)
+                self._history = heard
+                self.ring()
+                again = self._look_again
+        finally:
+            self._looking = None
 
     def _flush(self) -> None:
         """Send to all; pages that wait for the same are sent the same bytes."""
@@ -118,6 +193,7 @@ class Room:
         """Tell the pages what has changed in the database, whoever changed it."""
         known = None
         while True:
+            self._look()
             found = await changes.look(self.station)
             if known is not None and found is not None and found != known:
                 what = changes.difference(known, found)

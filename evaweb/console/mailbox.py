@@ -7,10 +7,13 @@ ever under way to it. A page that does not answer is sent nothing more, and cost
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 from evaweb.console.feed import History, Link
 from evaweb.console.parts import Part
+from evaweb.sight import EVERYTHING, Sight
+from evaweb.stations import veil
 
 CREDITS = 2
 EVENTS_AT_ONCE = 200
@@ -20,9 +23,16 @@ MakeFrame = Callable[[Iterable[Part]], bytes]
 
 
 class Mailbox:
-    """One page at one station; belongs to the event loop, where alone it may be used."""
+    """One page at one station; belongs to the event loop, where alone it may be used.
 
-    def __init__(self, deliver: Deliver) -> None:
+    `user` is whose page it is. `veiled` says that they see the station without what tells which checkpoint it is set
+    up for, `covers` that they see its events so, both by `sight`.
+    """
+
+    def __init__(self, deliver: Deliver, user: Any = None) -> None:
+        self.user = user
+        self.sight: Sight = EVERYTHING
+        self.veiled = self.covers = False
         self._deliver = deliver
         self._watched: frozenset[str] = frozenset()
         self._pending: dict[str, Part] = {}
@@ -85,10 +95,13 @@ class Mailbox:
         self._events_of = self._events_of or history.boot
         if self._events_of != history.boot or self._events_after > history.newest:
             self._events_of, self._events_after = history.boot, 0
-        rows = history.after(self._events_after)
+        rows: Sequence[Any] = history.after(self._events_after)
+        if self.covers:
+            rows = veil.events(rows, self.sight)
         for start in range(0, len(rows), EVENTS_AT_ONCE):
             some = rows[start : start + EVENTS_AT_ONCE]
-            if not self._say({"type": "events", "boot": history.boot, "events": some}):
+            covered = {"covered": True} if self.covers else {}
+            if not self._say({"type": "events", "boot": history.boot, "events": some, **covered}):
                 return
             self._events_after = some[-1]["number"]
 

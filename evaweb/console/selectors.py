@@ -7,6 +7,11 @@ from typing import Any
 
 from django.contrib.sessions.backends.base import SessionBase
 
+from evaweb.plans.bench import cameras_confirmed, cameras_of, references
+from evaweb.plans.handing import Progress, progress
+from evaweb.plans.models import CameraCheck, Handout, Plan, Reference
+from evaweb.plans.selectors import handout_of, plans_open
+from evaweb.sight import Sight
 from evaweb.stations.looks import facts_of
 from evaweb.stations.models import Lease, Station
 from evaweb.stations.selectors import last_set_up, leases_open, station_list
@@ -28,11 +33,15 @@ class StationRow:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """What the four steps of an evaluation show.
+    """What the four steps of an evaluation show, as one user may see it.
 
     `trial` is the unfinished one, with the `milestones` of its scene; `implied` says whether they decide on
     success, `set_up` whether the station was last set up for it. Without one, `scene`, `position` and
     `checkpoint` are the choice to begin with, after `last`, the newest finished one.
+
+    `plans` are those that are open here, `plan` the one that is worked on, `handout` how the trial was handed out,
+    `cameras` this user's look at the cameras as far as it holds. `views`: of each camera its reference picture, of the
+    trial's position or, without a trial, of the camera.
     """
 
     station: Station
@@ -47,6 +56,27 @@ class Panel:
     milestones: tuple[Milestone, ...]
     set_up: bool
     failures: tuple[str, ...]
+    hidden: bool  # which checkpoint the trial is of
+    plans: tuple[Plan, ...] = ()
+    plan: Plan | None = None
+    handout: Handout | None = None
+    progress: Progress | None = None
+    cameras: CameraCheck | None = None
+    views: tuple[tuple[str, Reference | None], ...] = ()
+
+    @property
+    def unseen(self) -> bool:
+        """Whether a camera has no reference yet."""
+        return any(row is None for _, row in self.views)
+
+    @property
+    def aid(self) -> dict[str, str]:
+        """Camera -> address of the reference picture of the trial's position."""
+        return (
+            {camera: f"/pictures/{row.picture}.jpg" for camera, row in self.views if row}
+            if self.trial
+            else {}
+        )
 
     @property
     def implied(self) -> bool:
@@ -100,11 +130,17 @@ def robot_facts(*, robot: str) -> dict[str, Any]:
     }
 
 
-def panel(*, station: Station, scene: str = "") -> Panel:
-    """The evaluation panel of a station; `scene` is the name of the one being chosen, "" for the last one."""
+def panel(*, station: Station, user: Any, sight: Sight, scene: str = "", plan: str | None = None) -> Panel:
+    """The evaluation panel of a station; `scene` is the name of the one being chosen, "" for the last one.
+
+    `plan`: the name of the one to work on, "" for none; None goes on with that of the last trial.
+    """
     trial = trial_open(station)
     last = None if trial else trial_list().filter(station=station).first()
-    scenes, checkpoints = tuple(scene_list()), tuple(checkpoint_list())
+    scenes, checkpoints = tuple(scene_list()), tuple(checkpoint_list(sight=sight))
+    handout = handout_of(trial=trial) if trial else None
+    plans = tuple(plans_open(station=station))
+    worked = handout.plan if handout else None if trial else _plan(plans, plan, last)
     chosen = _chosen_scene(scenes, scene or (last.scene.name if last else ""))
     positions = tuple(chosen.positions.all()) if chosen else ()
     return Panel(
@@ -116,11 +152,31 @@ def panel(*, station: Station, scene: str = "") -> Panel:
         scene=chosen,
         positions=positions,
         position=_next_position(positions, last),
-        checkpoint=last.checkpoint if last else None,
+        checkpoint=last.checkpoint if last and not sight.hides(last) else None,
         milestones=tuple(trial.scene.milestones.order_by("order")) if trial else (),
         set_up=trial is not None and _is_set_up(trial),
         failures=_failures() if trial else (),
+        hidden=trial is not None and sight.hides(trial),
+        plans=plans,
+        plan=worked,
+        handout=handout,
+        progress=progress(worked) if worked else None,
+        cameras=cameras_confirmed(user=user, station=station) if worked else None,
+        views=_views(station, trial) if worked else (),
     )
+
+
+def _plan(plans: tuple[Plan, ...], name: str | None, last: Trial | None) -> Plan | None:
+    """The one that was asked for; else that of the last trial, as long as it is open."""
+    if name is not None:
+        return next((plan for plan in plans if plan.name == name), None)
+    handout = handout_of(trial=last) if last else None
+    return next((plan for plan in plans if handout and plan.name == handout.plan.name), None)
+
+
+def _views(station: Station, trial: Trial | None) -> tuple[tuple[str, Reference | None], ...]:
+    known = references(station=station, position=trial.position if trial else None)
+    return tuple((camera, known.get(camera)) for camera in cameras_of(station))
 
 
 def _chosen_scene(scenes: tuple[Scene, ...], name: str) -> Scene | None:

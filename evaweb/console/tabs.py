@@ -19,7 +19,8 @@ class Tab:
     current: bool
 
 
-_STATION_TABS = (("Debug", "station-debug"), ("Eval", "station-eval"))
+_STATION_TABS = (("Debug", "station-debug"), ("Collect", "station-collect"), ("Eval", "station-eval"))
+_COLLECTING = "station-collect"  # there only where the station's deployment says how to collect
 _LAB_TABS = (("Replay", "/replay/"), ("Result", "/result/"))
 
 
@@ -35,6 +36,7 @@ def of(request: HttpRequest) -> list[Tab]:
             name == route,
         )
         for title, route in _STATION_TABS
+        if route != _COLLECTING or (station is not None and station.collects)
     ]
     in_lab = [Tab(title, address, request.path.startswith(address)) for title, address in _LAB_TABS]
     return at_station + in_lab

@@ -12,5 +12,8 @@ urlpatterns = [
     path("stations/<str:name>/debug/", views.debug, name="station-debug"),
     path("stations/<str:name>/eval/", views.evaluate, name="station-eval"),
     path("stations/<str:name>/eval/panel", views.panel, name="station-panel"),
+    path("stations/<str:name>/collect/", views.collect, name="station-collect"),
+    path("stations/<str:name>/collect/session", views.collect_session, name="collect-session"),
+    path("stations/<str:name>/collect/progress", views.collect_progress, name="collect-progress"),
     path("stations/<str:name>/lease", views.lease, name="station-lease"),
 ]

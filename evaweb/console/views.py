@@ -9,9 +9,12 @@ from django.shortcuts import redirect, render
 from django.templatetags.static import static
 from django.urls import reverse
 
+from evaweb.collect import panel as collecting
 from evaweb.console import selectors
-from evaweb.errors import NotFound
+from evaweb.datasets.on_robot import offer, recorded_at
+from evaweb.errors import EvaError, NotFound
 from evaweb.roles import role_of
+from evaweb.sight import sight_for
 from evaweb.stations.models import Station
 from evaweb.stations.selectors import request_list, station_get
 from evaweb.trials.selectors import checkpoint_list
@@ -30,7 +33,23 @@ def station(request: HttpRequest, name: str) -> HttpResponse:
 
 def debug(request: HttpRequest, name: str) -> HttpResponse:
     """A station by hand: every command, every figure."""
-    return _page(request, _station(name), "debug", {"checkpoints": checkpoint_list()})
+    found, seen = _station(name), sight_for(request)
+    if name in seen.at_work:
+        return _page(request, found, "veiled", {"why": seen.plans})
+    shown = {"checkpoints": checkpoint_list(sight=seen), **_replayed(request, found)}
+    return _page(request, found, "debug", shown)
+
+
+def _replayed(request: HttpRequest, station: Station) -> dict[str, Any]:
+    """The episode that ?replay= names, as this station would play it; why not, where it is none."""
+    source = request.GET.get("replay", "")
+    if not source:
+        return {}
+    try:
+        recorded = recorded_at(source, request.GET.get("robot", ""))
+        return {"replay": offer(recorded, station, request.GET.get("space", "joint"))}
+    except EvaError as error:
+        return {"replay_problem": str(error)}
 
 
 def evaluate(request: HttpRequest, name: str) -> HttpResponse:
@@ -42,6 +61,25 @@ def evaluate(request: HttpRequest, name: str) -> HttpResponse:
 def panel(request: HttpRequest, name: str) -> HttpResponse:
     """The four steps of a trial, to be put into the page."""
     return render(request, "console/panel.html", _panel(request, _station(name)))
+
+
+def collect(request: HttpRequest, name: str) -> HttpResponse:
+    """A station with the session that is collected there."""
+    found = _station(name)
+    shown = {**collecting.session_panel(station=found), **collecting.progress_panel(station=found)}
+    return _page(request, found, "collect", shown)
+
+
+def collect_session(request: HttpRequest, name: str) -> HttpResponse:
+    """The session, or how one is opened, to be put into the page."""
+    found = _station(name)
+    return render(request, "collect/session.html", collecting.session_panel(station=found))
+
+
+def collect_progress(request: HttpRequest, name: str) -> HttpResponse:
+    """Counts, the last episode and the queue, to be put into the page."""
+    found = _station(name)
+    return render(request, "collect/progress.html", collecting.progress_panel(station=found))
 
 
 def lease(request: HttpRequest, name: str) -> HttpResponse:
@@ -91,12 +129,30 @@ def _config(request: HttpRequest, station: Station, page: str, robot: dict[str, 
         "api": {"lease": f"{api}/lease", "commands": f"{api}/commands", "estop": f"{api}/estop"},
         "trials": f"{api}/trials",
         "trial": "/api/v1/trials",
+        "plans": "/api/v1/plans",
+        "cameras_confirmed": f"{api}/cameras",
+        "references": f"{api}/references",
+        "sessions": f"{api}/sessions",
+        "session": "/api/v1/sessions",
+        "jobs": "/api/v1/jobs",
+        "preflights": {
+            "ask": "/api/v1/preflights",
+            "result": "/preflights/",
+            "newest": reverse("preflight-newest"),
+        },
         "uplot": static("uplot/uPlot.esm.js"),
     }
 
 
 def _panel(request: HttpRequest, station: Station) -> dict[str, Any]:
-    return {"panel": selectors.panel(station=station, scene=request.GET.get("scene", "")), "station": station}
+    found = selectors.panel(
+        station=station,
+        user=request.user,
+        sight=sight_for(request),
+        scene=request.GET.get("scene", ""),
+        plan=request.GET.get("plan"),
+    )
+    return {"panel": found, "station": station}
 
 
 def _lease(request: HttpRequest, station: Station) -> dict[str, Any]:

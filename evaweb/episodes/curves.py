@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from evaweb.episodes.chunks import chunks
@@ -19,7 +21,11 @@ from runtime.recording.summary import HELD
 Array = NDArray[Any]
 
 
-def curves(folder: Path) -> bytes:
+# Events that say nothing of the policy, for those who are not to know which it was.
+_OPEN_MARKS = ("command", "estopped", "released", "truth")
+
+
+def curves(folder: Path, *, covered: bool = False) -> bytes:
     """One message of evaweb.frames; RecordingError names the file that is absent or damaged.
 
     Times are seconds of the video: row k is at k / fps. Streams, vectors joint by joint (a row per joint):
@@ -28,9 +34,17 @@ def curves(folder: Path) -> bytes:
     0 the held target), makers i4 [M + 1]: tick k was made of the entries makers[k] to makers[k + 1] of stream
     makers. makers: chunk i4 [W], weight f4 [W]. raw, where the policy speaks in joints: time f8 [R], values
     f4 [D, R], chunk i4 [R]. chunks: see evaweb.episodes.chunks.
+
+    `covered`: without what tells which policy it was, as of an episode of which no policy's answers were recorded.
     """
-    episode = open_episode(folder)
+    return curves_of(open_episode(folder), covered=covered)
+
+
+def curves_of(episode: Episode, *, covered: bool = False) -> bytes:
+    """The same of an episode that is open already."""
     start = _start(episode)
+    if covered:
+        episode = _covered(episode)
     made, makers = _makers(episode)
     streams = {
         "ticks": _ticks(episode, start, made),
@@ -48,6 +62,25 @@ def curves(folder: Path) -> bytes:
         period=_period(episode),
         held=held_spans(episode.rows.column("control_source").to_pylist(), episode.layout.fps),
         marks=_marks(episode, start),
+    )
+
+
+def _covered(episode: Episode) -> Episode:
+    """Without the policy's answers, the plans that were made of them, and what was said of them."""
+    events = tuple(
+        {**event, "text": str(event.get("text", "")).partition(",")[0]}
+        for event in episode.events
+        if event.get("kind") in _OPEN_MARKS
+    )
+    chunk = episode.ticks.schema.get_field_index("chunk_id")
+    nobody = pa.array(np.full(episode.ticks.num_rows, -1), episode.ticks.schema.field(chunk).type)
+    ticks = episode.ticks.set_column(chunk, episode.ticks.schema.field(chunk), nobody)
+    return replace(
+        episode,
+        raw=episode.raw.slice(0, 0),
+        smoothed=episode.smoothed.slice(0, 0),
+        ticks=ticks,
+        events=events,
     )
 
 

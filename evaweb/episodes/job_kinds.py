@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import UUID
 
 from django.utils import timezone
 
 from evaweb.episodes import services
+from evaweb.episodes.beside import sides_of
 from evaweb.episodes.folders import data_dir, datasets_dir, journal_folder, preview_folder, scores_file
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.preview import make_preview
@@ -19,6 +22,7 @@ from evaweb.jobs.kinds import Work, at_start, chore, job_kind
 from evaweb.jobs.services import enqueue
 from runtime.datasets.published import never_published, publish
 from runtime.recording.export import export
+from runtime.recording.labels import newest
 
 
 @job_kind("preview")
@@ -39,25 +43,36 @@ def export_episode(work: Work) -> Mapping[str, Any]:
 
 @job_kind("publish")
 def publish_episode(work: Work) -> Mapping[str, Any]:
-    """Write the episode into its dataset with the success of its newest score; args: uuid.
+    """Write the episode into its dataset with the success of its newest score; args: uuid, and a new one's version.
 
-    An interrupted one goes there only where somebody has scored it.
+    An interrupted one goes there only where somebody has scored it, one that was discarded never.
     """
     episode = Episode.objects.select_related("station").get(uuid=UUID(work.args["uuid"]))
     folder = journal_folder(episode.uuid)
     recorded = recorded_in(folder)
     if recorded.closed and not recorded.facts["frames"]:
         return {"published": False, "why": "it has no rows: its run ended before the first"}
-    why = never_published({"mode": recorded.facts.get("mode")})
+    why = never_published({name: recorded.facts.get(name) for name in ("mode", "kind")})
     if why:
         return {"published": False, "why": f"it {why}"}
+    label = newest(data_dir(), str(episode.uuid))
+    if label is not None and label.discarded:
+        return {"published": False, "why": f"it was discarded by {label.by}"}
     success = success_of(scores_file(episode.uuid))
     if success is None and recorded.facts["status"] in (EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED):
         return {"published": False, "why": f"it is {recorded.facts['status']} and nobody has scored it"}
     simulated = recorded.simulated or episode.station.simulated
     name = dataset_name(recorded, scored=success is not None, simulated=simulated)
     work.tell(f"into {name}")
-    placed = publish(folder, datasets_dir() / name, success=success, include_interrupted=success is not None)
+    with TemporaryDirectory() as beside:
+        placed = publish(
+            folder,
+            datasets_dir() / name,
+            success=success,
+            include_interrupted=success is not None,
+            version=work.args.get("version"),
+            sides=sides_of(episode.uuid, Path(beside)),
+        )
     dataset = str(placed.dataset.relative_to(data_dir()))
     Episode.objects.filter(uuid=episode.uuid).update(
         dataset=dataset, dataset_index=placed.episode_index, published_at=timezone.now()

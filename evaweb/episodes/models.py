@@ -28,6 +28,7 @@ class EpisodeMode(models.TextChoices):
     SIM = "sim", "simulated robot"
     MANUAL = "manual", "by hand"
     OBSERVE = "observe", "observed"
+    COLLECT = "collect", "collected"
 
 
 class Episode(models.Model):

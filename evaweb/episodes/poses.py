@@ -10,7 +10,7 @@ from evaweb.episodes.curves import vectors
 from evaweb.episodes.robot import looks_in
 from evaweb.errors import NotFound
 from evaweb.frames import Stream, encode
-from runtime.recording.reader import open_episode
+from runtime.recording.reader import Episode, open_episode
 
 MOST_ROWS = 900  # of one answer: half a minute at 30 Hz
 
@@ -21,7 +21,11 @@ def poses(folder: Path, first: int) -> bytes:
     Rows `first` to at most `first` + MOST_ROWS - 1, from the measured joints. NotFound where there is no such
     robot or row; RecordingError names the file that is absent or damaged.
     """
-    episode = open_episode(folder)
+    return poses_of(open_episode(folder), first)
+
+
+def poses_of(episode: Episode, first: int) -> bytes:
+    """The same of an episode that is open already."""
     looks = looks_in(episode.manifest)
     if not 0 <= first < max(1, episode.frames):
         raise NotFound(f"row {first}: the episode has rows 0 to {episode.frames - 1}")

@@ -23,7 +23,7 @@ QUALITY = 82
 
 
 def make_preview(journal: Path, target: Path, tell: Callable[[str], None]) -> int:
-    """Put <camera>.mp4 of every camera and thumbnail.jpg of the middle row into `target`; the number of rows.
+    """Put <camera>.mp4 of every camera, as far as it has pictures, and thumbnail.jpg into `target`; the number of rows.
 
     The folder appears whole or not at all, in the place of an older one. RecordingError names the file that
     is absent, damaged or cannot be written.
@@ -62,11 +62,15 @@ def _remove_drafts(target: Path) -> None:
 def _fill(episode: Episode, draft: Path, tell: Callable[[str], None]) -> None:
     for number, (camera, source) in enumerate(episode.videos.items(), 1):
         tell(f"camera {number} of {len(episode.videos)}")
+        if not episode.shown(camera):
+            continue  # lost before its first picture
         video = draft / f"{camera}.mp4"
-        remux(source, video, episode.frames, episode.layout.fps)
+        remux(source, video, episode.shown(camera), episode.layout.fps)
         _sync(video)
-    if episode.videos:
-        write_whole(draft / THUMBNAIL, thumbnail(next(iter(episode.videos.values())), episode.frames // 2))
+    shown = [camera for camera in episode.videos if episode.shown(camera)]
+    if shown:
+        middle = min(episode.frames // 2, episode.shown(shown[0]) - 1)
+        write_whole(draft / THUMBNAIL, thumbnail(episode.videos[shown[0]], middle))
     sync_folder(draft)
 
 

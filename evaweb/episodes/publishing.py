@@ -12,6 +12,7 @@ from typing import Any
 from evaweb.episodes.recorded import Recorded
 from runtime.recording.files import RecordingError
 
+DATASET_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _ROBOT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 
 
@@ -56,8 +57,10 @@ def success_of(path: Path) -> bool | None:
 def dataset_name(recorded: Recorded, *, scored: bool, simulated: bool) -> str:
     """Rollouts and demonstrations, real and simulated, scored and unscored ones are kept apart, robot by robot.
 
-    RecordingError where the robot's name cannot name a folder.
+    What was collected in a session goes where that says. RecordingError where a name cannot name a folder.
     """
+    if recorded.session.get("dataset"):
+        return session_dataset(str(recorded.session["dataset"]), simulated=simulated)
     robot = str(recorded.facts.get("robot", ""))
     if not _ROBOT.fullmatch(robot):
         raise RecordingError(
@@ -68,3 +71,12 @@ def dataset_name(recorded: Recorded, *, scored: bool, simulated: bool) -> str:
     parts += ["simulated"] if simulated else []
     parts += ["unscored"] if not demonstration and not scored else []
     return "-".join(parts)
+
+
+def session_dataset(name: str, *, simulated: bool) -> str:
+    """The folder of a session's dataset; RecordingError where the name cannot be one."""
+    if not DATASET_NAME.fullmatch(name):
+        raise RecordingError(
+            f"session.dataset is {name!r:.110}, must be letters, digits, '.', '_' and '-', the first no sign"
+        )
+    return f"{name}-simulated" if simulated else name

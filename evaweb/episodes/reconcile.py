@@ -5,27 +5,17 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 from uuid import UUID
 
 from django.db import DataError, IntegrityError
 
 from evaweb.episodes import services
-from evaweb.episodes.folders import (
-    data_dir,
-    datasets_dir,
-    episodes_dir,
-    journal_folder,
-    scores_dir,
-    scores_file,
-)
+from evaweb.episodes.folders import episodes_dir, scores_dir, scores_file
 from evaweb.episodes.models import Episode
-from evaweb.episodes.publishing import read_scores, success_of
+from evaweb.episodes.placing import places_read
+from evaweb.episodes.publishing import read_scores
 from evaweb.errors import EvaError
-from runtime.datasets.catalog import Catalog
-from runtime.datasets.layout import EVA_EPISODES
 from runtime.recording.files import RecordingError
 
 log = logging.getLogger(__name__)
@@ -84,7 +74,7 @@ def reconcile() -> Report:
             read.append(uuid)
     services.exports_asked(uuids=read)
     missing = services.missing_marked()
-    problems += _datasets()
+    problems += places_read()
     restored = _restored(read, problems)
     for problem in problems:
         log.warning("%s", problem)
@@ -113,45 +103,6 @@ def _folders() -> tuple[list[UUID], list[str]]:
         else:
             found.append(uuid)
     return found, problems
-
-
-def _datasets() -> list[str]:
-    root = datasets_dir()
-    folders = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
-    # Where an episode is in two, the one that knows its success counts.
-    folders.sort(key=lambda folder: not folder.name.endswith("-unscored"))
-    problems, successes = [], {}
-    for folder in folders:
-        try:
-            successes |= _places(folder)
-        except RecordingError as error:
-            problems.append(str(error))
-    for uuid, success in successes.items():
-        _publish_outdated(uuid, success)
-    return problems
-
-
-def _places(folder: Path) -> dict[UUID, bool | None]:
-    """Write down where the episodes of a dataset are; returns the success that it says of each."""
-    lines = Catalog.read(folder).eva
-    if not lines:
-        return {}
-    published_at = datetime.fromtimestamp((folder / EVA_EPISODES).stat().st_mtime, UTC)
-    name = str(folder.relative_to(data_dir()))
-    for line in lines:
-        place = {"dataset": name, "dataset_index": line["episode_index"]}
-        row = Episode.objects.filter(uuid=line["uuid"])
-        if not row.filter(**place).exists():
-            row.update(**place, published_at=published_at)
-    return {UUID(line["uuid"]): line.get("success") for line in lines}
-
-
-def _publish_outdated(uuid: UUID, success: bool | None) -> None:
-    """Have an episode published again that was scored, or scored otherwise, after it was; its job is lost."""
-    newest = success_of(scores_file(uuid))
-    if newest is not None and newest != success and journal_folder(uuid).is_dir():
-        for episode in Episode.objects.filter(uuid=uuid):
-            services.publish_asked(episode=episode)
 
 
 def _restored(read: Sequence[UUID], problems: list[str]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ class Recorded:
     trial: Mapping[str, Any]  # as the one who asked for the run named it; {} for none
     ended_at: datetime | None  # when the recording ended
     facts: Mapping[str, Any]
+    session: Mapping[str, Any] = field(default_factory=dict)  # of collecting: uuid and dataset; {} for none
 
     @property
     def closed(self) -> bool:
@@ -62,6 +63,7 @@ def recorded_in(folder: Path) -> Recorded:
         trial=_table(manifest, "trial"),
         ended_at=_time(outcome.get("ended_wall")),
         facts=facts | _end(path, outcome),
+        session=_table(manifest, "session"),
     )
 
 

@@ -13,9 +13,31 @@ from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.errors import NotFound
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import job_newest
+from evaweb.sight import EVERYTHING, Sight
 
-# What a page says of an episode beside its own facts; a trial is bound to it from above.
-_WITH = ("station", "trial__scene", "trial__position", "trial__checkpoint", "trial__verdict")
+# What a page says of an episode beside its own facts; trial and standing are bound to it from above.
+_WITH = (
+    "station",
+    "trial__scene",
+    "trial__position",
+    "trial__checkpoint",
+    "trial__verdict",
+    "trial__handout",
+    "standing__review",
+)
+
+# What the list can be narrowed to, each with its words.
+_ALL = ("all", Q())
+QUALITY = {
+    "clean": ("clean", Q(standing__clean=True)),
+    "flagged": ("flagged", Q(standing__clean=False)),
+    "unchecked": ("not checked", Q(standing__checked_at=None)),
+}
+REVIEW = {
+    "unreviewed": ("unreviewed", Q(standing__review=None, frames__gt=0) & ~Q(status=EpisodeStatus.RECORDING)),
+    "pass": ("passed", Q(standing__review__verdict="pass")),
+    "fail": ("failed", Q(standing__review__verdict="fail")),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +62,21 @@ def episode_get(*, uuid: UUID) -> Episode:
 
 
 def episode_list(
-    *, station: str = "", mode: str = "", status: str = "", words: str = ""
+    *,
+    station: str = "",
+    mode: str = "",
+    status: str = "",
+    quality: str = "",
+    review: str = "",
+    words: str = "",
+    sight: Sight = EVERYTHING,
 ) -> QuerySet[Episode]:
-    """The newest first; `words` are looked for in task, checkpoint, operator, scene and uuid."""
+    """The newest first; `words` are looked for in task, checkpoint, operator, scene, code and uuid.
+
+    In the names of checkpoints only as far as `sight` does not hide them.
+
+    `quality` is a key of QUALITY, `review` one of REVIEW; others choose nothing.
+    """
     newest = (F("started_at").desc(nulls_last=True), "-created_at")
     found = Episode.objects.select_related(*_WITH).order_by(*newest)
     if station:
@@ -51,10 +85,13 @@ def episode_list(
         found = found.filter(mode=mode)
     if status:
         found = found.filter(status=status)
+    found = found.filter(QUALITY.get(quality, _ALL)[1], REVIEW.get(review, _ALL)[1])
+    seen = ~Q(checkpoint__in=sight.names) & ~Q(trial__checkpoint__in=sight.checkpoints)
     for word in words.split():
         found = found.filter(
             Q(task__icontains=word)
-            | Q(checkpoint__icontains=word)
+            | (Q(checkpoint__icontains=word) & seen if not sight.clear else Q(checkpoint__icontains=word))
+            | Q(trial__handout__code__iexact=word)
             | Q(operator__icontains=word)
             | Q(trial__scene__title__icontains=word)
             | Q(uuid__icontains=word)

@@ -19,6 +19,7 @@ from evaweb.errors import EvaError
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import enqueue
 from evaweb.stations.models import Station
+from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError
 
 log = logging.getLogger(__name__)
@@ -115,14 +116,16 @@ def export_asked(*, episode: Episode) -> Job:
     return enqueue(kind="export", key=job_key(episode.uuid), args={"uuid": str(episode.uuid)})
 
 
-def publish_asked(*, episode: Episode) -> Job | None:
+def publish_asked(*, episode: Episode, version: str = "") -> Job | None:
     """Have the worker write the episode into its dataset, or write it anew with the score that counts now.
 
-    None for a run with a simulated robot, which no dataset ever holds.
+    `version` is that of a dataset that is new, "" for the usual one. None for a run with a simulated robot, which
+    no dataset ever holds.
     """
     if episode.mode == EpisodeMode.SIM:
         return None
-    return enqueue(kind="publish", key=f"publish:{episode.uuid}", args={"uuid": str(episode.uuid)})
+    args = {"uuid": str(episode.uuid)} | ({"version": version} if version else {})
+    return enqueue(kind="publish", key=f"publish:{episode.uuid}", args=args)
 
 
 def catch_up() -> int:
@@ -183,15 +186,16 @@ def _station_of(recorded: Recorded) -> Station:
         robot=recorded.facts.get("robot", ""),
         simulated=recorded.simulated,
         source=f"episode {recorded.uuid}",
+        active=recorded.facts["kind"] != IMPORTED,  # of those there is no bench
     )
 
 
-def station_known(*, name: str, robot: str, simulated: bool, source: str) -> Station:
+def station_known(*, name: str, robot: str, simulated: bool, source: str, active: bool = True) -> Station:
     """The station of that name; one that is not in the database any more is made from what `source` says."""
     station, made = Station.objects.get_or_create(
-        name=name, defaults={"robot": robot, "simulated": simulated, "title": name}
+        name=name, defaults={"robot": robot, "simulated": simulated, "title": name, "active": active}
     )
-    if made:
+    if made and active:
         log.warning("station %s was not in the database: made from %s", name, source)
     return station
 

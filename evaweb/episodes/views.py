@@ -15,6 +15,7 @@ from django.templatetags.static import static
 from django.urls import reverse
 from django.views.decorators.http import require_GET, require_POST
 
+import robots
 from evaweb.episodes import selectors, services
 from evaweb.episodes.curves import curves
 from evaweb.episodes.exporting import CONTENT_TYPE, table_file, table_of
@@ -26,11 +27,14 @@ from evaweb.episodes.selectors import episode_get, stage_of
 from evaweb.episodes.streaming import file_answer
 from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.roles import Role, require
+from evaweb.sight import sight_for
 from evaweb.stations.geometry import geometry
 from evaweb.stations.models import Station
+from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError, read_document
 
 PER_PAGE = 50
+FILTERS = ("station", "mode", "status", "quality", "review", "words")
 
 
 # --- pages ---------------------------------------------------------------------------------------------------
@@ -39,8 +43,9 @@ PER_PAGE = 50
 @require_GET
 def replay_list(request: HttpRequest) -> HttpResponse:
     """All episodes, the newest first."""
-    chosen = {name: request.GET.get(name, "").strip() for name in ("station", "mode", "status", "words")}
-    page = Paginator(selectors.episode_list(**chosen), PER_PAGE).get_page(request.GET.get("page"))
+    chosen = {name: request.GET.get(name, "").strip() for name in FILTERS}
+    found = selectors.episode_list(**chosen, sight=sight_for(request))
+    page = Paginator(found, PER_PAGE).get_page(request.GET.get("page"))
     rows = [(episode, stage_of(episode=episode)) for episode in page]
     context = {
         "page": page,
@@ -49,6 +54,9 @@ def replay_list(request: HttpRequest) -> HttpResponse:
         "stations": Station.objects.all(),
         "statuses": EpisodeStatus.choices,
         "modes": EpisodeMode.choices,
+        "qualities": [(key, words) for key, (words, _) in selectors.QUALITY.items()],
+        "reviews": [(key, words) for key, (words, _) in selectors.REVIEW.items()],
+        "narrowed": any(chosen.values()),
         "passing": any(stage.passing for _, stage in rows),
     }
     template = "episodes/rows.html" if request.headers.get("HX-Request") else "episodes/list.html"
@@ -65,7 +73,7 @@ def replay(request: HttpRequest, uuid: UUID) -> HttpResponse:
         "trial": selectors.trial_of(episode=episode),
         "stage": stage,
         "table": table_of(episode=episode),
-        "config": _config(episode) if stage.name == "ready" else None,
+        "config": replay_config(episode) | player() if stage.name == "ready" else None,
     }
     return render(request, "episodes/replay.html", context)
 
@@ -86,6 +94,7 @@ async def export(request: HttpRequest, uuid: UUID) -> HttpResponseBase:
     episode = await _known(uuid)
     if request.method == "POST":
         return await sync_to_async(_export_asked)(request, episode)
+    await sync_to_async(lambda: sight_for(request).require_episode(episode))()
     path = await sync_to_async(table_file)(uuid)
     return await file_answer(request, path, CONTENT_TYPE, path.name)
 
@@ -111,19 +120,24 @@ def preview(request: HttpRequest, uuid: UUID) -> HttpResponse:
     return redirect("replay", uuid=uuid)
 
 
-def _config(episode: Episode) -> dict[str, Any]:
-    """What the page's modules have to know."""
+def player() -> dict[str, Any]:
+    """What every page that plays needs, whatever it plays."""
+    return {"viewer": static("meshcat/main.min.js"), "uplot": static("uplot/uPlot.esm.js")}
+
+
+def replay_config(episode: Episode) -> dict[str, Any]:
+    """What the page's modules have to know of an episode; the first picture of a video is shown at its `start` [s]."""
     address = {
         name: reverse(f"episode-{name}", args=[episode.uuid]) for name in ("curves", "geometry", "poses")
     }
-    return {
-        **address,
-        "videos": [reverse("episode-video", args=[episode.uuid, camera]) for camera in episode.cameras],
-        "viewer": static("meshcat/main.min.js"),
-        "uplot": static("uplot/uPlot.esm.js"),
-        "fps": episode.fps,
-        "frames": episode.frames,
-    }
+    videos = [
+        {"camera": camera, "address": reverse("episode-video", args=[episode.uuid, camera]), "start": 0.0}
+        for camera in episode.cameras
+    ]
+    if episode.kind == IMPORTED and episode.robot not in robots.names():
+        called = f"calls its robot {episode.robot}" if episode.robot else "names no robot"
+        address |= {"geometry": "", "why": f"the dataset {called}: import it with --robot"}
+    return {**address, "videos": videos, "fps": episode.fps, "frames": episode.frames}
 
 
 # --- files ---------------------------------------------------------------------------------------------------
@@ -144,7 +158,7 @@ async def thumbnail(request: HttpRequest, uuid: UUID) -> HttpResponseBase:
 
 
 async def _known(uuid: UUID) -> Episode:
-    episode = await Episode.objects.filter(uuid=uuid).afirst()
+    episode = await Episode.objects.select_related("trial").filter(uuid=uuid).afirst()
     if episode is None:
         raise NotFound(f"episode {uuid} does not exist in this lab")
     return episode
@@ -153,8 +167,8 @@ async def _known(uuid: UUID) -> Episode:
 @require_GET
 def episode_curves(request: HttpRequest, uuid: UUID) -> HttpResponse:
     """Joint curves and events, as one message of evaweb.frames."""
-    episode_get(uuid=uuid)
-    return _message(lambda: curves(journal_folder(uuid)))
+    covered = sight_for(request).hides_episode(episode_get(uuid=uuid))
+    return _message(lambda: curves(journal_folder(uuid), covered=covered))
 
 
 @require_GET

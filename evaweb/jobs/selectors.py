@@ -7,6 +7,7 @@ from datetime import datetime
 
 from django.db.models import Exists, OuterRef, Q, QuerySet
 
+from evaweb.errors import NotFound
 from evaweb.jobs.models import Job, JobStatus
 
 
@@ -24,3 +25,11 @@ def jobs_ready(*, queues: Collection[str], now: datetime) -> QuerySet[Job]:
 def job_newest(*, key: str) -> Job | None:
     """The last job about `key`, whatever became of it."""
     return Job.objects.filter(key=key).order_by("-created_at", "-pk").first()
+
+
+def job_get(*, id: int) -> Job:
+    """The job of that number; NotFound where there is none."""
+    found = Job.objects.filter(pk=id).first()
+    if found is None:
+        raise NotFound(f"job {id} does not exist in this lab")
+    return found

@@ -17,6 +17,7 @@ from django.db import IntegrityError, transaction
 from django.db.models import F, QuerySet
 from django.utils import timezone
 
+from evaweb.errors import Conflict
 from evaweb.jobs import doorbell
 from evaweb.jobs.heartbeat import Heartbeat
 from evaweb.jobs.kinds import Args, Work, kind_named
@@ -64,7 +65,11 @@ def _waiting(kind: str, key: str, args: Args, queue: str) -> Job:
 
 
 def try_again(*, job: Job) -> Job:
-    """Ask anew for what a failed job was about."""
+    """Ask anew for what a failed job was about; Conflict where it has not failed."""
+    if job.status != JobStatus.FAILED:
+        raise Conflict(
+            f"job {job.pk} ({job.key}) is {job.get_status_display()}: only one that failed is tried again"
+        )
     return enqueue(kind=job.kind, key=job.key, args=job.args, queue=job.queue)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
@@ -52,8 +52,9 @@ def perform(visitor: Visitor, choice: Choice) -> Done:
     begun = time.monotonic()
     with closing(LivePage(visitor, choice.station)) as page:
         trial = start(visitor, page, choice)
-        resumed = _run(page, trial, float(visitor.get(f"trials/{trial}")["time_limit_s"]))
-        episode = _published(visitor, _score(visitor, trial)["episode"])
+        times = TruthTimes()
+        resumed = run_to_its_end(page, trial, float(visitor.get(f"trials/{trial}")["time_limit_s"]), times)
+        episode = _published(visitor, score_by_truth(visitor, trial, times)["episode"])
         scored = _whole(visitor, trial, episode)
     return Done(
         trial=trial,
@@ -78,13 +79,33 @@ def start(visitor: Visitor, page: LivePage, choice: Choice) -> int:
     named = {name: value for name, value in asdict(choice).items() if name != "station"}
     trial: int = visitor.post(f"stations/{choice.station}/trials", named)["id"]
     page.wait(lambda state: state["lease"]["epoch"] == page.epoch, _STOPPED_S, "waiting for the lease")
+    set_up_and_run(page, trial)
+    return trial
+
+
+def set_up_and_run(page: LivePage, trial: int) -> None:
+    """Set the station up for a prepared trial, and begin its run."""
     page.command("setup", trial)
     set_up = page.wait(lambda state: state["state"] != "setting_up", _READY_S, "setting up")
     if set_up["state"] != "ready":
         raise VisitFailed(f"set-up ended {set_up['state']}: {set_up['reason']}")
     page.command("run", trial)
-    page.wait(lambda state: state["state"] == "running", _STOPPED_S, "starting the run")
-    return trial
+    # One that holds at once, because an observation was late, has begun too: it is resumed.
+    page.wait(lambda state: state["state"] in ("running", "holding"), _STOPPED_S, "starting the run")
+
+
+@dataclass(slots=True)
+class TruthTimes:
+    """When the bench first said of each milestone that it is reached [s after the start of the run]."""
+
+    reached: dict[str, float] = field(default_factory=dict)
+
+    def note(self, state: Mapping[str, Any]) -> None:
+        """Take what a state of the run says."""
+        elapsed = float((state.get("run") or {}).get("elapsed") or 0.0)
+        for name, done in (state["truth"].get("milestones") or {}).items():
+            if done and state["state"] == "running":
+                self.reached.setdefault(name, round(elapsed, 2))
 
 
 def report(done: Done) -> dict[str, Any]:
@@ -92,7 +113,7 @@ def report(done: Done) -> dict[str, Any]:
     return asdict(done)
 
 
-def _run(page: LivePage, trial: int, limit: float) -> int:
+def run_to_its_end(page: LivePage, trial: int, limit: float, times: TruthTimes) -> int:
     """Watch until the bench says it is done or the run ends by itself; press Stop.
 
     Where it holds for a reason that passes (an observation that was late), resume a few times as an operator
@@ -102,6 +123,7 @@ def _run(page: LivePage, trial: int, limit: float) -> int:
 
     def over(state: Mapping[str, Any]) -> bool:
         nonlocal succeeded
+        times.note(state)
         if not state["truth"].get("success"):
             succeeded = 0.0
         elif not succeeded:
@@ -120,7 +142,7 @@ def _run(page: LivePage, trial: int, limit: float) -> int:
     return resumed
 
 
-def _score(visitor: Visitor, trial: int) -> Mapping[str, Any]:
+def score_by_truth(visitor: Visitor, trial: int, times: TruthTimes) -> Mapping[str, Any]:
     """Tick what the bench says was reached, once the trial waits to be scored and its truth is there."""
     facts = _poll(
         lambda: visitor.get(f"trials/{trial}"),
@@ -131,7 +153,13 @@ def _score(visitor: Visitor, trial: int) -> Mapping[str, Any]:
     milestones = visitor.get(f"scenes/{facts['scene']}")["milestones"]
     said = facts["truth"]["milestones"]
     reached = {str(milestone["id"]): bool(said.get(milestone["truth"])) for milestone in milestones}
-    content = {"milestones": reached, "note": "scored from the bench's truth", "source": "truth"}
+    when = {
+        str(milestone["id"]): times.reached.get(milestone["truth"])
+        for milestone in milestones
+        if reached[str(milestone["id"])]
+    }
+    words = {"note": "scored from the bench's truth", "source": "truth"}
+    content = {"milestones": reached, "times": when, **words}
     visitor.post(f"trials/{trial}/score", content)
     scored: Mapping[str, Any] = visitor.get(f"trials/{trial}")
     return scored

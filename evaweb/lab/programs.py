@@ -50,15 +50,30 @@ def tabletop(robot: str, seed: int) -> Program:
     )
 
 
-def policy(name: str, robot: str, options: Sequence[str]) -> Program:
-    """A scripted policy that looks at the pictures, on a free port that it keeps."""
+def leader(robot: str, observations: str, seed: int) -> Program:
+    """Somebody who shows the simulated bench's task with a leader arm, on a free port that it keeps."""
+
+    def arguments(endpoint: str) -> tuple[str, ...]:
+        watching = ("-m", "runtime.sim.leader", "--robot", robot, "--obs-endpoint", observations)
+        return (*watching, "--seed", str(seed), "--endpoint", endpoint)
+
+    return Program(
+        "leader",
+        arguments("tcp://127.0.0.1:0"),
+        announces=True,
+        again=lambda found: arguments(found["endpoint"]),
+    )
+
+
+def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> Program:
+    """A scripted policy that looks at the pictures, on that port, or on a free one that it keeps."""
 
     def arguments(port: object) -> tuple[str, ...]:
         serving = ("-m", "runtime.sim.serve", "openpi", "--robot", robot, "--behaviour", "pick_place")
         return (*serving, "--name", name, "--port", str(port), *options)
 
     return Program(
-        f"policy-{name}", arguments(0), announces=True, again=lambda found: arguments(_port(found))
+        f"policy-{name}", arguments(port), announces=True, again=lambda found: arguments(_port(found))
     )
 
 

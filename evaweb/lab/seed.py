@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from django.contrib.auth.models import User
 from django.db import transaction
 
+from evaweb.plans.documents import checkpoint_of
+from evaweb.plans.models import Plan, PlanState
+from evaweb.plans.services import plan_amend, plan_freeze
 from evaweb.roles import Role, grant
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
@@ -102,6 +105,38 @@ def demo_scene() -> Scene:
                 truth=step.truth,
             )
     return scene
+
+
+_PLAN_CHANGED = "the demo's policy servers listen elsewhere this time"
+
+
+def demo_plan(
+    *, name: str, title: str, owner: str, scene: Scene, checkpoints: Sequence[Checkpoint], repetitions: int
+) -> Plan:
+    """A blind plan that compares two checkpoints at all positions of a scene, frozen; one that is there is brought up
+    to date. Conflict where it cannot be, because trials of it are not finished."""
+    user = User.objects.get(username=owner)
+    plan = Plan.objects.filter(name=name).order_by("-version").first()
+    if plan is None:
+        first, second = checkpoints
+        plan = Plan.objects.create(
+            name=name,
+            title=title,
+            question=f"Does {first} put the block on the plate more often than {second}?",
+            owner=user,
+            repetitions=repetitions,
+            first=first,
+            second=second,
+            stopping="evidence",
+        )
+        plan.positions.set(scene.positions.all())
+        plan.checkpoints.set(checkpoints)
+    if plan.state == PlanState.FROZEN:
+        now = {row.name: checkpoint_of(row) for row in plan.checkpoints.all()}
+        if now == {row["name"]: row for row in (plan.document or {})["checkpoints"]}:
+            return plan
+        plan = plan_amend(user=user, plan=plan, reason=_PLAN_CHANGED)
+    return plan_freeze(user=user, plan=plan) if plan.state == PlanState.DRAFT else plan
 
 
 def demo_checkpoint(*, name: str, description: str, policy: Mapping[str, object]) -> Checkpoint:

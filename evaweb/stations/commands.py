@@ -30,9 +30,11 @@ from runtime.bus import CodecError
 
 log = logging.getLogger(__name__)
 STOPPING = ("stop", "halt", "estop")  # never stale; the runtime has the same list
+COLLECTING = ("arm", "disarm", "label", "discard")
 KINDS = (
     *("setup", "run", "stop", "halt", "resume", "home", "release", "record_start", "record_stop", "estop"),
     *("tune", "step", "commit", "cancel", "move", "gripper", "approach"),
+    *COLLECTING,
 )
 _UNANSWERED = (CommandStatus.PRESSED, CommandStatus.UNKNOWN)
 _NOTE_S = 0.5  # for which the answer to a stopping command is kept by its row; then the row is written later

@@ -34,6 +34,7 @@ class Station(models.Model):
     message = models.CharField(
         max_length=240, blank=True, help_text="Shown to everybody, e.g. why it is switched off."
     )
+    collects = models.BooleanField(default=False, editable=False)  # as its runtime last said
     # How far its events are in the database; they start anew with each boot of the runtime.
     boot = models.CharField(max_length=64, blank=True, editable=False)
     last_event = models.PositiveBigIntegerField(default=0, editable=False)

@@ -76,7 +76,7 @@ class MilestoneInline(admin.TabularInline):
 
     model = Milestone
     extra = 0
-    fields = ("order", "text", "points", "required", "truth")
+    fields = ("order", "text", "points", "required", "time_limit_s", "truth")
 
 
 class ActiveActions:
@@ -112,7 +112,7 @@ class SceneAdmin(ActiveActions, admin.ModelAdmin):
     formfield_overrides = _SHORT
     fieldsets = (
         (None, {"fields": (("title", "name"), "instruction", "active")}),
-        ("At the bench", {"fields": ("layout", "criterion", "time_limit_s")}),
+        ("At the bench", {"fields": ("layout", "criterion", "time_limit_s", "ordered")}),
     )
 
     def get_queryset(self, request: HttpRequest) -> QuerySet[Scene]:
@@ -167,11 +167,28 @@ class SceneAdmin(ActiveActions, admin.ModelAdmin):
 class CheckpointForm(forms.ModelForm):
     """A policy, and how it is reached."""
 
-    policy = Table(required=False, help_text=Checkpoint._meta.get_field("policy").help_text)
+    policy = Table(
+        required=False,
+        help_text=Checkpoint._meta.get_field("policy").help_text
+        + ' Over SSH: {"url": "ws://127.0.0.1:8000", "tunnel": {"host": "gpu-1.lab", "user": "lab"}}, the url as seen '
+        "from that host. Never a key or a password here: a key is named by its path on the station's machine.",
+    )
 
     class Meta:
         model = Checkpoint
-        fields = ("name", "description", "policy", "active")
+        fields = ("name", "description", "digest", "parent", "tags", "policy", "active")
+
+    tags = forms.CharField(required=False, help_text="Words, with commas between them: to find it by.")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.initial["tags"] = ", ".join(self.instance.tags)
+
+    def clean_tags(self) -> list[str]:
+        """The words, each once."""
+        return list(
+            dict.fromkeys(word for part in self.cleaned_data["tags"].split(",") if (word := part.strip()))
+        )
 
     def clean_policy(self) -> dict[str, Any]:
         """An empty field is an empty table: everything as in the deployment."""
@@ -185,17 +202,19 @@ class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
 
     form = CheckpointForm
     formfield_overrides = _SHORT
-    list_display = ("name", "active", "reached_at", "trials_n", "created_at")
+    list_display = ("name", "tagged", "active", "reached_at", "trials_n", "created_at")
     list_filter = ("active",)
-    search_fields = ("name", "description")
+    search_fields = ("name", "description", "digest", "tags")
+    autocomplete_fields = ("parent",)
 
     def get_queryset(self, request: HttpRequest) -> QuerySet[Checkpoint]:
         """With the number of trials."""
         return super().get_queryset(request).annotate(n_trials=Count("trials"))
 
     def get_readonly_fields(self, request: HttpRequest, obj: Checkpoint | None = None) -> tuple[str, ...]:
-        """The name is in every manifest from the first trial on."""
-        return ("name",) if obj and obj.trials.exists() else ()
+        """The name is in every manifest from the first trial on; those trials were of these weights."""
+        tried = bool(obj and obj.trials.exists())
+        return ("name", *(("digest",) if obj and obj.digest else ())) if tried else ()
 
     def save_model(self, request: HttpRequest, obj: Checkpoint, form: Any, change: bool) -> None:
         """Say so where trials were made with another table."""
@@ -208,11 +227,19 @@ class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
                 "not only another address, make another checkpoint: all would be counted together.",
             )
 
+    @admin.display(description="tags")
+    def tagged(self, checkpoint: Checkpoint) -> str:
+        """Its tags."""
+        return ", ".join(checkpoint.tags)
+
     @admin.display(description="policy")
     def reached_at(self, checkpoint: Checkpoint) -> str:
         """Its address, where it has one."""
         policy = checkpoint.policy if isinstance(checkpoint.policy, dict) else {}
-        return str(policy.get("url") or policy.get("path") or policy.get("kind") or "as deployed")
+        place = str(policy.get("url") or policy.get("path") or policy.get("kind") or "as deployed")
+        tunnel = policy.get("tunnel")
+        host = tunnel.get("host") if isinstance(tunnel, dict) else None
+        return f"{place} through {host}" if host else place
 
     @admin.display(description="trials", ordering="n_trials")
     def trials_n(self, checkpoint: Checkpoint) -> int:
@@ -292,7 +319,7 @@ class OutcomeInline(ReadOnly, admin.TabularInline):
 
     model = MilestoneOutcome
     extra = 0
-    fields = ("order", "text", "points", "required", "reached")
+    fields = ("order", "text", "points", "required", "reached", "at_s")
     readonly_fields = fields
 
 

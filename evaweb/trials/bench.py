@@ -15,6 +15,7 @@ from django.db import transaction
 from evaweb.errors import Conflict, EvaError
 from evaweb.frames import plain
 from evaweb.roles import Role, require
+from evaweb.sight import sight_of
 from evaweb.stations.commands import identity_of, issue
 from evaweb.stations.models import CARRIED_OUT, NOT_CARRIED_OUT, Command
 from evaweb.stations.selectors import last_set_up
@@ -23,6 +24,7 @@ from evaweb.trials import lifecycle
 from evaweb.trials.facts import trial_facts
 from evaweb.trials.following import run_begun
 from evaweb.trials.models import Checkpoint, Trial, TrialStatus
+from evaweb.trials.services import checked
 
 
 def trial_command(
@@ -80,8 +82,13 @@ def _policy_args(checkpoint: Checkpoint) -> dict[str, Any]:
 
 
 def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
-    """What the station needs to know for this trial; `reset` names this laying out of a simulated bench."""
+    """What the station needs to know for this trial; `reset` names this laying out of a simulated bench.
+
+    It connects, warms up and asks the policy each time, also where the same checkpoint comes twice.
+    """
     args: dict[str, Any] = {"task": trial.instruction, **_policy_args(trial.checkpoint)}
+    if trial.strategy is not None:
+        args["strategy"] = trial.strategy
     if trial.station.simulated and trial.seed is not None:
         args["bench"] = {"id": str(reset), "seed": trial.seed, "positions": trial.position.bench}
     return args
@@ -102,7 +109,7 @@ def run_args(trial: Trial, user: User) -> dict[str, Any]:
 def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
     first = Command.objects.filter(pk=given["uuid"]).first()
     if first is None:
-        _require_prepared(trial, "set up")
+        _require_prepared(trial, "set up", given["user"])
     args = setup_args(trial, given["uuid"])
     if first is not None:
         _require_same(first, trial, trial.setup == first.pk or first.args == plain(args))
@@ -121,9 +128,10 @@ def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
 def _run(trial: Trial, given: Mapping[str, Any]) -> Command:
     first = Command.objects.filter(pk=given["uuid"]).first()
     if first is None:
-        _require_prepared(trial, "run")
+        _require_prepared(trial, "run", given["user"])
         _require_set_up(trial)
-        _require_loaded(trial)
+        _require_loaded(trial, given["user"])
+        checked("run", trial, given["user"])
     else:
         _require_same(first, trial, _is_about(first, trial))
     args = first.args if first else run_args(trial, given["user"])
@@ -135,7 +143,7 @@ def _run(trial: Trial, given: Mapping[str, Any]) -> Command:
     return row
 
 
-def _require_prepared(trial: Trial, what: str) -> None:
+def _require_prepared(trial: Trial, what: str, user: User) -> None:
     status = TrialStatus(_held_status(trial))
     if status is not TrialStatus.PREPARED:
         raise Conflict(
@@ -144,7 +152,7 @@ def _require_prepared(trial: Trial, what: str) -> None:
         )
     if not trial.checkpoint.active:
         raise Conflict(
-            f"checkpoint {trial.checkpoint.name} was switched off since trial {trial.pk} was prepared: "
+            f"checkpoint {sight_of(user).label(trial)} was switched off since trial {trial.pk} was prepared: "
             "abandon it, and choose another one"
         )
 
@@ -161,16 +169,18 @@ def _require_set_up(trial: Trial) -> None:
         )
 
 
-def _require_loaded(trial: Trial) -> None:
+def _require_loaded(trial: Trial, user: User) -> None:
     """Whoever set the station up last, a terminal included: this is the checkpoint that it would run.
 
     What changes after this look makes the run stale, which the station refuses by itself.
     """
     told = wire_to(trial.station.name).status().get("checkpoint") or {}
     if told.get("id") != trial.checkpoint_id:
+        seen = sight_of(user)
+        other = "another checkpoint" if told.get("id") in seen.checkpoints else told.get("name")
         raise Conflict(
-            f"{trial.station.name} was set up for {told.get('name') or 'no checkpoint'} by somebody else, "
-            f"not for {trial.checkpoint.name}: press Set up again"
+            f"{trial.station.name} was set up for {other or 'no checkpoint'} by somebody else, "
+            f"not for {seen.label(trial)}: press Set up again"
         )
 
 

@@ -21,6 +21,7 @@ def trial_facts(trial: Trial) -> dict[str, Any]:
         "number": trial.number,
         "attempt": trial.attempt,
         "seed": trial.seed,
+        "strategy": trial.strategy,
         "instruction": trial.instruction,
         "time_limit_s": trial.time_limit_s,
         "station": trial.station.name,

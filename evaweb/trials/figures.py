@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import groupby
 
+from evaweb.statistics.proportions import Proportion
 from evaweb.trials.models import Scene
 from evaweb.trials.selectors import StatisticsRow
-from evaweb.trials.statistics import Proportion
 
 _WIDTH, _PAD = 200, 6
 

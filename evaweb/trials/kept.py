@@ -38,6 +38,7 @@ class KeptTrial(_Read):
     number: _Count
     attempt: _Small
     seed: _Count | None = None
+    strategy: dict[str, Any] | None = None
     instruction: str
     time_limit_s: _Seconds | None = None
     station: Annotated[str, Field(min_length=1, max_length=63)]
@@ -59,6 +60,7 @@ class KeptOutcome(_Read):
     points: _Small
     required: StrictBool
     reached: StrictBool
+    at_s: _Seconds | None = None
 
 
 class KeptScore(_Read):

@@ -5,13 +5,14 @@ from __future__ import annotations
 import uuid
 
 from django.conf import settings
-from django.core.validators import MaxValueValidator, MinValueValidator
+from django.core.exceptions import ValidationError
+from django.core.validators import MaxValueValidator, MinValueValidator, RegexValidator
 from django.db import models
 from django.utils import timezone
 
 from evaweb.episodes.models import Episode
 from evaweb.stations.models import Station
-from evaweb.trials.tables import check_bench, check_policy
+from evaweb.trials.tables import check_bench, check_policy, check_tags
 
 
 class Scene(models.Model):
@@ -30,6 +31,9 @@ class Scene(models.Model):
         blank=True,
         validators=[MinValueValidator(1), MaxValueValidator(3600)],
         help_text="A run ends by itself after this many seconds.",
+    )
+    ordered = models.BooleanField(
+        "milestones in order", default=False, help_text="One counts only after all those before it."
     )
     active = models.BooleanField(default=True, help_text="Off: not offered to operators.")
     created_at = models.DateTimeField(auto_now_add=True)
@@ -73,6 +77,13 @@ class Milestone(models.Model):
         default=1, validators=[MinValueValidator(1), MaxValueValidator(100)]
     )
     required = models.BooleanField(default=False, help_text="Without it the trial is no success.")
+    time_limit_s = models.FloatField(
+        "time limit [s]",
+        null=True,
+        blank=True,
+        validators=[MinValueValidator(0.1), MaxValueValidator(3600)],
+        help_text="Reached later than this after the start of the run it does not count.",
+    )
     truth = models.CharField(
         max_length=40,
         blank=True,
@@ -88,10 +99,32 @@ class Milestone(models.Model):
 
 
 class Checkpoint(models.Model):
-    """A trained policy and how it is reached."""
+    """A trained policy: which weights, trained on from what, and how it is reached."""
 
     name = models.CharField(max_length=120, unique=True)
     description = models.TextField(blank=True, help_text="Trained on what, for how long, by whom.")
+    digest = models.CharField(
+        "digest of the weights",
+        max_length=128,
+        blank=True,
+        validators=[
+            RegexValidator(
+                r"\A[A-Za-z0-9][A-Za-z0-9:._@+/=-]{6,127}\Z",
+                "%(value)s was given; allowed: 7 to 128 letters, digits and :._@+/=-, such as sha256:9f86d0…",
+            )
+        ],
+        help_text="Tells these weights from all others: sha256:…, a commit, a revision of a hub. Frozen with a plan.",
+    )
+    parent = models.ForeignKey(
+        "self",
+        null=True,
+        blank=True,
+        on_delete=models.PROTECT,
+        related_name="children",
+        verbose_name="trained on from",
+        help_text="The checkpoint that training went on from.",
+    )
+    tags = models.JSONField(default=list, blank=True, validators=[check_tags], help_text="To find it by.")
     policy = models.JSONField(
         default=dict,
         blank=True,
@@ -106,6 +139,23 @@ class Checkpoint(models.Model):
 
     def __str__(self) -> str:
         return self.name
+
+    @property
+    def lineage(self) -> list[Checkpoint]:
+        """Those that training went on from, the nearest first."""
+        found: list[Checkpoint] = []
+        above = self.parent
+        while above is not None and above not in found:
+            found.append(above)
+            above = above.parent
+        return found
+
+    def clean(self) -> None:
+        """Nothing is trained on from itself."""
+        if self.pk is not None and self in self.lineage:
+            raise ValidationError(
+                {"parent": f"{self.parent} was trained on from {self}; allowed: one that was not, or none"}
+            )
 
 
 class Evaluation(models.Model):
@@ -186,6 +236,9 @@ class Trial(models.Model):
     reason = models.TextField(blank=True, help_text="Why it is where it is, in one sentence.")
     instruction = models.TextField(help_text="As the policy was given it.")
     time_limit_s = models.FloatField(null=True, blank=True)
+    strategy = models.JSONField(
+        null=True, blank=True, help_text="The [strategy] table of its plan; none: as the station has it."
+    )
     seed = models.PositiveIntegerField(null=True, blank=True, help_text="Of a simulated bench.")
     episode = models.OneToOneField(
         Episode, null=True, blank=True, on_delete=models.PROTECT, related_name="trial"
@@ -247,6 +300,7 @@ class Trial(models.Model):
             models.Index(fields=("station", "status")),
             models.Index(fields=("station", "-changed_at")),
             models.Index(fields=("station", "-prepared_at")),
+            models.Index(fields=("-prepared_at", "-id"), name="trial_newest"),
         ]
 
     def __str__(self) -> str:
@@ -296,6 +350,7 @@ class MilestoneOutcome(models.Model):
     points = models.PositiveSmallIntegerField()
     required = models.BooleanField()
     reached = models.BooleanField()
+    at_s = models.FloatField(null=True, blank=True, help_text="When, after the start of the run [s].")
 
     class Meta:
         ordering = ("score", "order")

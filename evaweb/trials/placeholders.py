@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import logging
-
-from django.contrib.auth.models import User
-
 from evaweb.episodes.services import station_known
 from evaweb.stations.models import Station
 from evaweb.trials.kept import KeptTrial
 from evaweb.trials.models import Checkpoint, Evaluation, Position, Scene
 from evaweb.trials.services import open_bench
-
-log = logging.getLogger(__name__)
 
 LOST = "Known from recordings alone: the database was lost."
 
@@ -68,13 +62,3 @@ def position(scene: Scene, number: int) -> Position:
     words = f"{LOST} Write down again where things stand."
     found, _ = Position.objects.get_or_create(scene=scene, number=number, defaults={"description": words})
     return found
-
-
-def user(name: str) -> User:
-    """The account of that name; one that is gone is made again, deactivated and without a password."""
-    user, made = User.objects.get_or_create(username=name or "unknown", defaults={"is_active": False})
-    if made:
-        user.set_unusable_password()
-        user.save()
-        log.warning("user %s was not in the database: made, deactivated", user.username)
-    return user

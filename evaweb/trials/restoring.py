@@ -23,6 +23,7 @@ from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import Kept, restores
 from evaweb.episodes.recorded import CLOSED, recorded_in
 from evaweb.errors import EvaError
+from evaweb.roles import known_person
 from evaweb.trials import lifecycle, placeholders
 from evaweb.trials.kept import KeptOutcome, KeptScore, KeptTrial, KeptVoid, kept_line, kept_trial
 from evaweb.trials.models import (
@@ -125,9 +126,10 @@ def _made(facts: KeptTrial, episode: Episode | None) -> Trial:
         pk=None if Trial.objects.filter(pk=facts.id).exists() else facts.id,
         uuid=facts.uuid,
         station=station,
-        operator=placeholders.user((episode.operator if episode else "") or facts.operator),
+        operator=known_person((episode.operator if episode else "") or facts.operator),
         instruction=facts.instruction,
         time_limit_s=facts.time_limit_s,
+        strategy=facts.strategy,
         seed=facts.seed,
         **key,
         **(course | _numbered(facts, key, course["reason"])),
@@ -200,7 +202,7 @@ def _score(trial: Trial, line: KeptScore) -> None:
     score = Score.objects.create(
         uuid=line.uuid,
         trial=trial,
-        rater=placeholders.user(line.rater),
+        rater=known_person(line.rater),
         success=line.success,
         score=line.score,
         note=line.note,
@@ -220,7 +222,7 @@ def _milestones(scene: Scene, outcomes: Sequence[KeptOutcome]) -> dict[tuple[int
     """The scene's by order and words; a scene that was made here gets those of the first score that has any."""
     if not scene.active and scene.criterion.startswith(placeholders.LOST) and not scene.milestones.exists():
         for each in outcomes:
-            Milestone.objects.create(scene=scene, **each.model_dump(exclude={"reached"}))
+            Milestone.objects.create(scene=scene, **each.model_dump(exclude={"reached", "at_s"}))
     return {(milestone.order, milestone.text): milestone for milestone in scene.milestones.all()}
 
 
@@ -229,7 +231,7 @@ def _judged(trial: Trial, lines: Sequence[KeptScore | KeptVoid]) -> None:
     void = next((line for line in lines if isinstance(line, KeptVoid)), None)
     if void is not None and trial.status != TrialStatus.VOIDED:
         trial.status, trial.reason = TrialStatus.VOIDED, void.reason
-        trial.voided_by, trial.voided_at = placeholders.user(void.by), void.at
+        trial.voided_by, trial.voided_at = known_person(void.by), void.at
         trial.save()
     elif lines and trial.status not in _JUDGED:
         trial.status = TrialStatus.SCORED

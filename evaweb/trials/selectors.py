@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, time
 from typing import TypeVar
 
-from django.db.models import Count, Model, Prefetch, Q, QuerySet
+from django.db.models import Count, Max, Model, Prefetch, Q, QuerySet, Sum, TextField
+from django.db.models.functions import Cast
 from django.utils import timezone
 from django.utils.dateparse import parse_date, parse_datetime
 
 from evaweb.errors import EvaError, NotFound
+from evaweb.remembered import Kept
+from evaweb.sight import EVERYTHING, Sight
 from evaweb.stations.models import Command, Station
+from evaweb.statistics.proportions import Summary, summary
 from evaweb.trials import lifecycle
 from evaweb.trials.models import Checkpoint, Evaluation, Position, Scene, Score, Trial, TrialStatus
-from evaweb.trials.statistics import Summary, summary
 
 UNFINISHED = (*lifecycle.OPEN, TrialStatus.ENDED)
 _Named = TypeVar("_Named", bound=Model)
@@ -31,9 +34,9 @@ def scene_get(*, name: str | int) -> Scene:
     return _by_name(Scene.objects.all(), "scene", name)
 
 
-def checkpoint_get(*, name: str | int) -> Checkpoint:
-    """The checkpoint of that name or id; NotFound lists those that there are."""
-    return _by_name(Checkpoint.objects.all(), "checkpoint", name)
+def checkpoint_get(*, name: str | int, sight: Sight = EVERYTHING) -> Checkpoint:
+    """The checkpoint of that name or id; NotFound lists those that there are. What is hidden is not there."""
+    return _by_name(_checkpoints(sight), "checkpoint", name)
 
 
 def evaluation_get(*, name: str | int) -> Evaluation:
@@ -69,9 +72,20 @@ def scene_list(*, all_of_them: bool = False) -> QuerySet[Scene]:
     return rows if all_of_them else rows.filter(active=True)
 
 
-def checkpoint_list(*, all_of_them: bool = False) -> QuerySet[Checkpoint]:
-    """Checkpoints: those offered to operators, or all."""
-    return Checkpoint.objects.all() if all_of_them else Checkpoint.objects.filter(active=True)
+def checkpoint_list(
+    *, all_of_them: bool = False, tag: str = "", sight: Sight = EVERYTHING
+) -> QuerySet[Checkpoint]:
+    """Checkpoints: those offered to operators, or all; those with that tag, if one is given; none that are hidden."""
+    rows = _checkpoints(sight)
+    if tag:  # between its quotes: a tag has none, and not every database looks into lists
+        rows = rows.annotate(written=Cast("tags", TextField())).filter(written__contains=f'"{tag}"')
+    return rows if all_of_them else rows.filter(active=True)
+
+
+def _checkpoints(sight: Sight) -> QuerySet[Checkpoint]:
+    """Those that are not hidden, each without a parent that is."""
+    rows: QuerySet[Checkpoint] = sight.open(Checkpoint.objects.all(), "pk")
+    return rows.prefetch_related(Prefetch("parent", queryset=sight.open(Checkpoint.objects.all(), "pk")))
 
 
 def evaluation_list() -> QuerySet[Evaluation]:
@@ -97,7 +111,8 @@ def trial_get(*, id: int) -> Trial:
     return found
 
 
-_NAMED = ("evaluation", "checkpoint", "scene", "position", "station", "operator", "verdict")
+# The handout is bound to it from above, by evaweb.plans.
+_NAMED = ("evaluation", "checkpoint", "scene", "position", "station", "operator", "verdict", "handout")
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,12 +126,15 @@ class TrialFilters:
     status: str = ""
     since: str = ""
 
-    def apply(self, trials: QuerySet[Trial]) -> QuerySet[Trial]:
-        """The trials that fit; raises NotFound or EvaError that names what is allowed."""
+    def apply(self, trials: QuerySet[Trial], sight: Sight = EVERYTHING) -> QuerySet[Trial]:
+        """The trials that fit; raises NotFound or EvaError that names what is allowed.
+
+        A checkpoint that is hidden from `sight` does not exist: whoever may ask which trials are of it knows it.
+        """
         if self.evaluation:
             trials = trials.filter(evaluation=evaluation_get(name=self.evaluation))
         if self.checkpoint:
-            trials = trials.filter(checkpoint=checkpoint_get(name=self.checkpoint))
+            trials = trials.filter(checkpoint=checkpoint_get(name=self.checkpoint, sight=sight))
         if self.scene:
             trials = trials.filter(scene=scene_get(name=self.scene))
         if self.station:
@@ -128,15 +146,17 @@ class TrialFilters:
         return trials
 
 
-def trial_list(filters: TrialFilters | None = None) -> QuerySet[Trial]:
+def trial_list(filters: TrialFilters | None = None, sight: Sight = EVERYTHING) -> QuerySet[Trial]:
     """Trials that fit, the newest first, with what names them."""
     rows = Trial.objects.select_related(*_NAMED, "verdict__rater").order_by("-prepared_at", "-pk")
-    return (filters or TrialFilters()).apply(rows)
+    return (filters or TrialFilters()).apply(rows, sight)
 
 
-def trials_in_pages(filters: TrialFilters, *, size: int = 1000) -> Iterator[list[Trial]]:
+def trials_in_pages(
+    filters: TrialFilters, *, sight: Sight = EVERYTHING, size: int = 1000
+) -> Iterator[list[Trial]]:
     """All trials that fit, the oldest first, a page at a time: for exports of any length."""
-    rows = trial_list(filters).order_by("pk").prefetch_related("verdict__outcomes")
+    rows = trial_list(filters, sight).order_by("pk").prefetch_related("verdict__outcomes")
     last = 0
     while page := list(rows.filter(pk__gt=last)[:size]):
         yield page
@@ -177,10 +197,14 @@ class StatisticsRow:
     voided: int
 
 
-def statistics(filters: TrialFilters | None = None) -> list[StatisticsRow]:
-    """Per scene and checkpoint, both by name: only scored trials count, what else was run is beside them."""
-    trials = (filters or TrialFilters()).apply(Trial.objects.order_by())
-    cells = _scored_cells(trials)
+def statistics(filters: TrialFilters | None = None, sight: Sight = EVERYTHING) -> list[StatisticsRow]:
+    """Per scene and checkpoint, both by name: only scored trials count, what else was run is beside them.
+
+    Trials of hidden checkpoints are left out.
+    """
+    which = filters or TrialFilters()
+    trials = which.apply(sight.open(Trial.objects.order_by()), sight)
+    cells = _summaries.get((which, sight.checkpoints), _fingerprint(trials), lambda: _summarised(trials))
     others = _other_counts(trials)
     keys = {*cells, *others}
     scenes = Scene.objects.in_bulk({scene for scene, _ in keys})
@@ -189,7 +213,7 @@ def statistics(filters: TrialFilters | None = None) -> list[StatisticsRow]:
         StatisticsRow(
             scenes[scene],
             checkpoints[checkpoint],
-            _summary(cells.get((scene, checkpoint), [])),
+            cells.get((scene, checkpoint)) or _summary([]),
             others[scene, checkpoint][TrialStatus.ENDED],
             others[scene, checkpoint][TrialStatus.INTERRUPTED],
             others[scene, checkpoint][TrialStatus.VOIDED],
@@ -200,6 +224,24 @@ def statistics(filters: TrialFilters | None = None) -> list[StatisticsRow]:
 
 
 _Cell = tuple[int, int]  # scene, checkpoint
+_summaries: Kept[dict[_Cell, Summary]] = Kept()
+
+
+def _fingerprint(trials: QuerySet[Trial]) -> Hashable:
+    """Changes whenever a summary of these trials would."""
+    scored = Q(status=TrialStatus.SCORED)
+    counted = trials.aggregate(
+        n=Count("pk", filter=scored),
+        verdicts=Sum("verdict_id", filter=scored),
+        newest=Max("verdict_id", filter=scored),
+        seconds=Sum("duration_s", filter=scored),
+        changed=Max("changed_at"),
+    )
+    return tuple(counted.values())
+
+
+def _summarised(trials: QuerySet[Trial]) -> dict[_Cell, Summary]:
+    return {cell: _summary(outcomes) for cell, outcomes in _scored_cells(trials).items()}
 
 
 def _scored_cells(trials: QuerySet[Trial]) -> dict[_Cell, list[tuple[bool, float, float | None]]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from django.contrib.auth.models import User
@@ -11,6 +11,7 @@ from django.db import IntegrityError, transaction
 from django.db.models import Max
 from django.utils import timezone
 
+from evaweb.episodes.lines import text
 from evaweb.episodes.services import publish_asked
 from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.roles import Role, require
@@ -29,19 +30,35 @@ from evaweb.trials.models import (
     TrialStatus,
 )
 from evaweb.trials.selectors import trial_open
-from evaweb.trials.verdicts import LONGEST_FAILURE, LONGEST_NOTE, Verdict, text, verdict
+from evaweb.trials.verdicts import LONGEST_FAILURE, LONGEST_NOTE, Verdict, verdict
 
 __all__ = [
+    "checked",
+    "declare_check",
     "open_bench",
     "run_changed",
     "trial_abandon",
+    "trial_create",
     "trial_prepare",
     "trial_score",
     "trial_void",
 ]
 
 HIGHEST_SEED = 2**31 - 1
+Check = Callable[[str, Trial, Any], None]
+_checks: list[Check] = []
 _TRIES = 5  # to get a number that nobody else takes at the same moment
+
+
+def declare_check(check: Check) -> None:
+    """`check` is asked before a trial is "run" or "voided", with the trial and who wants it; it raises EvaError."""
+    _checks.append(check)
+
+
+def checked(what: str, trial: Trial, user: Any) -> None:
+    """Ask those who were declared."""
+    for check in _checks:
+        check(what, trial, user)
 
 
 # --- preparing ---------------------------------------------------------------------------------------------
@@ -103,14 +120,6 @@ def _prepared(
     checkpoint: Checkpoint,
     seed: int | None,
 ) -> Trial:
-    Station.objects.select_for_update().get(pk=station.pk)  # one at a time
-    unfinished = trial_open(station)
-    if unfinished is not None:
-        status = TrialStatus(unfinished.status)
-        raise Conflict(
-            f"trial {unfinished.pk} of {station.name} is {status.label}: {lifecycle.advice(status)}, "
-            "then prepare the next one"
-        )
     evaluation = open_bench(station)
     key = {
         "evaluation": evaluation,
@@ -120,10 +129,55 @@ def _prepared(
         "position": position,
     }
     number, attempt = _next_attempt(key)
+    return trial_create(
+        user=user,
+        station=station,
+        evaluation=evaluation,
+        scene=scene,
+        position=position,
+        checkpoint=checkpoint,
+        number=number,
+        attempt=attempt,
+        seed=seed,
+    )
+
+
+def trial_create(
+    *,
+    user: User,
+    station: Station,
+    evaluation: Evaluation,
+    scene: Scene,
+    position: Position,
+    checkpoint: Checkpoint,
+    number: int,
+    attempt: int,
+    seed: int | None = None,
+    strategy: Mapping[str, Any] | None = None,
+) -> Trial:
+    """This very trial, prepared; within a transaction, by who knows that it is the next one.
+
+    Conflict where the station has a trial that is not finished, and says what to do about it. IntegrityError where
+    there is one of this number and attempt.
+    """
+    require(user, Role.OPERATOR)
+    _check_choice(station, scene, position, checkpoint, seed)
+    Station.objects.select_for_update().get(pk=station.pk)  # one at a time
+    unfinished = trial_open(station)
+    if unfinished is not None:
+        status = TrialStatus(unfinished.status)
+        raise Conflict(
+            f"trial {unfinished.pk} of {station.name} is {status.label}: {lifecycle.advice(status)}, "
+            "then prepare the next one"
+        )
     if seed is None and station.simulated:
         seed = seed_of(scene, position, number)
     return Trial.objects.create(
-        **key,
+        evaluation=evaluation,
+        evaluation_version=evaluation.version,
+        checkpoint=checkpoint,
+        scene=scene,
+        position=position,
         number=number,
         attempt=attempt,
         station=station,
@@ -131,6 +185,7 @@ def _prepared(
         instruction=scene.instruction,
         time_limit_s=scene.time_limit_s,
         seed=seed,
+        strategy=strategy,
     )
 
 
@@ -158,6 +213,7 @@ def trial_score(
     user: User,
     trial: Trial,
     milestones: Mapping[object, object],
+    times: Mapping[object, object] | None = None,
     success: bool | None = None,
     note: str = "",
     failure: str = "",
@@ -166,7 +222,8 @@ def trial_score(
 ) -> Score:
     """Add a score; of a trial that has one it is a correction, needs a reason, and counts from then on.
 
-    `milestones`: id -> reached, for every milestone of the scene. Disk first, then the row, then publication.
+    `milestones`: id -> reached, for every milestone of the scene; `times`: id -> when [s after the start of the run],
+    as far as known. Disk first, then the row, then publication.
     """
     require(user, Role.OPERATOR)
     if source not in Score.Source.values:
@@ -179,7 +236,8 @@ def trial_score(
     with transaction.atomic():
         held = _held(trial)
         _check_scorable(held, words["reason"])
-        found = verdict(list(held.scene.milestones.order_by("order")), milestones, success)
+        rows = list(held.scene.milestones.order_by("order"))
+        found = verdict(rows, milestones, success, times=times, ordered=held.scene.ordered)
         if found.success and words["failure"]:
             raise EvaError(f"failure = {words['failure']!r} but the trial is a success: leave failure empty")
         score = Score(
@@ -195,6 +253,7 @@ def trial_void(*, user: User, trial: Trial, reason: str) -> Trial:
     """Take a trial out of the count: void is not fail. It stays in the record with its reason."""
     require(user, Role.OPERATOR)
     why = _reason_given(reason, "a trial is voided")
+    checked("voided", trial, user)
     with transaction.atomic():
         held = _held(trial)
         lifecycle.apply(held, Move.VOID)
@@ -269,8 +328,9 @@ def _keep(trial: Trial, score: Score, found: Verdict) -> None:
             points=milestone.points,
             required=milestone.required,
             reached=reached,
+            at_s=at,
         )
-        for milestone, reached in found.reached
+        for milestone, reached, at in found.reached
     ]
     journal.append(trial.episode_id or trial.uuid, journal.score_line(score, outcomes))
     score.save()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from difflib import get_close_matches
 from functools import cache
@@ -13,6 +14,7 @@ from django.core.exceptions import ValidationError
 
 from runtime.config import PolicyConfig
 
+_TAG = re.compile(r"[A-Za-z0-9_.:/+-]{1,40}")
 _PLACES = {"block": ("x", "y", "yaw in degrees"), "plate": ("x", "y")}
 
 
@@ -27,6 +29,15 @@ def check_policy(given: object) -> None:
     problems = {kind: _problems(given, kinds[kind]) for kind in ([wanted] if wanted else kinds)}
     if all(problems.values()):
         raise ValidationError(problems[max(problems, key=lambda kind: _likeness(given, kinds[kind]))])
+
+
+def check_tags(given: object) -> None:
+    """ValidationError unless `given` is a list of different short words."""
+    words = isinstance(given, list) and all(isinstance(tag, str) and _TAG.fullmatch(tag) for tag in given)
+    if not words:
+        raise ValidationError(_sentence(given, "words of at most 40 letters a to z, digits and ._:/+-"))
+    if len(set(given)) < len(given):  # type: ignore[arg-type, call-overload]
+        raise ValidationError(_sentence(given, "each tag once"))
 
 
 def check_bench(given: object) -> None:
@@ -78,14 +89,28 @@ def _likeness(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> tup
 def _problem(error: Any, config: type[pydantic.BaseModel], kind: str) -> str:
     key = ".".join(map(str, error["loc"])) or "policy"
     if error["type"] == "extra_forbidden":
-        return f"{key}: unknown key for kind {kind!r}; allowed: {', '.join(config.model_fields)}"
-    return f"{key} = {error['input']!r:.80}: {error['msg']}"
+        table = _table(config, error["loc"][:-1])
+        return f"{key}: unknown key for kind {kind!r}; allowed: {', '.join(table.model_fields)}"
+    if error["type"] == "secret":  # not shown, and not in any log
+        return f"{key}: {error['msg']}"
+    return f"{key} = {error['input']!r:.80}: {error['msg'].removeprefix('Value error, ')}"
+
+
+def _table(config: type[pydantic.BaseModel], way: tuple[str | int, ...]) -> type[pydantic.BaseModel]:
+    """The table within `config` to which the keys of `way` lead."""
+    for key in way:
+        field = config.model_fields.get(str(key))
+        parts = (field.annotation, *get_args(field.annotation)) if field else ()
+        within = [part for part in parts if isinstance(part, type) and issubclass(part, pydantic.BaseModel)]
+        config = within[0] if within else config
+    return config
 
 
 @cache
 def _kinds() -> dict[str, type[pydantic.BaseModel]]:
     union = get_args(PolicyConfig)[0] if get_args(PolicyConfig) else PolicyConfig
-    return {config.model_fields["kind"].default: config for config in get_args(union) or (union,)}
+    kinds = {config.model_fields["kind"].default: config for config in get_args(union) or (union,)}
+    return {kind: config for kind, config in kinds.items() if kind != "none"}  # no policy is no checkpoint
 
 
 def _sentence(given: object, allowed: str, name: str = "") -> str:

@@ -10,25 +10,39 @@ from evaweb.trials.models import Milestone
 
 LONGEST_NOTE = 8000  # characters
 LONGEST_FAILURE = 60
+LONGEST_RUN_S = 24 * 3600.0
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Which milestones were reached, the share of their points, and whether that is a success."""
+    """Which milestones were reached and when [s], the share of their points, and whether that is a success."""
 
-    reached: tuple[tuple[Milestone, bool], ...]
+    reached: tuple[tuple[Milestone, bool, float | None], ...]
     score: float
     success: bool
 
 
-def verdict(milestones: Sequence[Milestone], ticks: Mapping[object, object], success: bool | None) -> Verdict:
+def verdict(
+    milestones: Sequence[Milestone],
+    ticks: Mapping[object, object],
+    success: bool | None,
+    *,
+    times: Mapping[object, object] | None = None,
+    ordered: bool = False,
+) -> Verdict:
     """The verdict on one trial from `ticks`: milestone id -> reached, one for each of the scene's milestones.
+
+    `times`: milestone id -> when it was reached [s after the start of the run], as far as that is known; one reached
+    after its time limit does not count and has to be unticked. `ordered`: none without all before it.
 
     Success is: all required milestones are reached. Where none is required it has to be given. EvaError says
     which ids are missing or not the scene's, and what contradicts itself.
     """
     answers = _answers(milestones, ticks)
-    reached = tuple((milestone, answers[milestone.pk]) for milestone in milestones)
+    when = _times(milestones, answers, times or {})
+    reached = tuple((m, answers[m.pk], when.get(m.pk)) for m in milestones)
+    if ordered:
+        _require_order(reached)
     implied = _implied(reached)
     if implied is None and success is None:
         raise EvaError("success is missing: no milestone of this scene is required, so say true or false")
@@ -39,16 +53,6 @@ def verdict(milestones: Sequence[Milestone], ticks: Mapping[object, object], suc
         )
     final = bool(success if implied is None else implied)
     return Verdict(reached, _share(reached, final), final)
-
-
-def text(name: str, given: str, longest: int) -> str:
-    """A text as it was typed, without blanks at its ends; EvaError where it cannot be stored."""
-    if "\x00" in given:
-        raise EvaError(f"{name} contains the character U+0000, which no database keeps: remove it")
-    stripped = given.strip()
-    if len(stripped) > longest:
-        raise EvaError(f"{name} has {len(stripped)} characters; allowed: at most {longest}")
-    return stripped
 
 
 def _answers(milestones: Sequence[Milestone], ticks: Mapping[object, object]) -> dict[int, bool]:
@@ -71,13 +75,50 @@ def _answers(milestones: Sequence[Milestone], ticks: Mapping[object, object]) ->
     return found
 
 
-def _implied(reached: Sequence[tuple[Milestone, bool]]) -> bool | None:
-    required = [done for milestone, done in reached if milestone.required]
+def _times(
+    milestones: Sequence[Milestone], answers: Mapping[int, bool], given: Mapping[object, object]
+) -> dict[int, float]:
+    known = {str(milestone.pk): milestone for milestone in milestones}
+    found: dict[int, float] = {}
+    for key, at in given.items():
+        milestone = known.get(str(key))
+        if milestone is None:
+            raise EvaError(f"times: milestone {key!r} is not one of this scene; allowed: {', '.join(known)}")
+        if at is None:
+            continue
+        if isinstance(at, bool) or not isinstance(at, int | float) or not 0 <= at < LONGEST_RUN_S:
+            raise EvaError(f"times: milestone {key}: {at!r}; allowed: seconds from 0, or null")
+        if not answers[milestone.pk]:
+            raise EvaError(f"times: {milestone.text!r} has the time {at:g} s, but was not reached")
+        limit = milestone.time_limit_s
+        if limit is not None and at > limit:
+            raise EvaError(
+                f"{milestone.text!r} was reached after {at:g} s and counts within {limit:g} s: leave it unticked"
+            )
+        found[milestone.pk] = float(at)
+    return found
+
+
+def _require_order(reached: Sequence[tuple[Milestone, bool, float | None]]) -> None:
+    missed, last = "", 0.0
+    for milestone, done, at in reached:
+        if done and missed:
+            raise EvaError(
+                f"{milestone.text!r} is ticked and {missed!r} before it is not: the milestones of this scene "
+                "come one after the other"
+            )
+        if done and at is not None and at < last:
+            raise EvaError(f"{milestone.text!r} was reached after {at:g} s, before the one that comes first")
+        missed, last = missed or ("" if done else milestone.text), at if at is not None else last
+
+
+def _implied(reached: Sequence[tuple[Milestone, bool, float | None]]) -> bool | None:
+    required = [done for milestone, done, _ in reached if milestone.required]
     return all(required) if required else None
 
 
-def _share(reached: Sequence[tuple[Milestone, bool]], success: bool) -> float:
-    total = sum(milestone.points for milestone, _ in reached)
+def _share(reached: Sequence[tuple[Milestone, bool, float | None]], success: bool) -> float:
+    total = sum(milestone.points for milestone, _, _ in reached)
     if not total:
         return float(success)
-    return sum(milestone.points for milestone, done in reached if done) / total
+    return sum(milestone.points for milestone, done, _ in reached if done) / total

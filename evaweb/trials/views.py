@@ -14,6 +14,7 @@ from django.views.decorators.http import require_GET, require_POST
 from evaweb.episodes.selectors import stage_of
 from evaweb.errors import EvaError
 from evaweb.roles import Role, role_of
+from evaweb.sight import Sight, sight_for
 from evaweb.stations.selectors import station_list
 from evaweb.trials import lifecycle, selectors, services
 from evaweb.trials.figures import scene_figures
@@ -27,16 +28,17 @@ PER_PAGE = 50
 @require_GET
 def result(request: HttpRequest) -> HttpResponse:
     """Success per scene and checkpoint, then the trials; the filters are in the address."""
-    filters, fault = _filters(request.GET)
-    rows = selectors.statistics(replace(filters, status=""))  # which is about the list of trials
+    seen = sight_for(request)
+    filters, fault = _filters(request.GET, seen)
+    rows = selectors.statistics(replace(filters, status=""), seen)  # which is about the list of trials
     context = {
         "figures": scene_figures(rows),
-        "page": Paginator(selectors.trial_list(filters), PER_PAGE).get_page(request.GET.get("page")),
+        "page": Paginator(selectors.trial_list(filters, seen), PER_PAGE).get_page(request.GET.get("page")),
         "chosen": asdict(filters),
         "query": _query(filters),
         "fault": fault,
         "scenes": selectors.scene_list(all_of_them=True).prefetch_related(None),
-        "checkpoints": selectors.checkpoint_list(all_of_them=True),
+        "checkpoints": selectors.checkpoint_list(all_of_them=True, sight=seen),
         "stations": station_list(all_of_them=True),
         "evaluations": selectors.evaluation_list(),
         "statuses": TrialStatus.choices,
@@ -91,6 +93,7 @@ def _trial_page(
     request: HttpRequest, id: int, fault: EvaError | None = None, typed: Mapping[str, Any] | None = None
 ) -> HttpResponse:
     found = selectors.trial_get(id=id)
+    hidden = sight_for(request).hides(found)
     operator = role_of(request.user) is not Role.VIEWER
     milestones = list(found.scene.milestones.order_by("order"))
     context = {
@@ -104,11 +107,22 @@ def _trial_page(
         "may_score": operator and lifecycle.allows(found, Move.SCORE),
         "may_void": operator and lifecycle.allows(found, Move.VOID),
         "attempts": selectors.attempts_of(trial=found),
-        "commands": selectors.commands_of(trial=found),
+        # When a set-up was asked for and the run could begin tells how long a policy warms up.
+        "commands": () if hidden else selectors.commands_of(trial=found),
+        "hidden": hidden,
+        "laid_out": laid_out(found),
         "fault": fault,
         "typed": typed or _as_scored(found),
     }
     return render(request, "trials/trial.html", context, status=fault.status if fault else 200)
+
+
+def laid_out(trial: Trial) -> list[Any]:
+    """What the cameras showed before the run, as the newest look at each has it; bound to trials by evaweb.plans."""
+    newest: dict[str, Any] = {}
+    for row in trial.achieved.select_related("reference", "by").order_by("pk"):
+        newest[row.camera] = row
+    return list(newest.values())
 
 
 def _ticked(trial: Trial, milestone: int, typed: Mapping[str, Any] | None) -> bool:
@@ -128,12 +142,12 @@ def _as_scored(trial: Trial) -> dict[str, Any]:
     return {"note": verdict.note, "failure": verdict.failure, "success": success}
 
 
-def _filters(given: Mapping[str, str]) -> tuple[TrialFilters, EvaError | None]:
+def _filters(given: Mapping[str, str], sight: Sight) -> tuple[TrialFilters, EvaError | None]:
     """The filters of the address; where they name what does not exist, none of them and the sentence."""
     names = ("evaluation", "checkpoint", "scene", "station", "status", "since")
     filters = TrialFilters(**{name: given.get(name, "").strip() for name in names})
     try:
-        filters.apply(Trial.objects.all())
+        filters.apply(Trial.objects.all(), sight)
     except EvaError as fault:
         return TrialFilters(), fault
     return filters, None

@@ -1,7 +1,7 @@
 // Where the robot would go: asked over the live socket, answered by the station, shown by whoever listens.
 
 const EVERY_MS = 80; // between two questions; the newest one always goes out
-const PATIENCE_MS = 2000;
+const PATIENCE_MS = 4000; // longer than the lab's own
 
 /**
  * Asks the station where a target is; nothing moves. Every answer is told as the event "eva:aimed" on the document,

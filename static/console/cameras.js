@@ -1,5 +1,6 @@
 // Pictures of the cameras, drawn from one JPEG each; what is old goes grey and says how old it is.
 
+import { origin, trouble } from "./camera_words.js";
 import { age } from "./words.js";
 
 const STALE_S = 0.5; // as the runtime's own bound on pictures
@@ -16,6 +17,9 @@ class Camera {
     this.rateText = figure.querySelector(".camera-rate");
     this.freshText = figure.querySelector(".camera-fresh");
     this.ageText = figure.querySelector(".camera-age");
+    this.troubleText = figure.appendChild(document.createElement("p"));
+    this.troubleText.className = "camera-trouble";
+    this.troubleText.hidden = true;
     this.capturedAt = -Infinity; // on this page's clock [ms]
     this.drawn = []; // when the last pictures were drawn
     this.drawnAny = false;
@@ -51,6 +55,15 @@ class Camera {
     return (this.drawn.length * 1000) / WINDOW_MS;
   }
 
+  /** How a camera of the station's own is, `told` by the runtime at its `clock` [s]; nothing of any other. */
+  health(told, clock) {
+    const wrong = trouble(told, clock);
+    const text = wrong ? `${wrong.word}: ${wrong.reason}` : "";
+    if (this.troubleText.textContent !== text) this.troubleText.textContent = text;
+    this.troubleText.hidden = !text;
+    this.figure.title = told ? origin(told) : "";
+  }
+
   rate(measured, captured, fastest, now) {
     const shown = this.shownRate(now);
     const known = Number.isFinite(measured);
@@ -73,9 +86,9 @@ export class Cameras {
       const camera = new Camera(figure);
       this.#cameras.set(camera.name, camera);
     }
-    store.on("snapshot", ({ link, facts }) => {
+    store.on("snapshot", ({ link, facts, clock }) => {
       if (facts?.cameras) this.#keep(facts.cameras);
-      this.#measured(link);
+      this.#measured(link, clock);
     });
     store.on("second", () => store.fresh || this.#measured({ rates: {}, ages: {} }));
     setInterval(() => this.#tell(), 100);
@@ -110,12 +123,15 @@ export class Cameras {
     document.querySelector(".station").style.setProperty("--cameras", Math.max(1, shown));
   }
 
-  #measured({ rates, ages }) {
+  #measured({ rates, ages, cameras = {} }, clock = NaN) {
     const now = performance.now();
     if (now - this.#told < TELL_MS) return; // figures that flicker cannot be read
     this.#told = now;
     const fastest = Math.max(0, ...[...this.#cameras.keys()].map((name) => rates[name] ?? 0));
-    for (const camera of this.#cameras.values()) camera.rate(rates[camera.name] ?? NaN, ages[camera.name] ?? NaN, fastest, now);
+    for (const camera of this.#cameras.values()) {
+      camera.rate(rates[camera.name] ?? NaN, ages[camera.name] ?? NaN, fastest, now);
+      camera.health(cameras[camera.name], clock);
+    }
   }
 
   #tell() {

@@ -7,6 +7,7 @@ import { refusal } from "./reasons.js";
 import { answered, STOPPING, Stops } from "./stops.js";
 import { verb } from "./words.js";
 
+const AT_THE_DESK = ["score", "session"]; // what no robot is needed for
 const STOP_ADVICE = "Press it again; if the robot still moves, press E-STOP.";
 
 /** Gives commands, says what became of them, and shows which can be given now. */
@@ -34,14 +35,15 @@ export class Commands {
     this.#givers.set(kind, args);
   }
 
-  /** Send one command, for a trial or for the checkpoint of that id where one is given; resolves to the answer, or null where it was not accepted (and says why on the page). */
-  async give(kind, args = {}, { trial = null, checkpoint = "" } = {}) {
+  /** Send one command, for a trial, a session or the checkpoint of that id where one is given; resolves to the answer, or null where it was not accepted (and says why on the page). */
+  async give(kind, args = {}, { trial = null, checkpoint = "", session = "" } = {}) {
     const name = verb(kind);
     this.say(`${name}: pressed …`, "pressed");
     const command = { uuid: uuid(), kind, args, page: this.#store.page, epoch: this.#store.epoch };
     Object.assign(command, { boot: this.#store.snapshot?.boot ?? "", sequence: this.#store.snapshot?.sequence ?? 0 });
     if (trial) command.trial = Number(trial);
     if (checkpoint) command.checkpoint = Number(checkpoint);
+    if (session) command.session = session;
     try {
       const answer = await (STOPPING.includes(kind) ? this.#stops.give(command) : post(config.api.commands, command));
       this.say(`${name}: ${answer.status}`, "accepted");
@@ -83,8 +85,8 @@ export class Commands {
     line.dataset.kind = kind;
   }
 
-  /** Why a score cannot be saved now: it needs no robot, but it is for who commands to give. */
-  #scoreReason() {
+  /** Why a score cannot be saved, or a session changed, now: it needs no robot, but it is for who commands to do. */
+  #deskReason() {
     const { role, fresh, lease } = this.#store;
     if (role === "viewer") return "a viewer watches; an administrator can make you an operator";
     return fresh && lease === "other" ? "somebody else commands the station; ask for it" : "";
@@ -100,7 +102,7 @@ export class Commands {
     for (const button of document.querySelectorAll("[data-command], [data-gate]")) {
       const kind = button.dataset.command ?? button.dataset.gate;
       const own = "settling" in button.dataset ? "it has just come up: look, then press again" : (button.dataset.blocked ?? "");
-      setReason(button, own || (kind === "score" ? this.#scoreReason() : this.reason(kind)));
+      setReason(button, own || (AT_THE_DESK.includes(kind) ? this.#deskReason() : this.reason(kind)));
       if (button.dataset.onlyState) button.hidden = this.#store.snapshot?.state !== button.dataset.onlyState;
     }
   }

@@ -1,5 +1,6 @@
 // The Debug page: figures of the station as the runtime measures them.
 
+import { summary, trouble } from "./camera_words.js";
 import { Distribution } from "./distribution.js";
 import { reachWords } from "./reach.js";
 import { age, figure } from "./words.js";
@@ -18,9 +19,12 @@ const TEXTS = [
   ["Poses", ({ policy: p }) => (p.ik?.over ? "" : reachWords(p.ik))],
   ["Out of reach", ({ policy: p }) => (p.ik?.over ? reachWords(p.ik) : ""), "warn"],
   ["Joints", ({ link: l }) => `${age(l.ages.joints ?? Infinity)} old`],
+  ["Own cameras", ({ link: l, clock }) => (troubled(l) ? "" : summary(l.cameras, clock))],
+  ["Camera", ({ link: l, clock }) => (troubled(l) ? summary(l.cameras, clock) : ""), "warn"],
+  ["Commands", ({ link: l }) => Object.entries(l.unheard ?? {}).map(([topic, why]) => why || `nobody listens to ${topic}`).join("; "), "warn"],
   ["Faults seen", ({ link: l }) => Object.entries(l.faults).filter(([, count]) => count).map(([name, count]) => `${name} ${count}`).join(", ") || "none"],
   ["Task", (snapshot) => snapshot.task || "–"],
-  ["Last episode", (snapshot) => snapshot.episode?.uuid ?? snapshot.episode ?? "–"],
+  ["Last episode", ({ episode }) => episode?.uuid || "–"],
   ["Boot", (snapshot) => snapshot.boot],
 ];
 
@@ -29,6 +33,10 @@ const DISTRIBUTIONS = [
   ["Connection", "Latency", ({ policy: p }) => p.latencies_ms, { unit: "ms", nothing: NO_ANSWER, narrow: 10 }],
   ["Connection", "Delay", ({ policy: p }) => p.delays, { unit: "ticks", nothing: NO_ANSWER, whole: true }],
 ];
+
+function troubled(link) {
+  return Object.values(link.cameras ?? {}).some((told) => trouble(told, 0));
+}
 
 /** Fill the list of figures with the newest state, twice a second. */
 export function figures(store) {

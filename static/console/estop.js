@@ -7,6 +7,7 @@ import { config } from "./config.js";
 
 const ACK_MS = 500;
 const TEXT_FIELDS = 'textarea, [contenteditable="true"], input:not([type]), input[type="text"], input[type="search"], input[type="number"], input[type="password"], input[type="email"], input[type="url"]';
+const SPACE_IS_TAKEN = config.page === "collect"; // there it stops and saves whatever moves, and starts
 
 export class EStop {
   #socket;
@@ -92,7 +93,7 @@ export class EStop {
   #isStop(event) {
     if (event.ctrlKey || event.altKey || event.metaKey) return "";
     if (event.key === "Escape") return "Escape";
-    if (event.code === "Space" && !event.target.closest?.(TEXT_FIELDS)) return "space";
+    if (event.code === "Space" && !SPACE_IS_TAKEN && !event.target.closest?.(TEXT_FIELDS)) return "space";
     return "";
   }
 

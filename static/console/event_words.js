@@ -2,18 +2,29 @@
 
 import { verb, words } from "./words.js";
 
-const BAD = new Set(["estopped", "family_died", "policy_failed", "policy_lost", "recording_failed", "source_failed", "displaced", "moved_away", "too_far"]);
-const WARN = new Set(["refused", "word_refused", "tune_refused", "lock_refused", "refusals", "starved", "starvation", "limited", "near", "far_start", "chunk_dropped", "ik_unreached", "not_journalled", "unmeasured", "unreadable", "rtc_warning", "late_ticks", "scheduling"]);
-const GOOD = new Set(["policy_back", "recovered", "punctual", "released"]); // a trouble is over
+const BAD = new Set(["estopped", "family_died", "policy_failed", "policy_lost", "recording_failed", "source_failed", "video_lost", "displaced", "moved_away", "too_far", "node_silent", "leader_lost"]);
+const WARN = new Set(["camera_absent", "camera_ended", "camera_is_a_video", "camera_lost", "commands_unheard", "refused", "word_refused", "tune_refused", "lock_refused", "refusals", "starved", "starvation", "limited", "near", "far_start", "pictures_stopped", "chunk_dropped", "ik_unreached", "not_journalled", "unmeasured", "unreadable", "rtc_warning", "late_ticks", "scheduling", "episode_short"]);
+const GOOD = new Set(["camera_back", "commands_heard", "pictures_back", "policy_back", "recovered", "punctual", "released"]); // a trouble is over
 const NAMES = {
+  camera_absent: "camera absent",
+  camera_back: "camera is back",
+  camera_ended: "video is over",
+  camera_is_a_video: "video as camera",
+  camera_lost: "camera lost",
+  commands_heard: "commands heard",
+  commands_unheard: "not heard",
   chunk_dropped: "chunk not used",
+  collect_armed: "armed",
+  collect_disarmed: "disarmed",
   displaced: "arm was moved",
   episode_closed: "recording ended",
   episode_opened: "recording",
+  episode_short: "too short",
   estopped: "e-stop",
   family_died: "process ended",
   far_start: "far from robot",
   ik_unreached: "out of reach",
+  leader_lost: "leader lost",
   late_ticks: "control late",
   limited: "safety",
   limited_sum: "safety",
@@ -22,8 +33,11 @@ const NAMES = {
   motion_done: "motion",
   moved_away: "arm was moved",
   near: "too near",
+  node_silent: "node silent",
   near_sum: "too near",
   not_journalled: "not in journal",
+  pictures_back: "pictures again",
+  pictures_stopped: "no pictures",
   policy_back: "policy is back",
   policy_failed: "policy failed",
   policy_lost: "policy lost",
@@ -46,6 +60,7 @@ const NAMES = {
   tuned_to: "strategy asked",
   unmeasured: "joints not seen",
   unreadable: "not understood",
+  video_lost: "video lost",
   word_refused: "robot refused",
 };
 const UUID = /\b([0-9a-f]{8})-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b/g; // its beginning is enough to read

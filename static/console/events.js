@@ -30,7 +30,8 @@ export class Events {
     return this.#boot;
   }
 
-  add({ boot, events }) {
+  /** `covered`: some are kept from who looks, so that numbers are missing. */
+  add({ boot, events, covered = false }) {
     if (boot && boot !== this.#boot) {
       if (this.#boot && this.#newest) this.#divide("The station was started anew");
       this.#boot = boot;
@@ -39,7 +40,7 @@ export class Events {
     const fresh = events.filter((event) => event.number > this.#newest);
     if (!fresh.length) return;
     const expected = this.#newest + 1;
-    if (this.#newest && fresh[0].number > expected) this.#divide(`Events ${expected} to ${fresh[0].number - 1} are no longer kept`);
+    if (this.#newest && !covered && fresh[0].number > expected) this.#divide(`Events ${expected} to ${fresh[0].number - 1} are no longer kept`);
     for (const event of fresh) this.#list.prepend(this.#row(event));
     this.#newest = fresh.at(-1).number;
     while (this.#list.children.length > KEPT) this.#list.lastElementChild.remove();

@@ -2,11 +2,11 @@
 
 const FIXED = [
   ["Esc", "E-stop"],
-  ["Space", "E-stop, outside text fields"],
+  ["Space", "E-stop, outside text fields", '[data-key="space"]'], // but where something else has it
   ["?", "These keys, and away with them"],
 ];
 const TEXTS = 'input:not([type="checkbox"], [type="radio"], [type="range"], [type="number"]), textarea, [contenteditable="true"]';
-const STOPS = '[data-command="stop"], [data-command="halt"], [data-command="cancel"]';
+const STOPS = '[data-command="stop"], [data-command="halt"], [data-command="cancel"], [data-key="space"]';
 const SCROLLED = 'select, input[type="range"], input[type="radio"], #events'; // they go by arrows of their own
 const CAPS = { arrowleft: "←", arrowright: "→", arrowup: "↑", arrowdown: "↓", pageup: "PgUp", pagedown: "PgDn", shift: "⇧" };
 
@@ -16,7 +16,7 @@ function usable(element) {
 
 /** The names under which a press may be known: with Shift first the key with it, then the key alone. */
 export function namesOf({ key: pressed, ctrlKey, shiftKey }) {
-  const key = pressed.toLowerCase();
+  const key = pressed === " " ? "space" : pressed.toLowerCase();
   if (ctrlKey) return [`ctrl+${key}`];
   const shifted = shiftKey && (/^[a-z]$/.test(key) || key in CAPS);
   return shifted ? [`shift+${key}`, key] : [key];
@@ -39,7 +39,7 @@ function text(element) {
 }
 
 function show(dialog) {
-  const rows = [...FIXED];
+  const rows = FIXED.filter(([, , taken]) => !taken || !document.querySelector(taken));
   for (const element of document.querySelectorAll("[data-key]")) {
     if (usable(element)) rows.push([element.dataset.key, text(element)]);
   }
@@ -73,7 +73,7 @@ function kept(event, element) {
   const field = event.target;
   if (!field.closest || event.ctrlKey) return false;
   if (field.closest(TEXTS)) return true;
-  if (field.closest('input[type="number"]')) return !/^[a-z]$/i.test(event.key);
+  if (field.closest('input[type="number"]')) return !/^[a-z ]$/i.test(event.key);
   if (field.closest("select") && !element?.matches(STOPS)) return true;
   return /^(Arrow|Page)/.test(event.key) && Boolean(field.closest(SCROLLED));
 }
@@ -112,5 +112,9 @@ export function keyboard() {
     if (!element) return;
     event.preventDefault();
     press(element);
+  });
+  window.addEventListener("keyup", (event) => {
+    // Else the letting go would press the button that has the focus, beside the one that has the key.
+    if (event.key === " " && meant(event) && !kept(event, meant(event))) event.preventDefault();
   });
 }

@@ -7,8 +7,9 @@ export const MODES = {
   sim: "Drives a simulated robot, in 3D only.",
   step: "Each press moves the robot by one chunk.",
   preview: "Each press shows a chunk; Commit moves.",
-  continuous: "The policy drives the robot until Stop.",
+  continuous: "The policy drives the robot until Stop or the run's end.",
   manual: "You move the robot; no policy is asked.",
+  collect: "A person leads the robot; each run is an episode.",
 };
 
 /** What the policy sees in the mode sim, to be said while it runs. */

@@ -3,6 +3,8 @@
 import { STOPPING } from "./stops.js";
 import { verb, words } from "./words.js";
 
+const AT_WORK = ["setting_up", "running", "holding"];
+
 const MODES = { step: "step or preview", commit: "preview", cancel: "step, preview or manual", move: "manual" };
 
 /** Why this page cannot give `kind` now, "" where it can. To stop it needs no news, only the lease it last had. */
@@ -22,4 +24,12 @@ export function whyNot(kind, { allowed, guarded = {}, state }) {
   if (MODES[kind]) return state === "holding" ? "the robot holds: resume or stop first" : `run in the mode ${MODES[kind]} first`;
   const possible = allowed.filter((one) => one !== "estop").map(verb).join(", ") || "nothing";
   return `not while ${words(state)}; possible now: ${possible}`;
+}
+
+/** Why no preflight of a checkpoint can be asked for now, "" where one can; nobody needs the lease for it. */
+export function whyNoPreflight({ fresh, role, snapshot }, checkpoint) {
+  if (role === "viewer") return "a viewer watches; an administrator can make you an operator";
+  if (!checkpoint) return "choose a checkpoint: what is deployed is asked by Set up";
+  if (!fresh) return ""; // the worker asks where the station does not run
+  return AT_WORK.includes(snapshot?.state) ? `not while ${words(snapshot.state)}: the policy is at work` : "";
 }

@@ -1,12 +1,14 @@
 // The pane of the 3D scene: its buttons, what is drawn beside the robot, and a sentence where it cannot be drawn.
 
-import { get } from "../site/api.js";
+import { get, RequestFailed } from "../site/api.js";
 import { aimGhost } from "./aim_ghost.js";
 import { config } from "./config.js";
 import { Scene3D } from "./scene3d.js";
 import { GHOSTS } from "./scene_ghosts.js";
 import { ShownChunk } from "./shown_chunk.js";
 import { Tags } from "./tags.js";
+
+const AGAIN_MS = 3000; // until shapes are asked for again
 
 /** Resolves to {poses(numbers, count), bench(truth), chunk(chunk), software}; they do nothing where there is no scene. */
 export async function scenePane(store) {
@@ -15,7 +17,7 @@ export async function scenePane(store) {
     const element = document.getElementById("scene");
     const scene = new Scene3D(element);
     const shapes = new Shapes(store, (geometry) => scene.show(geometry));
-    await shapes.fetch();
+    await shapes.fetch((why) => (note.textContent = `No 3D scene yet: ${why}. It is asked for again.`));
     note.hidden = true;
     aimGhost(scene);
     const shown = new ShownChunk(scene, () => store.snapshot?.facts?.rate ?? store.facts.rate);
@@ -53,9 +55,9 @@ class Shapes {
     this.#show = show;
   }
 
-  /** Resolves when something is drawn; from then on the station is followed. */
-  async fetch() {
-    await this.#get(this.#said);
+  /** Resolves when something is drawn, and says why not yet; from then on the station is followed. */
+  async fetch(say) {
+    await this.#get(this.#said, say);
     this.#store.on("snapshot", () => this.#follow());
     this.#follow();
   }
@@ -64,9 +66,9 @@ class Shapes {
     return this.#store.snapshot?.facts?.groups?.join() ?? "";
   }
 
-  async #get(groups) {
+  async #get(groups, say) {
     this.#groups = groups;
-    const geometry = await get(groups ? `${config.geometry}?groups=${groups}` : config.geometry);
+    const geometry = await patiently(() => get(groups ? `${config.geometry}?groups=${groups}` : config.geometry), say);
     if (this.#groups !== groups) return; // it has said something else meanwhile
     this.#groups = geometry.groups.join();
     this.#show(geometry);
@@ -74,7 +76,22 @@ class Shapes {
 
   #follow() {
     const said = this.#said;
-    if (said && said !== this.#groups) this.#get(said).catch((error) => console.error(`no shapes for ${said}: ${error.message}`));
+    const complain = (why) => console.warn(`no shapes for ${said}: ${why}`);
+    if (said && said !== this.#groups) this.#get(said, complain).catch((error) => complain(error.message));
+  }
+}
+
+/** What `ask` resolves to; asked again while the web is busy or cannot be reached, which is said. */
+async function patiently(ask, say) {
+  for (;;) {
+    try {
+      return await ask();
+    } catch (error) {
+      const passes = error instanceof RequestFailed && (!error.status || error.status >= 500);
+      if (!passes) throw error;
+      say(error.message);
+      await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+    }
   }
 }
 

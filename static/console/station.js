@@ -1,5 +1,6 @@
 // A page bound to a station: everything it shows and asks, put together.
 
+import { CollectPanel } from "../collect/collect.js";
 import { drafts } from "../site/drafts.js";
 import { quietFragments } from "../site/fragments.js";
 import { pageId } from "../site/identity.js";
@@ -14,6 +15,8 @@ import { EStop } from "./estop.js";
 import { Events } from "./events.js";
 import { keyboard } from "./keys.js";
 import { LeaseControls } from "./lease.js";
+import { preflights } from "./preflight.js";
+import { resetAid } from "./reset_aid.js";
 import { scenePane } from "./scene_pane.js";
 import { setUp } from "./setup.js";
 import { LiveSocket } from "./socket.js";
@@ -21,9 +24,12 @@ import { statusBar } from "./status.js";
 import { current, mark } from "./steps.js";
 import { Store } from "./store.js";
 import { TrialPanel } from "./trial.js";
+import { veil } from "./veil.js";
 import { CLOSED } from "./words.js";
 
-function listen(store, { events, estop, commands, lease, trial, hand }) {
+const OF_SESSIONS = ["collect", "episode", "job"];
+
+function listen(store, { events, estop, commands, lease, trial, hand, collect }) {
   const answers = {
     hello: ({ facts, role }) => {
       store.closed = null;
@@ -41,7 +47,8 @@ function listen(store, { events, estop, commands, lease, trial, hand }) {
     renewed: (answer) => lease().renewed(answer),
     changed: ({ what }) => {
       if (what.includes("lease")) window.htmx.trigger("#lease", "eva:lease");
-      if (what.includes("trial") || what.includes("episode")) trial()?.refresh();
+      if (["trial", "episode", "sight"].some((one) => what.includes(one))) trial()?.refresh();
+      if (what.some((name) => OF_SESSIONS.includes(name))) collect()?.refresh();
     },
     error: ({ reason }) => console.error(`the server did not understand this page: ${reason}`),
   };
@@ -56,7 +63,7 @@ async function start() {
   const cameras = new Cameras(store);
   const parts = {};
   const socket = new LiveSocket(`${config.socket}?page=${store.page}`, {
-    told: listen(store, { events, estop: () => parts.estop, commands: () => parts.commands, lease: () => parts.lease, trial: () => parts.trial, hand: () => parts.hand }),
+    told: listen(store, { events, estop: () => parts.estop, commands: () => parts.commands, lease: () => parts.lease, trial: () => parts.trial, hand: () => parts.hand, collect: () => parts.collect }),
     draw: (frame) => draw(frame, store, cameras),
     changed: (open, code) => {
       store.open = open;
@@ -76,9 +83,15 @@ async function start() {
   const commands = new Commands(store, socket);
   parts.commands = commands;
   parts.lease = new LeaseControls(store, socket, commands);
-  if (config.page === "eval") parts.trial = new TrialPanel(store, commands);
+  if (config.page === "eval") {
+    parts.trial = new TrialPanel(store, commands);
+    resetAid();
+  }
   if (config.page === "debug") parts.hand = byHand(store, socket, commands);
+  veil(store);
+  if (config.page === "collect") parts.collect = new CollectPanel(store, commands);
   setUp(store);
+  preflights(store, commands);
   figures(store);
   store.on(["snapshot", "second"], () => steps(store));
   document.body.addEventListener("htmx:afterSettle", () => steps(store));

@@ -1,5 +1,7 @@
 // Which of the numbered steps is the one to do now; its button alone is the primary one.
 
+import { step } from "../collect/moments.js";
+
 /** The step that `panel` (data of the fragment) and the live state ask for. */
 export function current({ panel, status, setUp }, snapshot) {
   const state = snapshot?.state ?? "disconnected";
@@ -7,6 +9,7 @@ export function current({ panel, status, setUp }, snapshot) {
     if (state === "running" || state === "holding" || state === "ready") return "run";
     return "setup";
   }
+  if (panel === "collect") return step(snapshot, document.querySelector("[data-session-uuid]"));
   if (status === "ended") return "score";
   if (status === "running" || status === "paused") return "run";
   if (status === "prepared") return setUp === "yes" && state === "ready" ? "run" : "setup";

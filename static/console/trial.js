@@ -2,17 +2,19 @@
 
 import { post, RequestFailed } from "../site/api.js";
 import { config } from "./config.js";
+import { PlanControls, times } from "./plan.js";
 import { duration } from "./words.js";
 
 export class TrialPanel {
   #store;
   #commands;
   #panel = document.getElementById("panel");
-  #busy = false;
+  #busy = ""; // what is on its way
 
   constructor(store, commands) {
     this.#store = store;
     this.#commands = commands;
+    new PlanControls(store, commands, (name, work) => this.#do(name, work));
     document.addEventListener("click", (event) => this.#clicked(event));
     document.addEventListener("submit", (event) => this.#submitted(event));
     document.addEventListener("input", (event) => event.target.closest("#score") && scoreRule());
@@ -83,8 +85,11 @@ export class TrialPanel {
 
   /** One thing at a time, with its outcome on the page. */
   async #do(name, act) {
-    if (this.#busy) return;
-    this.#busy = true;
+    if (this.#busy) {
+      this.#commands.say(`${name}: not yet, ${this.#busy} is on its way`, "refused");
+      return;
+    }
+    this.#busy = name;
     this.#commands.say(`${name}: pressed …`, "pressed");
     try {
       const said = await act();
@@ -93,7 +98,7 @@ export class TrialPanel {
       if (!(error instanceof RequestFailed)) throw error;
       this.#commands.fail(name, error);
     } finally {
-      this.#busy = false;
+      this.#busy = "";
       this.refresh();
     }
   }
@@ -114,7 +119,7 @@ export class TrialPanel {
     const milestones = {};
     for (const box of form.querySelectorAll('[name="milestone"]')) milestones[box.value] = box.checked;
     const { note, failure, success } = form.elements;
-    const score = { milestones, note: note.value, failure: failure.disabled ? "" : failure.value };
+    const score = { milestones, times: times(form), note: note.value, failure: failure.disabled ? "" : failure.value };
     if (success) score.success = success.value === "yes";
     await post(`${config.trial}/${form.dataset.score}/score`, score);
     saved(form);

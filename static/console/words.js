@@ -43,6 +43,10 @@ export const VERBS = {
   move: "Send",
   gripper: "Gripper",
   approach: "Approach",
+  arm: "Arm",
+  disarm: "Disarm",
+  label: "Result",
+  discard: "Discard",
   lease_claim: "Station taken",
   lease_give_up: "Station given up",
 };

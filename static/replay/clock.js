@@ -1,6 +1,7 @@
 // One clock for everything on the page: row k is shown from k / fps on.
 
 const LONGEST_STEP_S = 0.25; // a tab that slept does not jump
+const ROUNDING = 1e-6; // rows: sums of tenths of a millisecond come out a little below the row they reach
 
 export class Clock extends EventTarget {
   #fps;
@@ -8,8 +9,10 @@ export class Clock extends EventTarget {
   #time = 0;
   #rate = 1;
   #playing = false;
-  #ready = () => true;
+  #ready = [];
   #before = 0;
+  #range = null; // {from, to}: the first row of what is played, and the one after its last
+  #loop = false;
 
   constructor({ fps, frames }) {
     super();
@@ -19,7 +22,7 @@ export class Clock extends EventTarget {
 
   /** `ready` says whether what follows the clock can go on; while it cannot, the clock waits. */
   waitFor(ready) {
-    this.#ready = ready;
+    this.#ready.push(ready);
   }
 
   get time() {
@@ -27,7 +30,7 @@ export class Clock extends EventTarget {
   }
 
   get row() {
-    return Math.min(this.#frames - 1, Math.floor(this.#time * this.#fps + 1e-6));
+    return Math.min(this.#frames - 1, Math.floor(this.#time * this.#fps + ROUNDING));
   }
 
   get rows() {
@@ -55,9 +58,36 @@ export class Clock extends EventTarget {
     this.#tell("rate");
   }
 
+  /** The rows that are played: [from, to), all of them without a range. */
+  get range() {
+    return this.#range ?? { from: 0, to: this.#frames };
+  }
+
+  /** Whether only a part is played. */
+  get narrowed() {
+    return this.#range !== null;
+  }
+
+  /** Play the rows from `from` to the one before `to` alone; null: all of them. */
+  narrow(range) {
+    const from = range && Math.min(Math.max(0, Math.floor(range.from)), this.#frames - 1);
+    this.#range = range && { from, to: Math.min(Math.max(from + 1, Math.floor(range.to)), this.#frames) };
+    this.#tell("range");
+  }
+
+  get loop() {
+    return this.#loop;
+  }
+
+  set loop(loop) {
+    this.#loop = loop;
+    this.#tell("range");
+  }
+
   play() {
     if (this.#playing) return;
-    if (this.row >= this.#frames - 1) this.seek(0);
+    const { from, to } = this.range;
+    if (this.row >= to - 1 || this.row < from) this.seekRow(from);
     this.#playing = true;
     this.#before = performance.now();
     requestAnimationFrame((now) => this.#go(now));
@@ -97,16 +127,94 @@ export class Clock extends EventTarget {
     if (!this.#playing) return;
     const passed = Math.min(Math.max(0, now - this.#before) / 1000, LONGEST_STEP_S);
     this.#before = now;
-    if (this.#ready()) {
-      this.#time = Math.min(this.#time + passed * this.#rate, this.duration);
-      this.#tell("tick");
-      if (this.#time >= this.duration) this.pause();
-    }
+    if (this.#ready.every((ready) => ready())) this.#advance(passed * this.#rate);
+    if (!this.#playing) return;
     requestAnimationFrame((next) => this.#go(next));
+  }
+
+  #advance(by) {
+    const end = this.range.to / this.#fps;
+    const over = (this.#time + by) * this.#fps + ROUNDING >= this.range.to; // as `row` counts
+    this.#time = Math.min(this.#time + by, end);
+    if (over && this.#loop) {
+      this.seekRow(this.range.from);
+      return;
+    }
+    this.#tell("tick");
+    if (!over) return;
+    const last = this.range.to - 1;
+    this.pause();
+    this.seekRow(last); // what is shown at the end is the last row, not the one after it
   }
 
   #tell(kind) {
     this.dispatchEvent(new Event(kind));
     if (kind !== "tick") this.dispatchEvent(new Event("change"));
+  }
+}
+
+/** The clock of one of several episodes: the shared one, `offset` seconds later; it rests before its first and after its last row. */
+export class Shifted extends EventTarget {
+  #clock;
+  #offset;
+
+  constructor(clock, { fps, frames }, offset = 0) {
+    super();
+    this.#clock = clock;
+    this.#offset = offset;
+    Object.assign(this, { fps, rows: frames, duration: frames / fps });
+    for (const kind of ["tick", "seek", "play", "pause", "rate", "change"]) {
+      clock.addEventListener(kind, () => this.dispatchEvent(new Event(kind)));
+    }
+  }
+
+  waitFor(ready) {
+    this.#clock.waitFor(() => this.resting || ready());
+  }
+
+  get offset() {
+    return this.#offset;
+  }
+
+  set offset(offset) {
+    this.#offset = offset;
+    this.dispatchEvent(new Event("seek"));
+  }
+
+  get #own() {
+    return this.#clock.time - this.#offset;
+  }
+
+  get time() {
+    return Math.min(Math.max(0, this.#own), this.duration);
+  }
+
+  get row() {
+    return Math.min(this.rows - 1, Math.floor(this.time * this.fps + 1e-6));
+  }
+
+  /** Whether the shared clock is where this episode has no row. */
+  get resting() {
+    return this.#own < -1e-6 || this.#own > this.duration - 0.5 / this.fps;
+  }
+
+  get playing() {
+    return this.#clock.playing && !this.resting;
+  }
+
+  get rate() {
+    return this.#clock.rate;
+  }
+
+  pause() {
+    this.#clock.pause();
+  }
+
+  seek(time) {
+    this.#clock.seek(time + this.#offset);
+  }
+
+  seekRow(row) {
+    this.seek(Math.min(Math.max(0, row), this.rows - 1) / this.fps);
   }
 }

@@ -32,7 +32,7 @@ export class Robot {
   }
 
   async #fetch(first) {
-    const { header, numbers } = await message(`${this.#address}?first=${first}`);
+    const { header, numbers } = await message(`${this.#address}${this.#address.includes("?") ? "&" : "?"}first=${first}`);
     return numbers(header.streams.poses);
   }
 
@@ -59,16 +59,19 @@ export class Robot {
   }
 }
 
-/** Fill the pane, or put a sentence in its place. */
-export async function robotPane({ clock, geometry: address, poses }) {
-  const note = document.getElementById("scene-note");
+/** Fill the pane in `root`, or put a sentence in its place; without an address that is `why`. */
+export async function robotPane({ root, clock, geometry: address, poses, why = "the episode names no robot" }) {
+  const note = root.querySelector("[data-scene-note]");
+  if (!address) {
+    note.textContent = `No 3D scene: ${why}.`;
+    return;
+  }
   try {
-    if (!address) throw new Error("the episode names no robot");
     const geometry = await get(address);
-    const scene = new Scene3D(document.getElementById("scene"));
+    const scene = new Scene3D(root.querySelector("[data-scene]"));
     scene.show(geometry);
     scene.toggle("path"); // a path that jumps with the clock would be none
-    for (const button of document.querySelectorAll("[data-view]")) {
+    for (const button of root.querySelectorAll("[data-view]")) {
       button.addEventListener("click", () => scene.view(button.dataset.view));
     }
     await new Robot({ scene, clock, address: poses, size: geometry.parts.length * MATRIX }).begin();

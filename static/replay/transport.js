@@ -1,8 +1,10 @@
 // Buttons and keys of the playback. Space plays here: this page is bound to no station.
 
+import { link } from "./link.js";
+
 const SECOND_KEYS = { ArrowLeft: -1, ArrowRight: 1 };
 
-/** Let buttons and keys move the clock. */
+/** Let buttons and keys move the clock, and the address say where it is. */
 export function transport(clock) {
   const play = document.getElementById("play");
   const speed = document.getElementById("speed");
@@ -17,7 +19,50 @@ export function transport(clock) {
   };
   clock.addEventListener("play", say);
   clock.addEventListener("pause", say);
+  rangeControls(clock);
   document.addEventListener("keydown", (event) => key(event, clock, speed));
+  link(clock, (wanted) => choose(speed, wanted));
+}
+
+/** The nearest of the speeds there are. */
+function choose(speed, wanted) {
+  const away = [...speed.options].map(({ value }) => Math.abs(Number(value) - wanted));
+  speed.selectedIndex = away.indexOf(Math.min(...away));
+  speed.dispatchEvent(new Event("change"));
+}
+
+/** The part that is played: its band on the time axis, and its buttons. */
+function rangeControls(clock) {
+  const band = document.getElementById("range");
+  const loop = document.getElementById("loop");
+  const clear = document.getElementById("range-clear");
+  document.getElementById("range-in").addEventListener("click", () => begin(clock));
+  document.getElementById("range-out").addEventListener("click", () => end(clock));
+  clear.addEventListener("click", () => clock.narrow(null));
+  loop.addEventListener("click", () => (clock.loop = !clock.loop));
+  const show = () => {
+    const { from, to } = clock.range;
+    band.hidden = !clock.narrowed;
+    band.style.left = `${(100 * from) / clock.rows}%`;
+    band.style.width = `${(100 * (to - from)) / clock.rows}%`;
+    band.title = `Rows ${from} to ${to - 1}`;
+    clear.setAttribute("aria-disabled", String(!clock.narrowed));
+    clear.title = clock.narrowed ? `Play all rows again, not only ${from} to ${to - 1}` : "All rows are played";
+    loop.setAttribute("aria-pressed", String(clock.loop));
+  };
+  clock.addEventListener("range", show);
+  show();
+}
+
+/** The part begins here; where that is behind its end, it ends with the episode. */
+function begin(clock) {
+  const { to } = clock.range;
+  clock.narrow({ from: clock.row, to: to > clock.row ? to : clock.rows });
+}
+
+function end(clock) {
+  const { from } = clock.range;
+  clock.narrow({ from: from <= clock.row ? from : 0, to: clock.row + 1 });
 }
 
 function key(event, clock, speed) {
@@ -29,8 +74,13 @@ function key(event, clock, speed) {
     " ": () => clock.toggle(),
     Home: () => clock.seekRow(0),
     End: () => clock.seekRow(clock.rows - 1),
-    "[": () => slower(speed, -1),
-    "]": () => slower(speed, 1),
+    "-": () => slower(speed, -1),
+    "+": () => slower(speed, 1),
+    "=": () => slower(speed, 1),
+    i: () => begin(clock),
+    o: () => end(clock),
+    l: () => (clock.loop = !clock.loop),
+    r: () => clock.narrow(null),
   };
   const direction = SECOND_KEYS[event.key];
   if (direction && event.shiftKey) clock.seek(clock.time + direction);

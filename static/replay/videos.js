@@ -1,4 +1,5 @@
-// Any number of videos that follow the clock. Row k of every video is shown from k / fps to (k + 1) / fps.
+// Any number of videos that follow the clock. Row k is shown from start + k / fps to start + (k + 1) / fps, where `start`
+// is that of the episode in a file that may hold many.
 
 const NEAR_S = 0.02; // closer than a person sees
 const BEHIND_S = 0.06; // beyond it the clock waits for the video
@@ -10,9 +11,10 @@ export class Videos {
   #clock;
   #videos = [];
 
-  constructor(elements, addresses, clock) {
+  /** `videos`: [{element, address, start}]. */
+  constructor(videos, clock) {
     this.#clock = clock;
-    elements.forEach((video, index) => this.#add(video, addresses[index]));
+    for (const { element, address, start = 0 } of videos) this.#add(element, address, start);
     clock.waitFor(() => this.#playable());
     clock.addEventListener("play", () => this.#start());
     clock.addEventListener("pause", () => this.#stop());
@@ -21,14 +23,17 @@ export class Videos {
     setInterval(() => this.#follow(), CHECK_MS);
   }
 
-  #add(element, address) {
-    const video = { element, broken: false };
-    element.addEventListener("error", () => {
+  #add(element, address, start) {
+    const video = { element, start, broken: false };
+    const broken = () => {
       video.broken = true;
       element.parentElement.querySelector("[data-fault]").textContent = "this video cannot be played";
-    });
+    };
+    element.addEventListener("error", broken);
     element.addEventListener("loadedmetadata", () => this.#place(video));
-    element.src = address;
+    if (element.getAttribute("src") !== address) element.src = address;
+    else if (element.error) broken(); // the page asked for it before this script was here
+    else if (element.readyState >= HTMLMediaElement.HAVE_METADATA) this.#place(video);
     this.#videos.push(video);
   }
 
@@ -38,13 +43,16 @@ export class Videos {
 
   /** Whether all show what the clock says and have the pictures that come next. */
   #playable() {
-    return this.#whole.every(({ element }) => {
-      const over = element.ended || element.duration - element.currentTime < 2 / this.#clock.fps;
-      return over || (element.readyState >= HTMLMediaElement.HAVE_FUTURE_DATA && this.#clock.time - element.currentTime < BEHIND_S);
+    const { duration, fps, time } = this.#clock;
+    return this.#whole.every(({ element, start }) => {
+      const shown = element.currentTime - start;
+      const over = element.ended || Math.min(duration, element.duration - start) - shown < 2 / fps;
+      return over || (element.readyState >= HTMLMediaElement.HAVE_FUTURE_DATA && time - shown < BEHIND_S);
     });
   }
 
   #start() {
+    if (!this.#clock.playing) return;
     for (const video of this.#whole) {
       video.element.playbackRate = this.#clock.rate;
       video.element.play().catch((error) => {
@@ -62,17 +70,18 @@ export class Videos {
   }
 
   /** In the middle of the row's picture, so that no rounding shows a neighbour. */
-  #place({ element }) {
+  #place({ element, start }) {
     const clock = this.#clock;
-    const wanted = clock.playing ? clock.time : (clock.row + 0.5) / clock.fps;
+    const wanted = start + (clock.playing ? clock.time : (clock.row + 0.5) / clock.fps);
     if (Math.abs(element.currentTime - wanted) > 1e-4) element.currentTime = wanted;
   }
 
   #follow() {
+    if (this.#clock.resting) this.#stop();
     if (!this.#clock.playing) return;
     for (const video of this.#whole) {
-      const { element } = video;
-      const off = element.currentTime - this.#clock.time;
+      const { element, start } = video;
+      const off = element.currentTime - start - this.#clock.time;
       if (Math.abs(off) > FAR_S && !element.seeking) this.#place(video);
       const hurry = Math.abs(off) > NEAR_S ? 1 - Math.sign(off) * CATCH_UP : 1;
       element.playbackRate = this.#clock.rate * hurry;

@@ -16,7 +16,7 @@ function align(video) {
 }
 
 function say() {
-  button.textContent = videos.some((video) => !video.paused) ? "Pause all" : "Play all";
+  if (button) button.textContent = videos.some((video) => !video.paused) ? "Pause all" : "Play all";
 }
 
 function playAll() {

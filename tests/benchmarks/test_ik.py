@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import time
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks.ik import _case, _figures
+from benchmarks.ik import _Call, _case, _compared, _enough, _figures
 from benchmarks.ik_paths import CHUNKS, OUT_OF_REACH, ROWS, Chunk, arm_dims, invented
 from robots import Robot, load
 from runtime.kinematics.base import IkFlag, IkResult, Kinematics
@@ -44,6 +46,14 @@ class Guess(Kinematics):
         assert anchor_row == 0
         self.asked += 1
         return self._result
+
+
+class Slow(Guess):
+    """Takes its time for it."""
+
+    def solve(self, *asked: Any, **more: Any) -> IkResult:
+        time.sleep(0.01)
+        return super().solve(*asked, **more)
 
 
 def guess(q: np.ndarray, away: float, flags: int = 0) -> Guess:
@@ -111,3 +121,39 @@ def test_bounds_are_for_the_default_backend_and_exactness_only_where_it_is_possi
     assert far["position_error_mm.r.out_of_reach"] is None
     other = {f.name: f.holds for f in _figures({**made, "kind": "other"})}
     assert other["position_error_mm.r.smooth.other"] is None
+
+
+@pytest.mark.parametrize(
+    ("took", "calls", "enough"),
+    [
+        (1e-4, 8, False),  # a call for each of eight chunks
+        (1e-4, 24, False),
+        (1e-4, 6000, True),
+        (0.1, 7, False),
+        (0.1, 8, False),
+        (0.1, 11, True),
+        (2.0, 7, False),
+        (2.0, 8, True),
+    ],
+)
+def test_a_fast_backend_gets_its_time_and_a_slow_one_a_call_for_each_chunk(
+    took: float, calls: int, enough: bool
+) -> None:
+    assert _enough([_Call(took, took)] * calls, 8, 0.5) is enough
+
+
+def test_a_backend_that_had_its_time_is_not_asked_on_while_another_needs_more() -> None:
+    chunk = chunks()["smooth"][0]
+    q = np.tile(chunk.seed, (ROWS, 1))
+    fast, slow = guess(q, 0.0), Slow(guess(q, 0.0)._result)
+    _case(ROBOT, {"compiled": fast, "other": slow}, [chunk], 0.02)
+    assert slow.asked < fast.asked
+
+
+def test_the_ratio_is_of_processor_time() -> None:
+    def of(kind: str, used: float) -> dict[str, object]:
+        return {"robot": "r", "trajectory": "t", "kind": kind, "chunk_ms": 5.0, "chunk_cpu_ms": used}
+
+    assert [
+        (figure.name, figure.value) for figure in _compared([of("compiled", 0.05), of("other", 25.0)])
+    ] == [("ratio.r.t.other", 500.0)]

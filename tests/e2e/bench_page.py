@@ -71,6 +71,7 @@ class BenchPage:
         return pixels(self.page.locator(f".camera[data-camera={key}] canvas"))
 
     def scene(self):
+        self.page.locator("#scene-note").wait_for(state="hidden")  # it is drawn
         return pixels(self.page.locator("#scene"))
 
     def close(self):

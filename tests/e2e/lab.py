@@ -57,7 +57,11 @@ class Demo:
             assert self.child.poll() is None, (self.folder / "demo.log").read_text()[-2000:]
             return ready.exists()
 
-        eventually(up, 90, "the demo is up")
+        try:
+            eventually(up, 90, "the demo is up")
+        except BaseException:
+            self.child.kill()  # all that it started ends with it
+            raise
         found = json.loads(ready.read_text())
         self.url, self.passwords, self.pids = found["url"], found["passwords"], found["pids"]
         return self

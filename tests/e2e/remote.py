@@ -75,7 +75,8 @@ class Page(LivePage):
             state = self.state()
             if state["state"] == "holding":
                 self.command("resume", trial)
-            return state["state"] == "running" and self.status(trial) == "running"
+            recorded = state["recording"]["rows"] > 0  # else its episode would be empty, and none
+            return state["state"] == "running" and self.status(trial) == "running" and recorded
 
         eventually(moves, _SOON_S, f"trial {trial} runs; the station is {self.state()['reason']}")
 

@@ -85,8 +85,8 @@ def hairline(red, green, blue):
 
 
 @pytest.fixture(scope="module")
-def bench(browser, shared):
-    live = Live(browser, shared, "operator", WIDE).open(f"/stations/{STATION}/debug/")
+def bench(browser, patient):
+    live = Live(browser, patient, "operator", WIDE).open(f"/stations/{STATION}/debug/")
     live.at_rest()
     live.take()
     live.page.keyboard.press("6")
@@ -98,7 +98,7 @@ def bench(browser, shared):
         live.press("stop")
     assert live.errors == []
     live.close()
-    tidy(visitor(shared, "admin"))
+    tidy(visitor(patient, "admin"))
 
 
 def test_a_proposed_chunk_is_a_ghost_until_it_is_cancelled(bench):

@@ -1,19 +1,24 @@
 """The Debug tab by hand, in every mode, with the real processes: what is pressed, what is said, what moves."""
 
+import os
+import signal
+
 import pytest
 
 from tests.e2e.by_hand import SOON_S, ByHand
 from tests.e2e.lab import STATION, WIDE
+from tests.e2e.remote import SKILLED
 from tests.processes import eventually
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 
 @pytest.fixture(scope="module")
-def bench(browser, demo):
-    bench = ByHand(browser, demo, "operator", WIDE).open(f"/stations/{STATION}/debug/")
+def bench(browser, patient):
+    bench = ByHand(browser, patient, "operator", WIDE).open(f"/stations/{STATION}/debug/")
     bench.at_rest()
     bench.take()
+    bench.page.fill("#seed", "1")  # the block is put back: whoever has done the task does not move any more
     yield bench
     assert bench.errors == []
     bench.close()
@@ -29,13 +34,18 @@ def ready(bench):
         bench.stop()
 
 
-def test_the_set_up_shows_its_stages_and_can_be_cancelled_and_repeated(bench):
-    bench.keys("u")
-    active = bench.page.locator("[data-stages] [data-state=active]")
-    active.first.wait_for()
-    assert bench.page.locator("[data-stages] li").count() >= 4
-    bench.keys("s")
-    bench.reaches("IDLE")
+def test_the_set_up_shows_its_stages_and_can_be_cancelled_and_repeated(bench, patient):
+    policy = patient.pid(SKILLED)
+    os.kill(policy, signal.SIGSTOP)  # so that there is something to be cancelled
+    try:
+        bench.keys("u")
+        active = bench.page.locator("[data-stages] [data-state=active]")
+        active.first.wait_for()
+        assert bench.page.locator("[data-stages] li").count() >= 4
+        bench.keys("s")
+        bench.reaches("IDLE")
+    finally:
+        os.kill(policy, signal.SIGCONT)
     assert "cancelled" in bench.snapshot()["reason"]
     bench.keys("u")
     bench.reaches("READY")
@@ -186,8 +196,13 @@ def test_grippers_close_open_and_lock_where_they_are(ready):
     assert ready.snapshot()["grippers"]["left_arm"]["locked"] is True
     ready.keys("-")
     eventually(lambda: "locked" not in left.inner_text(), SOON_S, "it is free again")
-    ready.keys(",")
-    at(0.1)
+
+    def opens():
+        ready.keys(",")  # again where the answer to the key before was still on its way
+        ready.page.wait_for_timeout(1000)
+        return ready.snapshot()["grippers"]["left_arm"]["at"] == pytest.approx(0.1, abs=0.005)
+
+    eventually(opens, SOON_S, "the gripper is open")
     ready.says("[data-drives=said]", "enabled, no fault")
 
 

@@ -51,6 +51,7 @@ class StandIn:
         self.commands: list[Command] = []
         self.pressed: list[Command] = []
         self.guard_says = "done"
+        self.collect: dict[str, Any] | None = None
         self.aims: list[Command] = []
         self.aim_says = Ack("", "done", data={"joints": [0.2] * DIM, "reached": True})
         self.effects = Effortless()
@@ -131,6 +132,7 @@ class StandIn:
                 "epoch": held.epoch if held else self.lease.epoch,
                 "expires_in": held.until - time.monotonic() if held else 0.0,
             },
+            "collect": self.collect,
             "latency": float("nan"),
             "newest_event": self.events.newest,
         }

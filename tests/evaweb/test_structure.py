@@ -8,11 +8,15 @@ from tests.sources import Sources
 
 # Who stands on whom; those of one floor do not know each other, but for the ground, where only circles are wrong.
 FLOORS = (
-    "errors environment roles frames lock_wait celery settings refusals administration apps",
+    "cells remembered errors environment roles frames lock_wait celery settings refusals administration apps "
+    "statistics guards sight sight_tags",
     "stations",
     "jobs",
     "episodes",
-    "trials",
+    "reviews",
+    "trials collect",
+    "plans",
+    "results preflights datasets",
     "console api",
     "lab",
     "asgi urls",

@@ -7,10 +7,10 @@ from typing import Any
 
 from django import template
 
+from evaweb.statistics.proportions import Proportion
 from evaweb.trials import figures
 from evaweb.trials.lifecycle import advice
 from evaweb.trials.models import TrialStatus
-from evaweb.trials.statistics import Proportion
 
 register = template.Library()
 

@@ -78,7 +78,7 @@ def test_a_browser_needs_its_csrf_token_to_change_something_and_none_to_read(ben
         ("trials", {"limit": "many"}, "limit = 'many'"),
         ("trials", {"limit": 10**6}, "less than or equal to 1000"),
         ("trials", {"offset": -1}, "offset"),
-        ("trials", {"format": "xml"}, "'json' or 'csv'"),
+        ("trials", {"format": "xml"}, "'json', 'csv' or 'parquet'"),
         ("episodes", {"status": "gone"}, "status = 'gone'"),
         (
             "trials",

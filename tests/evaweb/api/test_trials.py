@@ -3,6 +3,8 @@ import io
 
 import pytest
 
+from evaweb.plans.models import Plan
+from evaweb.plans.services import plan_freeze
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Trial
 from tests.evaweb.trials import builders
@@ -197,3 +199,24 @@ def test_scenes_and_checkpoints_are_listed_and_inactive_ones_on_request(rest, be
     Checkpoint.objects.create(name="lab/pi0/step 5000")
     assert rest.get("checkpoints/lab/pi0/step 5000")[1]["name"] == "lab/pi0/step 5000"
     assert "policy" not in rest.get("checkpoints/pi0-block")[1]
+
+
+def test_a_checkpoint_says_its_weights_its_lineage_and_its_tags_and_is_found_by_a_tag(rest, bench):
+    old = Checkpoint.objects.create(name="base", tags=["v1"])
+    Checkpoint.objects.create(name="tuned", parent=old, digest="sha256:0123abcd", tags=["v10", "block"])
+    found = rest.get("checkpoints/tuned")[1]
+    assert (found["parent"], found["digest"], found["tags"]) == ("base", "sha256:0123abcd", ["v10", "block"])
+    assert rest.get("checkpoints/base")[1]["parent"] is None
+    assert [row["name"] for row in rest.get("checkpoints", tag="v1")[1]["items"]] == ["base"]
+    assert rest.get("checkpoints", tag="%")[1]["total"] == 0
+
+
+def test_a_parent_of_a_blind_plan_is_not_named(rest, bench):
+    hidden = Checkpoint.objects.create(name="of-the-plan")
+    Checkpoint.objects.create(name="tuned", parent=hidden)
+    owner = builders.user("olga")
+    plan = Plan.objects.create(name="blind", title="Blind", owner=owner, blind=True)
+    plan.checkpoints.set([hidden])
+    plan.positions.set(bench.scene.positions.all())
+    plan_freeze(user=owner, plan=plan)
+    assert rest.get("checkpoints/tuned")[1]["parent"] is None

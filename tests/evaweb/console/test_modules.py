@@ -550,3 +550,61 @@ def test_an_early_e_stop_that_failed_says_to_use_the_hardware_stop(status: int, 
     found = run("words.js", EARLY + "listeners.estop(); await settled(); return shown();", given)
 
     assert found == ["failed", "USE THE HARDWARE STOP"]
+
+
+def camera(
+    condition: str, why: str = "", since: float = 10.0, losses: int = 0, age: float | None = 0.04
+) -> Any:
+    """As the runtime tells of it."""
+    told = {"kind": "rtsp", "source": "rtsp://10.0.0.7:554/one", "condition": condition, "since": since}
+    return {**told, "why": why, "losses": losses, "age": age}
+
+
+def test_a_camera_of_the_stations_own_is_named_with_what_is_wrong() -> None:
+    refused = "refused: nothing listens at that port"
+    cameras = {
+        "live": camera("live"),
+        "absent": camera("opening", refused, age=None),
+        "lost": camera("lost", refused, since=12.5, losses=1),
+        "ended": camera("ended", "the file is over"),
+        "other": camera("melting", "it is hot"),
+        "transports": None,
+    }
+    body = (
+        "return Object.fromEntries(Object.entries(given).map(([name, told]) => [name, m.trouble(told, 16)]))"
+    )
+    assert run("camera_words.js", body, cameras) == {
+        "live": None,
+        "absent": {"word": "no picture yet", "reason": refused},
+        "lost": {"word": "reconnecting, lost 3.5 s ago", "reason": refused},
+        "ended": {"word": "the video is over", "reason": "the file is over"},
+        "other": {"word": "melting", "reason": "it is hot"},
+        "transports": None,
+    }
+
+
+def test_all_cameras_of_the_stations_own_are_told_in_a_line() -> None:
+    cameras = {"cam_high": camera("live", losses=2), "cam_wrist": camera("opening", "404", age=None)}
+    body = "return [m.summary(given, 16), m.summary(undefined, 16), m.summary({}, 16)]"
+    assert run("camera_words.js", body, cameras) == [
+        "cam_high: rtsp from rtsp://10.0.0.7:554/one: newest picture 40 ms old, lost 2 times; "
+        "cam_wrist: no picture yet (404)",
+        "",
+        "",
+    ]
+    once = {"a": camera("live", losses=1, age=None)}
+    assert run("camera_words.js", "return m.summary(given, 16)", once) == (
+        "a: rtsp from rtsp://10.0.0.7:554/one: no picture yet, lost once"
+    )
+
+
+def test_what_happens_to_cameras_is_weighed() -> None:
+    kinds = ["camera_absent", "camera_lost", "camera_ended", "camera_is_a_video", "camera_back"]
+    body = "return given.map((kind) => [m.kindWords(kind), m.weight({kind, text: ''})])"
+    assert run("event_words.js", body, kinds) == [
+        ["camera absent", "warn"],
+        ["camera lost", "warn"],
+        ["video is over", "warn"],
+        ["video as camera", "warn"],
+        ["camera is back", "good"],
+    ]

@@ -17,7 +17,8 @@ from django.utils import timezone
 from evaweb.console import selectors
 from evaweb.episodes.models import Episode
 from evaweb.roles import Role
-from evaweb.stations.commands import KINDS
+from evaweb.sight import EVERYTHING
+from evaweb.stations.commands import COLLECTING, KINDS
 from evaweb.stations.models import Command, Lease, LeaseRequest, Station
 from evaweb.trials.models import (
     Checkpoint,
@@ -285,7 +286,7 @@ def test_the_debug_page_gives_every_command_there_is(browser: Client, station: S
     html = text_of(browser, "/stations/bench-1/debug/")
     given = set(re.findall(r'data-command="(\w+)"', html))
 
-    assert given == set(KINDS) - {"estop"}
+    assert given == set(KINDS) - {"estop", *COLLECTING}
 
 
 @pytest.mark.parametrize("status", [None, "prepared", "running", "paused", "ended"])
@@ -443,13 +444,13 @@ def test_a_trial_is_set_up_by_the_last_set_up_of_its_station_alone(
 ) -> None:
     own = Command.objects.create(station=station, user=ada, kind="setup", status="accepted")
     make_trial(station, ada, setup=own.pk)
-    assert selectors.panel(station=station).set_up
+    assert selectors.panel(station=station, user=ada, sight=EVERYTHING).set_up
 
     refused = Command.objects.create(station=station, user=ada, kind="setup", status="refused")
-    assert selectors.panel(station=station).set_up, refused
+    assert selectors.panel(station=station, user=ada, sight=EVERYTHING).set_up, refused
 
     Command.objects.create(station=station, user=ada, kind="setup", status="unknown")
-    assert not selectors.panel(station=station).set_up
+    assert not selectors.panel(station=station, user=ada, sight=EVERYTHING).set_up
 
 
 @pytest.mark.parametrize(
@@ -514,7 +515,7 @@ def test_the_failures_of_before_are_offered_newest_first(
         Score.objects.create(trial=trial, rater=ada, success=False, score=0.0, failure=word)
     make_trial(station, ada, "ended")
 
-    assert selectors.panel(station=station).failures == ("dropped", "missed")
+    assert selectors.panel(station=station, user=ada, sight=EVERYTHING).failures == ("dropped", "missed")
 
 
 @pytest.mark.parametrize(("status", "number"), [("scored", 2), ("voided", 1), ("interrupted", 1)])
@@ -523,7 +524,7 @@ def test_the_next_choice_begins_where_the_last_trial_leads(
 ) -> None:
     make_trial(station, ada, status)
 
-    found = selectors.panel(station=station)
+    found = selectors.panel(station=station, user=ada, sight=EVERYTHING)
 
     assert found.position is not None
     assert found.position.number == number

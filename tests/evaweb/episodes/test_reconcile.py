@@ -19,6 +19,8 @@ from evaweb.errors import EvaError
 from evaweb.jobs import services as jobs
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Station
+from runtime.datasets.operations import convert
+from tests.runtime.datasets.foreign import Plan, write
 
 pytestmark = pytest.mark.django_db
 
@@ -88,6 +90,7 @@ def test_what_cannot_be_read_is_told_and_keeps_no_other(
     broken = data / "datasets" / "other" / "meta"
     broken.mkdir(parents=True)
     (broken / "info.json").write_text('{"codebase_version": "v9"}')
+    shutil.copytree(broken, data / "datasets" / ".other.draft-x" / "meta")  # on its way
     report = reconcile()
     assert report.episodes == 1
     assert Episode.objects.count() == 1
@@ -95,6 +98,7 @@ def test_what_cannot_be_read_is_told_and_keeps_no_other(
     assert f"{damaged / 'manifest.json'} is not a whole JSON document" in told
     assert f"{data / 'episodes' / 'notes'} is no episode: its name is no uuid" in told
     assert "is a dataset of version 'v9'" in told
+    assert ".other.draft-x" not in told
 
 
 def test_a_manifest_of_another_episode_is_not_taken_for_this_one(
@@ -224,3 +228,63 @@ def test_a_table_that_is_missing_is_asked_for_and_a_damaged_episode_has_none(
     Job.objects.all().delete()
     reconcile()
     assert not Job.objects.exists()
+
+
+# --- one episode in several datasets -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def published(closed: Callable[..., Episode], data: Path) -> Episode:
+    """An episode in the dataset that it was published into."""
+    episode = closed()
+    services.publish_asked(episode=episode)
+    jobs.work("lab")
+    return Episode.objects.get(uuid=episode.uuid)
+
+
+def place(episode: Episode) -> tuple[str, int | None]:
+    return Episode.objects.values_list("dataset", "dataset_index").get(uuid=episode.uuid)
+
+
+def test_an_episode_stays_where_it_was_published_when_copies_of_that_are_made(
+    published: Episode, data: Path
+) -> None:
+    home = data / published.dataset
+    convert(home, data / "datasets" / "a-copy", "v3.0")
+    convert(home, data / "datasets" / "z-copy", "v2.1")
+    assert reconcile().problems == ()
+    assert place(published) == (published.dataset, 0)
+
+
+def test_a_lost_database_finds_the_dataset_again_that_is_no_copy(published: Episode, data: Path) -> None:
+    convert(data / published.dataset, data / "datasets" / "a-copy", "v3.0")
+    Episode.objects.all().delete()
+    reconcile()
+    assert place(published) == (published.dataset, 0)
+
+
+def test_a_copy_counts_once_the_dataset_that_it_was_made_of_is_gone(published: Episode, data: Path) -> None:
+    convert(data / published.dataset, data / "datasets" / "a-copy", "v3.0")
+    shutil.rmtree(data / published.dataset)
+    reconcile()
+    assert place(published) == ("datasets/a-copy", 0)
+
+
+def test_an_episode_that_is_in_no_dataset_any_more_is_not_said_to_be(published: Episode, data: Path) -> None:
+    shutil.rmtree(data / published.dataset)
+    reconcile()
+    row = Episode.objects.get(uuid=published.uuid)
+    assert (row.dataset, row.dataset_index, row.published_at) == ("", None, None)
+
+
+def test_a_dataset_that_cannot_be_read_keeps_its_episodes(published: Episode, data: Path) -> None:
+    convert(data / published.dataset, data / "datasets" / "a-copy", "v3.0")
+    (data / published.dataset / "meta" / "eva_episodes.jsonl").write_text("{")
+    assert len(reconcile().problems) == 1
+    assert place(published) == (published.dataset, 0)
+
+
+def test_datasets_of_others_in_any_version_are_no_problem(data: Path, db: None) -> None:
+    for version in ("v2.0", "v2.1", "v3.0"):
+        write(data / "datasets" / f"theirs-{version}", Plan(version, lengths=(4,), videos=()))
+    assert reconcile().problems == ()

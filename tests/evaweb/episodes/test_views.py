@@ -250,6 +250,10 @@ def page_of(browser: Client, episode: Episode) -> str:
 def test_the_page_has_a_video_for_each_camera_and_no_stop(previewed: Episode, browser: Client) -> None:
     page = page_of(browser, previewed)
     assert page.count("<video ") == 3
+    for video in json.loads(
+        page.partition('<script id="config" type="application/json">')[2].partition("<")[0]
+    )["videos"]:
+        assert f'<video src="{video["address"]}"' in page  # asked for before any script runs
     assert 'data-stage="ready"' in page
     assert "estop" not in page
 

@@ -1,3 +1,5 @@
+import json
+
 import pytest
 from django.test import Client
 
@@ -106,6 +108,31 @@ def test_a_policy_that_cannot_be_is_refused_with_a_sentence(admin, policy, sente
 def test_a_checkpoint_without_a_table_is_reached_as_deployed(admin):
     assert admin.post("/admin/trials/checkpoint/add/", {"name": "new", "policy": ""}).status_code == 302
     assert Checkpoint.objects.get(name="new").policy == {}
+
+
+def test_a_checkpoint_behind_a_tunnel_says_through_which_host_it_is_reached(admin):
+    policy = {"url": "ws://127.0.0.1:9000", "tunnel": {"host": "gpu-1.lab", "user": "lab"}}
+    form = {"name": "far", "policy": json.dumps(policy), "active": "on"}
+    assert admin.post("/admin/trials/checkpoint/add/", form).status_code == 302
+    assert Checkpoint.objects.get(name="far").policy == policy
+    listed = admin.get("/admin/trials/checkpoint/").content.decode()
+    assert "ws://127.0.0.1:9000 through gpu-1.lab" in listed
+
+
+def test_weights_lineage_and_tags_are_written_and_weights_that_were_tried_stay(admin, bench):
+    bench.scored()
+    page = f"/admin/trials/checkpoint/{bench.checkpoint.pk}/change/"
+    base = Checkpoint.objects.create(name="base")
+    form = {"policy": "{}", "active": "on", "digest": "sha256:0123abcd", "tags": "block,  v2, block"}
+    assert admin.post(page, form | {"parent": base.pk}).status_code == 302
+    bench.checkpoint.refresh_from_db()
+    assert (bench.checkpoint.digest, bench.checkpoint.tags) == ("sha256:0123abcd", ["block", "v2"])
+    assert bench.checkpoint.lineage == [base]
+    assert 'value="block, v2"' in admin.get(page).content.decode()
+    admin.post(page, form | {"digest": "sha256:9999ffff"})
+    bench.checkpoint.refresh_from_db()
+    assert bench.checkpoint.digest == "sha256:0123abcd"  # what was tried were these
+    assert "words of at most 40" in errors(admin.post(page, form | {"tags": "two words"}))
 
 
 def test_a_change_of_a_tried_policy_is_warned_about(admin, bench):

@@ -2,8 +2,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evaweb.statistics.proportions import proportion
 from evaweb.trials.figures import bar, interval, percent
-from evaweb.trials.statistics import proportion
 
 
 @given(st.integers(1, 300).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))

@@ -6,6 +6,7 @@ import pytest
 from django.db import IntegrityError, connection, transaction
 from django.db.models import ProtectedError
 
+from evaweb.episodes import lines as disk
 from evaweb.episodes.services import episode_opened
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
@@ -330,7 +331,7 @@ def test_what_cannot_be_written_to_the_disk_is_no_score(bench, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(journal, "_written", full)
+    monkeypatch.setattr(disk, "_written", full)
     with pytest.raises(EvaError, match="not kept: No space left on device"):
         score(bench, trial)
     trial.refresh_from_db()

@@ -3,10 +3,27 @@ from django.core.exceptions import ValidationError
 
 from evaweb.trials.tables import check_bench, check_policy
 
+KEY = "-----BEGIN OPENSSH PRIVATE KEY-----\nc2VjcmV0\n"
+
 
 @pytest.mark.parametrize(
     "policy",
-    [{}, {"url": "ws://10.0.0.1:8000"}, {"kind": "openpi", "image_size": [224, 224]}, {"kind": "mock"}],
+    [
+        {},
+        {"url": "ws://10.0.0.1:8000"},
+        {"kind": "openpi", "image_size": [224, 224]},
+        {"kind": "mock"},
+        {
+            "tunnel": {
+                "host": "gpu-1.lab",
+                "user": "lab",
+                "identity_file": "~/.ssh/id_lab",
+                "jump": ["gate.lab"],
+            }
+        },
+        {"kind": "gr00t", "tunnel": {"user": "lab"}},  # its host is the deployment's
+        {"tunnel": None},  # the deployment's is not for this one
+    ],
 )
 def test_policies_that_a_deployment_could_have_pass(policy):
     check_policy(policy)
@@ -23,6 +40,19 @@ def test_policies_that_a_deployment_could_have_pass(policy):
         ({"nonsense": 1}, "nonsense: unknown key"),
         ({"uri": "ws://10.0.0.1:8000"}, "uri: unknown key for kind 'openpi'; allowed: "),
         ({"image_size": [224]}, "image_size = [224]: "),
+        (
+            {"tunnel": {"host": "-oProxyCommand=id"}},
+            "tunnel.host = '-oProxyCommand=id': must be a host's name",
+        ),
+        (
+            {"tunnel": {"hosts": "gpu"}},
+            "tunnel.hosts: unknown key for kind 'openpi'; allowed: host, user, port",
+        ),
+        ({"kind": "mock", "tunnel": {"host": "gpu"}}, "tunnel: unknown key for kind 'mock'"),
+        (
+            {"tunnel": {"host": "gpu", "identity_file": KEY}},
+            "tunnel.identity_file: must be the path of a file",
+        ),
         ({"amplitud": 0.1}, "amplitud: unknown key for kind 'mock'; allowed: kind, amplitude"),
     ],
 )
@@ -30,6 +60,17 @@ def test_other_policies_are_refused_with_what_is_allowed(policy, sentence):
     with pytest.raises(ValidationError) as refused:
         check_policy(policy)
     assert sentence in " ".join(refused.value.messages)
+
+
+def test_nothing_of_a_key_is_shown_again():
+    with pytest.raises(ValidationError) as refused:
+        check_policy(
+            {"kind": "openpi", "tunnel": {"host": "gpu", "identity_file": KEY, "password": "c2VjcmV0"}}
+        )
+    said = " ".join(refused.value.messages)
+    assert "tunnel.password: unknown key" in said
+    assert "PRIVATE KEY" not in said
+    assert "c2VjcmV0" not in said
 
 
 @pytest.mark.parametrize(

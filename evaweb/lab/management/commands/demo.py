@@ -4,25 +4,34 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from argparse import ArgumentParser
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from django.conf import settings
 from django.core.management.base import BaseCommand, CommandError
 
 import robots
 from evaweb.errors import EvaError
-from evaweb.lab import programs, seed
+from evaweb.frames import plain
+from evaweb.lab import evaluate, lifetime, programs, seed
 from evaweb.lab.lab import Bench, Lab, a_lab
 from evaweb.lab.lifetime import Ended
 from evaweb.lab.once import Choice, perform, report
 from evaweb.lab.seed import Login
 from evaweb.lab.visitor import Visitor
+from evaweb.plans.models import Plan
+from evaweb.results.analysis import Analysis, Comparison, analyse
+from evaweb.results.gathering import outcomes_of_plan
 from evaweb.roles import Role
+from evaweb.trials.models import Checkpoint
 
 _DEPLOYMENTS = settings.BASE_DIR / "deployments"
+_MOST = 2000  # trials of --evaluate: a day and more
 _STATION, _ROBOT = "bench-1", "agilex_piper"
 _SKILLED, _CLUMSY = "pick-place-40k", "pick-place-8k"
 _POLICIES = {
@@ -46,26 +55,47 @@ class Command(BaseCommand):
         parser.add_argument("--host", default="127.0.0.1", help="address that the web listens on")
         parser.add_argument("--port", type=int, default=8000, help="port of the web; 0 takes a free one")
         parser.add_argument("--once", action="store_true", help="run, score and publish one trial, then end")
-        parser.add_argument("--json", type=Path, metavar="FILE", help="with --once: write the result there")
+        parser.add_argument(
+            "--evaluate",
+            type=int,
+            metavar="N",
+            help="carry out N trials of a blind plan without a human, reveal it, compare, then end",
+        )
+        parser.add_argument(
+            "--json", type=Path, metavar="FILE", help="with --once or --evaluate: write the result there"
+        )
         parser.add_argument(
             "--ready-file", type=Path, help="write address and logins there as JSON, for scripts"
         )
         parser.add_argument("--robot", default=_ROBOT, help="which robot the simulated bench has")
+        parser.add_argument(
+            "--collect", action="store_true", help="the bench collects too, led by a simulated leader"
+        )
         parser.add_argument("--seed", type=int, default=1, help="of the bench and of the policies")
+        parser.add_argument(
+            "--set",
+            action="append",
+            default=[],
+            metavar="KEY=VALUE",
+            help="on top of the station's deployment, as with python -m runtime",
+        )
         parser.add_argument("--position", type=int, default=1, help="with --once: the position of the scene")
         parser.add_argument(
             "--checkpoint", default=_SKILLED, choices=list(_POLICIES), help="with --once: which policy"
         )
 
     def handle(self, *args: Any, **options: Any) -> None:
+        _check(options)
         deployment = _deployment(options["robot"])
         try:
             with a_lab(options["host"], options["port"]) as lab:
-                url, logins = self._up(lab, deployment, options["robot"], options["seed"])
+                url, logins = self._up(lab, deployment, options)
                 if options["ready_file"]:
                     _announce(options["ready_file"], url, logins, lab.processes.pids())
                 if options["once"]:
                     self._once(url, logins[0], options)
+                elif options["evaluate"]:
+                    self._evaluate(url, logins, options)
                 else:
                     self._welcome(url, logins)
                     lab.watch()
@@ -76,11 +106,14 @@ class Command(BaseCommand):
                 options["json"].write_text(json.dumps({"error": str(error)}), "utf-8")
             raise CommandError(str(error)) from None
 
-    def _up(self, lab: Lab, deployment: Path, robot: str, seed_number: int) -> tuple[str, list[Login]]:
+    def _up(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> tuple[str, list[Login]]:
+        robot, seed_number = options["robot"], options["seed"]
         node = lab.processes.start(programs.tabletop(robot, seed_number))
         served = {}
-        for name, (description, options) in _POLICIES.items():
-            serving = programs.policy(name, robot, (*options, "--seed", str(seed_number)))
+        for name, (description, skill) in _POLICIES.items():
+            known = Checkpoint.objects.filter(name=name).values_list("policy__url", flat=True).first()
+            port = free_port_of(known)  # a plan that is frozen names it
+            serving = programs.policy(name, robot, (*skill, "--seed", str(seed_number)), port)
             served[name] = lab.processes.start(serving)["url"]
             seed.demo_checkpoint(name=name, description=description, policy={"url": served[name]})
         seed.demo_scene()
@@ -89,10 +122,34 @@ class Command(BaseCommand):
             f'transport.sub_endpoint="{node["obs_endpoint"]}"',
             f'transport.pub_endpoint="{node["action_endpoint"]}"',
             f'policy.url="{served[_SKILLED]}"',
+            *options["set"],
         ]
+        if options["collect"]:
+            leader = lab.processes.start(programs.leader(robot, node["obs_endpoint"], seed_number))
+            assignments += [
+                'collection.source="relay"',
+                'collection.dataset="tabletop_demonstrations"',
+                'collection.leader.kind="zmq"',
+                f'collection.leader.endpoint="{leader["endpoint"]}"',
+            ]
         url = lab.up([Bench(deployment, assignments)])
         roles = {"operator": Role.OPERATOR, "admin": Role.ADMIN}
-        return url, [seed.demo_login(username=name, role=role) for name, role in roles.items()]
+        logins = [seed.demo_login(username=name, role=role) for name, role in roles.items()]
+        try:
+            self._plan("block-on-plate-blind", "Block on plate", "evaluated", repetitions=3)
+        except EvaError as error:
+            self.stderr.write(f"The demo's plan is left as it is: {error}")
+        return url, logins
+
+    def _plan(self, name: str, title: str, use: str, repetitions: int) -> Plan:
+        # What a blind plan hands out is hidden from operators: single trials keep theirs.
+        served = [Checkpoint.objects.get(name=policy) for policy in (_SKILLED, _CLUMSY)]
+        checkpoints = [
+            seed.demo_checkpoint(name=f"{row.name}-{use}", description=row.description, policy=row.policy)
+            for row in served
+        ]
+        given = {"owner": "admin", "scene": seed.demo_scene(), "checkpoints": checkpoints}
+        return seed.demo_plan(name=name, title=title, repetitions=repetitions, **given)
 
     def _welcome(self, url: str, logins: list[Login]) -> None:
         self.stdout.write(f"\nEVA Web is at {url}\n")
@@ -101,6 +158,27 @@ class Command(BaseCommand):
         self.stdout.write(f"\nThe data is in {settings.DATA_DIR}, logs in its folder logs.")
         self.stdout.write("Ctrl-C ends everything.")
         self.stdout.flush()
+
+    def _evaluate(self, url: str, logins: list[Login], options: dict[str, Any]) -> None:
+        begun, count = time.monotonic(), options["evaluate"]
+        name = f"evaluate-{time.strftime('%Y%m%d-%H%M%S')}"
+        positions = seed.demo_scene().positions.count()
+        plan = self._plan(
+            name, f"{count} trials by the script", "by-script", repetitions=-(-count // (2 * positions))
+        )
+        self.stderr.write(f"{plan}: commitment {plan.commitment}")
+        visitors = [Visitor(url) for _ in logins]
+        for visitor, login in zip(visitors, logins, strict=True):
+            visitor.login(login.username, login.password)
+        made = evaluate.carry_out(visitors[0], _STATION, name, count, self.stderr.write)
+        result = evaluate.revealed(visitors[1], name, made)
+        plan.refresh_from_db()
+        found = analyse(outcomes_of_plan(plan), primary=(f"{_SKILLED}-by-script", f"{_CLUMSY}-by-script"))
+        result |= {"analysis": asdict(found), "wall_s": time.monotonic() - begun}
+        if options["json"]:
+            options["json"].write_text(json.dumps(plain(result), indent=1), "utf-8")
+        for line in told(found):
+            self.stdout.write(line)
 
     def _once(self, url: str, operator: Login, options: dict[str, Any]) -> None:
         visitor = Visitor(url)
@@ -113,6 +191,56 @@ class Command(BaseCommand):
         if options["json"]:
             options["json"].write_text(text, "utf-8")
         self.stdout.write(text)
+
+
+def told(found: Analysis) -> Iterator[str]:
+    """The comparison in a few lines: each rate with n and interval, the difference with its interval and evidence."""
+    for arm in found.arms:
+        yield f"{arm.checkpoint}: {arm.success.successes}/{arm.success.n} {_percent(arm.success.interval)}"
+    for one in found.comparisons:
+        yield (
+            f"{one.first} against {one.second}: difference {100 * one.difference.value:.0f} points "
+            f"{_percent(one.difference.interval)}, Barnard p = {one.test.p:.4f}, {one.pairs} pairs"
+        )
+        yield f"  {_evidence(one)}"
+    for note in found.notes:
+        yield f"  {note}"
+
+
+def _evidence(one: Comparison) -> str:
+    """What the test says that holds however often one looks."""
+    found = one.evidence
+    if found.winner is not None:
+        winner = one.first if found.winner == "first" else one.second
+        return f"evidence sufficed after {found.stop} pairs: {winner} is better (alpha = {found.alpha:g})"
+    least = min([*found.p_first[-1:], *found.p_second[-1:]], default=1.0)
+    return f"evidence does not suffice yet: anytime-valid p = {least:.3f}, wanted {found.alpha / 2:g} for a direction"
+
+
+def _percent(interval: Any) -> str:
+    return f"[{100 * interval.low:.0f}, {100 * interval.high:.0f}] %" if interval else "[no interval]"
+
+
+def _check(options: Mapping[str, Any]) -> None:
+    count = options["evaluate"]
+    if count is not None and (count < 2 or count % 2 or count > _MOST):
+        raise CommandError(
+            f"--evaluate {count}: allowed: an even number from 2 to {_MOST}, two checkpoints have a trial each"
+        )
+    if count is not None and options["once"]:
+        raise CommandError("--evaluate with --once: name one of them")
+
+
+def free_port_of(url: str | None) -> int:
+    """The port of that address where nobody has it now, else 0."""
+    port = urlsplit(url).port if url else None
+    if not port:
+        return 0
+    try:
+        lifetime.require_free("127.0.0.1", port)
+    except EvaError:
+        return 0
+    return port
 
 
 def _deployment(robot: str) -> Path:

@@ -1,0 +1,191 @@
+"""What it takes to record, and what a kill takes: a station's recorder, LeRobot's beside it, kill -9, a long list.
+
+One station records three cameras of 640x480 at 30 Hz, ends and publishes. Then the recorder alone and LeRobot's own
+writer are given the same frames at the same pace, if an interpreter with LeRobot is there: this one, or one that
+EVA_LEROBOT_PYTHONS names. Then processes are killed at random moments, and the page of 10,000 episodes is asked for.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from benchmarks import recording_frames, recording_station
+from benchmarks.busy_lab import PATIENT
+from benchmarks.labs import ROOT
+from benchmarks.recording_kills import Many, food, kill_recording, kill_worker
+from benchmarks.report import Figure, Report
+
+SECONDS = 60.0
+_LONG_S = 600.0
+_KILLED_S = (
+    200.0,
+    60.0,
+)  # for killing what records, and the worker: the default run is to end within ten minutes
+_BESIDE_S = 15.0  # of the same frames, per writer
+_LISTED = 10_000
+_MODES = ("default", "streaming")
+
+
+def measure(seconds: float, long: bool = False) -> Report:
+    """`frames_lost`, `memory_growth_mb`, `cpu_core_percent`, `stop_to_saved_s`, `kill9_worst_loss_s`, `list_10000_ms`.
+
+    And what they were made of; `load_1min` is of the machine at the end, each part's own stands in its row.
+    """
+    seed = random.SystemRandom().randrange(1 << 32)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        station = _timed(recording_station.record, _made(folder / "station"), _LONG_S if long else seconds)
+        frames = recording_frames.write(folder / "frames.npy")
+        beside = _timed(_beside, folder, frames)
+        kills = _timed(_kills, folder, frames, long, seed)
+        listing = _timed(_listing, _made(folder / "listing"))
+    return Report(
+        "recording",
+        figures(station, beside, kills, listing),
+        [
+            {"part": "station", **station},
+            {"part": "beside", **beside},
+            {"part": "kills", "seed": seed, **kills},
+            {"part": "listing", **listing},
+        ],
+    )
+
+
+def figures(
+    station: Mapping[str, Any],
+    beside: Mapping[str, Any],
+    kills: Mapping[str, Any],
+    listing: Mapping[str, Any],
+) -> list[Figure]:
+    """What is wanted of the four parts, and what is only told."""
+    memory, disk = station["memory_mb"], station["to_disk_ms"]
+    rows: Sequence[Mapping[str, Any]] = kills["rows"]
+    return [
+        Figure("frames_lost", station["frames_lost"], "", "== 0"),
+        Figure("cpu_core_percent", station["cpu_core_percent"], "%", "<= 50"),
+        Figure("cpu_core_percent.not_recording", station["cpu_core_percent_not_recording"], "%"),
+        Figure("memory_growth_mb", memory["peak"] - memory["start"], "MB", "<= 50"),
+        *(Figure(f"memory_{when}_mb", memory[when], "MB") for when in ("before", "start", "end", "peak")),
+        *(Figure(f"capture_to_disk_{q}_ms", value, "ms") for q, value in disk.items()),
+        Figure("stop_to_saved_s", station["stop_to_saved_s"], "s", "<= 1"),
+        Figure("publish_s", station["publish_s"], "s"),
+        Figure("publish_changed_frames", station["publish_changed_frames"], "", "== 0"),
+        *_ratios(beside["rows"]),
+        Figure("kill9_worst_loss_s", max(row["lost_s"] for row in rows), "s", "<= 1"),
+        *(
+            Figure(
+                f"kill9_worst_loss_s.{process}",
+                max(r["lost_s"] for r in rows if r["process"] == process),
+                "s",
+            )
+            for process in dict.fromkeys(row["process"] for row in rows)
+        ),
+        Figure("kill9_kills", sum(row["after_s"] is not None for row in rows), ""),
+        Figure("kill9_not_opening", sum(len(row.get("problems", ())) for row in rows), "", "== 0"),
+        Figure("list_10000_ms", max(row["median_ms"] for row in listing["rows"]), "ms", "<= 200"),
+        Figure("list_10000_processor_ms", max(row["processor_ms"] for row in listing["rows"]), "ms"),
+        Figure("load_1min", os.getloadavg()[0], ""),
+    ]
+
+
+def _ratios(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
+    """LeRobot's processor time per recorded frame as a multiple of ours, its dataset included in both."""
+    (ours,) = (row for row in rows if row["writer"] == "ours")
+    per_frame = {row["writer"]: (row["capture_cpu_s"] + row["save_cpu_s"]) / row["frames"] for row in rows}
+    found = [
+        Figure(f"cpu_ms_per_frame.{writer}", value * 1000.0, "ms") for writer, value in per_frame.items()
+    ]
+    for row in rows:
+        if row is not ours:
+            found += [
+                Figure(f"cpu_ratio.{row['writer']}", per_frame[row["writer"]] / per_frame["ours"], "x"),
+                Figure(f"save_ratio.{row['writer']}", row["save_s"] / ours["save_s"], "x"),
+            ]
+    return found
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def _timed(part: Any, *arguments: Any) -> dict[str, Any]:
+    """What a part found, how long it took, and the load of the machine when it ended."""
+    begun = time.monotonic()
+    print(f"recording: {part.__name__.strip('_')}", file=sys.stderr)  # minutes pass: say where it is
+    found = part(*arguments)
+    return {**found, "took_s": time.monotonic() - begun, "load": os.getloadavg()}
+
+
+def _beside(folder: Path, frames: Path) -> dict[str, Any]:
+    count = str(round(_BESIDE_S * 30))
+    own = _child(sys.executable, "recording_alone", str(frames), count, str(folder / "ours"))
+    rows = [{"writer": "ours", **own}]
+    for number, python in enumerate(interpreters()):
+        for mode in _MODES:
+            where = str(folder / f"lerobot_{number}_{mode}")
+            found = _child(python, "recording_lerobot", str(frames), count, where, mode)
+            rows.append({"writer": f"lerobot_{found['version']}_{mode}", **found})
+    return {"rows": rows}
+
+
+def interpreters() -> list[str]:
+    """Those that have a LeRobot whose writer can encode while it records, which is 0.4.4 and later."""
+    named = [path for path in os.environ.get("EVA_LEROBOT_PYTHONS", "").split(":") if path]
+    if find_spec("lerobot") is not None:
+        named.append(sys.executable)
+    asked = "from importlib.metadata import version; print(version('lerobot'))"
+    versions = {
+        path: subprocess.run(
+            [path, "-c", asked], stdout=subprocess.PIPE, text=True, check=True
+        ).stdout.strip()
+        for path in named
+    }
+    return [path for path, told in versions.items() if tuple(map(int, told.split(".")[:3])) >= (0, 4, 4)]
+
+
+def _child(python: str, module: str, *arguments: str, **environment: str) -> dict[str, Any]:
+    """What a module of ours prints last, as JSON; the whole of what it says where it fails."""
+    command = [python, "-m", f"benchmarks.{module}", *arguments]
+    done = subprocess.run(
+        command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        raise SystemExit(f"{' '.join(command)} ended with {done.returncode}: {done.stderr[-3000:]}")
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def _kills(folder: Path, frames: Path, long: bool, seed: int) -> dict[str, Any]:
+    """Each process at 10 moments, 50 where it may be long; fewer on a slow machine, but 10 in all."""
+    recording, working = (
+        (Many(150, 150, 0.0), Many(50, 50, 0.0))
+        if long
+        else (Many(30, 8, _KILLED_S[0]), Many(10, 2, _KILLED_S[1]))
+    )
+    lab = recording_station.PatientLab(_made(folder / "kills"))
+    try:
+        lab.node(*recording_station.SIZE).server()
+        lab.up(*PATIENT)
+        rows = kill_recording(lab, recording, seed)
+    finally:
+        lab.close()
+    data = folder / "published"  # apart: what was interrupted is not published before somebody has scored it
+    food(data, frames)
+    return {"rows": [*rows, *kill_worker(data, working, seed)]}
+
+
+def _listing(data: Path) -> dict[str, Any]:
+    return _child(
+        sys.executable, "recording_listing", str(_LISTED), EVA_DATA_DIR=str(data), EVA_LOG_LEVEL="ERROR"
+    )

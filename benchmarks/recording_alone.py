@@ -1,0 +1,77 @@
+"""Our recorder without a station: `python -m benchmarks.recording_alone FRAMES COUNT FOLDER`; prints JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+import uuid
+from pathlib import Path
+from typing import Any
+
+from benchmarks.recording_pace import CAMERAS, FPS, HEIGHT, JOINTS, WIDTH, Frames, finish, give, joints
+from runtime.datasets.published import publish
+from runtime.recording.base import ExecutedTick, Outcome, Row
+from runtime.recording.episode import EpisodeJournal
+from runtime.recording.settings import RecordingSettings
+
+_TICKS = 3  # of control per row: 90 Hz
+
+
+def manifest() -> dict[str, Any]:
+    """Of an episode of the frames that every recorder is given."""
+    names = [f"joint_{number}" for number in range(JOINTS)]
+    robot = {"name": "bench", "joint_names": names, "eef_names": [], "dim": JOINTS, "eef_dim": 0}
+    return {
+        "format": 1,
+        "uuid": str(uuid.uuid4()),
+        "station": "bench",
+        "robot": robot,
+        "fps": float(FPS),
+        "control_rate": float(FPS * _TICKS),
+        "cameras": {camera: {"width": WIDTH, "height": HEIGHT} for camera in CAMERAS},
+        "streams": {"qvel": False, "effort": False, "eef": False, "eef_action": False},
+        "capture_streams": ["joints", *CAMERAS],
+        "task": "wave",
+        "mode": "continuous",
+        "strategy": "async",
+        "kind": "rollout",
+        "started_wall": time.time(),
+        "started_monotonic": time.monotonic(),
+        "configuration": {},
+        "configuration_hash": "0",
+        "versions": {},
+    }
+
+
+def append(journal: EpisodeJournal, index: int, pictures: dict[str, Any]) -> None:
+    """Row `index` with its pictures, and its ticks."""
+    now, here = time.monotonic(), joints(index)
+    captured = dict.fromkeys(("joints", *CAMERAS), now)
+    journal.append(Row(index, index * _TICKS, now, index, here, here, captured, pictures, "policy"))
+    for step in range(index * _TICKS, (index + 1) * _TICKS):
+        journal.append(ExecutedTick(step, now, now, index, "policy", here, here, here))
+
+
+def main(path: str, count: str, folder: str) -> None:
+    """Record and publish one episode."""
+    root = Path(folder)
+    journal = EpisodeJournal(root / "episodes", RecordingSettings(min_free_bytes=0))
+    journal.begin(told := manifest())
+    given = give(Frames(Path(path)), int(count), lambda index, pictures: append(journal, index, pictures))
+    closed: list[float] = []
+
+    def save() -> None:
+        begun = time.monotonic()
+        journal.end(Outcome("finished", "the frames have ended", time.time()))
+        closed.append(time.monotonic() - begun)
+        publish(root / "episodes" / told["uuid"], root / "dataset")
+
+    written = finish(given, save, root / "dataset")
+    outcome = json.loads((root / "episodes" / told["uuid"] / "outcome.json").read_text("utf-8"))
+    lost = sum(outcome["repeated"].values()) + 3 * (int(count) - outcome["frames"])
+    print(json.dumps({**written.fields(), "closed_s": closed[0], "lost": lost}))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,33 @@
+"""Ask for the publication of all finished episodes: `python -m benchmarks.recording_jobs`; prints their uuids.
+
+The data folder is EVA_DATA_DIR.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+
+
+def main() -> None:
+    """Make the database where there is none, read the folders into it, and queue one job per episode."""
+    import django
+
+    os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
+    django.setup()
+    from django.core.management import call_command
+
+    from evaweb.episodes.models import Episode, EpisodeStatus
+    from evaweb.episodes.reconcile import reconcile
+    from evaweb.episodes.services import publish_asked
+
+    call_command("migrate", verbosity=0)
+    reconcile()
+    closed = Episode.objects.filter(status=EpisodeStatus.FINISHED, frames__gt=0)
+    asked = [str(episode.uuid) for episode in closed if publish_asked(episode=episode)]
+    json.dump(asked, sys.stdout)
+
+
+if __name__ == "__main__":
+    main()

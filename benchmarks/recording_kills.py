@@ -1,0 +1,225 @@
+"""kill -9 at random moments while a station records and a worker publishes: what is lost, and whether all still opens.
+
+Media, main and control are killed in turn, each during a run that records; the worker while it does the jobs of what
+was recorded. Nothing is timed by the victim: the moment of the kill is ours, on the clock that the rows are on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.labs import ROOT
+from benchmarks.recording_alone import append, manifest
+from benchmarks.recording_pace import FPS, Frames
+from runtime.datasets.consistency import check
+from runtime.datasets.layout import INFO
+from runtime.datasets.reader import open_dataset
+from runtime.errors import RecordingError
+from runtime.recording.base import Outcome
+from runtime.recording.episode import EpisodeJournal
+from runtime.recording.reader import Episode, open_episode
+from runtime.recording.settings import RecordingSettings
+from runtime.supervisor import MOST_RESTARTS, RESTART_WINDOW_S
+from tests.crash.lab import Lab
+from tests.processes import eventually
+
+EPISODES = 6  # for the worker
+PROCESSES = ("media", "main", "control")
+_SPREAD_S = (1.0, 3.5)  # of a recording, within which its kill falls
+_WORKING_S = (0.0, 1.5)  # of a worker, from when it has its first job
+_CLOSED_S = 120.0
+_PUBLISHED_S = 180.0
+
+
+@dataclass(frozen=True, slots=True)
+class Many:
+    """How often to kill: `most` times, or fewer but at least `least` where `seconds` are over before."""
+
+    most: int
+    least: int
+    seconds: float
+
+    def moments(self, seed: int, between: tuple[float, float]) -> Iterator[float]:
+        """When each kill is to fall, after what it interrupts has begun [s]."""
+        drawn, begun = random.Random(seed), time.monotonic()
+        for number in range(self.most):
+            if number >= self.least and time.monotonic() - begun > self.seconds:
+                return
+            yield drawn.uniform(*between)
+
+
+def kill_recording(lab: Lab, many: Many, seed: int) -> list[dict[str, Any]]:
+    """One row per kill: process, moment, what was lost [s], how the episode ended."""
+    kills: deque[float] = deque(maxlen=MOST_RESTARTS)
+    moments = enumerate(many.moments(seed, _SPREAD_S))
+    return [_one(lab, PROCESSES[number % len(PROCESSES)], moment, kills) for number, moment in moments]
+
+
+def _one(lab: Lab, process: str, moment: float, kills: deque[float]) -> dict[str, Any]:
+    if len(kills) == kills.maxlen:  # a family that dies more often is given up by its supervisor
+        time.sleep(max(0.0, kills[0] + RESTART_WINDOW_S + 1.0 - time.monotonic()))
+    lab.reach("idle", "ready")
+    lab.ready()
+    lab.client.command("run")
+    uuid = lab.client.wait(lambda status: status["recording"]["uuid"], lab.patience)["recording"]["uuid"]
+    before = lab.pids()
+    time.sleep(moment)
+    lab.kill(process)
+    killed = time.monotonic()
+    kills.append(killed)
+    folder = lab.data / "episodes" / uuid
+    episode = _closed(folder)
+    eventually(lambda: lab.pids()[process] != before[process], lab.patience, f"another {process}")
+    eventually(lab.answers, lab.patience, "the station answers again")
+    lab.reach("idle")
+    return {"process": process, "after_s": moment, **_loss(episode, killed)}
+
+
+def _closed(folder: Path) -> Episode:
+    deadline = time.monotonic() + _CLOSED_S
+    while not (folder / "outcome.json").exists():
+        if time.monotonic() > deadline:
+            raise SystemExit(f"{folder.name} was not completed within {_CLOSED_S:g} s of a kill")
+        time.sleep(0.02)
+    return open_episode(folder)
+
+
+def _loss(episode: Episode, killed: float) -> dict[str, Any]:
+    """From the last row that is left, with its pictures, until the kill [s]; a row stands for its own period.
+
+    Where none is left, from when the episode began.
+    """
+    times = episode.rows.column("tick_time").to_numpy()
+    started = float(episode.manifest["started_monotonic"])  # type: ignore[arg-type]
+    left = killed - (started + times[-1] + 1.0 / episode.layout.fps if len(times) else started)
+    outcome = episode.outcome or {}
+    return {
+        "lost_s": max(0.0, float(left)),
+        "frames": episode.frames,
+        "uuid": episode.layout.uuid,
+        "status": outcome.get("status"),
+    }
+
+
+# --- the worker ------------------------------------------------------------------------------------------------
+
+
+def food(data: Path, frames: Path, episodes: int = EPISODES) -> None:
+    """Finished episodes of two seconds for the worker to publish."""
+    pictures = Frames(frames)
+    for _ in range(episodes):
+        journal = EpisodeJournal(data / "episodes", RecordingSettings(min_free_bytes=0), patient=True)
+        journal.begin(manifest())
+        for index in range(2 * FPS):
+            append(journal, index, pictures(index))
+        journal.end(Outcome("finished", "the frames have ended", time.time()))
+
+
+def kill_worker(data: Path, many: Many, seed: int) -> list[dict[str, Any]]:
+    """Kill the worker while it works off a queue, then let one finish: rows per kill, the last of what came of it.
+
+    `problems` are the sentences of what did not open.
+    """
+    environment = os.environ | {
+        "EVA_DATA_DIR": str(data),
+        "EVA_LOG_LEVEL": "ERROR",
+        "EVA_JOB_STALE_S": "12",  # sweeping a dead worker's job is what is waited for here
+    }
+    asked = _ask(environment)
+    rows = []
+    for moment in many.moments(seed, _WORKING_S):
+        with _worker(environment) as worker:
+            job = _working(data, worker)
+            time.sleep(moment)
+            worker.kill()
+        found = {"job": job, "problems": _problems(data)}
+        rows.append({"process": "worker", "after_s": moment, "lost_s": 0.0, **found})
+        _ask(environment)
+    with _worker(environment) as worker:
+        _published(data, worker, asked)
+        worker.send_signal(signal.SIGTERM)
+    missing = _missing_s(data, asked)
+    rows.append({"process": "worker", "after_s": None, "lost_s": missing, "problems": _problems(data)})
+    return rows
+
+
+def _ask(environment: Mapping[str, str]) -> list[str]:
+    """Have every closed episode published, anew where it is already; their uuids."""
+    command = [sys.executable, "-m", "benchmarks.recording_jobs"]
+    done = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, check=True, text=True)
+    found: list[str] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+@contextmanager
+def _worker(environment: Mapping[str, str]) -> Iterator[subprocess.Popen[bytes]]:
+    command = [sys.executable, "manage.py", "worker"]
+    with subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.DEVNULL) as child:
+        try:
+            yield child
+        finally:
+            if child.poll() is None and sys.exc_info()[0] is not None:
+                child.kill()
+
+
+def _working(data: Path, worker: subprocess.Popen[bytes]) -> str:
+    """The key of the first job that this worker has."""
+    begun = time.monotonic()
+    while time.monotonic() - begun < 60.0 and worker.poll() is None:
+        mine = f"claimed_by like '%:{worker.pid}:%'"
+        found = _query(data, f"select key from jobs_job where status = 'running' and {mine}")
+        if found:
+            return str(found[0][0])
+        time.sleep(0.02)
+    raise SystemExit(f"the worker took no job ({worker.poll()})")
+
+
+def _published(data: Path, worker: subprocess.Popen[bytes], asked: list[str]) -> None:
+    begun = time.monotonic()
+    while _query(data, "select 1 from jobs_job where status in ('queued', 'running') limit 1"):
+        if time.monotonic() - begun > _PUBLISHED_S or worker.poll() is not None:
+            raise SystemExit(f"the jobs of {len(asked)} episodes were not done within {_PUBLISHED_S:g} s")
+        time.sleep(0.1)
+
+
+def _missing_s(data: Path, asked: list[str]) -> float:
+    """Of what was recorded, the longest that an episode's dataset has not [s]; all of it where it is in none."""
+    worst = 0.0
+    for uuid in asked:
+        episode = open_episode(data / "episodes" / uuid)
+        query = f"select dataset, dataset_index from episodes_episode where uuid = '{uuid.replace('-', '')}'"
+        ((dataset, index),) = _query(data, query)
+        there = open_dataset(data / dataset).entry(index).length if dataset else 0
+        worst = max(worst, (episode.frames - there) / episode.layout.fps)
+    return worst
+
+
+def _query(data: Path, query: str) -> list[Any]:
+    (database,) = data.glob("*.sqlite3")
+    with closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=10.0)) as connection:
+        return connection.execute(query).fetchall()
+
+
+def _problems(data: Path) -> list[str]:
+    """What of the datasets and episodes does not open as it is, before anybody has mended anything."""
+    datasets = [info.parents[1] for info in data.glob(f"datasets/**/{INFO}")]
+    found = [f"{dataset.name}: {said}" for dataset in datasets for said in check(dataset)]
+    for folder in data.glob("episodes/*"):
+        try:
+            open_episode(folder)
+        except RecordingError as error:
+            found.append(str(error))
+    return found

@@ -1,0 +1,65 @@
+"""LeRobot's own writer: `PYTHON -m benchmarks.recording_lerobot FRAMES COUNT FOLDER MODE`; prints JSON.
+
+Runs in an interpreter that has LeRobot 0.4 and nothing of ours. MODE is `default`, its pictures as PNG files that
+save_episode encodes, or `streaming`, H.264 while it records.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from benchmarks.recording_pace import CAMERAS, FPS, HEIGHT, JOINTS, WIDTH, Frames, finish, give, joints
+
+MODES: dict[str, dict[str, Any]] = {
+    "default": {"image_writer_threads": 4 * len(CAMERAS)},  # as its lerobot-record has it
+    "streaming": {"streaming_encoding": True, "vcodec": "h264"},
+}
+
+
+def main(path: str, count: str, folder: str, mode: str) -> None:
+    """Record one episode."""
+    os.environ["HF_HUB_OFFLINE"] = "1"
+    operators = _operators()
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    names = [f"joint_{number}" for number in range(JOINTS)]
+    vector = {"dtype": "float32", "shape": (JOINTS,), "names": names}
+    picture = {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": ["height", "width", "channels"]}
+    features = {"observation.state": vector, "action": vector}
+    features |= {f"observation.images.{camera}": picture for camera in CAMERAS}
+    root = Path(folder) / "dataset"
+    made = LeRobotDataset.create("eva/bench", FPS, features, root=root, robot_type="bench", **MODES[mode])
+
+    def add(index: int, pictures: dict[str, Any]) -> None:
+        images = {f"observation.images.{camera}": pixels for camera, pixels in pictures.items()}
+        here = joints(index)
+        made.add_frame({"observation.state": here, "action": here, "task": "wave", **images})
+
+    def save() -> None:
+        made.save_episode()
+        made.finalize()
+
+    written = finish(give(Frames(Path(path)), int(count), add), save, root)
+    del operators
+    print(json.dumps({**written.fields(), "version": version("lerobot")}))
+
+
+def _operators() -> Any:
+    """Declares what torchvision asks for and a torch without GPU lacks; lives as long as what is returned."""
+    import torch
+
+    library = torch.library.Library("torchvision", "DEF")
+    try:
+        library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+    except RuntimeError:  # it is there already
+        return None
+    return library
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

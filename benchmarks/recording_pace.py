@@ -1,0 +1,104 @@
+"""Frames that any recorder can be given, and the pace of a camera to give them at.
+
+Nothing but numpy is imported: the interpreter of another recorder runs this too.
+"""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FPS = 30
+CAMERAS = ("cam_high", "cam_left_wrist", "cam_right_wrist")
+HEIGHT, WIDTH = 480, 640
+JOINTS = 14
+_LATE_S = 1.0 / FPS
+
+
+class Frames:
+    """Pictures on disk, RGB uint8 [N, cameras, H, W, 3], shown to and fro so that motion has no cut."""
+
+    def __init__(self, path: Path) -> None:
+        self._pictures = np.load(path, mmap_mode="r")
+
+    def __call__(self, index: int) -> dict[str, Any]:
+        """By camera, picture `index` [H, W, 3], in memory of its own."""
+        turn = 2 * len(self._pictures) - 2
+        place = min(index % turn, turn - index % turn)
+        return {camera: np.array(self._pictures[place, number]) for number, camera in enumerate(CAMERAS)}
+
+
+def joints(index: int) -> Any:
+    """Joints [14] of frame `index`, float32 rad."""
+    return np.sin(index / FPS + np.arange(JOINTS)).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """What one recorder took for an episode; processor times with its children's [s]."""
+
+    frames: int
+    capture_cpu_s: float
+    save_cpu_s: float  # until the dataset holds the episode
+    save_s: float
+    add_mean_ms: float  # that the caller waits per frame
+    add_p99_ms: float
+    add_max_ms: float
+    late: int  # frames that were given a whole period too late, as the one before them took so long
+    bytes: int
+    peak_mb: float
+
+    def fields(self) -> dict[str, Any]:
+        """As JSON has them."""
+        return asdict(self)
+
+
+def give(frames: Frames, count: int, add: Callable[[int, dict[str, Any]], None]) -> dict[str, Any]:
+    """Call `add` for `count` frames at 30 Hz; the first half of a Written."""
+    took, late = [], 0
+    before = processor_s()
+    own = 0.0  # of making the frames, which is no recorder's
+    begun = time.monotonic()
+    for index in range(count):
+        drawn = time.thread_time()
+        pictures = frames(index)
+        own += time.thread_time() - drawn
+        wait = begun + index / FPS - time.monotonic()
+        late += wait < -_LATE_S
+        time.sleep(max(0.0, wait))
+        start = time.monotonic()
+        add(index, pictures)
+        took.append((time.monotonic() - start) * 1000.0)
+    return {
+        "frames": count,
+        "capture_cpu_s": processor_s() - before - own,
+        "add_mean_ms": float(np.mean(took)),
+        "add_p99_ms": float(np.percentile(took, 99)),
+        "add_max_ms": float(np.max(took)),
+        "late": late,
+    }
+
+
+def finish(given: dict[str, Any], save: Callable[[], None], folder: Path) -> Written:
+    """Call `save` and put the whole together; `folder` holds what was saved."""
+    before, begun = processor_s(), time.monotonic()
+    save()
+    return Written(
+        **given,
+        save_cpu_s=processor_s() - before,
+        save_s=time.monotonic() - begun,
+        bytes=sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()),
+        peak_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+    )
+
+
+def processor_s() -> float:
+    """Of this process with all its threads, and of its children that have ended [s]."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(one.ru_utime + one.ru_stime for one in used)

@@ -1,0 +1,221 @@
+"""One recording of a whole station: what media takes, how soon frames are on disk, how it ends and is published."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import psutil
+
+from benchmarks.busy_lab import PATIENT
+from benchmarks.labs import ROOT
+from runtime.recording.reader import Episode, open_episode
+from tests.crash.lab import Lab
+
+SIZE = ("--width", "640", "--height", "480")
+_SETTLED_S = 3.0  # of a recording, until encoders, queues and pools have what they need
+_SIZES_PERIOD_S = 0.01
+_MEMORY_PERIOD_S = 0.5
+
+
+class PatientLab(Lab):
+    """Its processes may start on a machine that is full."""
+
+    patience = 120.0
+    ending = 60.0
+
+    def ready(self) -> PatientLab:
+        """Set up, again where a process that was killed is not back yet; AssertionError says what is in the way."""
+        begun = time.monotonic()
+        while True:
+            try:
+                super().ready()
+            except AssertionError:
+                if time.monotonic() - begun > self.patience:
+                    raise
+                time.sleep(1.0)
+            else:
+                return self
+
+
+class Watch:
+    """Looks at media and at the videos of an episode from outside, on a thread, until `end`."""
+
+    def __init__(self, media: psutil.Process, folder: Path) -> None:
+        self._media = media
+        self._folder = folder
+        self._ending = threading.Event()
+        self.memory: list[float] = []  # resident [MB], every half second from when it has settled
+        self.processor = 0.0  # [s], from then on
+        self.seconds = 0.0
+        self.sizes: dict[str, list[tuple[float, int]]] = {}  # (monotonic, bytes) whenever a video has grown
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def end(self) -> None:
+        """Look no more."""
+        self._ending.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        settled = time.monotonic() + _SETTLED_S
+        while not self._ending.wait(_SIZES_PERIOD_S) and time.monotonic() < settled:
+            self._look()
+        begun, before = time.monotonic(), _used(self._media)
+        next_memory = begun
+        while not self._ending.wait(_SIZES_PERIOD_S):
+            self._look()
+            if time.monotonic() >= next_memory:
+                next_memory += _MEMORY_PERIOD_S
+                self.memory.append(resident_mb(self._media))
+        self.processor, self.seconds = _used(self._media) - before, time.monotonic() - begun
+
+    def _look(self) -> None:
+        for video in self._folder.glob("*.mp4"):
+            size = video.stat().st_size
+            seen = self.sizes.setdefault(video.stem, [])
+            if not seen or seen[-1][1] != size:
+                seen.append((time.monotonic(), size))
+
+
+def resident_mb(process: psutil.Process) -> float:
+    """What a process has in memory [MB]."""
+    return float(process.memory_info().rss) / 1e6
+
+
+def _used(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return float(times.user + times.system)
+
+
+def record(folder: Path, seconds: float) -> dict[str, Any]:
+    """Bring up a station with three cameras of 640x480 at 30 Hz, record `seconds` of a run, end it, publish it."""
+    lab = PatientLab(folder)
+    try:
+        lab.node(*SIZE).server()
+        lab.up(*PATIENT, f"run.duration_s={seconds + 600}", "bus.preview_rate=15")
+        media = psutil.Process(lab.pids()["media"])
+        lab.ready()
+        before = resident_mb(media), _used(media), time.monotonic()
+        time.sleep(_SETTLED_S)
+        idle = (_used(media) - before[1]) / (time.monotonic() - before[2]) * 100.0
+        missed = _missed(lab)
+        lab.client.command("run")
+        uuid = lab.client.wait(lambda status: status["recording"]["uuid"], lab.patience)["recording"]["uuid"]
+        episode = lab.data / "episodes" / uuid
+        watch = Watch(media, episode)
+        time.sleep(seconds)
+        stopped = time.monotonic()
+        lab.client.command("stop")
+        while not (episode / "outcome.json").exists():
+            if time.monotonic() - stopped > 60.0:
+                raise SystemExit(f"episode {uuid} was not closed within 60 s of the stop")
+            time.sleep(0.002)
+        saved = time.monotonic() - stopped
+        watch.end()
+        missed = _missed(lab) - missed
+    finally:
+        lab.close()
+    found = open_episode(episode)
+    return {
+        "seconds": seconds,
+        "cpu_core_percent": watch.processor / watch.seconds * 100.0,
+        "cpu_core_percent_not_recording": idle,
+        "memory_mb": {
+            "before": before[0],
+            "start": watch.memory[0],
+            "end": watch.memory[-1],
+            "peak": max(watch.memory),
+        },
+        **lost(found, missed),
+        "to_disk_ms": to_disk(found, watch.sizes),
+        "muxed_ms": found.outcome and found.outcome["muxed_ms"],
+        "skew": found.outcome and found.outcome["skew"],
+        "stop_to_saved_s": saved,
+        **published(episode, folder / "dataset", found.frames),
+    }
+
+
+def _missed(lab: Lab) -> int:
+    """Observations that the node has sent and the station has not received."""
+    return int(lab.client.status()["link"]["faults"].get("frames_lost", 0))
+
+
+def lost(episode: Episode, missed: int = 0) -> dict[str, Any]:
+    """Rows that the grid has and the table has not, pictures that a row was given and its video has not.
+
+    And the pictures of `missed` observations. `grid_repeats` and `grid_skips` are no loss: a source at 30 Hz of its
+    own beside a grid of 30 Hz of ours.
+    """
+    rows, outcome = episode.rows, episode.outcome or {}
+    times = rows.column("tick_time").to_numpy()
+    expected = 1 + round((times[-1] - times[0]) * episode.layout.fps)
+    dropped = repeats = 0
+    for camera in episode.layout.cameras:
+        captured = rows.column(f"capture_time.{camera}").to_numpy()
+        repeated = rows.column(f"repeated.{camera}").to_numpy()
+        changed = np.concatenate([[True], captured[1:] != captured[:-1]]) & np.isfinite(captured)
+        dropped += int((repeated & changed).sum())
+        repeats += int((repeated & ~changed).sum())
+    frames: Mapping[str, int] = outcome["video_frames"]  # type: ignore[assignment]
+    taken = int(outcome.get("rows", len(times)))  # type: ignore[call-overload]
+    short = sum(max(0, taken - frames[camera]) for camera in episode.layout.cameras)
+    steps = np.diff(rows.column("sequence").to_numpy())
+    absent = max(0, expected - len(times)) + missed
+    return {
+        "status": outcome.get("status"),
+        "reason": outcome.get("reason"),
+        "rows": len(times),
+        "frames_lost": dropped + short + absent * len(episode.layout.cameras),
+        "not_received": missed,
+        "not_encoded": dropped + short,
+        "grid_repeats": repeats,
+        "grid_skips": max(0, int(np.maximum(steps - 1, 0).sum()) - missed) * len(episode.layout.cameras),
+    }
+
+
+def to_disk(episode: Episode, sizes: Mapping[str, list[tuple[float, int]]]) -> dict[str, float]:
+    """From the capture of a picture until the file holds all of its packet, as seen from outside [ms]."""
+    started = float(episode.manifest["started_monotonic"])  # type: ignore[arg-type]
+    taken: list[float] = []
+    for camera, video in episode.videos.items():
+        times, grown = (np.array(column) for column in zip(*sizes[video.stem], strict=True))
+        with av.open(str(video)) as container:
+            ends = [(packet.pos or 0) + packet.size for packet in container.demux(video=0) if packet.size]
+        captured = episode.rows.column(f"capture_time.{camera}").to_numpy() + started
+        repeated = episode.rows.column(f"repeated.{camera}").to_numpy()
+        count = min(len(ends), len(captured))
+        seen = np.searchsorted(grown, ends[:count])  # the first look that found at least so many bytes
+        known = (seen < len(times)) & np.isfinite(captured[:count]) & ~repeated[:count]
+        taken.extend((times[seen[known]] - captured[:count][known]) * 1000.0)
+    if not taken:
+        raise SystemExit(f"no frame of {episode.path} was seen to reach its file")
+    p50, p99, longest = (float(value) for value in np.percentile(taken, (50, 99, 100)))
+    return {"p50": p50, "p99": p99, "max": longest}
+
+
+def published(episode: Path, dataset: Path, frames: int) -> dict[str, Any]:
+    """Publish by the command line; how long it takes, and how many coded frames differ from those recorded."""
+    command = [sys.executable, "-m", "runtime.datasets", "publish", str(episode), "--to", str(dataset)]
+    command.append("--include-interrupted")  # one that failed on a full machine is measured all the same
+    begun = time.monotonic()
+    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    took = time.monotonic() - begun
+    differing = 0
+    for recorded in sorted(episode.glob("*.mp4")):
+        (copied,) = dataset.glob(f"videos/**/*{recorded.stem}*/*.mp4")
+        pairs = zip(_packets(recorded)[:frames], _packets(copied), strict=True)
+        differing += sum(one != other for one, other in pairs)
+    return {"publish_s": took, "publish_changed_frames": differing}
+
+
+def _packets(video: Path) -> list[bytes]:
+    with av.open(str(video)) as container:
+        return [bytes(packet) for packet in container.demux(video=0) if packet.size]

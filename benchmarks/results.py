@@ -1,0 +1,115 @@
+"""Pages of results over 100,000 trials of 200 evaluations, exports, handing out at once, and the stopping rule.
+
+On SQLite, and on PostgreSQL where its programs and a driver are installed: a server of its own in a scratch folder.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from benchmarks.report import Figure, Report
+from benchmarks.results_postgresql import server, why_not
+from evaweb.statistics.sequential import success_evidence
+
+PLANS, TRIALS = 200, 100_000
+RATES = (0.5, 0.8, 0.3)
+RUNS = 2000  # of the stopping rule at each rate
+PAIRS = 100
+FIRST_LOOK = 10  # pairs, of who peeks at a test for a fixed number after every pair
+ALPHA = 0.05
+PAGES = (
+    "dashboard",
+    "evaluations",
+    "results",
+    "comparison",
+    "evidence",
+    "trials",
+    "all_trials",
+    "export",
+    "export_statistics",
+)
+WANTED_MS, MOST_QUERIES = 200, 30
+_ROOT = Path(__file__).parents[1]
+
+
+def measure(seconds: float, plans: int = PLANS, trials: int = TRIALS, runs: int = RUNS) -> Report:
+    """All figures; `seconds` bounds nothing here, because what is measured is counted."""
+    figures = list(rule_figures(runs))
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        rows.append(_measured(Path(folder) / "sqlite", {}, plans, trials))
+        missing = why_not()
+        if missing:
+            print(f"not measured on PostgreSQL: {missing}", file=sys.stderr)
+        else:
+            with server(Path(folder) / "postgresql") as url:
+                rows.append(_measured(Path(folder) / "web", {"DATABASE_URL": url}, plans, trials))
+    for row in rows:
+        figures += database_figures(row)
+    figures.append(Figure("export_rows_per_s", rows[0]["exports"]["evaluation_csv"], "1/s"))
+    return Report("results", figures, rows)
+
+
+def _measured(data: Path, environment: dict[str, str], plans: int, trials: int) -> dict[str, Any]:
+    """What a program of its own found on one database."""
+    data.mkdir()
+    out = data / "out.json"
+    words = ["-m", "benchmarks.results_pages", str(out), "--plans", str(plans), "--trials", str(trials)]
+    variables = os.environ | {"EVA_DATA_DIR": str(data), "EVA_LOG_LEVEL": "ERROR"} | environment
+    if "DATABASE_URL" not in environment:
+        variables.pop("DATABASE_URL", None)
+    subprocess.run([sys.executable, *words], cwd=_ROOT, env=variables, check=True)
+    found: dict[str, Any] = json.loads(out.read_text("utf-8"))
+    return found
+
+
+def database_figures(row: dict[str, Any]) -> Iterator[Figure]:
+    """Of one database."""
+    name = row["database"]
+    for page in PAGES:
+        found = row["pages"][page]
+        yield Figure(f"page_p50_ms.{page}.{name}", found["p50"], "ms")
+        yield Figure(f"page_p95_ms.{page}.{name}", found["p95"], "ms", f"<= {WANTED_MS}")
+        yield Figure(f"page_first_p95_ms.{page}.{name}", found["cold_p95"], "ms")
+        yield Figure(f"queries.{page}.{name}", found["queries"], "", f"<= {MOST_QUERIES}")
+    for what, rate in row["exports"].items():
+        yield Figure(f"export_rows_per_s.{what}.{name}", rate, "1/s")
+    handing = row["handing"]
+    for what in ("left", "twice", "codes_twice", "out_of_order"):
+        yield Figure(f"handing.{what}.{name}", handing[what], "", "== 0")
+    yield Figure(f"handing.locked.{name}", handing["locked"], "")
+    yield Figure(f"handing.p95_ms.{name}", handing["p95_ms"], "ms")
+
+
+def rule_figures(runs: int) -> Iterator[Figure]:
+    """How often the stopping rule, and who peeks, find a difference between equal checkpoints."""
+    for rate in RATES:
+        chance = random.Random(f"{rate}")
+        found = naive = 0
+        for _ in range(runs):
+            pairs = [(chance.random() < rate, chance.random() < rate) for _ in range(PAIRS)]
+            found += success_evidence(pairs, ALPHA).stop is not None
+            naive += _peeked(pairs)
+        yield Figure(f"false_positive_rate.{rate:g}", found / runs, "", f"<= {ALPHA}")
+        yield Figure(f"naive_false_positive_rate.{rate:g}", naive / runs, "")
+
+
+def _peeked(pairs: list[tuple[bool, bool]]) -> bool:
+    """Whether a test for a fixed number of pairs (two proportions, pooled) is ever significant at one of the looks."""
+    x1 = x2 = 0
+    for n, (one, other) in enumerate(pairs, start=1):
+        x1, x2 = x1 + one, x2 + other
+        pooled = (x1 + x2) / (2 * n)
+        spread = math.sqrt(2 * pooled * (1 - pooled) / n)
+        if n >= FIRST_LOOK and spread and math.erfc(abs(x1 - x2) / n / spread / math.sqrt(2)) <= ALPHA:
+            return True
+    return False

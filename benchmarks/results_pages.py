@@ -1,0 +1,284 @@
+"""The pages of results on one database: `python -m benchmarks.results_pages OUT.json [--plans N] [--trials N]`.
+
+EVA_DATA_DIR and DATABASE_URL say which database; it has to be empty, and is filled first. Requests go through the
+whole of the web's middleware within this process, without a socket.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import statistics
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from benchmarks.results_seed import Seeded, seed
+
+ROUNDS = 120
+_MS = 1000.0
+
+
+def main() -> None:
+    """Fill, ask, write what was measured."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--plans", type=int, default=200)
+    parser.add_argument("--trials", type=int, default=100_000)
+    parser.add_argument("--rounds", type=int, default=ROUNDS)
+    given = parser.parse_args()
+    os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
+    import django
+
+    django.setup()
+    from django.core.management import call_command
+    from django.db import connection
+    from django.test.utils import setup_test_environment
+
+    setup_test_environment()
+    call_command("migrate", verbosity=0)
+    began = time.perf_counter()
+    seeded = seed(given.plans, given.trials)
+    with connection.cursor() as cursor:
+        cursor.execute("ANALYZE")
+    found = {
+        "database": connection.vendor,
+        "seed_s": time.perf_counter() - began,
+        "pages": pages(seeded, given.rounds),
+        "exports": exports(seeded),
+        "handing": handing(seeded),
+    }
+    given.out.write_text(json.dumps(found), "utf-8")
+
+
+def pages(seeded: Seeded, rounds: int) -> dict[str, dict[str, float]]:
+    """Of each page: p50 and p95 [ms] of many requests, of the first to each evaluation, and most queries of one."""
+    from django.db import connection
+    from django.test import Client
+    from django.test.utils import CaptureQueriesContext
+
+    from evaweb.results import caching
+
+    client = Client()
+    client.force_login(seeded.viewer)
+    chance = random.Random(1)
+    found = {}
+    for page, address in _addresses(seeded).items():
+        _ask(client, address(seeded.plans[0]))  # templates are read, scipy is imported
+        caching.forget()
+        cold: list[float] = []
+        warm: list[float] = []
+        busy: list[float] = []
+        queries = 0
+        asked = chance.sample(list(seeded.plans), min(rounds, len(seeded.plans)))
+        for plan in asked:
+            with CaptureQueriesContext(connection) as captured:
+                _ask(client, address(plan))
+            queries = max(queries, len(captured))
+        caching.forget()
+        for times in (cold, warm):
+            for plan in asked:
+                began, worked = time.perf_counter(), time.process_time()
+                _ask(client, address(plan))
+                times.append((time.perf_counter() - began) * _MS)
+                busy.append((time.process_time() - worked) * _MS)
+        found[page] = {
+            "p50": statistics.median(warm),
+            "p95": _share(warm, 0.95),
+            "cold_p50": statistics.median(cold),
+            "cold_p95": _share(cold, 0.95),
+            "cpu_p95": _share(busy[len(cold) :], 0.95),
+            "cold_cpu_p95": _share(busy[: len(cold)], 0.95),
+            "queries": float(queries),
+        }
+    return found
+
+
+def _addresses(seeded: Seeded) -> dict[str, Callable[[Any], str]]:
+    def under(plan: Any, rest: str = "") -> str:
+        return f"/result/plans/{plan.name}/{plan.version}/{rest}"
+
+    def api(plan: Any, rest: str) -> str:
+        return f"/api/v1/plans/{plan.name}/{plan.version}/{rest}"
+
+    return {
+        "dashboard": lambda plan: "/result/lab/",
+        "evaluations": lambda plan: "/result/plans/",
+        "results": under,
+        "comparison": lambda plan: under(plan, "compare/"),
+        "evidence": lambda plan: under(plan, "evidence/"),
+        "trials": lambda plan: under(plan, "trials/?success=no"),
+        "all_trials": lambda plan: "/result/",
+        "export": lambda plan: api(plan, "outcomes"),
+        "export_statistics": lambda plan: api(plan, "results"),
+    }
+
+
+def exports(seeded: Seeded) -> dict[str, float]:
+    """Rows per second of exports of all trials, and of evaluations one after the other."""
+    from django.test import Client
+
+    client = Client()
+    client.force_login(seeded.viewer)
+    found = {}
+    for format in ("csv", "parquet"):
+        began, rows = time.perf_counter(), 0
+        for plan in seeded.plans[:40]:
+            answer = client.get(f"/api/v1/plans/{plan.name}/{plan.version}/outcomes?format={format}")
+            content = b"".join(answer.streaming_content)
+            rows += content.count(b"\r\n") - 1 if format == "csv" else _parquet_rows(content)
+        found[f"evaluation_{format}"] = rows / (time.perf_counter() - began)
+    began = time.perf_counter()
+    answer = client.get("/api/v1/trials?format=csv")
+    rows = sum(piece.count(b"\r\n") for piece in answer.streaming_content) - 1
+    found["all_trials_csv"] = rows / (time.perf_counter() - began)
+    return found
+
+
+def _parquet_rows(content: bytes) -> int:
+    import io
+
+    from pyarrow import parquet
+
+    return int(parquet.read_metadata(io.BytesIO(content)).num_rows)
+
+
+def handing(seeded: Seeded) -> dict[str, float]:
+    """All operators ask for trials of one plan at all stations at once until none is left."""
+    from evaweb.plans.models import Plan
+    from evaweb.plans.services import plan_freeze
+
+    source = seeded.plans[0]
+    plan = Plan.objects.create(
+        name="at-once",
+        title="At once",
+        owner=source.owner,
+        repetitions=4,
+        blind=True,
+        first=source.first,
+        second=source.second,
+    )
+    plan.checkpoints.set(source.checkpoints.all())
+    plan.positions.set(source.positions.all())
+    plan_freeze(user=plan.owner, plan=plan)
+    times: list[float] = []
+    locked: list[str] = []
+    faults: list[str] = []
+    threads = [
+        threading.Thread(
+            target=_operator,
+            args=(plan, operator, seeded.stations[i % len(seeded.stations)], times, locked, faults),
+        )
+        for i, operator in enumerate(seeded.operators)
+    ]
+    began = time.perf_counter()
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if faults:
+        raise SystemExit(f"asking for trials failed: {faults[0]}")
+    handed = list(
+        plan.handouts.order_by("number").values_list("slot__index", "slot__block", "trial__station", "code")
+    )
+    return {
+        "trials": float(len(handed)),
+        "left": float(plan.slots.count() - len(handed)),
+        "twice": float(sum(n - 1 for n in Counter(index for index, *_ in handed).values())),
+        "codes_twice": float(len(handed) - len({code for *_, code in handed})),
+        "out_of_order": float(
+            _out_of_order([(index, block, station) for index, block, station, _ in handed])
+        ),
+        "locked": float(len(locked)),
+        "p95_ms": _share(times, 0.95),
+        "seconds": time.perf_counter() - began,
+    }
+
+
+def _operator(
+    plan: Any, operator: Any, station: Any, times: list[float], locked: list[str], faults: list[str]
+) -> None:
+    """Ask, run, score, ask again; somebody else's trial on the station is waited for.
+
+    Where the database stays locked longer than it waits, the web refuses and the operator asks again: `locked`.
+    """
+    from django.db import OperationalError, connection
+
+    from evaweb.errors import Conflict
+
+    trial = None
+    try:
+        while True:
+            try:
+                trial = trial or _asked(plan, operator, station, times)
+                _made(trial, operator)
+                trial = None
+            except Conflict as refused:
+                if "nothing is left" in str(refused) or "are made" in str(refused):
+                    return
+                time.sleep(0.01)
+            except OperationalError as error:
+                if "locked" not in str(error):
+                    raise
+                locked.append(str(error))
+    except BaseException as error:
+        faults.append(repr(error))
+        raise
+    finally:
+        connection.close()
+
+
+def _asked(plan: Any, operator: Any, station: Any, times: list[float]) -> Any:
+    from evaweb.plans.handing import hand_out
+
+    began = time.perf_counter()
+    trial = hand_out(user=operator, station=station, plan=plan).trial
+    times.append((time.perf_counter() - began) * _MS)
+    return trial
+
+
+def _made(trial: Any, operator: Any) -> None:
+    """Its run is over, and it is scored."""
+    from evaweb.trials.models import Milestone, Trial, TrialStatus
+    from evaweb.trials.services import trial_score
+
+    Trial.objects.filter(pk=trial.pk, status=TrialStatus.PREPARED).update(
+        status=TrialStatus.ENDED, duration_s=10.0
+    )
+    trial.refresh_from_db()
+    ticks = dict.fromkeys(Milestone.objects.filter(scene=trial.scene).values_list("pk", flat=True), True)
+    trial_score(user=operator, trial=trial, milestones=ticks)
+
+
+def _out_of_order(handed: Sequence[tuple[int, int, int]]) -> int:
+    """Blocks that did not begin in the order of the schedule, or that a station left, or that two stations had."""
+    begun = list(dict.fromkeys(block for _, block, _ in handed))
+    wrong = sum(one > other for one, other in pairwise(begun))
+    for station in {station for *_, station in handed}:
+        mine = [(index, block) for index, block, at in handed if at == station]
+        wrong += sum(one > other for one, other in pairwise(mine))
+    owners: dict[int, set[int]] = {}
+    for _, block, station in handed:
+        owners.setdefault(block, set()).add(station)
+    return wrong + sum(len(stations) > 1 for stations in owners.values())
+
+
+def _ask(client: Any, address: str) -> None:
+    answer = client.get(address)
+    if answer.status_code != 200:
+        raise SystemExit(f"{address} answered {answer.status_code}: {answer.content[:300]!r}")
+
+
+def _share(values: Iterable[float], share: float) -> float:
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, int(share * len(ordered)))]
+
+
+if __name__ == "__main__":
+    main()

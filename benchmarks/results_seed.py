@@ -1,0 +1,241 @@
+"""A lab with many evaluations in the database, as they would be after years: for measurements of pages."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+_SCENES, _POSITIONS, _STATIONS, _OPERATORS = 4, 5, 5, 20
+_MILESTONES = ("grasped", "lifted", "placed")
+_FAILURES = ("dropped", "missed the grasp", "collided", "stood still", "wrong object")
+_BEGIN = datetime(2024, 1, 1, tzinfo=UTC)
+_BATCH = 5000
+
+
+@dataclass(frozen=True, slots=True)
+class Seeded:
+    """What is there: plans whose results anybody may see, and who looks at them."""
+
+    plans: Sequence[Any]
+    viewer: Any
+    operators: Sequence[Any]
+    stations: Sequence[Any]
+    trials: int
+
+
+def seed(plans: int, trials: int) -> Seeded:
+    """`plans` evaluations of together about `trials` trials, the last twentieth of the plans still running."""
+    from django.contrib.auth.models import Group, User
+
+    from evaweb.stations.models import Station
+    from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
+
+    chance = random.Random(8)
+    operators = [User.objects.create_user(f"operator-{i:02}") for i in range(_OPERATORS)]
+    group = Group.objects.get_or_create(name="operator")[0]
+    group.user_set.add(*operators)
+    viewer = User.objects.create_user("viewer")
+    stations = [Station.objects.create(name=f"bench-{i}", robot="agilex_piper") for i in range(_STATIONS)]
+    scenes = [
+        Scene.objects.create(name=f"scene-{i}", title=f"Scene {i}", instruction="put the block on the plate")
+        for i in range(_SCENES)
+    ]
+    for scene in scenes:
+        Position.objects.bulk_create(Position(scene=scene, number=n) for n in range(1, _POSITIONS + 1))
+        Milestone.objects.bulk_create(
+            Milestone(scene=scene, order=n, text=text, required=n == len(_MILESTONES))
+            for n, text in enumerate(_MILESTONES, start=1)
+        )
+    checkpoints = [Checkpoint.objects.create(name=f"policy-{i:02}") for i in range(12)]
+    late = round(plans * 0.95)  # from this one on they still run
+    share = trials // plans
+    made = [
+        _plan(i, share, chance, operators, stations, scenes, checkpoints, i >= late) for i in range(plans)
+    ]
+    return Seeded(made, viewer, operators, stations, trials)
+
+
+def _plan(
+    i: int,
+    trials: int,
+    chance: random.Random,
+    operators: Sequence[Any],
+    stations: Sequence[Any],
+    scenes: Sequence[Any],
+    checkpoints: Sequence[Any],
+    running: bool,
+) -> Any:
+    from evaweb.plans.models import Plan, PlanState
+    from evaweb.plans.services import plan_freeze
+    from evaweb.trials.models import Position
+
+    chosen = chance.sample(list(checkpoints), chance.choice((2, 2, 3, 4)))
+    places = chance.sample(list(scenes), 2)
+    plan = Plan.objects.create(
+        name=f"evaluation-{i:03}",
+        title=f"Evaluation {i}",
+        question="Is the newer one better?",
+        owner=operators[i % len(operators)],
+        repetitions=max(1, trials // (len(chosen) * 2 * _POSITIONS)),
+        blind=False,
+        first=chosen[0],
+        second=chosen[1],
+    )
+    plan.checkpoints.set(chosen)
+    plan.positions.set(Position.objects.filter(scene__in=places))
+    plan_freeze(user=plan.owner, plan=plan)
+    _trials(plan, chance, operators, stations, _BEGIN + timedelta(days=3 * i), 0.7 if running else 1.0)
+    if not running:
+        Plan.objects.filter(pk=plan.pk).update(
+            state=PlanState.REVEALED, revealed_at=_BEGIN + timedelta(days=3 * i + 2)
+        )
+        plan.refresh_from_db()
+    return plan
+
+
+def _trials(
+    plan: Any,
+    chance: random.Random,
+    operators: Sequence[Any],
+    stations: Sequence[Any],
+    begin: datetime,
+    share: float,
+) -> None:
+    """The first `share` of a plan's slots handed out, run, scored and counted."""
+    slots = list(plan.slots.order_by("index"))
+    slots = slots[: int(len(slots) * share)]
+    trials = _run(plan, slots, chance, operators, stations, begin)
+    skill = {pk: chance.uniform(0.3, 0.9) for pk in plan.checkpoints.values_list("pk", flat=True)}
+    _scored(trials, skill, chance)
+    _handed(plan, slots, trials)
+    _counted(plan)
+
+
+def _run(
+    plan: Any,
+    slots: Sequence[Any],
+    chance: random.Random,
+    operators: Sequence[Any],
+    stations: Sequence[Any],
+    begin: datetime,
+) -> list[Any]:
+    """A trial of each slot with its recording; each block at one station, by one operator."""
+    from evaweb.episodes.models import Episode
+    from evaweb.trials.models import Trial
+
+    block_of = {slot.block: (chance.choice(stations), chance.choice(operators)) for slot in slots}
+    trials = []
+    for number, slot in enumerate(slots):
+        station, operator = block_of[slot.block]
+        episode = _episode(station, begin + timedelta(seconds=100 * number), round(chance.uniform(6, 60), 3))
+        trials.append(_trial(plan, slot, episode, operator))
+    Episode.objects.bulk_create([trial.episode for trial in trials], batch_size=_BATCH)
+    return list(Trial.objects.bulk_create(trials, batch_size=_BATCH))
+
+
+def _episode(station: Any, started: datetime, seconds: float) -> Any:
+    from evaweb.episodes.models import Episode
+
+    return Episode(
+        station=station,
+        status="finished",
+        mode="continuous",
+        started_at=started,
+        duration_s=seconds,
+        cameras=["cam_high"],
+        frames=int(seconds * 30),
+        checkpoint="",
+        configuration_hash="0" * 64,
+    )
+
+
+def _trial(plan: Any, slot: Any, episode: Any, operator: Any) -> Any:
+    from evaweb.trials.models import Trial, TrialStatus
+
+    return Trial(
+        evaluation=plan.evaluation,
+        evaluation_version=plan.version,
+        checkpoint_id=slot.checkpoint_id,
+        scene_id=slot.scene_id,
+        position_id=slot.position_id,
+        number=slot.repetition,
+        station=episode.station,
+        operator=operator,
+        status=TrialStatus.ENDED,
+        instruction="put the block on the plate",
+        episode=episode,
+        started_at=episode.started_at,
+        ended_at=episode.started_at + timedelta(seconds=episode.duration_s),
+        duration_s=episode.duration_s,
+    )
+
+
+def _scored(trials: Sequence[Any], skill: Mapping[int, float], chance: random.Random) -> None:
+    """A score of each trial; `skill` is how often a checkpoint succeeds. Milestones are reached in their order."""
+    from evaweb.trials.models import Milestone, MilestoneOutcome, Score
+
+    stones: dict[int, list[Any]] = {}
+    for stone in Milestone.objects.order_by("order"):
+        stones.setdefault(stone.scene_id, []).append(stone)
+    scores, reached = [], []
+    for trial in trials:
+        success = chance.random() < skill[trial.checkpoint_id]
+        reached.append(len(_MILESTONES) if success else chance.randrange(len(_MILESTONES)))
+        scores.append(
+            Score(
+                trial=trial,
+                rater=trial.operator,
+                success=success,
+                score=reached[-1] / len(_MILESTONES),
+                failure="" if success else chance.choice(_FAILURES),
+                scored_at=trial.ended_at,
+            )
+        )
+    scores = Score.objects.bulk_create(scores, batch_size=_BATCH)
+    MilestoneOutcome.objects.bulk_create(
+        (
+            MilestoneOutcome(
+                score=score,
+                milestone=stone,
+                order=stone.order,
+                text=stone.text,
+                points=1,
+                required=stone.required,
+                reached=n < far,
+            )
+            for score, far in zip(scores, reached, strict=True)
+            for n, stone in enumerate(stones[score.trial.scene_id])
+        ),
+        batch_size=_BATCH,
+    )
+
+
+def _handed(plan: Any, slots: Sequence[Any], trials: Sequence[Any]) -> None:
+    """How each trial was handed out, in the order of the schedule."""
+    from evaweb.plans.blinding import codes
+    from evaweb.plans.models import Handout
+
+    known = codes(bytes(plan.key), len(slots))
+    Handout.objects.bulk_create(
+        (
+            Handout(plan=plan, number=n, slot=slot, trial=trial, code=code)
+            for n, (slot, trial, code) in enumerate(zip(slots, trials, known, strict=True), start=1)
+        ),
+        batch_size=_BATCH,
+    )
+
+
+def _counted(plan: Any) -> None:
+    """Each trial's one score is its verdict: in one statement, because one by one takes minutes."""
+    from django.db import connection
+
+    with connection.cursor() as cursor:
+        cursor.execute(
+            "UPDATE trials_trial SET status = 'scored', "
+            "verdict_id = (SELECT s.id FROM trials_score s WHERE s.trial_id = trials_trial.id) "
+            "WHERE evaluation_id = %s",
+            [plan.evaluation_id],
+        )

@@ -1,0 +1,242 @@
+"""What is at the two ends of each transport that `benchmarks.wires_transports` measures: one function per case."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import robots
+from benchmarks.labs import ROOT
+from benchmarks.wires_receiver import FPS
+from benchmarks.wires_recording import record
+from runtime.errors import ConfigurationError, SetupError
+from runtime.plugins import variants
+from runtime.sim.ros_domain import free_domain
+
+ROBOT, ROS2_ROBOT = "agilex_piper", "r1_lite"
+PATIENCE_S = 60.0
+_SECONDS_OF_VIDEO = 10
+_MOST_DECODED_HZ = 200.0
+
+
+@dataclass(slots=True)
+class Stage:
+    """Where a case is played: its processes, its folder, and how it is to be sent."""
+
+    stack: contextlib.ExitStack
+    folder: Path
+    rate: float
+    size: tuple[int, int]
+    robot: str
+    page: int  # descriptor
+    hurried: bool  # as fast as goes without loss
+    times: Path = field(init=False)
+    sender: subprocess.Popen[str] | None = None
+
+    def __post_init__(self) -> None:
+        self.times = self.folder / "times.json"
+
+    def send(self, module: str, *arguments: str) -> Mapping[str, Any]:
+        """Start what is at the other end; what it announces."""
+        page = str(self.page) if self.hurried else ""
+        command = [sys.executable, "-m", "benchmarks.wires_sender", str(self.times), page, module, *arguments]
+        self.sender = self.stack.enter_context(process(command, self.page))
+        assert self.sender.stdout is not None
+        said = self.sender.stdout.readline()
+        if not said:
+            raise SystemExit(f"the sender {module} ended with {self.sender.wait()}")
+        announced: Mapping[str, Any] = json.loads(said)
+        return announced
+
+    def sized(self) -> tuple[str, ...]:
+        """Rate and size for the command line of a simulated robot."""
+        return ("--rate", str(self.rate), "--height", str(self.size[0]), "--width", str(self.size[1]))
+
+    def sent(self) -> Any:
+        """End the sender; when it began what it sent."""
+        if self.sender is None:
+            return []
+        end(self.sender)
+        return json.loads(self.times.read_text("utf-8"))
+
+
+@dataclass(frozen=True, slots=True)
+class Wired:
+    """What to receive, and how a picture's birth is found: by its number in a "strip" or a "bar", or "due"."""
+
+    transport: Mapping[str, Any]
+    cameras: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    born: str = "strip"
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A transport by the name of its figures; `needs` is the kind that has to be usable here, with `program`.
+
+    `idle` is false where another case's memory tells of this one's.
+    """
+
+    name: str
+    needs: str
+    open: Callable[[Stage], Wired]
+    robot: str = ROBOT
+    played: bool = False  # of a recording, as fast as its reader goes
+    program: str = ""
+    idle: bool = True
+
+
+def cases() -> list[Case]:
+    """All that are measured where what they need is installed."""
+    return [
+        Case("zmq", "zmq", _zmq),
+        Case("ros1", "ros1", _ros1, program="rosmaster"),
+        Case("ros2", "ros2", _ros2_raw, ROS2_ROBOT),
+        Case("ros2_jpeg", "ros2", _ros2, ROS2_ROBOT, idle=False),
+        Case("dataset", "dataset", _dataset, played=True),
+        Case("file_cameras", "dataset", _file_cameras, played=True),
+        Case("mjpeg_cameras", "zmq", _mjpeg_cameras),
+    ]
+
+
+def absent(case: Case) -> str:
+    """Why it cannot be measured here; "" where it can."""
+    module = variants("runtime.transports").get(case.needs)
+    if module is None:
+        return f"there is no transport {case.needs!r}"
+    required = {"path": "."} if case.needs == "dataset" else {}
+    try:
+        module.capabilities(module.Config(**required))
+    except (SetupError, ConfigurationError) as error:
+        return str(error)
+    if case.program and shutil.which(case.program) is None:
+        return f"there is no program {case.program!r}"
+    return ""
+
+
+@contextlib.contextmanager
+def process(command: Sequence[str], *descriptors: int) -> Iterator[subprocess.Popen[str]]:
+    """A process with a lifeline."""
+    child = subprocess.Popen(
+        command,
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        pass_fds=descriptors,
+        text=True,
+    )
+    assert child.stdout is not None
+    try:
+        yield child
+    finally:
+        end(child)
+        child.stdout.close()
+
+
+def end(child: subprocess.Popen[str]) -> None:
+    assert child.stdin is not None
+    child.stdin.close()
+    try:
+        child.wait(PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        child.wait()
+
+
+def _node(stage: Stage, *more: str) -> dict[str, Any]:
+    """The transport of a simulated node."""
+    free = ("--obs-endpoint", "tcp://127.0.0.1:0", "--action-endpoint", "tcp://127.0.0.1:0")
+    said = stage.send("node", "--robot", stage.robot, *free, *more)
+    return {"kind": "zmq", "sub_endpoint": said["obs_endpoint"], "pub_endpoint": said["action_endpoint"]}
+
+
+def _zmq(stage: Stage) -> Wired:
+    return Wired(_node(stage, *stage.sized()))
+
+
+def _ros2(stage: Stage) -> Wired:
+    """As the robot publishes: JPEG."""
+    domain = stage.stack.enter_context(free_domain())
+    stage.send("ros2_node", "--robot", stage.robot, "--domain", str(domain), *stage.sized())
+    return Wired({"kind": "ros2", "domain": domain})
+
+
+def _ros2_raw(stage: Stage) -> Wired:
+    """The same robot, whose cameras publish pixels."""
+    folder = stage.folder / stage.robot
+    shutil.copytree(ROOT / "robots" / stage.robot, folder)
+    described = (folder / "robot.toml").read_text("utf-8")
+    (folder / "robot.toml").write_text(described.replace('/compressed"', '"'), "utf-8")
+    stage.robot = str(folder)
+    return _ros2(stage)
+
+
+def _ros1(stage: Stage) -> Wired:
+    """rospy at both ends, and a master of its own."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    master = f"http://127.0.0.1:{port}"
+    around = {"ROS_MASTER_URI": master, "ROS_IP": "127.0.0.1", "ROS_HOME": str(stage.folder)}
+    stage.stack.enter_context(_master(port, os.environ | around))
+    stage.send("ros1_node", "--robot", stage.robot, "--master", master, *stage.sized())
+    return Wired({"kind": "ros1", "master": master})
+
+
+@contextlib.contextmanager
+def _master(port: int, environment: Mapping[str, str]) -> Iterator[None]:
+    """A ROS 1 master that answers."""
+    child = subprocess.Popen(
+        ["rosmaster", "--core", "-p", str(port)], env=environment, stdout=subprocess.DEVNULL
+    )
+    try:
+        latest = time.monotonic() + PATIENCE_S
+        with socket.socket() as knocking:
+            while knocking.connect_ex(("127.0.0.1", port)):
+                if child.poll() is not None or time.monotonic() > latest:
+                    raise SystemExit(f"rosmaster does not answer at {port}")
+                time.sleep(0.05)
+        yield
+    finally:
+        child.terminate()
+        child.wait(PATIENCE_S)
+
+
+def _dataset(stage: Stage) -> Wired:
+    return Wired(_recorded(stage)[0], born="due")
+
+
+def _file_cameras(stage: Stage) -> Wired:
+    """Videos in place of the recording's own, of which its joints remain."""
+    transport, videos = _recorded(stage)
+    cameras = {key: {"kind": "file", "path": str(path)} for key, path in videos.items()}
+    return Wired(transport, cameras, born="due")
+
+
+def _recorded(stage: Stage) -> tuple[dict[str, Any], dict[str, Path]]:
+    path = stage.folder / "dataset"
+    videos = record(path, robots.load(stage.robot), int(_SECONDS_OF_VIDEO * FPS), int(FPS), *stage.size)
+    return {"kind": "dataset", "path": str(path)}, videos
+
+
+def _mjpeg_cameras(stage: Stage) -> Wired:
+    """Cameras of the network beside a node, whose own pictures are as small as can be.
+
+    What comes faster than it is decoded is passed over, so that no pictures may come as fast as they go.
+    """
+    keys = [camera.key for camera in robots.load(stage.robot).cameras]
+    rate, stage.hurried = str(min(stage.rate, _MOST_DECODED_HZ)), False
+    transport = _node(stage, "--rate", rate, "--height", "32", "--width", "32")
+    height, width = stage.size
+    said = stage.send("cameras", str(len(keys)), rate, str(width), str(height))
+    cameras = {key: {"kind": "mjpeg", "url": url} for key, url in zip(keys, said["urls"], strict=True)}
+    return Wired(transport, cameras, born="bar")

@@ -1,0 +1,247 @@
+"""The round trip of each policy protocol against its stand-in server, which is a process of its own.
+
+Every request is a whole `infer`: three pictures 224x224 and 14 joints go out, 50 rows of 14 numbers come back and are
+checked. The published `openpi-client` asks the same server, in turn with ours, for the same observation; what it is
+given are views of the same pictures, as its own examples hand them over.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+
+import robots
+from benchmarks.labs import ROOT
+from benchmarks.wires_relay import Relay
+from robots import Robot
+from runtime import heap
+from runtime.clock import MonotonicClock
+from runtime.errors import ConfigurationError
+from runtime.plugins import variants
+from runtime.policies.base import Policy
+from runtime.types import Observation
+
+ROBOT = "agilex_piper"  # two arms of seven numbers, three cameras
+PICTURE = (224, 224, 3)
+HORIZON = 50
+RATE = 30.0
+WARM = 20  # requests that are not counted
+_WEIGHED = 20  # requests whose bytes are counted
+_ROUNDS = 8
+_PATIENCE_S = 30.0
+Row = dict[str, Any]
+Ask = Callable[[], object]
+Opened = AbstractContextManager[Ask]
+Opening = Callable[[], Opened]
+_PEER = "openpi-client"
+
+
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """A protocol by the name that `runtime.sim.serve` has for it: our settings, and options of the server."""
+
+    name: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    options: Sequence[str] = ()
+
+
+def protocols(robot: Robot) -> list[Protocol]:
+    """All that are measured, each with three pictures and the joints of `robot`."""
+    keys = [camera.key for camera in robot.cameras]
+    places = {group.name: list(range(group.slice.start, group.slice.stop)) for group in robot.groups}
+    pictures = {key: key for key in keys}
+    return [
+        Protocol("openpi"),
+        Protocol(
+            "roboarena",
+            {
+                "cameras": dict(zip(keys, ("first", "second", "wrist"), strict=True)),
+                "gripper": "robot",
+                "cartesian_position": "zeros",
+            },
+            ("--externals", "2"),
+        ),
+        Protocol("starvla", {"cameras": keys}),
+        Protocol("gr00t", {"video": pictures, "state": places, "actions": places}),
+        Protocol(
+            "lerobot",
+            {"accept_pickle": True, "policy_type": "act", "checkpoint": "stand-in", "images": pictures},
+        ),
+    ]
+
+
+def measure(seconds: float) -> list[Row]:
+    """A row per protocol, each asked for `seconds`, openpi for twice as long as it shares them with its peer."""
+    heap.keep()  # as main does
+    robot = robots.load(ROBOT)
+    return [_case(protocol, robot, seconds) for protocol in protocols(robot)]
+
+
+def _case(protocol: Protocol, robot: Robot, seconds: float) -> Row:
+    why = absent(protocol, robot)
+    if why:
+        return {"protocol": protocol.name, "absent": why}
+    shown = observation(robot)
+    peer, missing = _peer(shown) if protocol.name == "openpi" else (None, "")
+    with _server(protocol) as url:
+        opened: list[Opening] = [lambda: _ours(protocol, robot, url, shown)]
+        opened += [] if peer is None else [lambda: peer(url)]
+        rounds = [_round(opened, len(opened) * seconds / _ROUNDS) for _ in range(_ROUNDS)]
+        weighed = _weighed(protocol, robot, url, shown)
+    ours = Timed.joined([found[0] for found in rounds])
+    row: Row = {"protocol": protocol.name, "requests": len(ours.round_trips), **ours.row(), **weighed}
+    if peer is not None:
+        theirs = Timed.joined([found[1] for found in rounds]).row()
+        row["peer"] = {"name": _PEER, "version": importlib.metadata.version(_PEER), **theirs}
+        row["ratio"] = float(np.median([mine.median / other.median for mine, other in rounds]))
+    elif missing:
+        row["peer_absent"] = missing
+    return row
+
+
+def _round(opened: Sequence[Opening], seconds: float) -> list[Timed]:
+    """Each client over a new connection: on which processor a connection's threads come to lie is luck."""
+    with contextlib.ExitStack() as stack:
+        return in_turn([stack.enter_context(opening()) for opening in opened], seconds)
+
+
+@contextlib.contextmanager
+def _ours(protocol: Protocol, robot: Robot, url: str, shown: Observation) -> Iterator[Ask]:
+    with contextlib.closing(_policy(protocol, robot, url)) as policy:
+        policy.connect()
+        yield lambda: policy.infer(shown)
+
+
+@dataclass(slots=True)
+class Timed:
+    """What was measured of one client: round trips [s], and processor time until the next one's turn [s]."""
+
+    round_trips: list[float] = field(default_factory=list)
+    processor: list[float] = field(default_factory=list)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Timed]) -> Timed:
+        return cls(
+            [one for part in parts for one in part.round_trips],
+            [one for part in parts for one in part.processor],
+        )
+
+    @property
+    def median(self) -> float:
+        return float(np.median(self.round_trips))
+
+    def row(self) -> Row:
+        """`cpu_ms` is of this process per request, all of its threads."""
+        percentiles = {f"p{q}": 1e3 * float(np.percentile(self.round_trips, q)) for q in (50, 99)}
+        return {"round_trip_ms": percentiles, "cpu_ms": 1e3 * float(np.mean(self.processor))}
+
+
+def in_turn(
+    asks: Sequence[Ask], seconds: float, clock: Callable[[], float] = time.perf_counter
+) -> list[Timed]:
+    """Ask each again and again, who was first is last the next time; what came before is for warming up."""
+    for _ in range(WARM):
+        for ask in asks:
+            ask()
+    found = [Timed() for _ in asks]
+    order = list(range(len(asks)))
+    end = clock() + seconds
+    while clock() < end:
+        for index in order:
+            used, begun = time.process_time(), clock()
+            asks[index]()
+            found[index].round_trips.append(clock() - begun)
+            found[index].processor.append(time.process_time() - used)
+        order.reverse()
+    return found
+
+
+def observation(robot: Robot) -> Observation:
+    """Joints at 0.1 and three pictures of noise."""
+    random = np.random.default_rng(0)
+    pictures = {camera.key: random.integers(0, 256, PICTURE, np.uint8) for camera in robot.cameras}
+    for picture in pictures.values():
+        picture.flags.writeable = False
+    return Observation(1, 0.0, {}, np.full(robot.dim, 0.1, np.float32), pictures, prompt="pick the block")
+
+
+def absent(protocol: Protocol, robot: Robot) -> str:
+    """What has to be installed before it can be measured; "" where nothing has."""
+    try:
+        _policy(protocol, robot)
+    except ConfigurationError as error:
+        return str(error)
+    return ""
+
+
+def _policy(protocol: Protocol, robot: Robot, url: str | None = None) -> Policy:
+    module = variants("runtime.policies")[protocol.name]
+    where = {} if url is None else {"url": url}
+    policy: Policy = module.build(module.Config(**where, **protocol.settings), robot, MonotonicClock(), RATE)
+    return policy
+
+
+def _peer(shown: Observation) -> tuple[Callable[[str], Opened] | None, str]:
+    """The published client asking for the same, or why it does not."""
+    try:
+        from openpi_client.websocket_client_policy import WebsocketClientPolicy
+    except ImportError as error:
+        return None, f"{_PEER} is not installed ({error}): pip install --no-deps {_PEER}"
+
+    @contextlib.contextmanager
+    def opened(url: str) -> Iterator[Ask]:
+        client = WebsocketClientPolicy(url)
+
+        def ask() -> object:
+            views = {key: picture.transpose(2, 0, 1) for key, picture in shown.pictures.items()}
+            return client.infer({"state": shown.qpos, "images": views, "prompt": shown.prompt})
+
+        yield ask
+        client._ws.close()  # it has no way of its own
+
+    return opened, ""
+
+
+def _weighed(protocol: Protocol, robot: Robot, url: str, shown: Observation) -> Row:
+    """Bytes per request and answer with all that the protocol wraps around them, through a relay that counts."""
+    place = urlsplit(url)
+    assert place.port is not None
+    with Relay(place.port) as relay:
+        there = place._replace(netloc=f"127.0.0.1:{relay.port}").geturl()
+        with contextlib.closing(_policy(protocol, robot, there)) as policy:
+            policy.connect()
+            policy.infer(shown)
+            before = relay.settled()
+            for _ in range(_WEIGHED):
+                policy.infer(shown)
+            out, back = (now - then for now, then in zip(relay.settled(), before, strict=True))
+    return {"request_bytes": out / _WEIGHED, "answer_bytes": back / _WEIGHED}
+
+
+@contextlib.contextmanager
+def _server(protocol: Protocol) -> Iterator[str]:
+    """The stand-in in a process of its own; its address."""
+    command = [sys.executable, "-m", "runtime.sim.serve", protocol.name, "--robot", ROBOT, "--port", "0"]
+    command += ["--horizon", str(HORIZON), "--rate", str(RATE), "--lifeline", *protocol.options]
+    child = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert child.stdin is not None
+    assert child.stdout is not None
+    try:
+        said = child.stdout.readline()
+        if not said:
+            raise SystemExit(f"the stand-in for {protocol.name} ended with {child.wait()}")
+        yield json.loads(said)["url"]
+    finally:
+        child.stdin.close()
+        child.wait(_PATIENCE_S)

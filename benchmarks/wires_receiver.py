@@ -1,0 +1,102 @@
+"""The receiving side of a transport in a process of its own, as media is: `python -m benchmarks.wires_receiver JSON`.
+
+The JSON is a `Receiving`. Observations go into the page whose descriptor it inherits, until standard input ends.
+With `fast`, which is for recordings, a virtual clock goes on by a frame as soon as the one before is in the page, and
+what has played out is played again; and then it has a clock that nobody else has.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import robots
+from robots import Robot
+from runtime import heap
+from runtime.cameras.attaching import attached
+from runtime.clock import Clock, MonotonicClock, VirtualClock
+from runtime.intake import Intake
+from runtime.messages import Event
+from runtime.page import Page, PageLayout
+from runtime.plugins import variants
+from runtime.transports.base import Source
+from runtime.types import Observation
+
+FPS = 30.0
+_PUMP_S = 0.002  # as media does
+
+
+@dataclass(frozen=True, slots=True)
+class Receiving:
+    """A robot by name or path, its transport and cameras as a deployment has them, the page, and whether `fast`."""
+
+    robot: str
+    transport: Mapping[str, Any]
+    page: int
+    cameras: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    fast: bool = False
+
+    def text(self) -> str:
+        return json.dumps(asdict(self))
+
+
+def layout(robot: Robot) -> PageLayout:
+    """The page of a station with this robot and all of its cameras."""
+    return PageLayout(robot.dim, robot.eef_dim, tuple(camera.key for camera in robot.cameras))
+
+
+def source(given: Receiving, robot: Robot, clock: Clock) -> Source:
+    """The transport's observations with the cameras of the deployment's own, of which it is not told."""
+    module = variants("runtime.transports")[given.transport["kind"]]
+    kinds = variants("runtime.cameras")
+    cameras = {key: kinds[table["kind"]].Config(**table) for key, table in given.cameras.items()}
+    told = replace(robot, cameras=tuple(camera for camera in robot.cameras if camera.key not in cameras))
+    return attached(module.source(module.Config(**given.transport), told, clock), cameras, clock)
+
+
+def main(text: str) -> None:
+    """Receive until the lifeline is cut."""
+    heap.keep()
+    given = Receiving(**json.loads(text))
+    robot = robots.load(given.robot)
+    clock = VirtualClock() if given.fast else MonotonicClock()
+    player = _Player()
+    page = Page.attach(layout(robot), given.page)
+    with contextlib.closing(source(given, robot, clock)) as opened:
+        intake = Intake(page, opened, clock, _say, player.see, lambda observation: None)
+        opened.connect()
+        opened.begin_run()
+        while not select.select([sys.stdin], [], [], 0.0)[0]:
+            intake.pump(0.0 if given.fast else _PUMP_S)
+            if isinstance(clock, VirtualClock):
+                clock.advance(1.0 / FPS)
+            if player.over:
+                player.over = False
+                opened.begin_run()
+        print(json.dumps(opened.faults()), flush=True)
+
+
+class _Player:
+    """Notices that a recording has played out."""
+
+    def __init__(self) -> None:
+        self.over = False
+
+    def see(self, observation: Observation) -> None:
+        self.over = self.over or observation.last
+
+
+def _say(event: Event) -> None:
+    print(event.text, file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
+    sys.stdout.flush()
+    os._exit(0)  # nothing is left to be put away, and threads of a middleware keep nobody waiting

@@ -1,0 +1,117 @@
+"""What is at the other end of a transport, and when it began each of its messages.
+
+`python -m benchmarks.wires_sender TIMES PAGE MODULE ARGUMENT...` runs the simulated robot `runtime.sim.MODULE`, or
+with MODULE "cameras" as many MJPEG cameras as the argument says: COUNT RATE WIDTH HEIGHT. When it ends, the times [s]
+are in the file TIMES as JSON: of message n, counted from 0, or by camera. Where PAGE is the descriptor of the page into
+which a simulated robot's pictures come, it is never more than a few ahead of them: nothing is to be lost on the way.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import socket
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from threading import Event
+
+import robots
+from benchmarks.wires_receiver import layout
+from runtime.clock import Clock
+from runtime.page import Page
+from runtime.sim import node, standin
+from runtime.sim.mjpeg_server import MjpegServer
+
+_AHEAD = 4  # pictures; the queues of a transport have no fewer places
+_LOOK_S = 0.0005
+
+
+class Pace:
+    """Lets a sender be a few pictures ahead of `arrived`; what has not come within `patience` [s] is lost."""
+
+    def __init__(self, arrived: Callable[[], int], clock: Clock, patience: float = 0.05) -> None:
+        self._arrived, self._clock, self._patience = arrived, clock, patience
+        self._seen, self._ahead = arrived(), 0
+
+    def wait(self) -> None:
+        """Until one more may be sent."""
+        end = self._clock.now() + self._patience
+        while True:
+            seen = self._arrived()
+            self._ahead = max(0, self._ahead - (seen - self._seen))
+            self._seen = seen
+            if self._ahead < _AHEAD:
+                break
+            now = self._clock.now()
+            if now >= end:
+                self._ahead = 0
+                break
+            self._clock.sleep_until(now + _LOOK_S)
+        self._ahead += 1
+
+
+class Noting:
+    """A node that notes when each of its ticks begins."""
+
+    def __init__(self, ticking: node.Ticking, clock: Clock, pace: Pace | None) -> None:
+        self._ticking, self._clock, self._pace = ticking, clock, pace
+        self.times: list[float] = []
+
+    def tick(self, seconds: float) -> None:
+        if self._pace is not None:
+            self._pace.wait()
+        self.times.append(self._clock.now())
+        self._ticking.tick(seconds)
+
+
+class NotingServer(MjpegServer):
+    """A camera that notes when each of its pictures leaves."""
+
+    def __init__(self, width: int, height: int, rate: float) -> None:
+        super().__init__(width, height, rate)
+        self.times: list[float] = []
+
+    def _send_picture(self, client: socket.socket, data: bytes) -> None:
+        self.times.append(time.monotonic())
+        super()._send_picture(client, data)
+
+
+def main(file: str, page: str, module: str, *arguments: str) -> int:
+    """The exit code of the simulated robot."""
+    if module == "cameras":
+        return _cameras(Path(file), arguments)
+    simulated = importlib.import_module(f"runtime.sim.{module}")
+    plain = simulated.run
+
+    def run(ticking: node.Ticking, clock: Clock, rate: float, told: Event) -> None:
+        noting = Noting(ticking, clock, _pace(page, arguments, clock) if page else None)
+        plain(noting, clock, rate, told)
+        Path(file).write_text(json.dumps(noting.times), "utf-8")
+
+    simulated.run = run
+    code: int = simulated.main([*arguments, "--lifeline"])
+    return code
+
+
+def _pace(page: str, arguments: Sequence[str], clock: Clock) -> Pace:
+    robot = robots.load(arguments[arguments.index("--robot") + 1])
+    attached = Page.attach(layout(robot), int(page))
+    return Pace(lambda: int(attached.observation.read()["picture_number"].min()), clock)
+
+
+def _cameras(file: Path, arguments: Sequence[str]) -> int:
+    count, rate, width, height = int(arguments[0]), float(arguments[1]), int(arguments[2]), int(arguments[3])
+    servers = [NotingServer(width, height, rate) for _ in range(count)]
+    told = standin.ending(lifeline=True)
+    standin.announce({"urls": [server.start() for server in servers]}, None)
+    told.wait()
+    for server in servers:
+        server.close()
+    file.write_text(json.dumps([server.times for server in servers]), "utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

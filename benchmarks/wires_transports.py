@@ -1,0 +1,228 @@
+"""The way of observations through each transport: three cameras and joints, from who sends them to the control loop.
+
+The sender, the receiving side (`benchmarks.wires_receiver`, as media without recording and previews) and the control
+loop are processes of their own. The control loop is this one: it looks at the page at 100 Hz, so that what it sees is
+evenly spread between two pictures. Live, pictures of 640x480 come at 30 Hz. How old they are is counted from the
+moment at which their sender began to draw and pack them: they carry their numbers. Recordings have no sender: their
+pictures are born when they are due. Afterwards another receiving side is given as many pictures as come in ten idle
+minutes, as fast as they go, and what it has grown by since the first of them is told. Where they do not go by within
+a few times the seconds of the live part, it is told how many minutes did.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+import robots
+from benchmarks.wires_cases import PATIENCE_S, Case, Stage, Wired, absent, cases, end, process
+from benchmarks.wires_receiver import FPS, Receiving, layout
+from runtime.clock import MonotonicClock
+from runtime.page import Page
+from runtime.sim.pictures import frame_number
+from runtime.types import UInt8
+
+IDLE_FRAMES = 18_900  # of each camera: half a minute to warm up, and ten
+_WARM_FRAMES = 900  # after which memory is to stay as it is
+_LIVE = (480, 640)
+_FLOOD = (120, 160)  # a picture that is kept is one whatever its size, and these go by in minutes
+_FLOOD_HZ = 1000.0
+_IDLE_SHARE = 3.0  # of the seconds of the live part, at most
+_LOOKS_HZ = 100.0
+_SETTLE_S = 1.5  # after the first observation
+Row = dict[str, Any]
+
+
+def measure(seconds: float) -> list[Row]:
+    """A row per transport: each live for `seconds`, then with the pictures of ten minutes as fast as they go."""
+    rows: list[Row] = []
+    for case in cases():
+        why = absent(case)
+        rows.append({"transport": case.name, **({"absent": why} if why else _measured(case, seconds))})
+    return rows
+
+
+def _measured(case: Case, seconds: float) -> Row:
+    return {**live(case, seconds), **(idle(case, _IDLE_SHARE * seconds) if case.idle else {})}
+
+
+def live(case: Case, seconds: float) -> Row:
+    """What a control loop sees of pictures that come at their usual rate, and what receiving them takes."""
+    with _staged(case, FPS, _LIVE) as (stage, page):
+        wired = case.open(stage)
+        receiver = _receiving(stage, wired, fast=False)
+        _await(page, receiver, 1)
+        time.sleep(_SETTLE_S)
+        watched = psutil.Process(receiver.pid)
+        before, begun = _processor(watched), time.monotonic()
+        looks, arrivals = _look(page, seconds)
+        took = time.monotonic() - begun
+        used = (_processor(watched) - before) / took
+        faults, sent = _ended(receiver), stage.sent()
+        known = [age for age in ages(looks, wired.born, sent) if age is not None]
+    return {
+        "cpu_percent": 100.0 * used,
+        "age_ms": {f"p{q}": 1e3 * float(np.percentile(known, q)) for q in (50, 99)},
+        "observation_hz": arrivals / took,
+        "sent_hz": sent_hz(sent, begun, took),
+        "faults": faults,
+    }
+
+
+def idle(case: Case, seconds: float, frames: int = IDLE_FRAMES) -> Row:
+    """How much memory the receiving side takes more after so many pictures of each camera, or so long, than before."""
+    with _staged(case, _FLOOD_HZ, _FLOOD, hurried=True) as (stage, page):
+        wired = case.open(stage)
+        receiver = _receiving(stage, wired, fast=case.played)
+        watched = psutil.Process(receiver.pid)
+        first = _await(page, receiver, min(_WARM_FRAMES, frames // 2))
+        warm = _resident(watched)
+        last = _await(page, receiver, frames, seconds)
+        grown = _resident(watched) - warm
+        faults = _ended(receiver)
+    minutes = (last - first) / (60.0 * FPS)
+    return {
+        "idle_minutes": minutes,
+        "resident_mb": (warm + grown) / 1e6,
+        "growth_mb": grown / 1e6,
+        "idle_faults": faults,
+    }
+
+
+@contextlib.contextmanager
+def _staged(
+    case: Case, rate: float, size: tuple[int, int], hurried: bool = False
+) -> Iterator[tuple[Stage, Page]]:
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        page, descriptor = Page.create(layout(robots.load(case.robot)))
+        stack.callback(os.close, descriptor)
+        yield Stage(stack, folder, rate, size, case.robot, descriptor, hurried), page
+
+
+def _receiving(stage: Stage, wired: Wired, fast: bool) -> subprocess.Popen[str]:
+    """The process that fills the page."""
+    given = Receiving(stage.robot, wired.transport, stage.page, wired.cameras, fast)
+    command = [sys.executable, "-m", "benchmarks.wires_receiver", given.text()]
+    return stage.stack.enter_context(process(command, stage.page))
+
+
+def _await(page: Page, receiver: subprocess.Popen[str], frames: int, seconds: float = math.inf) -> int:
+    """How many pictures of every camera are in the page, once it is so many or so long; SystemExit where none come."""
+    seen, since = 0, time.monotonic()
+    latest = since + seconds
+    while seen < frames and time.monotonic() < latest:
+        time.sleep(0.02)
+        now = int(page.observation.read()["picture_number"].min())
+        if now > seen:
+            seen, since = now, time.monotonic()
+        if receiver.poll() is not None or time.monotonic() - since > PATIENCE_S:
+            raise SystemExit(
+                f"{seen} of {frames} pictures of each camera came, then none for {PATIENCE_S:g} s"
+            )
+    return seen
+
+
+Look = list[
+    tuple[UInt8 | None, float, float]
+]  # per camera: the picture's head, when it was captured, and now
+
+
+def _look(page: Page, seconds: float) -> tuple[list[Look], int]:
+    """What a control loop sees at each of its ticks, and how many observations came meanwhile."""
+    clock = MonotonicClock()
+    first = int(page.observation.read()["sequence"])
+    looks: list[Look] = []
+    start = clock.now()
+    for tick in range(int(seconds * _LOOKS_HZ)):
+        clock.sleep_until(start + tick / _LOOKS_HZ)
+        now, record = clock.now(), page.observation.read()
+        look: Look = []
+        for index, camera in enumerate(page.layout.cameras):
+            picture = page.pictures[camera].read(int(record["picture_number"][index]))
+            captured = float(record["picture_captured"][index])
+            look.append((None if picture is None else marks(picture), captured, now))
+        looks.append(look)
+    return looks, int(page.observation.read()["sequence"]) - first
+
+
+def marks(picture: UInt8) -> UInt8:
+    """What tells its number: the strip at its head and the bar at its foot."""
+    return np.concatenate([picture[:16], picture[-16:]])
+
+
+def ages(looks: Sequence[Look], born: str, sent: Any) -> list[float | None]:
+    """Of the oldest picture that each tick saw [s]; None where one was being overwritten."""
+    found: list[float | None] = []
+    for look in looks:
+        births = [_birth(index, *one, born, sent) for index, one in enumerate(look)]
+        known = [birth for birth in births if birth is not None]
+        found.append(look[0][2] - min(known) if len(known) == len(look) else None)
+    return found
+
+
+def sent_hz(sent: Any, begun: float, took: float) -> float | None:
+    """What the sender kept up with; None for recordings."""
+    streams = [stream for stream in (sent if sent and isinstance(sent[0], list) else [sent]) if stream]
+    rates = [sum(begun <= at <= begun + took for at in stream) / took for stream in streams]
+    return min(rates, default=None)
+
+
+def _birth(
+    camera: int, marks: UInt8 | None, captured: float, now: float, born: str, sent: Any
+) -> float | None:
+    """When a picture's sender began with it [s]."""
+    if born == "due":
+        return captured
+    if marks is None:
+        return None
+    if born == "strip":
+        begun: float = sent[strip_number(marks)]
+        return begun
+    return bar_birth(marks, now, sent[camera])
+
+
+def strip_number(marks: UInt8) -> int:
+    """The number in the strip; `frame_number` looks for it in the head of a whole picture."""
+    whole = np.zeros((_LIVE[0], *marks.shape[1:]), np.uint8)
+    whole[:16] = marks[:16]
+    return frame_number(whole)
+
+
+def bar_birth(marks: UInt8, now: float, times: Sequence[float]) -> float:
+    """When the newest picture left whose bar is as wide: widths come again every 80 pictures of 640 pixels."""
+    width, cycle = int((marks[-4].mean(axis=-1) > 127).sum()), marks.shape[1] // 8
+    number = round((width - 1) / 8) % cycle
+    left = [time for index, time in enumerate(times) if index % cycle == number and time <= now]
+    return max(left)
+
+
+def _processor(process: psutil.Process) -> float:
+    """Processor time of a process and its children so far [s]."""
+    everybody = [process, *process.children(recursive=True)]
+    return float(sum(sum(one.cpu_times()[:2]) for one in everybody))
+
+
+def _resident(process: psutil.Process) -> float:
+    """Memory of a process and its children [bytes]."""
+    return float(sum(one.memory_info().rss for one in [process, *process.children(recursive=True)]))
+
+
+def _ended(receiver: subprocess.Popen[str]) -> Mapping[str, int]:
+    """End the receiving side; what went wrong there, by name."""
+    end(receiver)
+    assert receiver.stdout is not None
+    faults: Mapping[str, int] = json.loads(receiver.stdout.read())
+    return faults

@@ -1,0 +1,107 @@
+"""Datasets of the data folder, ours and those of others: what they are, their episodes, what is done to them."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+from uuid import UUID
+
+from django.http import HttpRequest
+from ninja import Router, Schema, Status
+
+from evaweb.api.answers import FAILURES
+from evaweb.api.jobs import JobOut
+from evaweb.datasets import listing, orders, work
+from evaweb.datasets.finding import Overview, overview, overviews
+from evaweb.errors import Conflict
+from runtime.recording.files import RecordingError
+
+router = Router(tags=["datasets"])
+
+
+class CheckOut(Schema):
+    """What the newest check found; `fresh` is false where the dataset has changed since."""
+
+    at: datetime
+    problems: list[str]
+    fresh: bool
+
+
+class DatasetOut(Schema):
+    """One dataset; its name is its folder, relative to the data folder. With a `problem` the rest is empty."""
+
+    name: str
+    version: str
+    robot: str
+    fps: float
+    episodes: int
+    frames: int
+    tasks: int
+    cameras: list[str]
+    size: int
+    problem: str
+    check: CheckOut | None
+
+    @staticmethod
+    def of(found: Overview) -> dict[str, Any]:
+        """With what its newest check found."""
+        own = [name for name in DatasetOut.model_fields if name != "check"]
+        checked = None if found.problem else work.checked(found.name)
+        check = checked and {"at": checked.at, "problems": list(checked.problems), "fresh": checked.fresh}
+        return {**{name: getattr(found, name) for name in own}, "check": check}
+
+
+class DatasetEpisodeOut(Schema):
+    """One episode of a dataset; `uuid` is that of the recording, null for one of others."""
+
+    index: int
+    rows: int
+    seconds: float
+    task: str
+    uuid: UUID | None
+    success: bool | None
+    verdict: str
+
+    @staticmethod
+    def of(row: listing.Row) -> dict[str, Any]:
+        """As the dataset lists it, with the newest verdict of the lab."""
+        plain = ("index", "seconds", "task", "success", "verdict")
+        return {**{name: getattr(row, name) for name in plain}, "rows": row.length, "uuid": row.uuid or None}
+
+
+@router.get("", response={200: list[DatasetOut], **FAILURES}, summary="Datasets", url_name="datasets")
+def datasets(request: HttpRequest) -> Any:
+    """All below the data folder, in the order of their names."""
+    return [DatasetOut.of(found) for found in overviews()]
+
+
+@router.get("/one", response={200: DatasetOut, **FAILURES}, summary="One dataset", url_name="dataset")
+def dataset(request: HttpRequest, name: str) -> Any:
+    """By its name; `cups` is datasets/cups."""
+    return DatasetOut.of(overview(orders.full_name(name)))
+
+
+@router.get(
+    "/episodes",
+    response={200: list[DatasetEpisodeOut], **FAILURES},
+    summary="Episodes of a dataset",
+    url_name="dataset-episodes",
+)
+def episodes(request: HttpRequest, name: str, words: str = "", success: str = "", verdict: str = "") -> Any:
+    """In the order of their indices; `success` is yes, no or unknown, `verdict` pass, fail or unreviewed."""
+    try:
+        found = listing.rows(orders.full_name(name), words=words, success=success, verdict=verdict)
+    except RecordingError as error:
+        raise Conflict(str(error)) from None
+    return [DatasetEpisodeOut.of(row) for row in found]
+
+
+@router.post(
+    "/jobs",
+    response={202: JobOut, **FAILURES},
+    summary="Have something done",
+    url_name="dataset-jobs",
+)
+def ask(request: HttpRequest, given: orders.Order) -> Any:
+    """Check, repair, convert, merge, split; delete and push are for administrators. The job says how far it is."""
+    return Status(202, orders.asked(user=request.auth, given=given.model_dump()))

@@ -1,0 +1,291 @@
+"""Plans: what is open, the next trial, the bench before it, and the reveal."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any
+
+from django.http import HttpRequest
+from ninja import Field, Query, Router, Schema, Status
+
+from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.api.trials import TrialDetail
+from evaweb.plans import bench, services
+from evaweb.plans.handing import give_back, progress
+from evaweb.plans.models import Achieved, CameraCheck, Plan, PlanState, Reference
+from evaweb.plans.selectors import plan_get, plan_list
+from evaweb.plans.sight import look, sealed_for
+from evaweb.sight import sight_for
+from evaweb.stations.selectors import station_get
+from evaweb.trials import selectors as trials
+
+router = Router(tags=["plans"])
+
+
+class PlanOut(Schema):
+    """One version of a plan. While it is blind for who asks, `document`, `digest` and `key` are empty.
+
+    `counted` trials of `total` have their score; `attempts` were handed out.
+    """
+
+    name: str
+    version: int
+    title: str
+    state: PlanState
+    blind: bool
+    sealed: bool
+    owner: str
+    stations: list[str]
+    total: int
+    counted: int
+    attempts: int
+    commitment: str
+    question: str
+    digest: str
+    key: str
+    document: dict[str, Any] | None
+    frozen_at: datetime | None
+    closed_at: datetime | None
+    closed_because: str
+    revealed_at: datetime | None
+
+    @staticmethod
+    def of(plan: Plan, user: Any) -> dict[str, Any]:
+        """As this user may see it."""
+        sealed = sealed_for(plan, user)
+        done = progress(plan)
+        plain = ("name", "version", "title", "state", "blind", "commitment")
+        times = ("frozen_at", "closed_at", "closed_because", "revealed_at")
+        return {
+            **{name: getattr(plan, name) for name in (*plain, *times)},
+            "sealed": sealed,
+            "owner": plan.owner.get_username(),
+            "stations": [station.name for station in plan.stations.all()],
+            "total": done.total,
+            "counted": done.counted,
+            "attempts": done.attempts,
+            "question": "" if sealed else plan.question,
+            "digest": "" if sealed else plan.digest,
+            "document": None if sealed else plan.document,
+            "key": bytes(plan.key or b"").hex() if plan.state == PlanState.REVEALED else "",
+        }
+
+
+class HandoutOut(Schema):
+    """The trial that was handed out; `reason`: what became of the attempt before."""
+
+    code: str
+    number: int
+    attempt: int
+    reason: str
+    trial: TrialDetail
+
+
+class At(Schema):
+    """Which station."""
+
+    station: str
+
+
+class Back(Schema):
+    """Which station's trials are given to others, and why."""
+
+    station: str
+    reason: Annotated[str, Field(min_length=1, max_length=2000)]
+
+
+class Freed(Schema):
+    """How many trials others can be handed now."""
+
+    freed: int
+
+
+class Reason(Schema):
+    """Why, for those who read it later."""
+
+    reason: str = ""
+
+
+class SeenOut(Schema):
+    """What one camera showed, its reference ("": none), and how well they match, from 1 down."""
+
+    camera: str
+    picture: str
+    reference: str
+    match: float | None
+
+
+class CamerasOut(Schema):
+    """Whether who asks has confirmed the station's cameras, with what they showed."""
+
+    confirmed: bool
+    at: datetime | None
+    cameras: list[SeenOut]
+
+    @staticmethod
+    def of(check: CameraCheck | None) -> dict[str, Any]:
+        """As it was confirmed."""
+        seen = check.seen if check else {}
+        rows = [{"camera": camera, **facts} for camera, facts in seen.items()]
+        return {"confirmed": check is not None, "at": check.at if check else None, "cameras": rows}
+
+
+class CamerasIn(Schema):
+    """`first`: what a camera without a reference shows becomes its reference."""
+
+    first: bool = False
+
+
+class ReferenceIn(Schema):
+    """Of which position of which scene; without a scene of the cameras at all."""
+
+    scene: str | int | None = None
+    position: int | None = None
+
+
+class ReferenceOut(Schema):
+    """One reference picture."""
+
+    camera: str
+    picture: str
+    by: str
+    at: datetime
+
+    @staticmethod
+    def of(row: Reference) -> dict[str, Any]:
+        """With who took it."""
+        return {"camera": row.camera, "picture": row.picture, "by": row.by.get_username(), "at": row.at}
+
+
+class AchievedIn(Schema):
+    """Why a lower match than the plan's least is accepted."""
+
+    override: str = ""
+
+
+@router.get("/plans", response={200: Page[PlanOut], **FAILURES}, summary="Plans", url_name="plans")
+def plans(request: HttpRequest, paging: Query[Paging], state: PlanState | None = None) -> Any:
+    """All versions by name, the newest first; drafts are for their owners and administrators."""
+    rows = plan_list(user=request.auth)
+    return paging.of(rows.filter(state=state.value) if state else rows, PlanOut, request.auth)
+
+
+@router.get("/plans/{name}", response={200: PlanOut, **FAILURES}, summary="One plan", url_name="plan")
+def plan(request: HttpRequest, name: str, version: int | None = None) -> Any:
+    """By its name; without a version the newest that is no draft."""
+    return PlanOut.of(plan_get(name=name, version=version, user=request.auth), request.auth)
+
+
+@router.post(
+    "/plans/{name}/next", response={201: HandoutOut, **FAILURES}, summary="Next trial", url_name="plan-next"
+)
+def following(request: HttpRequest, name: str, given: At) -> Any:
+    """Prepare the next trial of the plan's schedule on a station; operators who have confirmed its cameras."""
+    station = station_get(name=given.station)
+    found = plan_get(name=name, user=request.auth)
+    handout = bench.next_trial(user=request.auth, station=station, plan=found)
+    seen = sight_for(request)
+    return Status(
+        201,
+        {
+            "code": handout.code,
+            "number": handout.number,
+            "attempt": handout.trial.attempt,
+            "reason": "the attempt before does not count" if handout.reason else "",
+            "trial": TrialDetail.of(trials.trial_get(id=handout.trial_id), seen),
+        },
+    )
+
+
+@router.post(
+    "/plans/{name}/give-back",
+    response={200: Freed, **FAILURES},
+    summary="Give trials to others",
+    url_name="plan-give-back",
+)
+def back(request: HttpRequest, name: str, given: Back) -> Any:
+    """Let other stations have the trials that this one has begun a block of and not made; operators."""
+    found, station = plan_get(name=name, user=request.auth), station_get(name=given.station)
+    return {"freed": give_back(user=request.auth, plan=found, station=station, reason=given.reason)}
+
+
+@router.post(
+    "/plans/{name}/close", response={200: PlanOut, **FAILURES}, summary="Close it", url_name="plan-close"
+)
+def close(request: HttpRequest, name: str, given: Reason) -> Any:
+    """Hand out no more trials of it; its owner, or an administrator."""
+    found = plan_get(name=name, user=request.auth)
+    return PlanOut.of(services.plan_close(user=request.auth, plan=found, reason=given.reason), request.auth)
+
+
+@router.post("/plans/{name}/look", response={200: PlanOut, **FAILURES}, summary="Look", url_name="plan-look")
+def looked(request: HttpRequest, name: str) -> Any:
+    """Look behind the blind before the reveal: recorded, and who has looked runs none of its trials."""
+    found = plan_get(name=name, user=request.auth)
+    look(found, request.auth)
+    return PlanOut.of(found, request.auth)
+
+
+@router.post(
+    "/plans/{name}/reveal", response={200: PlanOut, **FAILURES}, summary="Reveal it", url_name="plan-reveal"
+)
+def reveal(request: HttpRequest, name: str) -> Any:
+    """Say which checkpoint was which, once and for all; its owner, or an administrator."""
+    found = plan_get(name=name, user=request.auth)
+    return PlanOut.of(services.plan_reveal(user=request.auth, plan=found), request.auth)
+
+
+@router.get(
+    "/stations/{name}/cameras",
+    response={200: CamerasOut, **FAILURES},
+    summary="Confirmed cameras",
+    url_name="cameras",
+)
+def cameras(request: HttpRequest, name: str) -> Any:
+    """Whether who asks has confirmed them; it holds until the station is started anew, half a day at most."""
+    return CamerasOut.of(bench.cameras_confirmed(user=request.auth, station=station_get(name=name)))
+
+
+@router.post(
+    "/stations/{name}/cameras",
+    response={201: CamerasOut, **FAILURES},
+    summary="Confirm the cameras",
+    url_name="cameras-confirm",
+)
+def cameras_confirm(request: HttpRequest, name: str, given: CamerasIn) -> Any:
+    """Each camera shows what its reference shows; kept with what it shows now. Operators."""
+    check = bench.cameras_confirm(user=request.auth, station=station_get(name=name), first=given.first)
+    return Status(201, CamerasOut.of(check))
+
+
+@router.post(
+    "/stations/{name}/references",
+    response={201: list[ReferenceOut], **FAILURES},
+    summary="Take reference pictures",
+    url_name="references",
+)
+def references(request: HttpRequest, name: str, given: ReferenceIn) -> Any:
+    """What the cameras show now is how the position should lie; operators."""
+    position = None
+    if given.scene is not None:
+        scene = trials.scene_get(name=given.scene)
+        position = trials.position_get(scene=scene, number=given.position or 0)
+    taken = bench.references_take(user=request.auth, station=station_get(name=name), position=position)
+    return Status(201, [ReferenceOut.of(row) for row in taken])
+
+
+@router.post(
+    "/trials/{int:id}/achieved",
+    response={201: list[SeenOut], **FAILURES},
+    summary="Keep how the bench is laid out",
+    url_name="achieved",
+)
+def achieved(request: HttpRequest, id: int, given: AchievedIn) -> Any:
+    """Before the run: what the cameras show, and how well it matches the position's references; operators."""
+    taken = bench.achieve(user=request.auth, trial=trials.trial_get(id=id), override=given.override)
+    return Status(201, [_seen(row) for row in taken])
+
+
+def _seen(row: Achieved) -> dict[str, Any]:
+    reference = row.reference.picture if row.reference else ""
+    return {"camera": row.camera, "picture": row.picture, "reference": reference, "match": row.match}

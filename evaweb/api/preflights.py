@@ -1,0 +1,99 @@
+"""Preflights: a checkpoint's server asked without a robot, and what was found."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any
+from uuid import UUID
+
+from django.http import HttpRequest
+from ninja import Field, Query, Router, Schema, Status
+
+from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.preflights import selectors, services
+from evaweb.preflights.models import Preflight, PreflightStatus
+from evaweb.preflights.sight import shown
+from evaweb.sight import sight_for
+from evaweb.stations.selectors import station_get
+from evaweb.trials.selectors import checkpoint_get
+
+router = Router(tags=["preflights"])
+
+
+class PreflightOut(Schema):
+    """One preflight. `report` is what `python -m runtime.preflight --json` says, null while it is under way.
+
+    `hidden` says why a part of it is kept back from who asks; `reason` why there is no report.
+    """
+
+    id: UUID
+    checkpoint: str
+    station: str
+    by: Preflight.By
+    status: PreflightStatus
+    verdict: str
+    asked_by: str
+    asked_at: datetime
+    ended_at: datetime | None
+    reason: str
+    hidden: str
+    report: dict[str, Any] | None
+
+    @staticmethod
+    def of(row: Preflight, user: Any) -> dict[str, Any]:
+        """As this user may see it."""
+        seen = shown(row, user)
+        plain = ("by", "status", "verdict", "asked_at", "ended_at")
+        return {
+            **{name: getattr(row, name) for name in plain},
+            "id": row.pk,
+            "checkpoint": row.checkpoint.name,
+            "station": row.station.name,
+            "asked_by": row.user.get_username() if row.user else "",
+            "reason": seen.reason,
+            "hidden": seen.hidden,
+            "report": seen.report,
+        }
+
+
+class PreflightIn(Schema):
+    """Which checkpoint, by name or id, with the deployment of which station; without one the first that can."""
+
+    checkpoint: str | int
+    station: Annotated[str, Field(max_length=63)] = ""
+
+
+class Which(Schema):
+    """Of which checkpoint, by name or id; without one of all."""
+
+    checkpoint: str = ""
+
+
+@router.get("", response={200: Page[PreflightOut], **FAILURES}, summary="Preflights", url_name="preflights")
+def preflights(request: HttpRequest, filters: Query[Which], paging: Query[Paging]) -> Any:
+    """The newest first."""
+    seen = sight_for(request)
+    checkpoint = checkpoint_get(name=filters.checkpoint, sight=seen) if filters.checkpoint else None
+    return paging.of(selectors.preflight_list(checkpoint=checkpoint, sight=seen), PreflightOut, request.auth)
+
+
+@router.post(
+    "", response={202: PreflightOut, **FAILURES}, summary="Ask for a preflight", url_name="preflight-ask"
+)
+def ask(request: HttpRequest, given: PreflightIn) -> Any:
+    """Begin one; it is under way then, and read at its id."""
+    row = services.preflight_ask(
+        user=request.auth,
+        checkpoint=checkpoint_get(name=given.checkpoint, sight=sight_for(request)),
+        station=station_get(name=given.station) if given.station else None,
+    )
+    return Status(202, PreflightOut.of(row, request.auth))
+
+
+@router.get(
+    "/{uuid:id}", response={200: PreflightOut, **FAILURES}, summary="One preflight", url_name="preflight"
+)
+def preflight(request: HttpRequest, id: UUID) -> Any:
+    """How it goes, or went."""
+    row = services.preflight_settled(row=selectors.preflight_get(id=id, sight=sight_for(request)))
+    return PreflightOut.of(row, request.auth)

@@ -1,0 +1,290 @@
+"""What plans found: every statistic, every attempt, comparisons, second ratings, preferences."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any
+from uuid import UUID
+
+from django.http import HttpRequest
+from ninja import Field, Query, Router, Schema
+from pydantic import create_model
+
+from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.api.tables import Format, table_answer
+from evaweb.cells import in_pages
+from evaweb.errors import NotFound
+from evaweb.plans.models import Plan
+from evaweb.results import caching
+from evaweb.results.agreement import agreement_of, preferences_of
+from evaweb.results.analysis import Analysis
+from evaweb.results.document import analysis_document, arm_document, comparison_document
+from evaweb.results.filters import Chosen, chosen
+from evaweb.results.models import Preference, Rating
+from evaweb.results.planner import Question, question_of, table_of
+from evaweb.results.seen import require_seen
+from evaweb.results.selectors import plan_get
+from evaweb.results.tables import COLUMNS, outcome_page, outcome_pages
+from evaweb.trials.models import Score
+
+router = Router(tags=["results"])
+_USUAL = Question()
+_PLAN = "/plans/{name}/{int:version}"
+
+
+class Only(Schema):
+    """Which trials are meant, all of them together; "" where it does not matter."""
+
+    scene: str = ""
+    position: str = ""
+    station: str = ""
+    operator: str = ""
+
+
+_FIELDS: dict[str, Any] = {name: (hint, ...) for name, hint in COLUMNS.items()}
+OutcomeOut: Any = create_model("OutcomeOut", __base__=Schema, **_FIELDS)
+
+
+class RatingOut(Schema):
+    """What a second rater said of a trial."""
+
+    uuid: UUID
+    trial: int
+    rater: str
+    success: bool
+    score: float
+    failure: str
+    note: str
+    blind: bool
+    at: datetime
+
+    @staticmethod
+    def of(rating: Rating) -> dict[str, Any]:
+        """Flat."""
+        plain = ("uuid", "success", "score", "failure", "note", "blind", "at")
+        return {
+            **{name: getattr(rating, name) for name in plain},
+            "trial": rating.trial_id,
+            "rater": rating.rater.get_username(),
+        }
+
+
+class PreferenceOut(Schema):
+    """Which of two trials somebody preferred, and why."""
+
+    uuid: UUID
+    first: int
+    second: int
+    first_checkpoint: str
+    second_checkpoint: str
+    outcome: str
+    why: str
+    rater: str
+    blind: bool
+    at: datetime
+
+    @staticmethod
+    def of(row: Preference) -> dict[str, Any]:
+        """Flat."""
+        return {
+            **{name: getattr(row, name) for name in ("uuid", "outcome", "why", "blind", "at")},
+            "first": row.first_id,
+            "second": row.second_id,
+            "first_checkpoint": row.first.checkpoint.name,
+            "second_checkpoint": row.second.checkpoint.name,
+            "rater": row.rater.get_username(),
+        }
+
+
+class ScoreRow(Schema):
+    """One score of a trial; the newest of a trial counts, the others are what it replaced."""
+
+    uuid: UUID
+    trial: int
+    rater: str
+    source: str
+    success: bool
+    score: float
+    failure: str
+    note: str
+    reason: str
+    scored_at: datetime
+
+    @staticmethod
+    def of(score: Score) -> dict[str, Any]:
+        """Flat."""
+        plain = ("uuid", "source", "success", "score", "failure", "note", "reason", "scored_at")
+        return {
+            **{name: getattr(score, name) for name in plain},
+            "trial": score.trial_id,
+            "rater": score.rater.get_username(),
+        }
+
+
+class Planned(Schema):
+    """A question to the planner; see its page."""
+
+    rate: Annotated[float, Field(ge=0, le=1)] = _USUAL.rate
+    better: Annotated[float, Field(ge=0, le=1)] = _USUAL.better
+    alpha: Annotated[float, Field(ge=0.0001, le=0.5)] = _USUAL.alpha
+    power: Annotated[float, Field(ge=0.5, le=0.999)] = _USUAL.power
+    cycle_s: Annotated[float, Field(ge=1, le=36_000)] = _USUAL.cycle_s
+    checkpoints: Annotated[int, Field(ge=2, le=50)] = _USUAL.checkpoints
+    stations: Annotated[int, Field(ge=1, le=100)] = _USUAL.stations
+    hours: Annotated[float, Field(ge=0.1, le=10_000)] = _USUAL.hours
+
+
+@router.get(
+    _PLAN + "/results",
+    response={200: dict[str, Any], **FAILURES},
+    summary="Every statistic",
+    url_name="plan-results",
+)
+def results(request: HttpRequest, name: str, version: int, only: Query[Only]) -> Any:
+    """Of each checkpoint, of each pair, and of raters and preferences; intervals are [low, high] at 95 %."""
+    plan, which = _seen(request, name, version, only)
+    analysis = caching.analysis_of(plan, which)
+    return {
+        "plan": plan.name,
+        "version": plan.version,
+        "digest": plan.digest,
+        "only": {name: value for name, value in only.model_dump().items() if value},
+        **analysis_document(analysis),
+        "notes": list(analysis.notes),
+        "agreement": agreement_of(plan),
+        "preferences": preferences_of(plan),
+    }
+
+
+@router.get(
+    _PLAN + "/results/{checkpoint}",
+    response={200: dict[str, Any], **FAILURES},
+    summary="One checkpoint",
+    url_name="plan-checkpoint",
+)
+def checkpoint(request: HttpRequest, name: str, version: int, checkpoint: str, only: Query[Only]) -> Any:
+    """Its rates, scores, milestones and times."""
+    plan, which = _seen(request, name, version, only)
+    analysis = caching.analysis_of(plan, which)
+    found = next((arm for arm in analysis.arms if arm.checkpoint == checkpoint), None)
+    if found is None:
+        raise NotFound(f"no trial of {checkpoint!r:.80} counts; there are trials of: {_names(analysis)}")
+    return arm_document(found)
+
+
+@router.get(
+    _PLAN + "/comparison",
+    response={200: dict[str, Any], **FAILURES},
+    summary="Two checkpoints",
+    url_name="plan-comparison",
+)
+def comparison(
+    request: HttpRequest, name: str, version: int, first: str, second: str, only: Query[Only]
+) -> Any:
+    """Difference, tests and evidence; the first minus the second, whichever way round the page has them."""
+    plan, which = _seen(request, name, version, only)
+    analysis = caching.analysis_of(plan, which)
+    found = analysis.compared(first, second)
+    if found is None:
+        raise NotFound(
+            f"no comparison of {first!r:.80} and {second!r:.80}; there are trials of: {_names(analysis)}"
+        )
+    return comparison_document(found)
+
+
+@router.get(
+    _PLAN + "/outcomes",
+    response={200: Page[OutcomeOut], **FAILURES},  # type: ignore[valid-type]
+    summary="Every attempt",
+    url_name="plan-outcomes",
+)
+def outcomes(
+    request: HttpRequest,
+    name: str,
+    version: int,
+    only: Query[Only],
+    paging: Query[Paging],
+    format: Format = "json",
+) -> Any:
+    """In the order in which they were handed out, those that do not count included; CSV and Parquet have all."""
+    plan, which = _seen(request, name, version, only)
+    if format != "json":
+        name = f"{plan.name}-v{plan.version}-trials"
+        return table_answer(request, name, COLUMNS, outcome_pages(plan, which), format)
+    return outcome_page(plan, which, paging.offset, paging.limit)
+
+
+@router.get(
+    _PLAN + "/scores",
+    response={200: Page[ScoreRow], **FAILURES},
+    summary="Every score",
+    url_name="plan-scores",
+)
+def scores(
+    request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
+) -> Any:
+    """Those that were corrected included."""
+    plan, _ = _seen(request, name, version, Only())
+    rows = Score.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
+    return _rows(request, plan, "scores", rows, ScoreRow, paging, format)
+
+
+@router.get(
+    _PLAN + "/ratings",
+    response={200: Page[RatingOut], **FAILURES},
+    summary="Second ratings",
+    url_name="plan-ratings",
+)
+def ratings(
+    request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
+) -> Any:
+    """Given by people who did not run the trial; they never change its score."""
+    plan, _ = _seen(request, name, version, Only())
+    rows = Rating.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
+    return _rows(request, plan, "ratings", rows, RatingOut, paging, format)
+
+
+@router.get(
+    _PLAN + "/preferences",
+    response={200: Page[PreferenceOut], **FAILURES},
+    summary="Preferences",
+    url_name="plan-preferences",
+)
+def preferences(
+    request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
+) -> Any:
+    """Which of two trials at the same initial condition somebody preferred."""
+    plan, _ = _seen(request, name, version, Only())
+    rows = plan.preferences.select_related("rater", "first__checkpoint", "second__checkpoint").order_by("pk")
+    return _rows(request, plan, "preferences", rows, PreferenceOut, paging, format)
+
+
+@router.get(
+    "/planner", response={200: dict[str, Any], **FAILURES}, summary="How many trials", url_name="planner"
+)
+def planner(request: HttpRequest, asked: Query[Planned]) -> Any:
+    """Trials and robot hours for a wanted difference, and what the trials there is time for would miss."""
+    question = question_of({name: str(value) for name, value in asked.model_dump().items()})
+    return {"question": asked.model_dump(), **table_of(question)}
+
+
+def _seen(request: Any, name: str, version: int, only: Only) -> tuple[Plan, Chosen]:
+    """The plan, of which the user sees results, and which of its trials are meant."""
+    plan = plan_get(name=name, version=version)
+    require_seen(plan, request.auth)
+    given = only.model_dump()
+    return plan, chosen(given, caching.runs_of(plan).outcomes) if any(given.values()) else Chosen()
+
+
+def _rows(
+    request: HttpRequest, plan: Plan, what: str, rows: Any, shape: Any, paging: Paging, format: Format
+) -> Any:
+    if format == "json":
+        return paging.of(rows, shape)
+    columns = {name: field.annotation for name, field in shape.model_fields.items()}
+    pages = in_pages(map(shape.of, rows.iterator(chunk_size=1000)))
+    return table_answer(request, f"{plan.name}-v{plan.version}-{what}", columns, pages, format)
+
+
+def _names(analysis: Analysis) -> str:
+    return ", ".join(arm.checkpoint for arm in analysis.arms) or "none yet"

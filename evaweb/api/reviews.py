@@ -1,0 +1,219 @@
+"""What is said of episodes: quality, verdicts, annotations; and which one waits for a review."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Literal
+from uuid import UUID
+
+from django.http import HttpRequest
+from ninja import Field, Router, Schema, Status
+
+from evaweb.api.answers import FAILURES
+from evaweb.api.jobs import JobOut
+from evaweb.episodes.selectors import episode_get
+from evaweb.reviews import selectors, services
+from evaweb.reviews.models import Review, Segment
+from evaweb.roles import Role, require
+from evaweb.sight import sight_for
+
+router = Router(tags=["reviews"])
+
+_Frame = Annotated[int, Field(ge=0, lt=2**31)]
+
+
+class FlagOut(Schema):
+    """A finding in the frames `first` to `last`, both included; -1 both where it is about no frame."""
+
+    kind: str
+    severity: Literal["info", "warning", "error"]
+    first: int
+    last: int
+    stream: str
+    text: str
+    value: float | None
+    bound: float | None
+
+
+class CountOut(Schema):
+    """How often a kind was found, and in how many frames."""
+
+    flags: int
+    frames: int
+
+
+class QualityOut(Schema):
+    """What the checks found; `unchecked` says what could not be judged."""
+
+    episode: str
+    frames: int
+    fps: float
+    clean: bool
+    worst: Literal["", "info", "warning", "error"]
+    flags: list[FlagOut]
+    counts: dict[str, CountOut]
+    unchecked: list[str]
+    figures: dict[str, float | None]
+
+
+class ReviewOut(Schema):
+    """What one person said; the newest pass or fail counts."""
+
+    uuid: UUID
+    verdict: str
+    note: str
+    reviewer: str
+    at: datetime
+
+    @staticmethod
+    def of(review: Review) -> dict[str, Any]:
+        """With the reviewer's name."""
+        plain = ("uuid", "verdict", "note", "at")
+        return {**{name: getattr(review, name) for name in plain}, "reviewer": review.reviewer.get_username()}
+
+
+class SegmentOut(Schema):
+    """A part of an episode, both frames included; `milestone` is what is reached at its last one."""
+
+    uuid: UUID
+    first: int
+    last: int
+    label: str
+    milestone: str
+    annotator: str
+    at: datetime
+
+    @staticmethod
+    def of(segment: Segment) -> dict[str, Any]:
+        """With the annotator's name."""
+        plain = ("uuid", "first", "last", "label", "milestone", "at")
+        return {
+            **{name: getattr(segment, name) for name in plain},
+            "annotator": segment.annotator.get_username(),
+        }
+
+
+class SaidOut(Schema):
+    """All that is said of an episode: reviews newest first, segments in order, the report where there is one."""
+
+    verdict: ReviewOut | None
+    reviews: list[ReviewOut]
+    segments: list[SegmentOut]
+    asked: bool
+    quality: QualityOut | None
+
+
+class ReviewIn(Schema):
+    """A verdict, or a note that leaves the verdict as it is."""
+
+    verdict: Annotated[str, Field(description="pass, fail or note")]
+    note: str = ""
+
+
+class SegmentIn(Schema):
+    """A part of the episode; with `segment`, one of one's own is changed."""
+
+    first: _Frame
+    last: _Frame
+    label: str
+    milestone: str = ""
+    segment: UUID | None = None
+
+
+class NextOut(Schema):
+    """An episode that nobody has passed or failed, None where there is no other; `waiting` counts all."""
+
+    episode: UUID | None
+    waiting: int
+
+
+@router.get(
+    "/reviews/next", response={200: NextOut, **FAILURES}, summary="Next unreviewed", url_name="review-next"
+)
+def following(request: HttpRequest, after: UUID | None = None) -> Any:
+    """The one after the episode `after` in the list, newest first; from the top where there is none below."""
+    found, waiting = selectors.unreviewed_next(after=after)
+    return {"episode": found.uuid if found else None, "waiting": waiting}
+
+
+@router.get(
+    "/episodes/{uuid:uuid}/reviews",
+    response={200: SaidOut, **FAILURES},
+    summary="What is said of it",
+    url_name="episode-reviews",
+)
+def said(request: HttpRequest, uuid: UUID) -> Any:
+    """Verdicts, annotations, and what the checks found."""
+    return _said(uuid)
+
+
+@router.post(
+    "/episodes/{uuid:uuid}/reviews",
+    response={200: SaidOut, **FAILURES},
+    summary="Pass, fail or note",
+    url_name="episode-review",
+)
+def review(request: HttpRequest, uuid: UUID, given: ReviewIn) -> Any:
+    """Add to what is said; operators. Nothing that was said is changed."""
+    services.review_add(user=request.auth, episode=episode_get(uuid=uuid), **given.model_dump())
+    return _said(uuid)
+
+
+@router.post(
+    "/episodes/{uuid:uuid}/segments",
+    response={200: SaidOut, **FAILURES},
+    summary="Annotate a part",
+    url_name="episode-segment",
+)
+def segment(request: HttpRequest, uuid: UUID, given: SegmentIn) -> Any:
+    """Mark a part, or change one of one's own; operators."""
+    services.segment_put(user=request.auth, episode=episode_get(uuid=uuid), **given.model_dump())
+    return _said(uuid)
+
+
+@router.post(
+    "/episodes/{uuid:uuid}/segments/{uuid:segment}/remove",
+    response={200: SaidOut, **FAILURES},
+    summary="Take a part away",
+    url_name="episode-segment-remove",
+)
+def segment_removed(request: HttpRequest, uuid: UUID, segment: UUID) -> Any:
+    """One of one's own; administrators any."""
+    services.segment_remove(user=request.auth, episode=episode_get(uuid=uuid), segment=segment)
+    return _said(uuid)
+
+
+@router.get(
+    "/episodes/{uuid:uuid}/quality",
+    response={200: QualityOut, **FAILURES},
+    summary="What the checks found",
+    url_name="episode-quality",
+)
+def quality(request: HttpRequest, uuid: UUID) -> Any:
+    """Flag by flag, with frames, values and bounds."""
+    return selectors.report_get(uuid=episode_get(uuid=uuid).uuid)
+
+
+@router.post(
+    "/episodes/{uuid:uuid}/quality",
+    response={202: JobOut, **FAILURES},
+    summary="Have it checked",
+    url_name="episode-quality-asked",
+)
+def quality_asked(request: HttpRequest, uuid: UUID) -> Any:
+    """Again where it was; operators. The job says how far it is."""
+    require(request.auth, Role.OPERATOR)
+    asked = services.quality_asked(episode=episode_get(uuid=uuid))
+    return Status(202, JobOut.of(asked, sight_for(request)))
+
+
+def _said(uuid: UUID) -> dict[str, Any]:
+    episode = episode_get(uuid=uuid)
+    standing = selectors.standing_of(episode=episode)
+    return {
+        "verdict": ReviewOut.of(standing.review) if standing.review else None,
+        "reviews": [ReviewOut.of(review) for review in selectors.reviews_of(episode=episode)],
+        "segments": [SegmentOut.of(segment) for segment in selectors.segments_of(episode=episode)],
+        "asked": standing.asked_at is not None,
+        "quality": selectors.report_of(uuid=uuid),
+    }

@@ -1,0 +1,116 @@
+"""Rows as files that others read: CSV that a spreadsheet can open without being told what to do by a cell, Parquet."""
+
+from __future__ import annotations
+
+import csv
+import io
+import types
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import datetime
+from enum import Enum
+from itertools import islice
+from typing import Any, Union, get_args, get_origin
+
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+Pages = Iterable[Iterable[Mapping[str, Any]]]
+
+
+def cell(value: object) -> str:
+    """A value as it stands in CSV: None is empty, times are ISO 8601, and no text is a formula.
+
+    A text that a spreadsheet would take for a formula gets an apostrophe in front (OWASP, CSV injection).
+    """
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if isinstance(value, int | float):
+        return repr(value)
+    text = str(value)
+    return f"'{text}" if text.startswith(_FORMULA) else text
+
+
+def csv_lines(columns: Sequence[str], pages: Pages) -> Iterator[str]:
+    """A header line, then all rows, a piece per page."""
+    yield _lines([columns])
+    for page in pages:
+        yield _lines([cell(row[column]) for column in columns] for row in page)
+
+
+def in_pages(rows: Iterable[Mapping[str, Any]], size: int = 1000) -> Iterator[list[Mapping[str, Any]]]:
+    """Rows of any length, so many at a time."""
+    left = iter(rows)
+    while page := list(islice(left, size)):
+        yield page
+
+
+def _lines(rows: Iterable[Sequence[str]]) -> str:
+    buffer = io.StringIO(newline="")
+    csv.writer(buffer).writerows(rows)
+    return buffer.getvalue()
+
+
+def parquet_pieces(columns: Mapping[str, Any], pages: Pages) -> Iterator[bytes]:
+    """A Parquet file, written page by page, each a row group; `columns` has the type of each: `int | None`, `str`.
+
+    Texts, names of enumerations and what has no type of its own are strings; times are UTC in microseconds.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    schema = pa.schema([(name, _arrow(hint)) for name, hint in columns.items()])
+    textual = [name for name in columns if schema.field(name).type == pa.string()]
+    sink = _Sink()
+    with parquet.ParquetWriter(sink, schema, compression="zstd") as writer:
+        for page in pages:
+            rows = [{**row, **{name: _text(row[name]) for name in textual}} for row in page]
+            if rows:
+                writer.write_table(pa.Table.from_pylist(rows, schema))
+                yield sink.taken()
+    yield sink.taken()
+
+
+def _arrow(hint: Any) -> Any:
+    import pyarrow as pa
+
+    kinds = [kind for kind in get_args(hint) if kind is not type(None)] if _is_union(hint) else [hint]
+    kind = kinds[0] if len(kinds) == 1 else str
+    known = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), datetime: pa.timestamp("us", tz="UTC")}
+    return known.get(kind, pa.string())
+
+
+def _is_union(hint: Any) -> bool:
+    return get_origin(hint) in (Union, types.UnionType)
+
+
+def _text(value: object) -> str | None:
+    if value is None:
+        return None
+    return str(value.value) if isinstance(value, Enum) else str(value)
+
+
+class _Sink(io.RawIOBase):
+    """What is written to it until somebody takes it; a Parquet file is written from front to back."""
+
+    def __init__(self) -> None:
+        self._pieces: list[bytes] = []
+        self._at = 0
+
+    def writable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def write(self, data: Any) -> int:
+        piece = bytes(data)
+        self._pieces.append(piece)
+        self._at += len(piece)
+        return len(piece)
+
+    def taken(self) -> bytes:
+        """All since the last time."""
+        whole, self._pieces = b"".join(self._pieces), []
+        return whole

@@ -1,0 +1,17 @@
+"""Registers the app."""
+
+from django.apps import AppConfig
+
+
+class CollectConfig(AppConfig):
+    """Collecting sessions and their demonstrations."""
+
+    name = "evaweb.collect"
+    default_auto_field = "django.db.models.BigAutoField"
+
+    def ready(self) -> None:
+        from evaweb.collect import restoring  # noqa: F401  it declares itself to those that reconcile
+        from evaweb.collect.guarded import GUARDS
+        from evaweb.guards import keep
+
+        keep(self, GUARDS)

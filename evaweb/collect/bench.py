@@ -1,0 +1,77 @@
+"""The commands of a session: what its set-up and its runs take with them, and what an accepted run does to it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+from uuid import UUID
+
+from evaweb.collect.following import demonstration_bound
+from evaweb.collect.models import CollectSession
+from evaweb.collect.selectors import session_get
+from evaweb.collect.setups import require_same, setup_of
+from evaweb.episodes.services import episode_opened
+from evaweb.errors import Conflict, EvaError
+from evaweb.roles import Role, require
+from evaweb.stations.commands import identity_of, issue
+from evaweb.stations.models import CARRIED_OUT, Command
+from evaweb.stations.wire import wire_to
+
+
+def session_command(
+    *,
+    user: Any,
+    session: CollectSession,
+    kind: str,
+    uuid: UUID | str | None = None,
+    args: Mapping[str, Any] | None = None,
+    **given: Any,
+) -> Command:
+    """Give a command for a session: `setup` and `run` get task and session from it; `given` as in `issue`.
+
+    Before each run the station is looked at: SetupChanged where it is not as the session had it. Never within a
+    transaction. An accepted run has begun: its episode has a row.
+    """
+    require(user, Role.OPERATOR)
+    identity = identity_of(uuid)
+    own = _own(session, kind, user)
+    beside = dict(args or {})
+    doubled = sorted(own.keys() & beside.keys())
+    if doubled:
+        raise EvaError(f"args say {', '.join(doubled)} beside the session, which has its own: leave it out")
+    if not Command.objects.filter(pk=identity).exists():  # else it is asked again what became of it
+        _require_fit(session, kind)
+    row = issue(user=user, station=session.station, kind=kind, args={**beside, **own}, uuid=identity, **given)
+    if kind == "run" and row.status in CARRIED_OUT and row.data.get("episode"):
+        episode = episode_opened(
+            station=session.station,
+            uuid=row.data["episode"],
+            kind="demonstration",
+            mode="collect",
+            task=session.task,
+            operator=user.get_username(),
+        )
+        demonstration_bound(episode=episode, session=session)
+    return row
+
+
+def _own(session: CollectSession, kind: str, user: Any) -> dict[str, Any]:
+    if kind == "setup":
+        return {"collect": True, "task": session.task}
+    if kind == "run":
+        return {
+            "mode": "collect",
+            "task": session.task,
+            "operator": user.get_username(),
+            "session": {"uuid": str(session.pk), "dataset": session.dataset},
+        }
+    raise EvaError(f"{kind} takes no session; allowed: setup, run")
+
+
+def _require_fit(session: CollectSession, kind: str) -> None:
+    """Whatever the page thinks: the session is open, and before a run the station is as it was."""
+    if session_get(uuid=session.pk).closed_at is not None:
+        raise Conflict(f"session {session} is closed: resume it first")
+    if kind == "run":
+        station = session.station.name
+        require_same(setup_of(wire_to(station).status(), station), session.setup, f"session {session}")

@@ -1,0 +1,78 @@
+"""What a station's events do to demonstrations: bound to their session, labelled. Any event may come twice."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any
+from uuid import UUID
+
+from django.db import transaction
+
+from evaweb.collect.models import CollectSession, Demonstration
+from evaweb.episodes.folders import data_dir, journal_folder
+from evaweb.episodes.models import Episode
+from evaweb.episodes.recorded import recorded_in
+from evaweb.episodes.services import publish_asked
+from runtime.recording.files import RecordingError
+from runtime.recording.labels import newest
+
+log = logging.getLogger(__name__)
+TOLD = ("episode_closed", "labelled")
+"""The kinds of events that say something of a demonstration."""
+
+
+def demonstration_told(*, event: Mapping[str, Any]) -> Demonstration | None:
+    """Take one row of a station's event log; the demonstration it is about, None where that is of no session."""
+    data = event.get("data") or {}
+    try:
+        uuid = UUID(str(data.get("episode") or data.get("uuid")))
+    except ValueError:
+        return None
+    found = demonstration_of(episode=Episode.objects.filter(pk=uuid).first())
+    return None if found is None else label_read(demonstration=found)
+
+
+def demonstration_of(*, episode: Episode | None) -> Demonstration | None:
+    """That of an episode, made where its manifest names a session that is known."""
+    if episode is None:
+        return None
+    found = Demonstration.objects.filter(pk=episode.pk).first()
+    return found or demonstration_bound(episode=episode, session=_session_of(episode))
+
+
+def demonstration_bound(*, episode: Episode, session: CollectSession | None) -> Demonstration | None:
+    """Say that the episode is one of the session; None for none."""
+    if session is None:
+        return None
+    return Demonstration.objects.get_or_create(episode=episode, defaults={"session": session})[0]
+
+
+def _session_of(episode: Episode) -> CollectSession | None:
+    try:
+        named = recorded_in(journal_folder(episode.pk)).session.get("uuid")
+        return CollectSession.objects.filter(pk=UUID(str(named))).first() if named else None
+    except (RecordingError, ValueError) as error:
+        log.warning("nobody knows whether episode %s is one of a session: %s", episode.pk, error)
+        return None
+
+
+@transaction.atomic
+def label_read(*, demonstration: Demonstration) -> Demonstration:
+    """Bring the row up to the newest label on the disk; a published episode goes to its dataset anew with it."""
+    held = (
+        Demonstration.objects.select_for_update(of=("self",))
+        .select_related("episode")
+        .get(pk=demonstration.pk)
+    )
+    label = newest(data_dir(), str(held.pk))
+    if label is None:
+        return held
+    before = held.result
+    held.result, held.note, held.discarded = label.result or "", label.note, label.discarded
+    held.labelled_by, held.labelled_at = label.by[:150], datetime.fromtimestamp(label.time, UTC)
+    held.save()
+    if before != held.result and held.episode.dataset_index is not None and not held.discarded:
+        publish_asked(episode=held.episode)
+    return held

@@ -1,0 +1,46 @@
+"""What the Collect page of a station shows, for its two fragments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from evaweb.collect import selectors
+from evaweb.collect.work import queue_of
+from evaweb.stations.models import Station
+
+SHOWN = 8  # jobs that are listed; the others are counted
+
+
+def session_panel(*, station: Station) -> dict[str, Any]:
+    """The open session with its counts, else what another one is opened or resumed with."""
+    session = selectors.session_open(station=station)
+    shown: dict[str, Any] = {"station": station, "session": session}
+    if session is not None:
+        return {**shown, "counts": selectors.counts_of(session=session)}
+    earlier = list(selectors.sessions_earlier(station=station))
+    return {
+        **shown,
+        "earlier": earlier,
+        "tasks": selectors.tasks_earlier(station=station),
+        "dataset": earlier[0].dataset if earlier else "",
+    }
+
+
+def progress_panel(*, station: Station) -> dict[str, Any]:
+    """Of the open session: its last episode, what the worker does for all of them, what can be published."""
+    session = selectors.session_open(station=station)
+    shown: dict[str, Any] = {"station": station, "session": session}
+    if session is None:
+        return shown
+    queue = queue_of(session=session)
+    return {
+        **shown,
+        "counts": selectors.counts_of(session=session),
+        "last": selectors.demonstrations_of(session=session).first(),
+        "queue": queue,
+        "listed": queue.items[:SHOWN],
+        "more": max(0, len(queue.items) - SHOWN),
+        "dataset": selectors.dataset_of(session=session),
+        "accepted": selectors.to_publish(session=session).count(),
+        "failures": selectors.to_publish(session=session, results=("fail",)).count(),
+    }

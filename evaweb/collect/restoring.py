@@ -1,0 +1,108 @@
+"""Sessions and demonstrations that the database has lost, made again from the disk."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+from uuid import UUID
+
+from django.db import transaction
+from django.utils import timezone
+
+from evaweb.collect.following import demonstration_bound, label_read
+from evaweb.collect.kept import KeptEvent, kept_events, opening
+from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
+from evaweb.collect.setups import setup_in
+from evaweb.episodes.folders import journal_folder
+from evaweb.episodes.models import Episode
+from evaweb.episodes.reconcile import Kept, restores
+from evaweb.episodes.recorded import recorded_in
+from evaweb.episodes.services import station_known
+from evaweb.errors import EvaError
+from evaweb.roles import known_person
+from evaweb.stations.models import Station
+from runtime.recording.files import read_document
+
+
+@restores
+def restore(kept: Kept) -> int:
+    """Make the rows of an episode's session and of itself as its demonstration that are not there; how many."""
+    episode = Episode.objects.filter(uuid=kept.uuid).first() if kept.recorded else None
+    if episode is None:
+        return 0
+    named = recorded_in(journal_folder(kept.uuid)).session.get("uuid")
+    if not named:
+        return 0
+    try:
+        uuid = UUID(str(named))
+    except ValueError:
+        raise EvaError(f"its session {named!r:.60} is no uuid") from None
+    with transaction.atomic():
+        session, made = CollectSession.objects.filter(pk=uuid).first(), 0
+        if session is None:
+            session, made = _session(uuid, episode), 1
+        fresh = not Demonstration.objects.filter(pk=episode.pk).exists()
+        demonstration = demonstration_bound(episode=episode, session=session)
+        assert demonstration is not None
+        label_read(demonstration=demonstration)
+    return made + fresh
+
+
+def _session(uuid: UUID, episode: Episode) -> CollectSession:
+    """From its own file, else from the manifest of the first episode that is met: without target and history then."""
+    events = kept_events(uuid)
+    first = opening(events)
+    if first is None:
+        return _from_manifest(uuid, episode)
+    station = station_known(
+        name=first.station, robot=str(first.setup.get("robot", "")), simulated=False, source=f"session {uuid}"
+    )
+    targets = [event.target for event in events if event.kind in ("opened", "target")]
+    session = _made(
+        uuid,
+        station,
+        dataset=first.dataset,
+        task=first.task,
+        operator=known_person(first.by),
+        target=targets[-1],
+        setup=first.setup,
+        opened_at=first.at,
+        closed_at=_closed_at(events),
+    )
+    for event in events:
+        SessionEvent.objects.create(
+            session=session, kind=event.kind, text=event.text, by=known_person(event.by), at=event.at
+        )
+    return session
+
+
+def _closed_at(events: list[KeptEvent]) -> Any:
+    moves = [event for event in events if event.kind in ("opened", "closed", "resumed")]
+    return moves[-1].at if moves[-1].kind == "closed" else None
+
+
+def _from_manifest(uuid: UUID, episode: Episode) -> CollectSession:
+    manifest: Mapping[str, Any] = read_document(journal_folder(episode.pk) / "manifest.json")
+    try:
+        setup, dataset = setup_in(manifest), str(manifest["session"]["dataset"])
+    except (KeyError, TypeError, AttributeError) as error:
+        raise EvaError(f"its manifest does not say how its session was set up: {error!r}") from None
+    opened = episode.started_at or timezone.now()
+    return _made(
+        uuid,
+        episode.station,
+        dataset=dataset,
+        task=episode.task,
+        operator=known_person(episode.operator),
+        target=None,
+        setup=setup,
+        opened_at=opened,
+        closed_at=opened,
+    )
+
+
+def _made(uuid: UUID, station: Station, **facts: Any) -> CollectSession:
+    """Closed where another one is open at the station."""
+    if facts["closed_at"] is None and CollectSession.objects.filter(station=station, closed_at=None).exists():
+        facts["closed_at"] = timezone.now()
+    return CollectSession.objects.create(uuid=uuid, station=station, **facts)

@@ -1,0 +1,147 @@
+"""Reads of sessions and their demonstrations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from uuid import UUID
+
+from django.db.models import Count, F, Q, QuerySet
+
+from evaweb.collect.models import CollectSession, Demonstration, Result
+from evaweb.episodes.folders import datasets_dir
+from evaweb.episodes.models import EpisodeStatus
+from evaweb.episodes.publishing import session_dataset
+from evaweb.errors import NotFound
+from evaweb.stations.models import Station
+from runtime.datasets.catalog import Catalog
+from runtime.datasets.layout import DEFAULT_VERSION, WRITABLE_VERSIONS
+from runtime.recording.files import RecordingError
+
+EARLIER = 12  # sessions offered to be resumed, tasks to be picked
+PUBLISHED_RESULTS = (Result.SUCCESS.value, Result.PARTIAL.value)
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """Episodes of a session: `saved` are whole and not discarded, those by result among them; `cut` ended otherwise."""
+
+    saved: int
+    success: int
+    partial: int
+    fail: int
+    unlabelled: int
+    discarded: int
+    cut: int
+    published: int
+
+
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    """Where a session's episodes go: the folder's name, and its version, "" where it does not exist yet."""
+
+    name: str
+    version: str
+    problem: str = ""
+
+    @property
+    def versions(self) -> tuple[str, ...]:
+        """Those that may be asked for, the usual one first."""
+        if self.version:
+            return (self.version,)
+        others = (version for version in WRITABLE_VERSIONS if version != DEFAULT_VERSION)
+        return (DEFAULT_VERSION, *others)
+
+
+def session_list(
+    *, station: str = "", dataset: str = "", is_open: bool | None = None
+) -> QuerySet[CollectSession]:
+    """The newest first."""
+    found = CollectSession.objects.select_related("station", "operator").order_by("-opened_at", "pk")
+    wanted = {"station__name": station, "dataset": dataset}
+    found = found.filter(**{name: value for name, value in wanted.items() if value})
+    return found if is_open is None else found.filter(closed_at__isnull=is_open)
+
+
+def session_get(*, uuid: UUID) -> CollectSession:
+    """The session; NotFound where there is none."""
+    found = session_list().filter(pk=uuid).first()
+    if found is None:
+        raise NotFound(f"session {uuid} does not exist in this lab")
+    return found
+
+
+def session_open(*, station: Station) -> CollectSession | None:
+    """The one that goes on at the station."""
+    return session_list(is_open=True).filter(station=station).first()
+
+
+def sessions_earlier(*, station: Station) -> QuerySet[CollectSession]:
+    """Those that may be resumed there, the last used first."""
+    closed = session_list(is_open=False).filter(station=station)
+    return closed.annotate(saved=Count("demonstrations", _saved("demonstrations__"))).order_by("-closed_at")[
+        :EARLIER
+    ]
+
+
+def tasks_earlier(*, station: Station) -> list[str]:
+    """What was demonstrated there, the newest first, each once."""
+    newest = session_list().filter(station=station).values_list("task", flat=True)
+    return list(dict.fromkeys(newest[:200]))[:EARLIER]
+
+
+def counts_of(*, session: CollectSession) -> Counts:
+    """How many episodes it has, and how they went."""
+    cut = Q(discarded=False, episode__status__in=(EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED))
+    wanted = {
+        "saved": _saved(),
+        **{result.value or "unlabelled": _saved() & Q(result=result) for result in Result},
+        "discarded": Q(discarded=True),
+        "cut": cut,
+        "published": Q(episode__dataset_index__isnull=False),
+    }
+    # Names of their own: one that is also a field's would hide it from those after it.
+    counted = session.demonstrations.aggregate(
+        **{f"n_{name}": Count("pk", of) for name, of in wanted.items()}
+    )
+    return Counts(**{name: counted[f"n_{name}"] for name in wanted})
+
+
+def _saved(path: str = "") -> Q:
+    """Of demonstrations; `path` leads to them."""
+    named = {"discarded": False, "episode__frames__gt": 0, "episode__status": EpisodeStatus.FINISHED}
+    return Q(**{f"{path}{name}": value for name, value in named.items()})
+
+
+def demonstrations_of(*, session: CollectSession) -> QuerySet[Demonstration]:
+    """The newest first."""
+    newest = (F("episode__started_at").desc(nulls_last=True), "-episode__created_at")
+    return session.demonstrations.select_related("episode__standing__review").order_by(*newest)
+
+
+def accepted(*, session: CollectSession, results: tuple[str, ...]) -> QuerySet[Demonstration]:
+    """Those that may be published: whole, not discarded, of these results, failed by no review."""
+    return (
+        demonstrations_of(session=session)
+        .filter(_saved(), result__in=results)
+        .exclude(episode__standing__review__verdict="fail")
+    )
+
+
+def to_publish(
+    *, session: CollectSession, results: tuple[str, ...] = PUBLISHED_RESULTS
+) -> QuerySet[Demonstration]:
+    """Those of them that are in no dataset yet, in the order in which they were recorded."""
+    waiting = accepted(session=session, results=results).filter(episode__dataset_index=None)
+    return waiting.order_by("episode__started_at", "episode__created_at")
+
+
+def dataset_of(*, session: CollectSession) -> Dataset:
+    """Where its episodes go; `problem` says why nothing can be put there now."""
+    name = session_dataset(session.dataset, simulated=session.station.simulated)
+    folder = datasets_dir() / name
+    if not folder.is_dir():
+        return Dataset(name, "")
+    try:
+        return Dataset(name, Catalog.read(folder).version)
+    except RecordingError as error:
+        return Dataset(name, "", str(error))

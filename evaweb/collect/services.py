@@ -1,0 +1,197 @@
+"""What is done with sessions: opened, closed, resumed, published. A line on the disk first, then the row."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from django.db import IntegrityError, transaction
+from django.utils import timezone
+
+from evaweb.collect import selectors
+from evaweb.collect.kept import event_line, session_file
+from evaweb.collect.models import CollectSession, Result, SessionEvent, SessionEventKind
+from evaweb.collect.setups import require_same, setup_of
+from evaweb.episodes.lines import append_line, text
+from evaweb.episodes.publishing import DATASET_NAME
+from evaweb.episodes.services import publish_asked
+from evaweb.errors import Conflict, EvaError
+from evaweb.jobs.models import Job
+from evaweb.roles import Role, require
+from evaweb.stations.holders import who
+from evaweb.stations.models import Station
+from evaweb.stations.wire import wire_to
+
+LONGEST_TASK = 2000  # characters; as a station takes it
+HIGHEST_TARGET = 100_000
+_ROLLOUTS = "rollouts"  # begins the names of datasets of policies' runs
+
+
+def session_begin(
+    *, user: Any, station: Station, task: str, dataset: str = "", target: int | None = None
+) -> CollectSession:
+    """Open a session with the station's present set-up; operators, while nobody else commands it.
+
+    `dataset` "" takes the deployment's own. Conflict where one is open there, or the dataset was collected with
+    another set-up: every difference is listed.
+    """
+    require(user, Role.OPERATOR)
+    task = text("task", task, LONGEST_TASK)
+    if not task:
+        raise EvaError("task is empty: say what is to be demonstrated")
+    _check_target(target)
+    if not station.active:
+        raise Conflict(f"station {station.name} is switched off: choose another, or ask an administrator")
+    snapshot = _commanded(user, station)
+    setup = setup_of(snapshot, station.name)
+    dataset = _dataset(dataset or snapshot["collect"]["dataset"])
+    before = selectors.session_list(dataset=dataset).filter(station__simulated=station.simulated).first()
+    if before is not None:
+        require_same(setup, before.setup, f"the dataset {dataset}")
+    _require_none_open(station)
+    session = CollectSession(
+        station=station, dataset=dataset, task=task, operator=user, target=target, setup=setup
+    )
+    try:
+        with transaction.atomic():
+            session.save(force_insert=True)
+            _note(session, user, SessionEventKind.OPENED)
+    except IntegrityError:
+        raise Conflict(
+            f"somebody else opened a session at {station.name} at the same moment: look at it"
+        ) from None
+    return session
+
+
+def session_close(*, user: Any, session: CollectSession) -> CollectSession:
+    """End it for now; it can be resumed."""
+    require(user, Role.OPERATOR)
+    snapshot = _commanded(user, session.station, needed=False)
+    running = (snapshot.get("collect") or {}).get("episode")
+    if running and session.demonstrations.filter(pk=running).exists():
+        raise Conflict("an episode of it is being recorded: stop it first")
+    with transaction.atomic():
+        held = _held(session)
+        if held.closed_at is not None:
+            raise Conflict(f"session {held.pk} is closed already")
+        held.closed_at = timezone.now()
+        _note(held, user, SessionEventKind.CLOSED)
+        held.save(update_fields=["closed_at"])
+    return held
+
+
+def session_resume(*, user: Any, session: CollectSession) -> CollectSession:
+    """Go on with it, however long ago it was closed; SetupChanged where the station is not as it was then."""
+    require(user, Role.OPERATOR)
+    station = session.station
+    require_same(setup_of(_commanded(user, station), station.name), session.setup, f"session {session}")
+    _require_none_open(station)
+    try:
+        with transaction.atomic():
+            held = _held(session)
+            held.closed_at = None
+            held.save(update_fields=["closed_at"])
+            _note(held, user, SessionEventKind.RESUMED)
+    except IntegrityError:
+        raise Conflict(
+            f"somebody else opened a session at {station.name} at the same moment: look at it"
+        ) from None
+    return held
+
+
+@transaction.atomic
+def session_target(*, user: Any, session: CollectSession, target: int | None) -> CollectSession:
+    """How many episodes are wanted, None for as many as there will be."""
+    require(user, Role.OPERATOR)
+    _check_target(target)
+    held = _held(session)
+    held.target = target
+    _note(held, user, SessionEventKind.TARGET, f"{target or 'none'}")
+    held.save(update_fields=["target"])
+    return held
+
+
+def session_publish(
+    *,
+    user: Any,
+    session: CollectSession,
+    results: Sequence[str] = selectors.PUBLISHED_RESULTS,
+    version: str = "",
+) -> list[Job]:
+    """Have the accepted episodes of these results that are in no dataset yet written into the session's.
+
+    `version` is that of a new dataset, "" for the usual one or that which it has. Conflict where there is none to
+    publish, or the dataset is of another version.
+    """
+    require(user, Role.OPERATOR)
+    allowed = [result.value for result in Result if result.value]
+    if not results or set(results) - set(allowed):
+        raise EvaError(f"results = {', '.join(results) or 'none'}; allowed: some of {', '.join(allowed)}")
+    dataset = selectors.dataset_of(session=session)
+    if dataset.problem:
+        raise Conflict(dataset.problem)
+    if version and version not in dataset.versions:
+        why = f": {dataset.name} is of that version already, convert it" if dataset.version else ""
+        raise Conflict(f"version = {version!r:.20}; allowed: {', '.join(dataset.versions)}{why}")
+    waiting = list(selectors.to_publish(session=session, results=tuple(results)))
+    if not waiting:
+        raise Conflict(
+            "nothing to publish: episodes that are whole, not discarded, failed by no review, labelled "
+            f"{' or '.join(results)} and in no dataset yet"
+        )
+    chosen = version or dataset.versions[0]
+    with transaction.atomic():
+        _note(
+            _held(session), user, SessionEventKind.PUBLISHED, f"{len(waiting)} episodes into {dataset.name}"
+        )
+        asked = [publish_asked(episode=one.episode, version=chosen) for one in waiting]
+    return [job for job in asked if job is not None]
+
+
+def _note(session: CollectSession, user: Any, kind: SessionEventKind, words: str = "") -> None:
+    """The caller holds the session's row."""
+    event = SessionEvent(session=session, kind=kind, text=words, by=user, at=timezone.now())
+    append_line(session_file(session.pk), event_line(event))
+    event.save(force_insert=True)
+
+
+def _held(session: CollectSession) -> CollectSession:
+    rows = CollectSession.objects.select_for_update(of=("self",)).select_related("station", "operator")
+    return rows.get(pk=session.pk)
+
+
+def _require_none_open(station: Station) -> None:
+    other = selectors.session_open(station=station)
+    if other is not None:
+        raise Conflict(f"a session is open at {station.name} ({other}): close it first")
+
+
+def _commanded(user: Any, station: Station, *, needed: bool = True) -> dict[str, Any]:
+    """The station's snapshot; Conflict while somebody else commands it. Not `needed`: {} of a station that is away."""
+    try:
+        snapshot = wire_to(station.name).status()
+    except EvaError:
+        if needed:
+            raise
+        return {}
+    holder = who((snapshot.get("lease") or {}).get("holder") or "")
+    if holder and holder != user.get_username():
+        raise Conflict(f"{holder} commands {station.name}: ask for it first")
+    return dict(snapshot)
+
+
+def _dataset(name: str) -> str:
+    if not DATASET_NAME.fullmatch(name):
+        raise EvaError(
+            f"dataset = {name!r:.110}; allowed: 1 to 100 letters, digits, '.', '_' and '-', the first a letter or digit"
+        )
+    if name.lower().startswith(_ROLLOUTS):
+        raise EvaError(
+            f"dataset = {name!r}: names with {_ROLLOUTS} are those of policies' runs; choose another"
+        )
+    return name
+
+
+def _check_target(target: int | None) -> None:
+    if target is not None and not 1 <= target <= HIGHEST_TARGET:
+        raise EvaError(f"target = {target}; allowed: 1 to {HIGHEST_TARGET}, or none")

@@ -1,0 +1,87 @@
+"""Set-ups of sessions: what a station says that its next episode will be like, and what differs from another one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from evaweb.errors import Conflict
+
+Setup = Mapping[str, Any]
+_PLAIN = ("robot", "groups", "joints", "fps")
+
+
+class SetupChanged(Conflict):
+    """The station is not as the session had it."""
+
+
+def setup_of(snapshot: Mapping[str, Any], station: str) -> dict[str, Any]:
+    """The set-up that a station's snapshot shows; Conflict where it collects nothing or a camera is not seen yet."""
+    collect = snapshot.get("collect")
+    if collect is None:
+        raise Conflict(f"{station} collects nothing: its deployment has no [collection]")
+    if collect.get("setup") is None:
+        raise Conflict(
+            f"{station} has not seen a picture of every camera ({', '.join(collect['cameras'])}): "
+            "look at those that are grey"
+        )
+    return dict(collect["setup"])
+
+
+def setup_in(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """The set-up that an episode's manifest shows."""
+    robot = manifest["robot"]
+    return {
+        "robot": robot["name"],
+        "groups": list(dict.fromkeys(name.partition(".")[0] for name in robot["joint_names"])),
+        "joints": list(robot["joint_names"]),
+        "cameras": manifest["cameras"],
+        "fps": manifest["fps"],
+        "streams": manifest["streams"],
+    }
+
+
+def differences(given: Setup, allowed: Setup) -> list[str]:
+    """A sentence for everything in which `given` is not as `allowed`; none where they are alike."""
+    return [
+        *_plain(given, allowed),
+        *_cameras(given["cameras"], allowed["cameras"]),
+        *_streams(given, allowed),
+    ]
+
+
+def require_same(given: Setup, allowed: Setup, whose: str) -> None:
+    """SetupChanged with every difference; `whose` is what `allowed` belongs to."""
+    found = differences(given, allowed)
+    if found:
+        raise SetupChanged(f"the set-up is not that of {whose}: {'; '.join(found)}")
+
+
+def _plain(given: Setup, allowed: Setup) -> Iterator[str]:
+    for name in _PLAIN:
+        if given[name] != allowed[name]:
+            yield f"{name} = {_words(given[name])}, allowed {_words(allowed[name])}"
+
+
+def _cameras(given: Mapping[str, Any], allowed: Mapping[str, Any]) -> Iterator[str]:
+    for key in sorted(given.keys() | allowed.keys()):
+        if given.get(key) != allowed.get(key):
+            yield f"camera {key} = {_size(given.get(key))}, allowed {_size(allowed.get(key))}"
+
+
+def _streams(given: Setup, allowed: Setup) -> Iterator[str]:
+    recorded = [
+        sorted(name for name, there in setup["streams"].items() if there) for setup in (given, allowed)
+    ]
+    if recorded[0] != recorded[1]:
+        yield f"recorded = {_words(recorded[0])}, allowed {_words(recorded[1])}"
+
+
+def _words(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
+    return (", ".join(map(str, value)) or "none") if isinstance(value, list) else str(value)
+
+
+def _size(size: Mapping[str, Any] | None) -> str:
+    return "none" if size is None else f"{size['width']}x{size['height']}"

@@ -1,0 +1,26 @@
+"""How times are written on the Collect page."""
+
+from __future__ import annotations
+
+from django import template
+
+register = template.Library()
+_MINUTE = 60
+
+
+@register.filter
+def left(seconds: float | str | None) -> str:
+    """How long something still takes, roughly as a person would say it; templates say "" for what is not known."""
+    if not isinstance(seconds, float | int):
+        return "time left not known yet"
+    if seconds < 1:
+        return "a moment left"
+    if seconds < 2 * _MINUTE:
+        return f"about {seconds:.0f} s left"
+    return f"about {seconds / _MINUTE:.0f} min left"
+
+
+@register.filter
+def lasting(seconds: float | str | None) -> str:
+    """Seconds with one decimal; a dash where they are not known."""
+    return f"{seconds:.1f} s" if isinstance(seconds, float | int) else "–"

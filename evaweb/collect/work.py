@@ -1,0 +1,117 @@
+"""What the worker has to do for the episodes of a session: how far it is, and how long it takes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from uuid import UUID
+
+from django.utils import timezone
+
+from evaweb.collect.models import CollectSession
+from evaweb.episodes.models import Episode
+from evaweb.jobs.models import Job, JobStatus
+
+KINDS = ("preview", "quality", "export", "publish", "sides")
+_MEASURED = 20  # jobs of a kind that its speed is taken from
+_AT_ONCE = 500  # keys in one question
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """A job that is not done: `number` counts the session's episodes, `left_s` is how long it still takes if known."""
+
+    job: Job
+    episode: UUID
+    number: int
+    left_s: float | None
+    expected_s: float | None
+
+    @property
+    def fraction(self) -> float | None:
+        """How much of it is done, by the time it takes."""
+        if self.left_s is None or not self.expected_s or self.job.status != JobStatus.RUNNING:
+            return None
+        return min(1.0, max(0.0, 1 - self.left_s / self.expected_s))
+
+
+@dataclass(frozen=True, slots=True)
+class Queue:
+    """What has failed, runs and waits, in this order; `left_s` of all that runs and waits, one after the other."""
+
+    items: tuple[Item, ...]
+    done: int
+    left_s: float | None
+
+    @property
+    def total(self) -> int:
+        """Jobs about these episodes, each thing once."""
+        return self.done + len(self.items)
+
+    @property
+    def active(self) -> bool:
+        """Whether something runs or waits, so that a page looks again."""
+        return any(item.job.status != JobStatus.FAILED for item in self.items)
+
+    @property
+    def failed(self) -> int:
+        """How many of them a person has to look at."""
+        return sum(item.job.status == JobStatus.FAILED for item in self.items)
+
+
+def queue_of(*, session: CollectSession) -> Queue:
+    """The newest job of each kind about each of its episodes."""
+    in_order = session.demonstrations.order_by("episode__started_at", "episode__created_at")
+    frames = {
+        pk: (number, count)
+        for number, (pk, count) in enumerate(in_order.values_list("pk", "episode__frames"), 1)
+    }
+    newest = _newest([f"{kind}:{uuid}" for uuid in frames for kind in KINDS])
+    open_jobs = [job for job in newest if job.status != JobStatus.DONE]
+    speeds = {kind: _seconds_per_frame(kind) for kind in {job.kind for job in open_jobs}}
+    items = sorted((_item(job, frames, speeds) for job in open_jobs), key=_turn)
+    waiting = [item.left_s for item in items if item.job.status != JobStatus.FAILED]
+    known = [left for left in waiting if left is not None]
+    return Queue(tuple(items), len(newest) - len(items), sum(known) if len(known) == len(waiting) else None)
+
+
+def _newest(keys: Sequence[str]) -> list[Job]:
+    found: dict[str, Job] = {}
+    for part in _parts(keys):
+        for job in Job.objects.filter(key__in=part).order_by("created_at", "pk"):
+            found[job.key] = job
+    return list(found.values())
+
+
+def _parts(keys: Sequence[str]) -> Iterator[list[str]]:
+    left = iter(keys)
+    while part := list(islice(left, _AT_ONCE)):
+        yield part
+
+
+def _item(job: Job, frames: Mapping[UUID, tuple[int, int]], speeds: Mapping[str, float | None]) -> Item:
+    uuid = UUID(job.key.partition(":")[2])
+    number, count = frames[uuid]
+    speed = speeds[job.kind]
+    expected = left = None if speed is None else speed * max(count, 1)
+    if left is not None and job.status == JobStatus.RUNNING and job.claimed_at is not None:
+        left = max(0.0, left - (timezone.now() - job.claimed_at).total_seconds())
+    return Item(job, uuid, number, None if job.status == JobStatus.FAILED else left, expected)
+
+
+def _turn(item: Item) -> tuple[int, object]:
+    order = (JobStatus.FAILED, JobStatus.RUNNING, JobStatus.QUEUED)
+    return (order.index(JobStatus(item.job.status)), item.job.created_at)
+
+
+def _seconds_per_frame(kind: str) -> float | None:
+    """Of the last ones of that kind in this lab; None where none is done yet."""
+    done = Job.objects.filter(
+        kind=kind, status=JobStatus.DONE, claimed_at__isnull=False, finished_at__isnull=False
+    )
+    rows = list(done.order_by("-finished_at").values_list("key", "claimed_at", "finished_at")[:_MEASURED])
+    uuids = [key.partition(":")[2] for key, _, _ in rows]
+    frames = sum(Episode.objects.filter(pk__in=uuids).values_list("frames", flat=True))
+    seconds = sum((finished - claimed).total_seconds() for _, claimed, finished in rows)
+    return seconds / frames if frames else None

@@ -1,0 +1,160 @@
+"""Which datasets there are under the data folder, and what each says of itself."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from evaweb.episodes.folders import data_dir
+from evaweb.errors import EvaError, NotFound
+from runtime.datasets import layout
+from runtime.datasets.reader import Dataset, open_dataset
+from runtime.recording.files import RecordingError
+
+DEPTH = 3  # folders below the data folder at which datasets are looked for
+# Of the lab itself: nothing in there is a dataset.
+_OWN = frozenset(
+    ("episodes", "previews", "exports", "labels", "quality", "reviews", "scores", "logs", "static", "media")
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Overview:
+    """What info.json says; where that cannot be read, `problem` does, and the rest is empty."""
+
+    name: str  # its folder, relative to the data folder
+    version: str = ""
+    robot: str = ""
+    fps: float = 0.0
+    episodes: int = 0
+    frames: int = 0
+    tasks: int = 0
+    cameras: tuple[str, ...] = ()
+    size: int = 0  # bytes on the disk
+    problem: str = ""
+
+    @property
+    def lasts(self) -> str:
+        """How long all of it is, in words."""
+        seconds = self.frames / self.fps if self.fps else 0.0
+        if seconds < 120:
+            return f"{seconds:.1f} s"
+        return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+    @property
+    def short(self) -> str:
+        """Its name without the folder that most of them are in."""
+        return self.name.removeprefix("datasets/")
+
+
+def dataset_names() -> list[str]:
+    """All datasets there are, relative to the data folder, in order."""
+    root = data_dir()
+    return sorted(path.relative_to(root).as_posix() for path in _walk(root, DEPTH))
+
+
+def _walk(folder: Path, depth: int) -> Iterator[Path]:
+    """Datasets below `folder`; hidden ones are on their way, or were left by a crash."""
+    try:
+        below = [Path(entry.path) for entry in os.scandir(folder) if entry.is_dir()]
+    except OSError:
+        return  # it went away meanwhile, or is somebody else's
+    for path in below:
+        if path.name.startswith(".") or (folder == data_dir() and path.name in _OWN):
+            continue
+        if (path / layout.INFO).is_file():
+            yield path
+        elif depth > 1:
+            yield from _walk(path, depth - 1)
+
+
+def folder_named(name: str) -> Path:
+    """The folder of a new dataset or of one that is there: below the data folder, never hidden; EvaError."""
+    parts = PurePosixPath(name).parts
+    wrong = (
+        not parts or len(parts) > DEPTH or any(part in (".", "..") or part.startswith(".") for part in parts)
+    )
+    if wrong or PurePosixPath(name).is_absolute() or "\x00" in name or parts[0] in _OWN:
+        raise EvaError(
+            f"{name!r:.120} names no dataset; allowed: a folder below the data folder such as datasets/cups, without "
+            "leading dots"
+        )
+    return data_dir().joinpath(*parts)
+
+
+def dataset_found(name: str) -> Path:
+    """The folder of a dataset that is there; NotFound lists what is."""
+    folder = folder_named(name)
+    if not (folder / layout.INFO).is_file():
+        there = dataset_names()
+        more = f", and {len(there) - 8} more" if len(there) > 8 else ""
+        raise NotFound(
+            f"there is no dataset {name!r:.120}; there are: {', '.join(there[:8]) or 'none'}{more}"
+        )
+    return folder
+
+
+def overview(name: str) -> Overview:
+    """What the dataset of that name says of itself."""
+    folder = dataset_found(name)
+    try:
+        info = layout.read_info(folder)
+        return Overview(
+            name=name,
+            version=str(info["codebase_version"]),
+            robot=str(info.get("robot_type") or ""),
+            fps=float(info["fps"]),
+            episodes=int(info["total_episodes"]),
+            frames=int(info.get("total_frames") or 0),
+            tasks=int(info.get("total_tasks") or 0),
+            cameras=tuple(camera_keys(info["features"])),
+            size=_size(folder, _stamp(folder)),
+        )
+    except RecordingError as error:
+        return Overview(name=name, problem=str(error))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        return Overview(name=name, problem=f"{folder / layout.INFO} is not of the format: {error!r}")
+
+
+def overviews() -> list[Overview]:
+    """All datasets."""
+    return [overview(name) for name in dataset_names()]
+
+
+def camera_keys(features: dict[str, Any]) -> dict[str, str]:
+    """The feature of each camera's pictures, videos first, by the name that a person calls it."""
+    keys = [*layout.video_keys(features), *layout.image_keys(features)]
+    return {key.removeprefix("observation.images.").removeprefix("observation."): key for key in keys}
+
+
+def opened(name: str) -> Dataset:
+    """The dataset with its list of episodes; read again only after it has changed. RecordingError."""
+    folder = dataset_found(name)
+    return _opened(folder, _stamp(folder))
+
+
+def _stamp(folder: Path) -> tuple[int, int]:
+    """Changes with every publication: info.json is written last."""
+    stat = (folder / layout.INFO).stat()
+    return stat.st_mtime_ns, stat.st_ino
+
+
+@lru_cache(16)
+def _opened(folder: Path, stamp: tuple[int, int]) -> Dataset:
+    return open_dataset(folder)
+
+
+@lru_cache(256)
+def _size(folder: Path, stamp: tuple[int, int]) -> int:
+    total = 0
+    for place, _, files in os.walk(folder):
+        for file in files:
+            try:
+                total += os.stat(os.path.join(place, file)).st_size
+            except FileNotFoundError:
+                continue  # published anew meanwhile
+    return total

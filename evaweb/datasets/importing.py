@@ -1,0 +1,71 @@
+"""Episodes that were recorded elsewhere become ones of this lab, to be checked, reviewed, annotated like its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from uuid import UUID
+
+from evaweb.datasets.finding import folder_named
+from evaweb.datasets.orders import full_name
+from evaweb.episodes import services
+from evaweb.episodes.folders import data_dir, datasets_dir, episodes_dir
+from evaweb.episodes.placing import places_read
+from evaweb.errors import EvaError
+from runtime.datasets.identities import named_copy
+from runtime.datasets.importing import bring, whose
+from runtime.datasets.reader import open_dataset
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """What was brought: the dataset's name, its episodes in order, and how many of them were new."""
+
+    dataset: str
+    episodes: tuple[UUID, ...]
+    made: int
+    problems: tuple[str, ...]  # of datasets that could not be read meanwhile
+
+
+def imported(
+    dataset: Path,
+    *,
+    to: str = "",
+    state: str = "",
+    robot: str = "",
+    rename: Mapping[str, str] | None = None,
+    reencode: bool = False,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Imported:
+    """Import a LeRobot dataset of any version as the dataset `to`; by default of its folder's name. RecordingError.
+
+    What was imported before stays as it is, so that one that was cut short is gone on with.
+    """
+    if not rename:
+        whose(open_dataset(dataset), state, robot)  # before anything is copied
+    target = _target(dataset, to)
+    if target.resolve() != dataset.resolve():
+        tell(f"{dataset} is copied to {target}")
+    copied = named_copy(dataset, target, rename=rename, reencode=reencode)
+    told = whose(copied, state, robot)
+    uuids, made = [], 0
+    for entry in copied.episodes:
+        tell(f"episode {entry.index + 1} of {len(copied.episodes)}")
+        uuid, new = bring(copied, entry.index, episodes_dir(), told)
+        services.episode_read(uuid=UUID(uuid))
+        uuids.append(UUID(uuid))
+        made += new
+    problems = places_read()
+    return Imported(target.relative_to(data_dir()).as_posix(), tuple(uuids), made, tuple(problems))
+
+
+def _target(dataset: Path, to: str) -> Path:
+    """Where it is already, or the folder below datasets/ of that name; by default of its own."""
+    here, root = dataset.resolve(), datasets_dir().resolve()
+    if not to and here.parent == root:
+        return datasets_dir() / here.name
+    folder = folder_named(full_name(to) if to else f"datasets/{here.name}")
+    if folder.parent != datasets_dir():
+        raise EvaError(f"to = {to!r:.120}; allowed: a name, or datasets/NAME: what is reviewed lies there")
+    return folder

@@ -1,0 +1,134 @@
+"""The job of datasets: whatever is asked for is done here, and the rows of episodes follow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from evaweb.datasets.finding import dataset_found, folder_named
+from evaweb.datasets.orders import KIND
+from evaweb.episodes.placing import places_read
+from evaweb.errors import EvaError
+from evaweb.jobs.kinds import Work, job_kind
+from runtime.recording.files import RecordingError
+
+Found = dict[str, Any]
+
+
+@job_kind(KIND)
+def dataset(work: Work) -> Mapping[str, Any]:
+    """Do an order; args: those of evaweb.datasets.orders, checked.
+
+    What is refused is a result (`done` false, `why`): to try it again would change nothing.
+    """
+    try:
+        found = _KINDS[work.args["what"]](work)
+    except (RecordingError, EvaError) as fault:
+        return {"done": False, "why": str(fault)}
+    if work.args["what"] not in ("check", "push"):
+        work.tell("the database is brought up to it")
+        found["problems"] = [*found.get("problems", ()), *places_read()]
+    return {"done": True, **found}
+
+
+def _check(work: Work) -> Found:
+    from runtime.datasets.consistency import check  # web processes know this kind too, and never do it
+
+    work.tell("every file is compared with the metadata")
+    return {"problems": check(_source(work))}
+
+
+def _repair(work: Work) -> Found:
+    from runtime.datasets.operations import repair
+
+    return {"problems": repair(_source(work))}
+
+
+def _convert(work: Work) -> Found:
+    from runtime.datasets.operations import convert
+
+    args = work.args
+    target = folder_named(args["to"])
+    made = convert(
+        _source(work),
+        target,
+        args["version"],
+        rename=args["rename"],
+        reencode=args["reencode"],
+        tell=work.tell,
+    )
+    return _made(args["to"], made)
+
+
+def _import(work: Work) -> Found:
+    from evaweb.datasets.importing import imported
+
+    args = work.args
+    done = imported(_source(work), state=args["state"], robot=args["robot"], tell=work.tell)
+    return {"dataset": done.dataset, "episodes": len(done.episodes), "made": done.made}
+
+
+def _merge(work: Work) -> Found:
+    from runtime.datasets.operations import merge
+
+    args = work.args
+    sources = [dataset_found(name) for name in args["datasets"]]
+    target = folder_named(args["to"])
+    made = merge(sources, target, args["version"], reencode=args["reencode"], tell=work.tell)
+    return _made(args["to"], made)
+
+
+def _split(work: Work) -> Found:
+    from runtime.datasets.operations import split
+
+    args = work.args
+    targets = {folder_named(f"{args['to']}/{part}"): which for part, which in args["parts"].items()}
+    done = split(_source(work), targets, args["version"], reencode=args["reencode"], tell=work.tell)
+    parts = [_made(f"{args['to']}/{one.dataset.name}", one) for one in done]
+    return {"datasets": [part["dataset"] for part in parts], "parts": parts}
+
+
+def _delete(work: Work) -> Found:
+    from runtime.datasets.operations import delete
+
+    args = work.args
+    made = delete(
+        _source(work), args["episodes"], reencode=args["reencode"], known=args["known"], tell=work.tell
+    )
+    return _made(args["dataset"], made)
+
+
+def _push(work: Work) -> Found:
+    from runtime.datasets.hub import push
+
+    args = work.args
+    return {"address": push(_source(work), args["repository"], private=args["private"], tell=work.tell)}
+
+
+_KINDS: Mapping[str, Callable[[Work], Found]] = {
+    "check": _check,
+    "repair": _repair,
+    "convert": _convert,
+    "import": _import,
+    "merge": _merge,
+    "split": _split,
+    "delete": _delete,
+    "push": _push,
+}
+
+
+def _source(work: Work) -> Path:
+    return dataset_found(work.args["dataset"])
+
+
+def _made(name: str, made: Any) -> Found:
+    """What came of an operation that wrote a dataset."""
+    return {
+        "dataset": name,
+        "version": made.version,
+        "episodes": made.episodes,
+        "frames": made.frames,
+        "encoded": list(made.encoded),
+        "left_out": list(made.left_out),
+    }

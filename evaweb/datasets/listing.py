@@ -1,0 +1,101 @@
+"""The episodes of one dataset as a page lists them: what it says of each, what the lab knows of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from uuid import UUID
+
+from evaweb.datasets.finding import opened
+from evaweb.episodes.models import Episode
+from runtime.datasets import layout
+from runtime.datasets.reader import Dataset
+from runtime.recording.files import RecordingError
+
+SUCCESSES = ("yes", "no", "unknown")
+VERDICTS = ("pass", "fail", "unreviewed")
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One episode; `recording` is the lab's own, where it is one of ours that the database knows."""
+
+    index: int
+    length: int
+    seconds: float
+    task: str
+    uuid: str = ""
+    success: bool | None = None
+    outcome: str = ""
+    station: str = ""
+    recording: Episode | None = None
+
+    @property
+    def verdict(self) -> str:
+        """pass, fail, or "" where nobody has decided."""
+        review = getattr(getattr(self.recording, "standing", None), "review", None)
+        return str(review.verdict) if review else ""
+
+
+def rows(name: str, *, words: str = "", success: str = "", verdict: str = "") -> list[Row]:
+    """The episodes of a dataset, narrowed to those whose task or uuid has all `words`, and so on; RecordingError.
+
+    `success` is one of SUCCESSES, `verdict` one of VERDICTS; others choose nothing.
+    """
+    dataset = opened(name)
+    told = told_of(dataset)
+    known = _known([str(line.get("uuid")) for line in told.values()])
+    found = [_row(dataset, listed, told.get(listed.index, {}), known) for listed in dataset.episodes]
+    return [row for row in found if _fits(row, words.lower().split(), success, verdict)]
+
+
+def told_of(dataset: Dataset) -> dict[int, Mapping[str, Any]]:
+    """Our own lines about the episodes of a dataset, by index; {} for one of others."""
+    lines = layout.read_lines(dataset.root / layout.EVA_EPISODES)
+    try:
+        return {int(line["episode_index"]): line for line in lines}
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordingError(
+            f"{dataset.root / layout.EVA_EPISODES} has a line of no episode: {error!r}"
+        ) from error
+
+
+def _known(uuids: Sequence[str]) -> dict[str, Episode]:
+    """Those that the database knows."""
+    wanted = []
+    for uuid in uuids:
+        try:
+            wanted.append(UUID(uuid))
+        except ValueError:
+            continue
+    found: dict[str, Episode] = {}
+    for first in range(0, len(wanted), 500):  # a database takes so many parameters at once
+        chosen = Episode.objects.select_related("trial", "standing__review__reviewer")
+        found |= {str(row.uuid): row for row in chosen.filter(uuid__in=wanted[first : first + 500])}
+    return found
+
+
+def _row(dataset: Dataset, listed: Any, told: Mapping[str, Any], known: Mapping[str, Episode]) -> Row:
+    uuid, success, outcome = str(told.get("uuid", "")), told.get("success"), told.get("outcome")
+    return Row(
+        index=listed.index,
+        length=listed.length,
+        seconds=listed.length / dataset.fps,
+        task=", ".join(listed.tasks),
+        uuid=uuid,
+        success=success if isinstance(success, bool) else None,
+        outcome=str(outcome.get("status", "")) if isinstance(outcome, Mapping) else "",
+        station=str(told.get("station", "")),
+        recording=known.get(uuid),
+    )
+
+
+def _fits(row: Row, words: Sequence[str], success: str, verdict: str) -> bool:
+    text = f"{row.task} {row.uuid} {row.station}".lower()
+    wanted = {"yes": True, "no": False, "unknown": None}
+    return (
+        all(word in text for word in words)
+        and (success not in wanted or row.success is wanted[success])
+        and (verdict not in VERDICTS or (row.verdict or "unreviewed") == verdict)
+    )

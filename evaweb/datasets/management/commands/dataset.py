@@ -1,0 +1,129 @@
+"""manage.py dataset: what is done to the lab's datasets, at once and here; the database follows."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+from django.core.management.base import BaseCommand, CommandError
+
+from evaweb.datasets import work
+from evaweb.datasets.finding import folder_named, overviews
+from evaweb.datasets.importing import imported
+from evaweb.datasets.orders import full_name
+from evaweb.episodes.folders import data_dir
+from evaweb.episodes.job_kinds import publish_episode
+from evaweb.episodes.models import Episode
+from evaweb.episodes.placing import places_read
+from evaweb.errors import EvaError
+from evaweb.jobs.kinds import Work
+from runtime.datasets.__main__ import add_commands, renamed
+from runtime.recording.files import RecordingError
+
+_ONLY_LOOK = ("list", "check", "push")
+
+
+class Command(BaseCommand):
+    """Names are those of the pages: cups is DATA/datasets/cups. A path that begins with / or . is taken as it is."""
+
+    help = "Publishes, imports, converts, merges, splits, prunes, repairs, checks, lists and pushes datasets."
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        commands = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
+        listing = commands.add_parser("list", help="all datasets below the data folder")
+        listing.set_defaults(run=self._list)
+        publishing = commands.add_parser("publish", help="publish finished episodes where the lab puts them")
+        publishing.add_argument("episodes", nargs="+", type=UUID, metavar="UUID", help="of the recording")
+        publishing.set_defaults(run=self._publish)
+        importing = commands.add_parser(
+            "import", help="make a dataset's episodes ones of this lab, to be reviewed"
+        )
+        importing.add_argument("dataset", type=_folder, help="folder of the dataset, of any version")
+        importing.add_argument(
+            "--to", default="", metavar="NAME", help="of the copy; that of its folder without"
+        )
+        importing.add_argument(
+            "--state", default="", metavar="COLUMN", help="of measured joints, by its new name"
+        )
+        importing.add_argument("--robot", default="", help="whose numbers these are, in its order of joints")
+        importing.add_argument(
+            "--rename", action="append", default=[], metavar="OLD=NEW", help="of a feature"
+        )
+        importing.add_argument("--reencode", action="store_true", help="code again what cannot be copied")
+        importing.set_defaults(run=self._import)
+        add_commands(commands, dataset=_folder, publishing=False)
+
+    def handle(self, *args: Any, **options: Any) -> None:
+        try:
+            code = int(options["run"](argparse.Namespace(**options)))
+            problems = () if options["what"] in _ONLY_LOOK else places_read()
+        except (RecordingError, EvaError) as error:
+            raise CommandError(str(error)) from error
+        for problem in problems:
+            self.stderr.write(self.style.WARNING(problem))
+        if code:
+            raise CommandError("not all is well: see above", returncode=code)
+
+    def _list(self, options: argparse.Namespace) -> int:
+        found = overviews()
+        for one in found:
+            if one.problem:
+                self.stdout.write(f"{one.name}: {one.problem}")
+                continue
+            checked = work.checked(one.name)
+            state = "not checked" if checked is None else _state(checked)
+            self.stdout.write(
+                f"{one.name}: {one.version}, {one.robot or 'robot not said'}, {one.episodes} episodes, "
+                f"{one.frames} rows, {one.size / 1e6:.1f} MB, {state}"
+            )
+        if not found:
+            self.stdout.write(f"there is no dataset below {data_dir()}")
+        return int(any(one.problem for one in found))
+
+    def _import(self, options: argparse.Namespace) -> int:
+        done = imported(
+            options.dataset,
+            to=options.to,
+            state=options.state,
+            robot=options.robot,
+            rename=renamed(options.rename),
+            reencode=options.reencode,
+            tell=self.stdout.write,
+        )
+        for index, uuid in enumerate(done.episodes):
+            self.stdout.write(f"{uuid} is episode {index} of {done.dataset}")
+        self.stdout.write(f"imported: {len(done.episodes)} episodes, {done.made} of them new")
+        return 0
+
+    def _publish(self, options: argparse.Namespace) -> int:
+        code = 0
+        for uuid in options.episodes:
+            if not Episode.objects.filter(uuid=uuid).exists():
+                raise EvaError(f"episode {uuid} is not in the database: run manage.py reconcile")
+            done = publish_episode(Work({"uuid": str(uuid)}, self.stdout.write))
+            if done["published"]:
+                self.stdout.write(
+                    f"{uuid} is episode {done['index']} of {done['dataset']}, {done['frames']} rows"
+                )
+            else:
+                self.stderr.write(f"{uuid} is not published: {done['why']}")
+                code = 1
+        return code
+
+
+def _state(checked: work.Checked) -> str:
+    if not checked.fresh:
+        return "changed since its check"
+    return f"{len(checked.problems)} problems" if checked.problems else "whole"
+
+
+def _folder(given: str) -> Path:
+    """The folder that a name means."""
+    if given.startswith(("/", ".")):
+        return Path(given)
+    try:
+        return folder_named(full_name(given))
+    except EvaError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None

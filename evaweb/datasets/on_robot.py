@@ -1,0 +1,224 @@
+"""A recorded episode played on a robot: what would be sent, whether a station can, and what its set-up is told."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlencode
+from uuid import UUID
+
+from django.urls import reverse
+
+import robots
+from evaweb.datasets.orders import full_name
+from evaweb.datasets.playing import Played, played
+from evaweb.episodes.folders import journal_folder
+from evaweb.episodes.models import EpisodeStatus
+from evaweb.episodes.selectors import episode_get
+from evaweb.errors import Conflict, EvaError, NotFound, StationGone
+from evaweb.stations.looks import facts_of
+from evaweb.stations.models import Station
+from evaweb.stations.wire import wire_to
+from runtime.recording.files import RecordingError
+from runtime.recording.reader import open_episode
+
+SPACES = {"joint": "joints", "eef": "poses of the end effectors"}
+AFTER_S = 1.0  # for which the last row is held before the run ends by itself
+RATE = 5.0  # answers per second; each reaches a second ahead
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """An episode as a robot would get it; `columns` are the names of the numbers by space, and what stores them."""
+
+    source: str  # as in addresses
+    title: str
+    path: str  # of the dataset's folder, or of the recording's
+    index: int
+    rows: int
+    fps: float
+    task: str
+    robot: str
+    joints: Sequence[str]
+    poses: Sequence[str]
+    columns: Mapping[str, str]  # of a dataset by space; those of a recording are known
+    ours: bool  # recorded by a lab like this: it is known in which frames its poses are
+
+    @property
+    def seconds(self) -> float:
+        return self.rows / self.fps
+
+    @property
+    def page(self) -> str:
+        """Where it is played without a robot."""
+        if not self.columns:
+            return reverse("replay", args=[self.source])
+        name, _, index = self.source.rpartition(":")
+        path = reverse("dataset-replay", args=[name, int(index)])
+        return path if self.ours else f"{path}?{urlencode({'robot': self.robot})}"
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """What one station would do with it in one space; `differences` say why it does not."""
+
+    recorded: Recorded
+    station: Station
+    space: str
+    differences: tuple[str, ...]
+    running: bool  # the station answers
+
+    @property
+    def sent(self) -> str:
+        """What is sent, in words."""
+        return SPACES[self.space]
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Of the numbers that are sent."""
+        return self.recorded.joints if self.space == "joint" else self.recorded.poses
+
+    @property
+    def set_up(self) -> str:
+        """The arguments of the set-up, as JSON."""
+        recorded = self.recorded
+        policy: dict[str, Any] = {
+            "kind": "replay",
+            "path": recorded.path,
+            "episode": recorded.index,
+            "space": self.space,
+            "horizon": max(10, round(recorded.fps)),
+        }
+        if recorded.columns:
+            key = "action" if self.space == "joint" else "action_eef"
+            policy["mapping"] = {key: recorded.columns[self.space]}
+        args = {"policy": policy, "strategy": {"kind": "naive", "inference_rate": RATE}}
+        return json.dumps(args | ({"task": recorded.task[:2000]} if recorded.task else {}))
+
+    @property
+    def run(self) -> str:
+        """The arguments of the run, as JSON: it ends by itself after the last row."""
+        return json.dumps({"duration_s": round(self.recorded.seconds + AFTER_S, 3)})
+
+    @property
+    def address(self) -> str:
+        """Where it is set up and run: the station's own page."""
+        return f"{reverse('station-debug', args=[self.station.name])}?{query(self.recorded, self.space)}"
+
+
+def query(recorded: Recorded, space: str) -> str:
+    """What an address says of it."""
+    assumed = {"robot": recorded.robot} if recorded.columns else {}
+    return urlencode({"replay": recorded.source, "space": space, **assumed})
+
+
+def recorded_at(source: str, robot: str = "") -> Recorded:
+    """The episode of that name, with the numbers of `robot` where a person says so; NotFound, Conflict."""
+    try:
+        uuid = UUID(source)
+    except ValueError:
+        name, _, index = source.rpartition(":")
+        if not (name and index.isascii() and index.isdecimal() and len(index) < 10):
+            raise NotFound(f"{source!r:.120} is no episode; allowed: a uuid, or DATASET:INDEX") from None
+        try:
+            return _of_dataset(played(full_name(name), int(index), robot))
+        except RecordingError as error:
+            raise Conflict(str(error)) from None
+    return _recording(uuid)
+
+
+def _recording(uuid: UUID) -> Recorded:
+    row = episode_get(uuid=uuid)
+    if row.status == EpisodeStatus.RECORDING:
+        raise Conflict(f"episode {uuid} is still being recorded")
+    try:
+        episode = open_episode(journal_folder(uuid))
+    except RecordingError as error:
+        raise Conflict(str(error)) from None
+    told = episode.manifest["robot"]
+    robot = told if isinstance(told, Mapping) else {}
+    has_poses = "eef_action" in episode.layout.streams
+    return Recorded(
+        source=str(uuid),
+        title=row.task or "Episode without a task",
+        path=str(episode.path.absolute()),
+        index=0,
+        rows=episode.frames,
+        fps=episode.layout.fps,
+        task=row.task,
+        robot=str(robot.get("name", "")),
+        joints=[str(name) for name in robot.get("joint_names") or ()],
+        poses=[str(name) for name in robot.get("eef_names") or ()] if has_poses else (),
+        columns={},
+        ours=True,
+    )
+
+
+def _of_dataset(shown: Played) -> Recorded:
+    features = shown.dataset.features
+    action = shown.action
+    poses = next((name for name in ("eef_action", "action_eef") if name in features), "")
+    joints = shown.names(action) if action else []
+    if shown.assumed:
+        known = facts_of(shown.robot)["joint_names"]
+        joints = known if len(known) == len(joints) else joints
+    return Recorded(
+        source=f"{shown.name}:{shown.index}",
+        title=shown.task or "Episode without a task",
+        path=str(shown.dataset.root.absolute()),
+        index=shown.index,
+        rows=shown.frames,
+        fps=shown.fps,
+        task=shown.task,
+        robot=shown.robot,
+        joints=joints,
+        poses=shown.names(poses) if poses else (),
+        columns={"joint": action, "eef": poses},
+        ours=bool(shown.uuid) and not shown.assumed,
+    )
+
+
+def offer(recorded: Recorded, station: Station, space: str) -> Offer:
+    """What the station would do with the episode; EvaError for a space that is none."""
+    if space not in SPACES:
+        raise EvaError(f"space = {space!r:.40}; allowed: {', '.join(SPACES)}")
+    facts, running = _facts(station)
+    return Offer(recorded, station, space, tuple(_differences(recorded, facts, space)), running)
+
+
+def _facts(station: Station) -> tuple[Mapping[str, Any], bool]:
+    """What the station says of its robot; where it does not answer, what is known of such a robot."""
+    try:
+        return wire_to(station.name).status()["facts"], True
+    except (StationGone, KeyError):
+        return facts_of(station.robot), False
+
+
+def _differences(recorded: Recorded, facts: Mapping[str, Any], space: str) -> list[str]:
+    """Everything in which the episode's robot is not the station's; [] where it is the same."""
+    found = []
+    own = str(facts.get("robot", ""))
+    if recorded.robot not in robots.names():
+        called = f"calls its robot {recorded.robot!r}" if recorded.robot else "names no robot"
+        return [f"the episode {called}: say on its page in Replay whose numbers it has, then come back"]
+    if recorded.robot != own:
+        found.append(f"the episode is of the robot {recorded.robot}, the station has {own}")
+    theirs, ours = list(recorded.joints), [str(name) for name in facts.get("joint_names", ())]
+    groups = [list(dict.fromkeys(name.partition(".")[0] for name in names)) for names in (theirs, ours)]
+    if groups[0] != groups[1]:
+        found.append(
+            f"the episode has the groups {', '.join(groups[0]) or 'none'}, the station {', '.join(groups[1])}"
+        )
+    elif theirs != ours:
+        found.append(
+            f"the episode has the joints {', '.join(theirs) or 'none'}, the station {', '.join(ours)}"
+        )
+    if space == "eef" and not recorded.poses:
+        found.append("the episode has no poses of its actions: send joints")
+    elif space == "eef" and not recorded.ours:
+        found.append("nobody knows in which frames its poses are, for it is of somebody else: send joints")
+    elif space == "eef" and list(facts.get("eef_names", recorded.poses)) != list(recorded.poses):
+        found.append(f"the episode has the poses {', '.join(recorded.poses)}, the station others")
+    return found

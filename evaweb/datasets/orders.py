@@ -1,0 +1,189 @@
+"""What can be asked for about datasets: checked here, done by the worker, one kind of job for all."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+import robots
+from evaweb.datasets.finding import dataset_found, dataset_names, folder_named
+from evaweb.errors import Conflict, EvaError
+from evaweb.jobs.models import Job, JobStatus
+from evaweb.jobs.services import enqueue
+from evaweb.roles import Role, require
+from runtime.datasets.operations import fingerprint
+from runtime.recording.files import RecordingError
+
+KIND = "dataset"
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Index = Annotated[int, Field(ge=0, lt=2**31)]
+Version = Literal["v2.1", "v3.0"]
+
+
+class _Order(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Check(_Order):
+    """Look whether a dataset is what its own metadata promise."""
+
+    what: Literal["check"]
+    dataset: Name
+
+
+class Repair(_Order):
+    """Take back what a crash left."""
+
+    what: Literal["repair"]
+    dataset: Name
+
+
+class Convert(_Order):
+    """Write a dataset as a new one of that version; features may get new names."""
+
+    what: Literal["convert"]
+    dataset: Name
+    to: Name
+    version: Version
+    rename: dict[Name, Name] = Field(default_factory=dict, max_length=100)
+    reencode: bool = False
+
+
+class Import(_Order):
+    """Make its episodes ones of this lab, to be checked, reviewed and annotated; `robot` is whose numbers they are."""
+
+    what: Literal["import"]
+    dataset: Name
+    robot: Annotated[str, Field(max_length=63)] = ""
+    state: Annotated[str, Field(max_length=200)] = ""
+
+
+class Merge(_Order):
+    """Write the episodes of several datasets, in this order, as a new one."""
+
+    what: Literal["merge"]
+    datasets: Annotated[list[Name], Field(min_length=2, max_length=100)]
+    to: Name
+    version: Version | None = None
+    reencode: bool = False
+
+
+class Split(_Order):
+    """Write some episodes of a dataset as new ones below the folder `to`."""
+
+    what: Literal["split"]
+    dataset: Name
+    to: Name
+    parts: Annotated[dict[Name, list[Index]], Field(min_length=1, max_length=100)]
+    version: Version | None = None
+    reencode: bool = False
+
+
+class Delete(_Order):
+    """Take episodes out of a dataset; later ones move up. Administrators."""
+
+    what: Literal["delete"]
+    dataset: Name
+    episodes: Annotated[list[Index], Field(min_length=1)]
+    reencode: bool = False
+
+
+class Push(_Order):
+    """Upload a dataset to the Hugging Face hub. Administrators."""
+
+    what: Literal["push"]
+    dataset: Name
+    repository: Name
+    private: bool = True
+
+
+Order = Annotated[
+    Check | Repair | Convert | Import | Merge | Split | Delete | Push, Field(discriminator="what")
+]
+_ADAPTER: TypeAdapter[Check | Repair | Convert | Import | Merge | Split | Delete | Push] = TypeAdapter(Order)
+_ADMIN = (Delete, Push)
+
+
+def order_of(given: Mapping[str, Any]) -> Any:
+    """The order that is meant; EvaError names what is wrong with it."""
+    try:
+        return _ADAPTER.validate_python(dict(given))
+    except ValidationError as invalid:
+        error = invalid.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in error["loc"] if part != given.get("what")) or "what"
+        raise EvaError(f"{place}: {error['msg']}; given: {error.get('input')!r:.120}") from None
+
+
+def full_name(given: str) -> str:
+    """The name of a dataset, whose usual folder need not be said: cups is datasets/cups where that is there."""
+    usual = f"datasets/{given}"
+    names = dataset_names()
+    return usual if usual in names or (given not in names and "/" not in given) else given
+
+
+def asked(*, user: Any, given: Mapping[str, Any]) -> Job:
+    """Have the worker do it; operators, what takes data away or out of the house administrators.
+
+    Raises EvaError where a dataset is not there, a new one is already, or a name leads out of the data folder.
+    """
+    order = order_of(given)
+    require(user, Role.ADMIN if isinstance(order, _ADMIN) else Role.OPERATOR)
+    sources = list(order.datasets) if isinstance(order, Merge) else [order.dataset]
+    names = [full_name(name) for name in sources]
+    for name in names:
+        dataset_found(name)
+    args = order.model_dump()
+    if isinstance(order, Merge):
+        args["datasets"] = names
+    else:
+        args["dataset"] = names[0]
+    if isinstance(order, Convert | Merge | Split):
+        args["to"] = _new(order.to, order.parts if isinstance(order, Split) else ())
+    if isinstance(order, Delete):
+        args |= {"episodes": sorted(set(order.episodes)), "known": _known(names[0])}
+    if isinstance(order, Import) and order.robot and order.robot not in robots.names():
+        raise EvaError(f"robot = {order.robot!r}; allowed: {', '.join(robots.names())}, or none")
+    _require_quiet(names)
+    return enqueue(kind=KIND, key=key_of(order.what, names[0], args), args=args)
+
+
+def key_of(what: str, name: str, args: Mapping[str, Any]) -> str:
+    """What the job is about: one check of a dataset at a time, while two exports of it are two things."""
+    if what in ("check", "repair"):
+        return f"dataset:{what}:{_short(name)}"
+    rest = hashlib.sha256(json.dumps(dict(args), sort_keys=True).encode()).hexdigest()[:12]
+    return f"dataset:{what}:{_short(name)}:{rest}"
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= 100 else f"{name[:80]}-{hashlib.sha256(name.encode()).hexdigest()[:12]}"
+
+
+def _new(to: str, parts: Sequence[str] | Mapping[str, Any]) -> str:
+    """The name of what is to be written; Conflict where that is there already."""
+    name = to if "/" in to else f"datasets/{to}"
+    for wanted in [f"{name}/{part}" for part in parts] or [name]:
+        folder = folder_named(wanted)
+        if folder.exists() and any(folder.iterdir()):
+            raise Conflict(f"{wanted} is there already and not empty: choose another name")
+    return name
+
+
+def _known(name: str) -> str:
+    try:
+        return fingerprint(dataset_found(name))
+    except RecordingError as fault:
+        raise Conflict(str(fault)) from None
+
+
+def _require_quiet(names: Sequence[str]) -> None:
+    """Two deletions that wait for each other would be about different episodes."""
+    for job in Job.objects.filter(
+        kind=KIND, status__in=(JobStatus.QUEUED, JobStatus.RUNNING), args__what="delete"
+    ):
+        if job.args.get("dataset") in names:
+            raise Conflict(f"episodes of {job.args['dataset']} are being deleted: wait until that is done")

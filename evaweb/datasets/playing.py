@@ -1,0 +1,310 @@
+"""An episode of a dataset in the form of a recording of ours, so that the same modules play both."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from uuid import NAMESPACE_URL, UUID, uuid5
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+import robots
+from evaweb.datasets.finding import camera_keys, opened
+from evaweb.datasets.listing import told_of
+from evaweb.errors import NotFound
+from evaweb.stations.looks import looks_of
+from runtime.datasets import layout
+from runtime.datasets.entries import EpisodeEntry, Span
+from runtime.datasets.reader import Dataset
+from runtime.datasets.sides import side_files
+from runtime.recording.files import RecordingError
+from runtime.recording.layout import Layout
+from runtime.recording.reader import Episode
+from runtime.recording.tables import SCHEMAS
+
+STATES = ("observation.state", "observation.qpos")  # measured joints, the first that there is
+_SOURCE = "control_source"
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Played:
+    """One episode of a dataset; `robot` is whose numbers are meant, "" where nobody knows.
+
+    `assumed`: a person says so, whatever the dataset says, and that they are in that robot's order.
+    """
+
+    name: str  # of the dataset
+    index: int
+    dataset: Dataset
+    entry: EpisodeEntry
+    told: Mapping[str, Any]  # our own line about it; {} for one of others
+    robot: str
+    assumed: bool
+
+    @property
+    def uuid(self) -> str:
+        """Of the recording, "" for an episode of others."""
+        try:
+            return str(UUID(str(self.told["uuid"])))
+        except (KeyError, ValueError):
+            return ""
+
+    @property
+    def fps(self) -> float:
+        return self.dataset.fps
+
+    @property
+    def frames(self) -> int:
+        return self.entry.length
+
+    @property
+    def task(self) -> str:
+        return ", ".join(self.entry.tasks)
+
+    @property
+    def cameras(self) -> dict[str, str]:
+        """The feature of each camera's pictures."""
+        return camera_keys(dict(self.dataset.features))
+
+    def video(self, camera: str) -> Span | None:
+        """Where the video of a camera is; None where its pictures are in a column. NotFound for no camera of it."""
+        key = self.cameras.get(camera)
+        if key is None:
+            raise NotFound(
+                f"{self.name} has no camera {camera!r:.80}; it has {', '.join(self.cameras) or 'none'}"
+            )
+        return self.entry.videos.get(key)
+
+    @property
+    def state(self) -> str:
+        """The column of measured joints, "" where there is none."""
+        vectors = _vectors(self.dataset)
+        usual = [name for name in STATES if name in vectors]
+        return next(iter([*usual, *(name for name in vectors if name.startswith("observation"))]), "")
+
+    @property
+    def action(self) -> str:
+        """The column of commanded joints, "" where there is none."""
+        vectors = _vectors(self.dataset)
+        return (
+            "action"
+            if "action" in vectors
+            else next((name for name in vectors if name.startswith("action")), "")
+        )
+
+    def names(self, column: str) -> list[str]:
+        """Of the numbers of a column."""
+        feature = self.dataset.features.get(column, {})
+        width, names = int((feature.get("shape") or [0])[0]), feature.get("names")
+        if isinstance(names, Mapping) and len(names) == 1:  # {"motors": [...]}, as some have it
+            names = next(iter(names.values()))
+        told = [str(name) for name in names] if isinstance(names, list) else []
+        return told if len(told) == width else [f"{column}[{k}]" for k in range(width)]
+
+    def beside(self) -> dict[str, Path]:
+        """The side files of the episode by kind."""
+        return side_files(self.dataset.root, self.uuid) if self.uuid else {}
+
+
+def played(name: str, index: int, robot: str = "") -> Played:
+    """Episode `index` of a dataset, with the numbers of `robot` where that is given; NotFound, RecordingError."""
+    dataset = opened(name)
+    listed = next((one for one in dataset.episodes if one.index == index), None)
+    if listed is None:
+        raise NotFound(f"{name} has no episode {index}, there are {len(dataset.episodes)}")
+    if robot and robot not in robots.names():
+        raise NotFound(f"robot {robot!r:.80} does not exist; there are: {', '.join(robots.names())}")
+    own = str(dataset.info.get("robot_type") or "")
+    return Played(name, index, dataset, listed, told_of(dataset).get(index, {}), robot or own, bool(robot))
+
+
+def _vectors(dataset: Dataset) -> list[str]:
+    return [
+        key
+        for key, feature in dataset.features.items()
+        if str(feature.get("dtype", "")).startswith("float")
+        and len(feature.get("shape") or ()) == 1
+        and int(feature["shape"][0]) > 1
+    ]
+
+
+def as_recording(shown: Played) -> Episode:
+    """The episode with the tables that a recording has; the three action streams where they lie beside it.
+
+    Where state and action are of different numbers, the joints are those of both. Raises RecordingError.
+    """
+    table = shown.dataset.table(shown.index)
+    joints, measured, commanded = _numbers(shown, table)
+    manifest = _manifest(shown, joints)
+    form = Layout.of(manifest)
+    rows = pa.table(
+        {
+            "tick_time": np.arange(shown.frames) / shown.fps,
+            _SOURCE: table[_SOURCE] if _SOURCE in table.column_names else pa.nulls(shown.frames, pa.string()),
+            "qpos": _lists(measured),
+        }
+    )
+    streams = shown.beside().get("streams")
+    if streams is not None and len(joints) == measured.shape[1]:
+        return _with_streams(shown, streams, rows)
+    ticks = pa.table(
+        {
+            "step": np.arange(shown.frames),
+            "planned": np.arange(shown.frames) / shown.fps,
+            "qpos": _lists(measured),
+            "executed": _lists(commanded),
+            "changes": pa.array([[]] * shown.frames, pa.list_(pa.string())),
+            "refused": np.zeros(shown.frames, bool),
+            "chunk_id": np.full(shown.frames, -1),
+        }
+    )
+    return _episode(
+        shown,
+        form,
+        manifest,
+        rows,
+        ticks,
+        *(SCHEMAS[name](form).empty_table() for name in ("smoothed", "raw")),
+    )
+
+
+def _numbers(shown: Played, table: Any) -> tuple[list[str], Array, Array]:
+    """Names of the joints, measured and commanded ones [N, D]; NaN where a column has nothing of a joint."""
+    state, action = shown.state, shown.action
+    if not state and not action:
+        raise RecordingError(f"{shown.name} has no column of joints, neither measured nor commanded")
+    names = [shown.names(column) if column else [] for column in (state, action)]
+    values = [_values(table, column, len(told)) for column, told in zip((state, action), names, strict=True)]
+    if len(names[0]) == len(names[1]):
+        return names[0], values[0], values[1]
+    nothing = [np.full_like(one, np.nan) for one in values]
+    joints = [*names[0], *(f"action {name}" for name in names[1])] if state else names[1]
+    return joints, np.hstack([values[0], nothing[1]]), np.hstack([nothing[0], values[1]])
+
+
+def _values(table: Any, column: str, width: int) -> Array:
+    if not column:
+        return np.zeros((table.num_rows, 0), np.float32)
+    if column not in table.column_names:
+        raise RecordingError(f"a column {column!r} is declared, but the rows have {table.column_names}")
+    stored = table[column].combine_chunks()
+    flat = np.asarray(stored.flatten().to_numpy(zero_copy_only=False), np.float32)
+    if stored.null_count or flat.size != table.num_rows * width:
+        raise RecordingError(f"rows of column {column!r} have not {width} numbers each, as is declared")
+    return flat.reshape(table.num_rows, width)
+
+
+def _lists(values: Array) -> Any:
+    flat = pa.array(np.ascontiguousarray(values, np.float32).reshape(-1))
+    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+
+
+def _manifest(shown: Played, joints: list[str]) -> dict[str, Any]:
+    return {
+        "uuid": shown.uuid or str(uuid5(NAMESPACE_URL, f"{shown.name}#{shown.index}")),
+        "fps": shown.fps,
+        "control_rate": shown.fps,
+        "started_monotonic": 0.0,
+        "task": shown.task,
+        "robot": {"name": shown.robot, "dim": len(joints), "joint_names": _called(shown, joints)},
+        "streams": {},
+        "cameras": {},
+        "capture_streams": [],
+    }
+
+
+def _called(shown: Played, joints: list[str]) -> list[str]:
+    """The joints as the robot calls them, where a person says that they are that robot's; NotFound for too many."""
+    if not shown.assumed:
+        return joints
+    known = list(looks_of(shown.robot).robot.joint_names)
+    if len(known) != len(joints):
+        raise NotFound(
+            f"the episode has {len(joints)} joints, {shown.robot} has {len(known)}: choose another robot"
+        )
+    return known
+
+
+def _episode(
+    shown: Played, form: Layout, manifest: Mapping[str, Any], rows: Any, ticks: Any, smoothed: Any, raw: Any
+) -> Episode:
+    return Episode(
+        path=shown.dataset.root,
+        layout=form,
+        manifest=manifest,
+        outcome=None,
+        frames=shown.frames,
+        rows=rows,
+        ticks=ticks,
+        smoothed=smoothed,
+        raw=raw,
+        events=(),
+        videos={},
+    )
+
+
+# --- the three action streams --------------------------------------------------------------------------------
+
+
+def _with_streams(shown: Played, path: Path, rows: Any) -> Episode:
+    """With what the policy meant, what was planned and what was sent, from the side file."""
+    try:
+        table = pq.read_table(path)
+        manifest = json.loads((table.schema.metadata or {})[b"eva.manifest"])
+        form = Layout.of(manifest)
+        by = {
+            name: table.filter(pa.compute.equal(table["stream"], name))
+            for name in ("raw", "smoothed", "executed")
+        }
+        executed, smoothed, raw = by["executed"], by["smoothed"], by["raw"]
+        ticks = _renamed(
+            executed,
+            {"step": "step", "planned": "time", "qpos": "measured", "executed": "action"},
+            ("changes", "refused"),
+            ("chunk_id",),
+        )
+        planned = _renamed(smoothed, {"smoothed": "action"}, ("step", "chunk_ids", "weights"), ())
+        meant = _renamed(
+            raw,
+            {},
+            (
+                "chunk_id",
+                "observation_step",
+                "index",
+                "action",
+                "space",
+                "mistimed",
+                "inference_ms",
+                "strategy",
+                "overlap",
+            ),
+            ("arrival_step", "target_step", "delay"),
+        )
+    except (OSError, pa.ArrowException, KeyError, ValueError) as error:
+        raise RecordingError(f"{path} is no table of action streams: {error}") from error
+    return _episode(shown, form, manifest, rows, ticks, planned, meant)
+
+
+def _renamed(table: Any, new: Mapping[str, str], same: tuple[str, ...], numbers: tuple[str, ...]) -> Any:
+    """Columns as a recording names them; in `numbers` -1 stands for none."""
+    columns = {name: table[old] for name, old in new.items()} | {name: table[name] for name in same}
+    return pa.table(columns | {name: table[name].fill_null(-1) for name in numbers})
+
+
+def annotations(shown: Played) -> list[dict[str, Any]]:
+    """The segments that travel with the episode; RecordingError where their file is damaged."""
+    path = shown.beside().get("annotations")
+    return [] if path is None else layout.read_lines(path)
+
+
+def reviews(shown: Played) -> list[dict[str, Any]]:
+    """The verdicts that travel with the episode, oldest first; RecordingError where their file is damaged."""
+    path = shown.beside().get("reviews")
+    return [] if path is None else layout.read_lines(path)

@@ -1,0 +1,179 @@
+"""Pages that replay episodes of datasets and several episodes beside each other, and the files they play."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from asgiref.sync import sync_to_async
+from django.http import HttpRequest, HttpResponse, JsonResponse
+from django.http.response import HttpResponseBase
+from django.shortcuts import render
+from django.views.decorators.http import require_GET
+
+import robots
+from evaweb.datasets import playing
+from evaweb.datasets.on_robot import AFTER_S, SPACES, offer, recorded_at
+from evaweb.datasets.orders import full_name
+from evaweb.datasets.playing import Played, as_recording
+from evaweb.datasets.sources import dataset_config, episode_of, shown
+from evaweb.datasets.stills import still
+from evaweb.episodes.curves import curves_of
+from evaweb.episodes.models import Episode
+from evaweb.episodes.poses import poses_of
+from evaweb.episodes.robot import looks_in
+from evaweb.episodes.streaming import file_answer
+from evaweb.episodes.views import player
+from evaweb.errors import Conflict, EvaError, NotFound
+from evaweb.sight import sight_for
+from evaweb.stations.geometry import geometry
+from evaweb.stations.models import Station
+from runtime.recording.files import RecordingError
+
+Result = TypeVar("Result")
+MOST = 6  # episodes beside each other
+_TYPES = {".mp4": "video/mp4", ".mkv": "video/x-matroska", ".webm": "video/webm", ".mov": "video/quicktime"}
+
+
+# --- pages ---------------------------------------------------------------------------------------------------
+
+
+@require_GET
+def replay(request: HttpRequest, name: str, index: int) -> HttpResponse:
+    """One episode of a dataset: cameras, robot and curves on one clock."""
+    episode = _episode(request, name, index)
+    context = {
+        "episode": episode,
+        "short": episode.name.removeprefix("datasets/"),
+        "recording": _recording(episode),
+        "cameras": list(episode.cameras),
+        "last": len(episode.dataset.episodes) - 1,
+        "robots": robots.names(),
+        "config": dataset_config(episode) | player(),
+    }
+    return render(request, "datasets/replay.html", context)
+
+
+@require_GET
+def side_by_side(request: HttpRequest) -> HttpResponse:
+    """Several episodes on one clock; ?show= names each, see evaweb.datasets.sources."""
+    names = list(dict.fromkeys(name.strip() for name in request.GET.getlist("show") if name.strip()))
+    if len(names) > MOST:
+        raise EvaError(f"{len(names)} episodes beside each other; allowed: at most {MOST}")
+    found, problems = [], []
+    for name in names:
+        try:
+            found.append(shown(request, name))
+        except EvaError as error:
+            problems.append(str(error))
+    config = player() | {"episodes": [{"name": one.name, "title": one.title, **one.config} for one in found]}
+    context = {"shown": found, "problems": problems, "config": config, "most": MOST}
+    return render(request, "datasets/side_by_side.html", context)
+
+
+@require_GET
+def on_robot(request: HttpRequest) -> HttpResponse:
+    """Which stations can play an episode, and what they would send."""
+    recorded = recorded_at(request.GET.get("show", ""), request.GET.get("robot", ""))
+    space = request.GET.get("space", "joint")
+    offers = [offer(recorded, station, space) for station in Station.objects.filter(active=True)]
+    context = {
+        "recorded": recorded,
+        "offers": sorted(offers, key=lambda one: (bool(one.differences), one.station.name)),
+        "space": space,
+        "spaces": SPACES,
+        "robot": request.GET.get("robot", ""),
+        "after_s": AFTER_S,
+    }
+    return render(request, "datasets/on_robot.html", context)
+
+
+# --- files ---------------------------------------------------------------------------------------------------
+
+
+async def video(request: HttpRequest, name: str, index: int, camera: str) -> HttpResponseBase:
+    """The video in which the pictures of a camera are, also in parts; others may be in it too."""
+    episode = await sync_to_async(_episode)(request, name, index)
+    span = episode.video(camera)
+    if span is None:
+        raise NotFound(f"the pictures of {camera} are in a column: there is no video of them")
+    kind = _TYPES.get(span.path.suffix.lower(), "application/octet-stream")
+    return await file_answer(request, span.path, kind)
+
+
+@require_GET
+def picture(request: HttpRequest, name: str, index: int, camera: str) -> HttpResponse:
+    """Picture ?row= of a camera whose pictures are in a column."""
+    episode = _episode(request, name, index)
+    row = _number(request, "row")
+    if row >= episode.frames:
+        raise NotFound(f"row {row}: the episode has rows 0 to {episode.frames - 1}")
+    content, kind = _readable(lambda: still(episode, camera, row))
+    answer = HttpResponse(content, content_type=kind)
+    answer["Cache-Control"] = "private, max-age=600"
+    return answer
+
+
+@require_GET
+def curves(request: HttpRequest, name: str, index: int) -> HttpResponse:
+    """Joint curves, and the action streams where they lie beside it, as one message of evaweb.frames."""
+    episode = _episode(request, name, index)
+    recording = _recording(episode)
+    covered = recording is not None and sight_for(request).hides_episode(recording)
+    return _message(lambda: curves_of(as_recording(episode), covered=covered))
+
+
+@require_GET
+def shapes(request: HttpRequest, name: str, index: int) -> HttpResponse:
+    """What the 3D scene needs of the robot, as JSON."""
+    episode = _episode(request, name, index)
+    found = _readable(lambda: as_recording(episode))
+    robot = looks_in(found.manifest).robot
+    return JsonResponse(geometry(robot.name, [group.name for group in robot.groups], simulated=False))
+
+
+@require_GET
+def poses(request: HttpRequest, name: str, index: int) -> HttpResponse:
+    """Where the robot's parts were from row ?first= on, as one message of evaweb.frames."""
+    episode = _episode(request, name, index)
+    first = _number(request, "first")
+    return _message(lambda: poses_of(as_recording(episode), first))
+
+
+@require_GET
+def segments(request: HttpRequest, name: str, index: int) -> HttpResponse:
+    """The annotations and verdicts that travel with the episode, as JSON."""
+    episode = _episode(request, name, index)
+    said = _readable(lambda: {"segments": playing.annotations(episode), "reviews": playing.reviews(episode)})
+    return JsonResponse(said)
+
+
+def _episode(request: HttpRequest, name: str, index: int) -> Played:
+    return episode_of(full_name(name), index, request.GET.get("robot", ""))
+
+
+def _recording(episode: Played) -> Episode | None:
+    """The lab's own recording of it, where the database knows it."""
+    if not episode.uuid:
+        return None
+    return Episode.objects.select_related("trial").filter(uuid=episode.uuid).first()
+
+
+def _number(request: HttpRequest, name: str) -> int:
+    given = request.GET.get(name, "0")
+    if not (given.isascii() and given.isdecimal()) or len(given) > 9:
+        raise EvaError(f"{name} = {given!r:.40}; allowed: a whole number from 0")
+    return int(given)
+
+
+def _readable(make: Callable[[], Result]) -> Result:
+    try:
+        return make()
+    except RecordingError as error:
+        raise Conflict(str(error)) from None
+
+
+def _message(make: Callable[[], bytes]) -> HttpResponse:
+    answer = HttpResponse(_readable(make), content_type="application/octet-stream")
+    answer["Cache-Control"] = "private, no-cache"
+    return answer

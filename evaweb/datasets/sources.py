@@ -1,0 +1,115 @@
+"""Whatever can be replayed, by one name each: a recording by its uuid, an episode of a dataset as NAME:INDEX."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlencode
+from uuid import UUID
+
+from django.urls import reverse
+
+import robots
+from evaweb.datasets.orders import full_name
+from evaweb.datasets.playing import Played, played
+from evaweb.episodes.models import Episode
+from evaweb.episodes.selectors import episode_get, stage_of
+from evaweb.episodes.views import replay_config
+from evaweb.errors import Conflict, NotFound
+from evaweb.sight import sight_for
+from runtime.recording.files import RecordingError
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """One of the episodes of a page: `name` as in addresses, what the page's modules have to know in `config`."""
+
+    name: str
+    title: str
+    detail: str
+    address: str
+    cameras: tuple[str, ...]
+    config: dict[str, Any]
+
+
+def shown(request: Any, name: str) -> Shown:
+    """What is meant by a name; NotFound, Conflict where it cannot be played."""
+    try:
+        uuid = UUID(name)
+    except ValueError:
+        return _of_dataset(name)
+    return _recording(request, episode_get(uuid=uuid))
+
+
+def _recording(request: Any, episode: Episode) -> Shown:
+    stage = stage_of(episode=episode)
+    if stage.name != "ready":
+        raise Conflict(f"episode {episode.uuid} cannot be played yet. {stage.sentence}")
+    made_by = sight_for(request).policy_of(episode)
+    started = f"{episode.started_at:%Y-%m-%d %H:%M:%S}" if episode.started_at else "time unknown"
+    return Shown(
+        name=str(episode.uuid),
+        title=episode.task or "Episode without a task",
+        detail=" · ".join(filter(None, (started, str(episode.station), made_by))),
+        address=reverse("replay", args=[episode.uuid]),
+        cameras=tuple(episode.cameras),
+        config=replay_config(episode),
+    )
+
+
+def _of_dataset(name: str) -> Shown:
+    dataset, colon, index = name.rpartition(":")
+    if not (colon and index.isascii() and index.isdecimal() and len(index) < 10):
+        raise NotFound(f"{name!r:.120} is no episode; allowed: the uuid of a recording, or DATASET:INDEX")
+    episode = episode_of(full_name(dataset), int(index))
+    return Shown(
+        name=f"{episode.name}:{episode.index}",
+        title=episode.task or "Episode without a task",
+        detail=f"{episode.name.removeprefix('datasets/')}, episode {episode.index}",
+        address=dataset_address("dataset-replay", episode),
+        cameras=tuple(episode.cameras),
+        config=dataset_config(episode),
+    )
+
+
+def episode_of(name: str, index: int, robot: str = "") -> Played:
+    """As `played`; Conflict where the dataset cannot be read."""
+    try:
+        return played(name, index, robot)
+    except RecordingError as error:
+        raise Conflict(str(error)) from None
+
+
+def dataset_address(route: str, episode: Played, *more: Any) -> str:
+    """The address of something of an episode of a dataset; whose robot's numbers are meant goes along."""
+    path = reverse(route, args=[episode.name, episode.index, *more])
+    return f"{path}?{urlencode({'robot': episode.robot})}" if episode.assumed else path
+
+
+def dataset_config(episode: Played) -> dict[str, Any]:
+    """What the page's modules have to know, as evaweb.episodes.views says of a recording."""
+    known = episode.robot in robots.names()
+    videos = []
+    for camera in episode.cameras:
+        span = episode.video(camera)
+        route = "dataset-picture" if span is None else "dataset-video"
+        videos.append(
+            {
+                "camera": camera,
+                "address": dataset_address(route, episode, camera),
+                "start": 0.0 if span is None else span.start or 0.0,
+                "pictures": span is None,
+            }
+        )
+    return {
+        "curves": dataset_address("dataset-curves", episode),
+        "geometry": dataset_address("dataset-geometry", episode) if known else "",
+        "why": ""
+        if known
+        else f"the dataset calls its robot {episode.robot or 'nothing'}: choose the one to be drawn",
+        "poses": dataset_address("dataset-poses", episode),
+        "segments": dataset_address("dataset-segments", episode),
+        "videos": videos,
+        "fps": episode.fps,
+        "frames": episode.frames,
+    }

@@ -1,0 +1,68 @@
+"""Single pictures of cameras that a dataset keeps in a column instead of a video."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import simplejpeg
+from PIL import Image, UnidentifiedImageError
+
+from evaweb.datasets.playing import Played
+from evaweb.errors import NotFound
+from runtime.recording.files import RecordingError
+
+QUALITY = 85
+_SHOWN = {"JPEG": "image/jpeg", "PNG": "image/png"}  # as they are coded
+
+
+def still(episode: Played, camera: str, row: int) -> tuple[bytes, str]:
+    """Picture `row` of a camera and its type; coded again only where no browser shows it. RecordingError, NotFound."""
+    if episode.video(camera) is not None:
+        raise NotFound(f"the pictures of {camera} are in a video")
+    key = episode.cameras[camera]
+    content = _stored(episode, key, row)
+    try:
+        with Image.open(io.BytesIO(content)) as picture:
+            kind = _SHOWN.get(picture.format or "")
+            if kind:
+                return content, kind
+            pixels = np.ascontiguousarray(picture.convert("RGB"))
+    except (OSError, UnidentifiedImageError) as error:
+        raise RecordingError(f"picture {row} of {key!r} cannot be decoded: {error}") from error
+    jpeg: bytes = simplejpeg.encode_jpeg(pixels, quality=QUALITY)
+    return jpeg, "image/jpeg"
+
+
+def _stored(episode: Played, key: str, row: int) -> bytes:
+    """What the column has in one row, without reading those of other episodes into Python."""
+    path = episode.entry.data
+    try:
+        columns = [key, *(["episode_index"] if episode.entry.shared else [])]
+        table = pq.read_table(path, columns=columns)
+        if episode.entry.shared:
+            table = table.filter(pc.equal(table["episode_index"], episode.index))
+        found = table[key][row].as_py()
+    except (OSError, pa.ArrowException, KeyError, IndexError) as error:
+        raise RecordingError(f"{path}: no picture {row} of {key!r}: {error}") from error
+    if not isinstance(found, dict) or not (found.get("bytes") or found.get("path")):
+        raise RecordingError(
+            f"{path}: picture {row} of {key!r} is {type(found).__name__}, expected a coded picture"
+        )
+    if found.get("bytes"):
+        return bytes(found["bytes"])
+    return _file(episode, key, str(found["path"]))
+
+
+def _file(episode: Played, key: str, name: str) -> bytes:
+    root = episode.dataset.root.resolve()
+    path = (root / name).resolve()
+    if not path.is_relative_to(root):
+        raise RecordingError(f"a picture of {key!r} leads out of the dataset: {name!r:.120}")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error

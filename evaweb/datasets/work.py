@@ -1,0 +1,124 @@
+"""The jobs about a dataset, in words, and what the newest check of it found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from django.db.models import Q
+
+from evaweb.datasets.finding import dataset_found
+from evaweb.datasets.orders import KIND, key_of
+from evaweb.jobs.models import Job, JobStatus
+from runtime.datasets import layout
+
+SHOWN = 8  # newest jobs of a page
+_VERBS = {
+    "check": "Check",
+    "repair": "Repair",
+    "convert": "Convert",
+    "import": "Import",
+    "merge": "Merge",
+    "split": "Split",
+    "delete": "Delete",
+    "push": "Push",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """One job: a title, how it stands (waiting, running, done, refused, failed), and a sentence."""
+
+    job: Job
+    title: str
+    state: str
+    sentence: str
+    made: tuple[str, ...] = ()  # datasets that came of it
+
+    @property
+    def passing(self) -> bool:
+        """Whether it changes by itself, so that a page looks again."""
+        return self.state in ("waiting", "running")
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """What the newest check found; `fresh` is false where the dataset has changed since."""
+
+    at: datetime
+    problems: tuple[str, ...]
+    fresh: bool
+
+
+def jobs_of(name: str = "") -> list[Told]:
+    """The newest jobs about a dataset, or about all."""
+    rows = Job.objects.filter(kind=KIND)
+    if name:
+        rows = rows.filter(
+            Q(args__dataset=name) | Q(args__to=name) | Q(args__datasets__icontains=f'"{name}"')
+        )
+    return [told(job) for job in rows[:SHOWN]]
+
+
+def told(job: Job) -> Told:
+    """How a job stands."""
+    args, result = job.args, job.result
+    title = f"{_VERBS.get(args['what'], args['what'])} {_about(args)}"
+    if job.status == JobStatus.DONE and not result.get("done"):
+        return Told(job, title, "refused", str(result.get("why", "")))
+    if job.status == JobStatus.DONE:
+        made = [result["dataset"]] if "dataset" in result else result.get("datasets", [])
+        return Told(job, title, "done", _sentence(args["what"], result), tuple(made))
+    if job.status == JobStatus.FAILED:
+        return Told(job, title, "failed", job.error)
+    if job.status == JobStatus.RUNNING:
+        return Told(job, title, "running", job.progress or "it has begun")
+    return Told(
+        job, title, "waiting", f"tried again in a moment: {job.error}" if job.error else "for the worker"
+    )
+
+
+def _about(args: Mapping[str, Any]) -> str:
+    sources = [name.removeprefix("datasets/") for name in args.get("datasets") or [args.get("dataset", "")]]
+    about = ", ".join(sources)
+    if args.get("to"):
+        return f"{about} to {args['to'].removeprefix('datasets/')}"
+    if args["what"] == "delete":
+        return f"{len(args['episodes'])} episodes of {about}"
+    return f"{about} to {args['repository']}" if args["what"] == "push" else about
+
+
+def _sentence(what: str, result: Mapping[str, Any]) -> str:
+    problems = result.get("problems") or []
+    if what in ("check", "repair"):
+        return (
+            "whole"
+            if not problems
+            else f"{len(problems)} problem{'s' if len(problems) > 1 else ''}: {problems[0]}"
+        )
+    if what == "push":
+        return str(result.get("address", ""))
+    if what == "import":
+        said = f"{result['episodes']} episodes can be reviewed, {result['made']} of them new"
+        return said + (f"; {problems[0]}" if problems else "")
+    parts = result.get("parts") or [result]
+    said = f"{sum(part['episodes'] for part in parts)} episodes, {sum(part['frames'] for part in parts)} rows"
+    again = sum(len(part["encoded"]) for part in parts)
+    left = [thing for part in parts for thing in part["left_out"]]
+    said += f"; {again} videos coded again" if again else ""
+    said += f"; left out: {'; '.join(left)}" if left else ""
+    return said + (f"; {problems[0]}" if problems else "")
+
+
+def checked(name: str) -> Checked | None:
+    """What the newest finished check of the dataset found; None where there is none."""
+    key = key_of("check", name, {})
+    repaired = key_of("repair", name, {})
+    job = Job.objects.filter(key__in=(key, repaired), status=JobStatus.DONE, result__done=True).first()
+    if job is None or job.claimed_at is None or job.finished_at is None:
+        return None
+    changed = datetime.fromtimestamp((dataset_found(name) / layout.INFO).stat().st_mtime, UTC)
+    since = job.finished_at if job.args["what"] == "repair" else job.claimed_at
+    return Checked(job.finished_at, tuple(job.result["problems"]), changed <= since)

@@ -1,0 +1,26 @@
+"""What goes beside an episode into its dataset; apps above this one have it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from uuid import UUID
+
+SideGiver = Callable[[UUID, Path], Mapping[str, Path]]
+
+_givers: list[SideGiver] = []
+
+
+def gives_sides(function: SideGiver) -> SideGiver:
+    """Declare what goes beside a published episode, by kind of side file: an app above this one, from its `ready`.
+
+    It is given the episode and a folder of its own, and writes JSON Lines there.
+    """
+    if function not in _givers:
+        _givers.append(function)
+    return function
+
+
+def sides_of(uuid: UUID, folder: Path) -> dict[str, Path]:
+    """What goes beside the episode, written into `folder`."""
+    return {kind: path for give in _givers for kind, path in give(uuid, folder).items()}

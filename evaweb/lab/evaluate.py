@@ -1,0 +1,107 @@
+"""A blind plan carried out without a human: trial by trial as an operator does it, judged by the bench's own truth.
+
+The operator's session takes the station, confirms its cameras, asks for the next trial, sets up, runs, scores, all over
+REST and the live socket; it is never told which checkpoint it runs. Then the plan's owner closes and reveals the plan.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from evaweb.lab.once import TruthTimes, run_to_its_end, score_by_truth, set_up_and_run
+from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
+
+_STATION_UP_S = 60.0
+_LEASE_S = 10.0
+_TRIES = 3  # of one trial, whose set-up or run was interrupted
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """One trial that counts, as the operator knows it; `times`: milestone -> when it was reached [s of the run]."""
+
+    code: str
+    trial: int
+    attempt: int
+    scene: str
+    position: int
+    success: bool
+    score: float
+    duration_s: float
+    times: Mapping[str, float]
+
+
+def carry_out(operator: Visitor, station: str, plan: str, count: int, tell: Tell) -> list[Made]:
+    """The next `count` trials of a plan; VisitFailed where one does not come about, or tells what it is of."""
+    made = []
+    with closing(LivePage(operator, station)) as page:
+        page.wait(lambda state: state["state"] != "disconnected", _STATION_UP_S, "waiting for the station")
+        page.claim()
+        page.wait(lambda state: state["lease"]["epoch"] == page.epoch, _LEASE_S, "waiting for the lease")
+        operator.post(f"stations/{station}/cameras", {"first": True})
+        for number in range(1, count + 1):
+            one = _made(operator, page, station, plan)
+            made.append(one)
+            verdict = "success" if one.success else "no success"
+            tell(f"{number:>3} of {count}  {one.code}  position {one.position}  {verdict}, {one.score:.0%}")
+    return made
+
+
+def revealed(owner: Visitor, plan: str, made: list[Made]) -> dict[str, Any]:
+    """Close and reveal the plan: what was committed to, its key, and the trials with the names of their checkpoints."""
+    owner.post(f"plans/{plan}/close", {"reason": f"{len(made)} trials were made"})
+    told = owner.post(f"plans/{plan}/reveal", {})
+    trials = [{**asdict(one), "checkpoint": owner.get(f"trials/{one.trial}")["checkpoint"]} for one in made]
+    return {
+        "plan": told["name"],
+        "version": told["version"],
+        "digest": told["digest"],
+        "commitment": told["commitment"],
+        "key": told["key"],
+        "trials": trials,
+    }
+
+
+def _made(operator: Visitor, page: LivePage, station: str, plan: str) -> Made:
+    fault = ""
+    for _ in range(_TRIES):
+        handed = operator.post(f"plans/{plan}/next", {"station": station})
+        code, trial = handed["code"], handed["trial"]
+        _require_blind(code, trial)
+        try:
+            set_up_and_run(page, trial["id"])
+            times = TruthTimes()
+            run_to_its_end(page, trial["id"], float(trial["time_limit_s"]), times)
+            scored = score_by_truth(operator, trial["id"], times)
+        except VisitFailed as failed:
+            fault = str(failed)
+            _give_up(operator, page, trial["id"], fault)
+            continue
+        facts = {name: scored[name] for name in ("scene", "position", "success", "score", "duration_s")}
+        return Made(code=code, trial=trial["id"], attempt=handed["attempt"], times=times.reached, **facts)
+    raise VisitFailed(f"a trial of {plan} was not made in {_TRIES} attempts: {fault}")
+
+
+def _require_blind(code: str, trial: Mapping[str, Any]) -> None:
+    if trial["checkpoint"] != code:
+        raise VisitFailed(
+            f"the plan is not blind for its operator, who was told {trial['checkpoint']!r} of {code}: nothing is run"
+        )
+
+
+def _give_up(operator: Visitor, page: LivePage, trial: int, fault: str) -> None:
+    """Leave the station free for the next attempt, whatever was under way."""
+    status = operator.get(f"trials/{trial}")["status"]
+    if status in ("running", "paused"):
+        page.command("stop")
+        time.sleep(1.0)
+        status = operator.get(f"trials/{trial}")["status"]
+    if status == "prepared":
+        operator.post(f"trials/{trial}/abandon", {"reason": fault[:200]})
+    elif status in ("ended", "scored"):
+        operator.post(f"trials/{trial}/void", {"reason": fault[:200]})

@@ -1,0 +1,1 @@
+"""Evaluations that are planned, frozen and carried out blind."""

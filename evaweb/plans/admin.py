@@ -1,0 +1,201 @@
+"""Plans in the admin pages: drafts are edited there; what is done with a frozen one is on its own page."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django import forms
+from django.contrib import admin, messages
+from django.db import models
+from django.db.models import QuerySet
+from django.http import HttpRequest, HttpResponse
+from django.shortcuts import redirect, render
+from django.urls import URLPattern, path
+
+from evaweb.errors import EvaError
+from evaweb.plans.exchange import exported, imported
+from evaweb.plans.models import Plan, PlanEvent, PlanState
+from evaweb.trials.admin import ReadOnly, Table
+from evaweb.trials.models import Checkpoint, Position, Scene
+
+_FROZEN = (
+    "name",
+    "title",
+    "question",
+    "owner",
+    "positions",
+    "checkpoints",
+    "repetitions",
+    "stations",
+    "strategy",
+    "blind",
+    "stopping",
+    "alpha",
+    "first",
+    "second",
+    "second_rater_share",
+    "match_gate",
+)
+_LARGEST = 2_000_000  # bytes of a file that is imported
+
+
+class PlanForm(forms.ModelForm):
+    """A draft."""
+
+    strategy = Table(required=False, help_text=Plan._meta.get_field("strategy").help_text)
+
+    class Meta:
+        model = Plan
+        fields = _FROZEN
+
+    def clean_strategy(self) -> Any:
+        """An empty field is no strategy of the plan's own."""
+        return self.cleaned_data["strategy"] or None
+
+
+class Conditions(forms.ModelMultipleChoiceField):
+    """Initial conditions of several scenes in one list: numbers alone would be those of any scene."""
+
+    def label_from_instance(self, obj: Any) -> str:
+        """Scene and position."""
+        return f"{obj.scene}, {obj}"
+
+
+class EventInline(ReadOnly, admin.TabularInline):
+    """What was done with it."""
+
+    model = PlanEvent
+    extra = 0
+    fields = ("at", "by", "what", "text")
+    readonly_fields = fields
+
+
+class FileForm(forms.Form):
+    """A file to import."""
+
+    file = forms.FileField(help_text="TOML with scenes, checkpoints and plans, as the export writes it.")
+
+    def clean_file(self) -> str:
+        """Its text."""
+        given = self.cleaned_data["file"]
+        if given.size > _LARGEST:
+            raise forms.ValidationError(f"{given.size} bytes; allowed: {_LARGEST}")
+        try:
+            return str(given.read().decode())
+        except UnicodeDecodeError as error:
+            raise forms.ValidationError(f"This is not a text: {error}") from None
+
+
+@admin.register(Plan)
+class PlanAdmin(admin.ModelAdmin):
+    """What is to be found out, with what trials."""
+
+    form = PlanForm
+    list_display = ("title", "name", "version", "state", "owner", "blind", "trials", "frozen_at")
+    list_filter = ("state", "blind", "owner")
+    search_fields = ("name", "title", "question")
+    list_select_related = ("owner",)
+    filter_horizontal = ("positions", "checkpoints", "stations")
+    prepopulated_fields = {"name": ("title",)}
+    inlines = (EventInline,)
+    actions = ("export",)
+    formfield_overrides = {models.TextField: {"widget": forms.Textarea(attrs={"rows": 3, "cols": 80})}}
+    change_list_template = "plans/admin_list.html"
+    fieldsets = (
+        (None, {"fields": (("title", "name"), "question", "owner")}),
+        ("Trials", {"fields": ("positions", "checkpoints", "repetitions", "stations", "strategy")}),
+        (
+            "Rules",
+            {
+                "fields": (
+                    "blind",
+                    ("first", "second"),
+                    ("stopping", "alpha"),
+                    "second_rater_share",
+                    "match_gate",
+                )
+            },
+        ),
+    )
+
+    def formfield_for_manytomany(
+        self, db_field: Any, request: HttpRequest, **kwargs: Any
+    ) -> forms.ModelMultipleChoiceField | None:
+        """Positions by scene and number."""
+        if db_field.name == "positions":
+            kwargs |= {"form_class": Conditions, "queryset": Position.objects.select_related("scene")}
+        return super().formfield_for_manytomany(db_field, request, **kwargs)
+
+    def get_readonly_fields(self, request: HttpRequest, obj: Plan | None = None) -> tuple[str, ...]:
+        """What was frozen is only read; the name is that of all versions."""
+        if obj is None:
+            return ()
+        return _FROZEN if obj.state != PlanState.DRAFT else (("name",) if obj.version > 1 else ())
+
+    def get_prepopulated_fields(self, request: HttpRequest, obj: Plan | None = None) -> dict[str, Any]:
+        """Only as long as the name can be chosen."""
+        return {} if obj else dict(self.prepopulated_fields)
+
+    def has_delete_permission(self, request: HttpRequest, obj: Plan | None = None) -> bool:
+        """Only of a draft on which nothing rests."""
+        return obj is not None and obj.state == PlanState.DRAFT and not obj.events.exists()
+
+    def get_changeform_initial_data(self, request: HttpRequest) -> dict[str, Any]:
+        """Whoever writes it owns it."""
+        return {"owner": request.user.pk, **super().get_changeform_initial_data(request)}
+
+    def get_urls(self) -> list[URLPattern]:
+        """With the import of a file, and the export of everything."""
+        view = self.admin_site.admin_view
+        return [
+            path("import/", view(self.import_file), name="plans_plan_import"),
+            path("export/", view(self.export_all), name="plans_plan_export"),
+            *super().get_urls(),
+        ]
+
+    def import_file(self, request: HttpRequest) -> HttpResponse:
+        """Take a file, or say what is wrong with it."""
+        form = FileForm(request.POST or None, request.FILES or None)
+        if request.method == "POST" and form.is_valid():
+            try:
+                lines = imported(user=request.user, text=form.cleaned_data["file"])
+            except EvaError as error:
+                form.add_error("file", str(error))
+            else:
+                for line in lines or ["the file is empty"]:
+                    messages.success(request, line)
+                return redirect("admin:plans_plan_changelist")
+        context = {
+            **self.admin_site.each_context(request),
+            "title": "Import",
+            "form": form,
+            "opts": self.opts,
+        }
+        return render(request, "plans/admin_import.html", context)
+
+    def export_all(self, request: HttpRequest) -> HttpResponse:
+        """Every scene, checkpoint and plan, each plan as it is newest."""
+        newest = {plan.name: plan for plan in Plan.objects.order_by("version")}
+        text = exported(
+            scenes=list(Scene.objects.all()),
+            checkpoints=list(Checkpoint.objects.all()),
+            plans=list(newest.values()),
+        )
+        return _download(text, "lab.toml")
+
+    @admin.action(description="Export as TOML")
+    def export(self, request: HttpRequest, rows: QuerySet[Plan]) -> HttpResponse:
+        """Those chosen, with the scenes and checkpoints that they are made of."""
+        plans = list({plan.name: plan for plan in rows.order_by("version")}.values())
+        return _download(exported(plans=plans), f"{plans[0].name}.toml" if len(plans) == 1 else "plans.toml")
+
+    @admin.display(description="trials")
+    def trials(self, plan: Plan) -> str:
+        """How many are foreseen."""
+        n = plan.slots.count() or plan.positions.count() * plan.checkpoints.count() * plan.repetitions
+        return str(n)
+
+
+def _download(text: str, name: str) -> HttpResponse:
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return HttpResponse(text, content_type="application/toml; charset=utf-8", headers=headers)

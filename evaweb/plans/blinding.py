@@ -1,0 +1,56 @@
+"""What hides which checkpoint runs: a fresh code for every trial, and a commitment that nothing was changed after.
+
+Codes are of one trial each, because labels that stay are learned. The commitment is shown before the first trial; the
+reveal shows the key it was made with, from which anybody computes schedule, codes and commitment again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from collections.abc import Sequence
+
+from evaweb.errors import EvaError
+from evaweb.plans.canonical import digest
+from evaweb.plans.chance import KEY_BYTES, Chance
+from evaweb.plans.schedule import Unit
+
+_LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"  # without 0 and O, 1 and I: they are read aloud across a bench
+_LENGTH = 5
+
+
+def codes(key: bytes, count: int) -> list[str]:
+    """`count` different codes, in the order of the trials; they say nothing of what they stand for."""
+    if count > len(_LETTERS) ** _LENGTH // 100:
+        raise EvaError(f"{count} codes; allowed: {len(_LETTERS) ** _LENGTH // 100}")
+    chance, found = Chance(key, "codes"), dict[str, None]()
+    while len(found) < count:
+        found["".join(_LETTERS[chance.below(len(_LETTERS))] for _ in range(_LENGTH))] = None
+    return list(found)
+
+
+def commitment(plan: str, units: Sequence[Unit], key: bytes) -> str:
+    """What is shown before: HMAC-SHA-256 by the key of the plan's digest and of that of its schedule, in hexadecimal.
+
+    With a key of 256 bits it tells nothing of the schedule, and no second schedule has it.
+    """
+    if len(key) != KEY_BYTES:
+        raise EvaError(f"a key of {len(key)} bytes; allowed: {KEY_BYTES}")
+    return hmac.new(key, f"{plan}\n{schedule_digest(units)}".encode(), hashlib.sha256).hexdigest()
+
+
+def schedule_digest(units: Sequence[Unit]) -> str:
+    """SHA-256 of the canonical form of the schedule."""
+    return digest(
+        {
+            "units": [
+                [u.index, u.block, u.checkpoint, u.condition.scene, u.condition.position, u.repetition]
+                for u in units
+            ]
+        }
+    )
+
+
+def verified(plan: str, units: Sequence[Unit], key: bytes, committed: str) -> bool:
+    """Whether plan, schedule and key are those that were committed to."""
+    return hmac.compare_digest(commitment(plan, units, key), committed)

@@ -1,0 +1,74 @@
+"""One way to write a plan down, so that its digest is its name, and what two plans differ in.
+
+The canonical form is that of RFC 8785 for what a plan may hold: keys sorted by code point, no space, UTF-8, numbers as
+Python writes them, which for integers and for floats of everyday size is what ECMAScript writes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from evaweb.errors import EvaError
+
+_MISSING = object()
+
+
+def canonical(document: Mapping[str, Any]) -> bytes:
+    """`document` in its canonical form; EvaError names the value that has none."""
+    return json.dumps(
+        _plain(document, ""), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+    ).encode()
+
+
+def digest(document: Mapping[str, Any]) -> str:
+    """SHA-256 of the canonical form, in hexadecimal."""
+    return hashlib.sha256(canonical(document)).hexdigest()
+
+
+def difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """What makes `new` of `old`, a line each: where, what it was, what it is."""
+    return list(_differences(_plain(old, ""), _plain(new, ""), ""))
+
+
+def _plain(value: Any, where: str) -> Any:
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            raise EvaError(f"{where or 'plan'} = {value}; allowed: finite numbers")
+        return int(value) if value.is_integer() and abs(value) < 2**53 else value
+    if isinstance(value, Mapping):
+        for key in value:
+            if not isinstance(key, str):
+                raise EvaError(f"{where or 'plan'} has the key {key!r}; allowed: texts")
+        return {key: _plain(inner, f"{where}.{key}" if where else key) for key, inner in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, (bytes, bytearray)):
+        return [_plain(inner, f"{where}[{i}]") for i, inner in enumerate(value)]
+    raise EvaError(f"{where or 'plan'} is a {type(value).__name__}; allowed: what JSON has")
+
+
+def _differences(old: Any, new: Any, where: str) -> Iterator[str]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted({*old, *new}):
+            yield from _differences(
+                old.get(key, _MISSING), new.get(key, _MISSING), f"{where}.{key}" if where else key
+            )
+    elif isinstance(old, list) and isinstance(new, list):
+        for i in range(max(len(old), len(new))):
+            yield from _differences(
+                old[i] if i < len(old) else _MISSING, new[i] if i < len(new) else _MISSING, f"{where}[{i}]"
+            )
+    elif old is _MISSING:
+        yield f"{where}: new, {_written(new)}"
+    elif new is _MISSING:
+        yield f"{where}: gone, was {_written(old)}"
+    elif type(old) is not type(new) or old != new:
+        yield f"{where}: {_written(old)} -> {_written(new)}"
+
+
+def _written(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, sort_keys=True)

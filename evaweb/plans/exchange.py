@@ -1,0 +1,304 @@
+"""Scenes, checkpoints and plans as TOML: what one lab wrote down, another reads.
+
+    [[scene]]       name, title, instruction, criterion, layout, time_limit_s, ordered
+    [[scene.position]]   number, label, description, bench
+    [[scene.milestone]]  order, text, points, required, time_limit_s, truth
+    [[checkpoint]]  name, description, policy, digest, parent (a name), tags
+    [[plan]]        name, title, question, positions (scene and number each), checkpoints, repetitions, ...
+
+What is there already under the same name is left where it is the same, changed where no trial was made with it, and
+refused, with the differences, where one was. All of a file is taken, or nothing.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeVar
+
+import tomli_w
+from django.contrib.auth.models import User
+from django.core.exceptions import ValidationError as Invalid
+from django.db import models, transaction
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from evaweb.errors import Conflict, EvaError
+from evaweb.plans.canonical import difference
+from evaweb.plans.documents import checkpoint_of, scene_of
+from evaweb.plans.models import Plan, PlanState, Reference
+from evaweb.roles import Role, require
+from evaweb.stations.models import Station
+from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
+
+_Row = TypeVar("_Row", bound=models.Model)
+_Name = Annotated[str, Field(min_length=1, max_length=120)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class _Position(_Table):
+    number: int = Field(ge=0, lt=2**15)
+    label: str = ""
+    description: str = ""
+    bench: dict[str, list[float]] | None = None
+
+
+class _Milestone(_Table):
+    order: int = Field(ge=0, lt=2**15)
+    text: str = Field(min_length=1, max_length=200)
+    points: int = Field(default=1, ge=1, le=100)
+    required: bool = False
+    time_limit_s: float | None = None
+    truth: str = ""
+
+
+class _Scene(_Table):
+    name: _Name
+    title: _Name
+    instruction: str
+    criterion: str = ""
+    layout: str = ""
+    time_limit_s: float | None = None
+    ordered: bool = False
+    position: list[_Position] = Field(min_length=1)
+    milestone: list[_Milestone] = []
+
+
+class _Checkpoint(_Table):
+    name: _Name
+    description: str = ""
+    policy: dict[str, Any] = {}
+    digest: str = ""
+    parent: str | None = None
+    tags: list[str] = []
+
+
+class _Place(_Table):
+    scene: str
+    number: int
+
+
+class _Plan(_Table):
+    name: _Name
+    title: _Name
+    question: str = ""
+    positions: list[_Place] = Field(min_length=1)
+    checkpoints: list[str] = Field(min_length=1)
+    repetitions: int = Field(default=1, ge=1)
+    stations: list[str] = []
+    strategy: dict[str, Any] | None = None
+    blind: bool = True
+    stopping: str = "none"
+    alpha: float = 0.05
+    comparison: list[str] = Field(default=[], max_length=2)
+    second_rater_share: float = 0.0
+    match_gate: float | None = None
+
+
+class _File(_Table):
+    scene: list[_Scene] = []
+    checkpoint: list[_Checkpoint] = []
+    plan: list[_Plan] = []
+
+
+# --- out ---------------------------------------------------------------------------------------------------
+
+
+def exported(
+    *,
+    scenes: list[Scene] | None = None,
+    checkpoints: list[Checkpoint] | None = None,
+    plans: list[Plan] | None = None,
+) -> str:
+    """A file with these, and with the scenes and checkpoints that the plans are made of."""
+    shown_scenes = {scene.pk: scene for scene in scenes or ()}
+    shown_checkpoints = {row.pk: row for row in checkpoints or ()}
+    for plan in plans or ():
+        shown_scenes |= {p.scene.pk: p.scene for p in plan.positions.select_related("scene")}
+        shown_checkpoints |= {row.pk: row for row in plan.checkpoints.all()}
+    shown_checkpoints |= {
+        above.pk: above for row in list(shown_checkpoints.values()) for above in row.lineage
+    }
+    written = {
+        "scene": [_scene_table(row) for row in sorted(shown_scenes.values(), key=lambda row: row.name)],
+        "checkpoint": [_checkpoint_table(row) for row in sorted(shown_checkpoints.values(), key=_generation)],
+        "plan": [_plan_table(plan) for plan in plans or ()],
+    }
+    return tomli_w.dumps({key: _without_none(rows) for key, rows in written.items() if rows})
+
+
+def _scene_table(scene: Scene) -> dict[str, Any]:
+    table = scene_of(scene, list(scene.positions.order_by("number")))
+    table["position"], table["milestone"] = table.pop("positions"), table.pop("milestones")
+    return table
+
+
+def _checkpoint_table(checkpoint: Checkpoint) -> dict[str, Any]:
+    parent = checkpoint.parent.name if checkpoint.parent else None
+    return {
+        **checkpoint_of(checkpoint),
+        "digest": checkpoint.digest,
+        "parent": parent,
+        "tags": checkpoint.tags,
+    }
+
+
+def _generation(checkpoint: Checkpoint) -> tuple[int, str]:
+    """In this order every checkpoint comes after the one that it was trained on from."""
+    return len(checkpoint.lineage), checkpoint.name
+
+
+def _plan_table(plan: Plan) -> dict[str, Any]:
+    return {
+        "name": plan.name,
+        "title": plan.title,
+        "question": plan.question,
+        "positions": [
+            {"scene": p.scene.name, "number": p.number}
+            for p in plan.positions.select_related("scene").order_by("scene__name", "number")
+        ],
+        "checkpoints": list(plan.checkpoints.order_by("name").values_list("name", flat=True)),
+        "repetitions": plan.repetitions,
+        "stations": list(plan.stations.order_by("name").values_list("name", flat=True)),
+        "strategy": plan.strategy,
+        "blind": plan.blind,
+        "stopping": plan.stopping,
+        "alpha": plan.alpha,
+        "comparison": [row.name for row in (plan.first, plan.second) if row],
+        "second_rater_share": plan.second_rater_share,
+        "match_gate": plan.match_gate,
+    }
+
+
+def _without_none(value: Any) -> Any:
+    """TOML has no null: what is not set is not written."""
+    if isinstance(value, Mapping):
+        return {key: _without_none(inner) for key, inner in value.items() if inner is not None}
+    if isinstance(value, list):
+        return [_without_none(inner) for inner in value]
+    return value
+
+
+# --- in ----------------------------------------------------------------------------------------------------
+
+
+def imported(*, user: User, text: str) -> list[str]:
+    """Take a file; what was done, a line each. EvaError or Conflict names what cannot be, and nothing is taken then."""
+    require(user, Role.ADMIN)
+    given = _read(text)
+    with transaction.atomic():
+        return [
+            *(_take_scene(table) for table in given.scene),
+            *(_take_checkpoint(table) for table in given.checkpoint),
+            *(_take_plan(table, user) for table in given.plan),
+        ]
+
+
+def _read(text: str) -> _File:
+    try:
+        return _File.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise EvaError(f"this is not TOML: {error}") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise EvaError(f"{where}: {first['msg']} (given: {first['input']!r:.80})") from None
+
+
+def _take_scene(table: _Scene) -> str:
+    made = Scene.objects.select_for_update().filter(name=table.name).first()
+    wanted = table.model_dump()
+    positions, milestones = wanted.pop("position"), wanted.pop("milestone")
+    if made is not None:
+        now = _scene_table(made)
+        changes = difference(now, {**wanted, "position": positions, "milestone": milestones})
+        if not changes:
+            return f"scene {made.name}: the same"
+        if made.trials.exists() or Reference.objects.filter(position__scene=made).exists():
+            raise _refused(f"scene {made.name}", changes)
+        made.positions.all().delete()
+        made.milestones.all().delete()
+    scene = made or Scene(name=table.name)
+    for name, value in wanted.items():
+        setattr(scene, name, value)
+    _kept(scene, f"scene {table.name}")
+    for row in positions:
+        _kept(Position(scene=scene, **row), f"position {row['number']} of scene {table.name}")
+    for row in milestones:
+        _kept(Milestone(scene=scene, **row), f"milestone {row['order']} of scene {table.name}")
+    return f"scene {scene.name}: {'changed' if made else 'new'}"
+
+
+def _take_checkpoint(table: _Checkpoint) -> str:
+    made = Checkpoint.objects.select_for_update().filter(name=table.name).first()
+    wanted = table.model_dump()
+    if made is not None:
+        changes = difference(_checkpoint_table(made), wanted)
+        if not changes:
+            return f"checkpoint {made.name}: the same"
+        if made.trials.exists():
+            raise _refused(f"checkpoint {made.name}", changes)
+    checkpoint = made or Checkpoint()
+    parent = wanted.pop("parent")
+    checkpoint.parent = Checkpoint.objects.filter(name=parent).first() if parent else None
+    if parent and checkpoint.parent is None:
+        raise EvaError(
+            f"checkpoint {table.name}: parent = {parent!r} does not exist, here or further up in the file"
+        )
+    for name, value in wanted.items():
+        setattr(checkpoint, name, value)
+    _kept(checkpoint, f"checkpoint {table.name}")
+    return f"checkpoint {checkpoint.name}: {'changed' if made else 'new'}"
+
+
+def _take_plan(table: _Plan, user: User) -> str:
+    newest = Plan.objects.select_for_update().filter(name=table.name).order_by("-version").first()
+    if newest is not None and newest.state != PlanState.DRAFT:
+        raise Conflict(f"plan {table.name} is {newest.get_state_display()}: amend it, then change the draft")
+    plan = newest or Plan(name=table.name, owner=user)
+    wanted = table.model_dump(exclude={"positions", "checkpoints", "stations", "comparison"})
+    for name, value in wanted.items():
+        setattr(plan, name, value)
+    checkpoints = [_named(Checkpoint, "checkpoint", name, table) for name in table.checkpoints]
+    stations = [_named(Station, "station", name, table) for name in table.stations]
+    compared = [_named(Checkpoint, "checkpoint", name, table) for name in table.comparison]
+    if len(compared) == 1:
+        raise EvaError(
+            f"plan {table.name}: comparison = {table.comparison}; allowed: two checkpoints, or none"
+        )
+    plan.first, plan.second = compared or (None, None)
+    _kept(plan, f"plan {table.name}")
+    plan.positions.set([_position(place, table) for place in table.positions])
+    plan.checkpoints.set(checkpoints)
+    plan.stations.set(stations)
+    return f"plan {plan.name}: {'draft changed' if newest else 'new draft'}"
+
+
+def _position(place: _Place, table: _Plan) -> Position:
+    found = Position.objects.filter(scene__name=place.scene, number=place.number).first()
+    if found is None:
+        raise EvaError(f"plan {table.name}: position {place.number} of scene {place.scene!r} does not exist")
+    return found
+
+
+def _named(model: type[_Row], kind: str, name: str, table: _Plan) -> _Row:
+    found = model._default_manager.filter(name=name).first()
+    if found is None:
+        raise EvaError(f"plan {table.name}: {kind} {name!r} does not exist")
+    return found
+
+
+def _kept(row: models.Model, what: str) -> None:
+    try:
+        row.full_clean()
+    except Invalid as invalid:
+        problem = next(iter(invalid.message_dict.items()))
+        raise EvaError(f"{what}: {problem[0]}: {'; '.join(problem[1])}") from None
+    row.save()
+
+
+def _refused(what: str, changes: list[str]) -> Conflict:
+    shown = "; ".join(changes[:5]) + (f"; and {len(changes) - 5} more" if len(changes) > 5 else "")
+    return Conflict(f"{what} has trials and is another one in the file ({shown}): give it another name")

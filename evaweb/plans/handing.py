@@ -1,0 +1,156 @@
+"""The next trial: which slot of a plan a station gets, under which code; each handed out once, in the plan's order.
+
+A block goes to one station whole, so that checkpoints are compared on the same robot at nearly the same time. A station
+finishes its block, repetitions of what did not count included, before it gets another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from django.contrib.auth.models import User
+from django.db import transaction
+from django.db.models import Max, OuterRef, Subquery
+
+from evaweb.errors import Conflict, NotAllowed
+from evaweb.plans import blinding
+from evaweb.plans.canonical import digest
+from evaweb.plans.documents import checkpoint_of, scene_of
+from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState, Slot
+from evaweb.plans.sight import has_looked
+from evaweb.roles import Role, require
+from evaweb.stations.models import Station
+from evaweb.trials import lifecycle
+from evaweb.trials.models import Position, Trial, TrialStatus
+from evaweb.trials.services import trial_create
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How many trials a plan foresees, how many of them count already, and how many attempts there were."""
+
+    total: int
+    counted: int
+    attempts: int
+
+
+def progress(plan: Plan) -> Progress:
+    """How far a plan is; it tells nothing of any checkpoint."""
+    slots = _with_newest(plan.slots.all())
+    counted = slots.filter(newest=TrialStatus.SCORED).count()
+    return Progress(plan.slots.count(), counted, plan.handouts.count())
+
+
+@transaction.atomic
+def hand_out(*, user: User, station: Station, plan: Plan) -> Handout:
+    """Prepare the next trial of `plan` on `station`.
+
+    Conflict where nothing is left for it, its last trial is not finished, or scene or checkpoint are not as frozen;
+    NotAllowed for who has looked behind the blind.
+    """
+    require(user, Role.OPERATOR)
+    held = Plan.objects.select_for_update(of=("self",)).select_related("owner", "evaluation").get(pk=plan.pk)
+    _check(held, user, station)
+    slot, before = _next(held, station)
+    _check_unchanged(held, slot)
+    if slot.station_id is None:
+        held.slots.filter(block=slot.block).update(station=station)
+    number = (held.handouts.aggregate(last=Max("number"))["last"] or 0) + 1
+    trial = trial_create(
+        user=user,
+        station=station,
+        evaluation=held.evaluation,
+        scene=slot.scene,
+        position=slot.position,
+        checkpoint=slot.checkpoint,
+        number=slot.repetition,
+        attempt=before.attempt + 1 if before else 1,
+        strategy=held.strategy,
+    )
+    return Handout.objects.create(
+        plan=held,
+        number=number,
+        slot=slot,
+        trial=trial,
+        code=blinding.codes(bytes(held.key or b""), number)[-1],
+        reason=_why_again(before) if before else "",
+    )
+
+
+@transaction.atomic
+def give_back(*, user: User, plan: Plan, station: Station, reason: str) -> int:
+    """Take the slots that `station` has not begun from it, for others: a robot broke. How many it were."""
+    require(user, Role.OPERATOR)
+    held = Plan.objects.select_for_update(of=("self",)).get(pk=plan.pk)
+    mine = _with_newest(held.slots.filter(station=station))
+    idle = [slot.pk for slot in mine if slot.newest is None or slot.newest in lifecycle.REPEATED]
+    freed = Slot.objects.filter(pk__in=idle).update(station=None)
+    if freed:
+        PlanEvent.objects.create(
+            plan=held, by=user, what="given back", text=f"{freed} trials of {station.name}: {reason.strip()}"
+        )
+    return freed
+
+
+def _check(plan: Plan, user: User, station: Station) -> None:
+    if plan.state != PlanState.FROZEN:
+        raise Conflict(f"{plan} is {plan.get_state_display()}: no trial of it is handed out")
+    if plan.sealed and has_looked(plan, user):
+        raise NotAllowed(
+            f"you have seen results of {plan}, which is blind: ask another operator to run its trials"
+        )
+    allowed = list(plan.stations.values_list("name", flat=True))
+    if allowed and station.name not in allowed:
+        raise Conflict(f"{plan} is for {', '.join(sorted(allowed))}, not for {station.name}")
+
+
+def _next(plan: Plan, station: Station) -> tuple[Slot, Trial | None]:
+    """The slot, and its newest attempt where there was one that does not count."""
+    slots = _with_newest(plan.slots.select_related("scene", "position", "checkpoint").order_by("index"))
+    for slot in slots.filter(station=station):
+        if slot.newest is None or slot.newest in lifecycle.REPEATED:
+            return slot, _newest_trial(slot)
+    fresh = slots.filter(station=None).first()
+    if fresh is not None:
+        return fresh, _newest_trial(fresh)
+    elsewhere = [slot for slot in slots if slot.newest is None or slot.newest in lifecycle.REPEATED]
+    if elsewhere:
+        names = ", ".join(sorted({slot.station.name for slot in elsewhere if slot.station}))
+        raise Conflict(
+            f"nothing is left of {plan} for {station.name}: {len(elsewhere)} trials are on {names}"
+        )
+    raise Conflict(f"all {len(slots)} trials of {plan} are made")
+
+
+def _with_newest(slots):  # type: ignore[no-untyped-def]
+    """Each with the status of its newest attempt as `newest`, None before the first."""
+    newest = Handout.objects.filter(slot=OuterRef("pk")).order_by("-number").values("trial__status")[:1]
+    return slots.annotate(newest=Subquery(newest))
+
+
+def _newest_trial(slot: Slot) -> Trial | None:
+    handout = slot.handouts.select_related("trial").order_by("-number").first()
+    return handout.trial if handout else None
+
+
+def _why_again(before: Trial) -> str:
+    said = f": {before.reason}" if before.reason else ""
+    return f"attempt {before.attempt} was {TrialStatus(before.status).label}{said}"
+
+
+def _check_unchanged(plan: Plan, slot: Slot) -> None:
+    """The scene and the checkpoint are those that were frozen: who edits them meanwhile must amend the plan."""
+    document = plan.document or {}
+    frozen = {scene["name"]: scene for scene in document["scenes"]}[slot.scene.name]
+    numbers = [position["number"] for position in frozen["positions"]]
+    positions = list(Position.objects.filter(scene=slot.scene, number__in=numbers).order_by("number"))
+    if digest(scene_of(slot.scene, positions)) != digest(frozen):
+        raise Conflict(
+            f"scene {slot.scene.name} was changed since {plan} was frozen: change it back, or amend the plan"
+        )
+    # Not which one: the operator must not learn what comes next.
+    if not slot.checkpoint.active:
+        raise Conflict(f"a checkpoint of {plan} is switched off: its owner can say why")
+    policy = {row["name"]: row for row in document["checkpoints"]}[slot.checkpoint.name]
+    if digest(checkpoint_of(slot.checkpoint)) != digest(policy):
+        raise Conflict(f"a checkpoint was changed since {plan} was frozen: change it back, or amend the plan")

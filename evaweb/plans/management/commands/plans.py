@@ -1,0 +1,62 @@
+"""manage.py plans: scenes, checkpoints and plans as files."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from django.contrib.auth.models import User
+from django.core.management.base import BaseCommand, CommandError, CommandParser
+
+from evaweb.errors import EvaError
+from evaweb.plans.exchange import exported, imported
+from evaweb.plans.models import Plan
+from evaweb.trials.models import Checkpoint, Scene
+
+
+class Command(BaseCommand):
+    """`import FILE --user NAME` takes a file, `export [NAME ...]` writes one."""
+
+    help = "Imports and exports scenes, checkpoints and plans as TOML."
+
+    def add_arguments(self, parser: CommandParser) -> None:
+        parts = parser.add_subparsers(dest="what", required=True)
+        take = parts.add_parser("import", help="take a file, whole or not at all")
+        take.add_argument("file", type=Path, help="- for standard input")
+        take.add_argument("--user", required=True, help="the administrator who takes it, and owns its plans")
+        give = parts.add_parser("export", help="write plans with all that they are made of")
+        give.add_argument("names", nargs="*", help="of plans; none: every scene, checkpoint and plan")
+
+    def handle(self, *args: Any, **options: Any) -> None:
+        try:
+            if options["what"] == "import":
+                self._import(options["file"], options["user"])
+            else:
+                self._export(options["names"])
+        except EvaError as error:
+            raise CommandError(str(error)) from error
+
+    def _import(self, file: Path, name: str) -> None:
+        user = User.objects.filter(username=name).first()
+        if user is None:
+            raise CommandError(f"--user {name}: there is no such user")
+        try:
+            text = sys.stdin.read() if str(file) == "-" else file.read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            raise CommandError(f"{file}: {error}") from error
+        for line in imported(user=user, text=text):
+            self.stdout.write(line)
+
+    def _export(self, names: list[str]) -> None:
+        newest = {plan.name: plan for plan in Plan.objects.order_by("version")}
+        unknown = [name for name in names if name not in newest]
+        if unknown:
+            raise CommandError(
+                f"plan {unknown[0]} does not exist; there are: {', '.join(newest) or 'none yet'}"
+            )
+        if names:
+            self.stdout.write(exported(plans=[newest[name] for name in names]))
+        else:
+            everything = {"scenes": list(Scene.objects.all()), "checkpoints": list(Checkpoint.objects.all())}
+            self.stdout.write(exported(**everything, plans=list(newest.values())))

@@ -1,0 +1,280 @@
+"""Plans, the trials that they foresee, who was handed which, and who looked."""
+
+from __future__ import annotations
+
+from django.conf import settings
+from django.core.validators import MaxValueValidator, MinValueValidator
+from django.db import models
+from django.db.models import Q
+
+from evaweb.stations.models import Station
+from evaweb.trials.models import Checkpoint, Evaluation, Position, Scene, Trial
+
+
+class PlanState(models.TextChoices):
+    """Where a plan stands; evaweb.plans.services alone moves it."""
+
+    DRAFT = "draft", "draft"
+    FROZEN = "frozen", "running"
+    CLOSED = "closed", "closed"
+    REVEALED = "revealed", "revealed"
+
+
+class StoppingRule(models.TextChoices):
+    """When the trials of a plan end before they are all made."""
+
+    NONE = "none", "never: all trials are made"
+    EVIDENCE = "evidence", "when the evidence suffices, however often one looks"
+
+
+class Plan(models.Model):
+    """One version of an evaluation: while a draft it is edited, frozen it is a document that nobody changes.
+
+    `document` and its `digest` are the frozen form. `key` is the secret that schedule, codes and commitment are made
+    of, until the reveal.
+    """
+
+    name = models.SlugField(max_length=60, help_text="Of all its versions; in addresses and exports.")
+    version = models.PositiveIntegerField(default=1, editable=False)
+    title = models.CharField(max_length=120)
+    question = models.TextField(
+        blank=True, help_text="What is to be found out, written down before the first trial."
+    )
+    owner = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="plans")
+    state = models.CharField(max_length=8, choices=PlanState, default=PlanState.DRAFT, editable=False)
+
+    positions = models.ManyToManyField(
+        Position, blank=True, help_text="Initial conditions, of any number of scenes."
+    )
+    checkpoints = models.ManyToManyField(Checkpoint, blank=True)
+    repetitions = models.PositiveIntegerField(
+        default=1,
+        validators=[MinValueValidator(1)],
+        help_text="Trials of each checkpoint at each position.",
+    )
+    stations = models.ManyToManyField(
+        Station, blank=True, help_text="Where it is carried out; none: anywhere."
+    )
+    strategy = models.JSONField(
+        null=True, blank=True, help_text="The [strategy] table for all trials; empty: as each station has it."
+    )
+    blind = models.BooleanField(default=True, help_text="Operators are not told which checkpoint runs.")
+    stopping = models.CharField(max_length=8, choices=StoppingRule, default=StoppingRule.NONE)
+    alpha = models.FloatField(default=0.05, validators=[MinValueValidator(0.0001), MaxValueValidator(0.5)])
+    first = models.ForeignKey(
+        Checkpoint,
+        null=True,
+        blank=True,
+        on_delete=models.PROTECT,
+        related_name="+",
+        help_text="Of the comparison that the question is about.",
+    )
+    second = models.ForeignKey(Checkpoint, null=True, blank=True, on_delete=models.PROTECT, related_name="+")
+    second_rater_share = models.FloatField(
+        default=0.0,
+        validators=[MinValueValidator(0), MaxValueValidator(1)],
+        help_text="Share of the trials that somebody else scores again from the video, not knowing the first score.",
+    )
+    match_gate = models.FloatField(
+        "least match",
+        null=True,
+        blank=True,
+        validators=[MinValueValidator(0), MaxValueValidator(1)],
+        help_text="Of the bench with the position's reference picture, 0 to 1, before a trial runs; a lower one "
+        "needs a reason. Empty: it is measured, and stops nothing.",
+    )
+
+    evaluation = models.OneToOneField(
+        Evaluation, null=True, blank=True, editable=False, on_delete=models.PROTECT, related_name="plan"
+    )
+    document = models.JSONField(null=True, blank=True, editable=False)
+    digest = models.CharField(max_length=64, blank=True, editable=False)
+    commitment = models.CharField(max_length=64, blank=True, editable=False)
+    key = models.BinaryField(max_length=32, null=True, editable=False)
+    amends = models.OneToOneField(
+        "self", null=True, blank=True, editable=False, on_delete=models.PROTECT, related_name="amendment"
+    )
+    amended_because = models.TextField(blank=True, editable=False)
+    created_at = models.DateTimeField(auto_now_add=True)
+    frozen_at = models.DateTimeField(null=True, blank=True, editable=False)
+    closed_at = models.DateTimeField(null=True, blank=True, editable=False)
+    closed_because = models.TextField(blank=True, editable=False)
+    revealed_at = models.DateTimeField(null=True, blank=True, editable=False)
+    revealed_by = models.ForeignKey(
+        settings.AUTH_USER_MODEL,
+        null=True,
+        blank=True,
+        editable=False,
+        on_delete=models.PROTECT,
+        related_name="+",
+    )
+
+    class Meta:
+        ordering = ("name", "-version")
+        constraints = [
+            models.UniqueConstraint(fields=("name", "version"), name="plan_version_once"),
+            models.CheckConstraint(
+                condition=Q(state="draft", document=None)
+                | (~Q(state="draft") & Q(document__isnull=False) & Q(evaluation__isnull=False)),
+                name="plan_frozen_has_its_document",
+            ),
+        ]
+
+    def __str__(self) -> str:
+        return f"{self.title} v{self.version}"
+
+    @property
+    def sealed(self) -> bool:
+        """Whether which checkpoint ran is still a secret."""
+        return self.blind and self.state in (PlanState.FROZEN, PlanState.CLOSED)
+
+
+class Slot(models.Model):
+    """One trial that a plan foresees, in the order in which they are handed out."""
+
+    plan = models.ForeignKey(Plan, on_delete=models.PROTECT, related_name="slots")
+    index = models.PositiveIntegerField()
+    block = models.PositiveIntegerField(
+        help_text="Slots of one initial condition, carried out one after the other."
+    )
+    checkpoint = models.ForeignKey(Checkpoint, on_delete=models.PROTECT, related_name="+")
+    scene = models.ForeignKey(Scene, on_delete=models.PROTECT, related_name="+")
+    position = models.ForeignKey(Position, on_delete=models.PROTECT, related_name="+")
+    repetition = models.PositiveIntegerField()
+    station = models.ForeignKey(
+        Station,
+        null=True,
+        blank=True,
+        on_delete=models.PROTECT,
+        related_name="+",
+        help_text="Which has taken its block.",
+    )
+
+    class Meta:
+        ordering = ("plan", "index")
+        constraints = [models.UniqueConstraint(fields=("plan", "index"), name="slot_index_once")]
+        indexes = [models.Index(fields=("plan", "station", "index")), models.Index(fields=("plan", "block"))]
+
+    def __str__(self) -> str:
+        return f"{self.plan} #{self.index}"
+
+
+class Handout(models.Model):
+    """A trial as it was handed out: for which slot, under which code. Each attempt is a handout of its own."""
+
+    plan = models.ForeignKey(Plan, on_delete=models.PROTECT, related_name="handouts")
+    number = models.PositiveIntegerField(help_text="In the order in which they were handed out, from 1.")
+    slot = models.ForeignKey(Slot, on_delete=models.PROTECT, related_name="handouts")
+    trial = models.OneToOneField(Trial, on_delete=models.PROTECT, related_name="handout")
+    code = models.CharField(max_length=8, help_text="What the operator knows it by.")
+    reason = models.TextField(blank=True, help_text="Of a repetition: what became of the attempt before.")
+    handed_at = models.DateTimeField(auto_now_add=True)
+
+    class Meta:
+        ordering = ("plan", "number")
+        constraints = [
+            models.UniqueConstraint(fields=("plan", "number"), name="handout_number_once"),
+            models.UniqueConstraint(fields=("plan", "code"), name="handout_code_once"),
+        ]
+
+    def __str__(self) -> str:
+        return f"{self.plan} {self.code}"
+
+
+class Look(models.Model):
+    """Somebody saw what is sealed: from then on they run none of the plan's trials."""
+
+    plan = models.ForeignKey(Plan, on_delete=models.PROTECT, related_name="looks")
+    user = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
+    at = models.DateTimeField(auto_now_add=True)
+
+    class Meta:
+        ordering = ("plan", "at")
+        constraints = [models.UniqueConstraint(fields=("plan", "user"), name="look_once")]
+
+    def __str__(self) -> str:
+        return f"{self.user} saw {self.plan}"
+
+
+class PlanEvent(models.Model):
+    """What was done with a plan, by whom and why: never changed, never removed."""
+
+    plan = models.ForeignKey(Plan, on_delete=models.PROTECT, related_name="events")
+    at = models.DateTimeField(auto_now_add=True)
+    by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
+    what = models.CharField(max_length=12)
+    text = models.TextField()
+
+    class Meta:
+        ordering = ("plan", "id")
+
+    def __str__(self) -> str:
+        return f"{self.plan}: {self.what}"
+
+
+class Reference(models.Model):
+    """What a camera of a station shows of a position as it should lie; without a position what the camera shows at all.
+
+    The newest of a camera and position counts. `picture` names a file: see evaweb.plans.pictures.
+    """
+
+    station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="references")
+    camera = models.CharField(max_length=63)
+    position = models.ForeignKey(
+        Position, null=True, blank=True, on_delete=models.PROTECT, related_name="references"
+    )
+    picture = models.CharField(max_length=64)
+    by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
+    at = models.DateTimeField(auto_now_add=True)
+
+    class Meta:
+        ordering = ("-pk",)
+        indexes = [models.Index(fields=("station", "position", "camera", "-id"))]
+
+    def __str__(self) -> str:
+        return f"{self.camera} of {self.station} at {self.position or 'any position'}"
+
+
+class Achieved(models.Model):
+    """What a camera showed when a trial's run was asked for, and how well that matches the reference there was.
+
+    `match` is evaweb.plans.pictures.match; `override` the reason why a lower one than the plan's least was accepted.
+    """
+
+    trial = models.ForeignKey(Trial, on_delete=models.PROTECT, related_name="achieved")
+    camera = models.CharField(max_length=63)
+    picture = models.CharField(max_length=64)
+    reference = models.ForeignKey(
+        Reference, null=True, blank=True, on_delete=models.PROTECT, related_name="+"
+    )
+    match = models.FloatField(null=True, blank=True)
+    override = models.TextField(blank=True)
+    by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
+    at = models.DateTimeField(auto_now_add=True)
+
+    class Meta:
+        ordering = ("trial", "pk")
+
+    def __str__(self) -> str:
+        return f"{self.trial_id}: {self.camera}"
+
+
+class CameraCheck(models.Model):
+    """Somebody confirmed that each camera of a station shows what its reference shows.
+
+    It holds for them until the station is started anew or half a day is over. `seen`: camera -> {"picture",
+    "reference", "match"}.
+    """
+
+    station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="camera_checks")
+    boot = models.CharField(max_length=64, blank=True)
+    seen = models.JSONField()
+    by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
+    at = models.DateTimeField(auto_now_add=True)
+
+    class Meta:
+        ordering = ("-pk",)
+        indexes = [models.Index(fields=("station", "by", "-id"))]
+
+    def __str__(self) -> str:
+        return f"{self.station}, {self.by}, {self.at:%Y-%m-%d %H:%M}"

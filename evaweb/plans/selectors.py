@@ -1,0 +1,45 @@
+"""Reads of plans."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django.db.models import Q, QuerySet
+
+from evaweb.errors import NotFound
+from evaweb.plans.models import Handout, Plan, PlanState
+from evaweb.roles import Role, role_of
+from evaweb.stations.models import Station
+from evaweb.trials.models import Trial
+
+
+def plan_list(*, user: Any) -> QuerySet[Plan]:
+    """All versions of all plans; drafts are their owners' and administrators', for they name checkpoints."""
+    rows = Plan.objects.select_related("owner", "first", "second").prefetch_related("stations")
+    if role_of(user) is Role.ADMIN:
+        return rows
+    return rows.filter(~Q(state=PlanState.DRAFT) | Q(owner=user))
+
+
+def plan_get(*, name: str, version: int | None = None, user: Any) -> Plan:
+    """That version, or the newest that is no draft; NotFound lists what there is."""
+    rows = plan_list(user=user).filter(name=name).order_by("-version")
+    frozen = rows.exclude(state=PlanState.DRAFT)
+    found = rows.filter(version=version).first() if version is not None else frozen.first() or rows.first()
+    if found is None:
+        known = ", ".join(sorted(set(plan_list(user=user).values_list("name", flat=True)))) or "none yet"
+        raise NotFound(
+            f"plan {name:.60}{f' v{version}' if version else ''} does not exist; there are: {known}"
+        )
+    return found
+
+
+def plans_open(*, station: Station) -> list[Plan]:
+    """Those of which trials are handed out at this station."""
+    rows = Plan.objects.filter(state=PlanState.FROZEN).select_related("owner")
+    return list(rows.filter(Q(stations=None) | Q(stations=station)).distinct().order_by("title", "-version"))
+
+
+def handout_of(*, trial: Trial) -> Handout | None:
+    """How a trial was handed out, None for one of no plan."""
+    return Handout.objects.select_related("plan", "slot").filter(trial=trial).first()

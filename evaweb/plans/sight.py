@@ -1,0 +1,92 @@
+"""Who may know which checkpoint a trial of a blind plan is of.
+
+Before the reveal everybody is blind who has not looked. Its owner and administrators may look, by an act that is
+recorded, as far as they do not run its trials: whoever has been handed one of them sees nothing, whoever has looked is
+handed none. Which comes first decides, so that also somebody who is alone in a lab can do either, but not both.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django.db import transaction
+
+from evaweb.errors import NotAllowed
+from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState
+from evaweb.roles import Role, role_of
+from evaweb.sight import EVERYTHING, Sight, declare, masked
+from evaweb.trials.models import Checkpoint
+from evaweb.trials.selectors import UNFINISHED
+
+
+def sealed_for(plan: Plan, user: Any) -> bool:
+    """Whether this user is not to know; looking is not recorded by asking."""
+    return plan.sealed and not has_looked(plan, user)
+
+
+@transaction.atomic
+def look(plan: Plan, user: Any) -> None:
+    """Record that this user sees what is sealed from now on; raise NotAllowed where they may not."""
+    held = Plan.objects.select_for_update(of=("self",)).select_related("owner").get(pk=plan.pk)
+    if not held.sealed:
+        return
+    why = _why_not(held, user)
+    if why:
+        raise NotAllowed(why)
+    _, made = Look.objects.get_or_create(plan=held, user=user)
+    if made:
+        PlanEvent.objects.create(
+            plan=held, by=user, what="looked", text="behind the blind, before the reveal"
+        )
+
+
+def has_looked(plan: Plan, user: Any) -> bool:
+    """Whether this user has seen what is sealed."""
+    return Look.objects.filter(plan=plan, user=user).exists()
+
+
+def may_look(plan: Plan, user: Any) -> bool:
+    """Whether `look` would be granted, or was."""
+    return not plan.sealed or _why_not(plan, user) == ""
+
+
+def hidden_from(user: Any) -> Sight:
+    """What plans hide from this user now; see evaweb.sight."""
+    plans = Plan.objects.filter(blind=True, state__in=(PlanState.FROZEN, PlanState.CLOSED))
+    if user.pk is not None:
+        plans = plans.exclude(looks__user=user)
+    # Names as they were frozen too: recordings keep the name that a checkpoint had.
+    found = list(plans.values_list("pk", "title", "version", "document__checkpoints"))
+    if not found:
+        return EVERYTHING
+    keys = [pk for pk, *_ in found]
+    hidden = dict(Checkpoint.objects.filter(plan__in=keys).values_list("pk", "name"))
+    frozen = {row["name"] for *_, rows in found for row in rows or ()}
+    handed = list(
+        Handout.objects.filter(plan__in=keys)
+        .order_by()
+        .values_list("trial__station__name", "trial__status")
+        .distinct()
+    )
+    return Sight(
+        checkpoints=frozenset(hidden),
+        names=frozenset({*hidden.values(), *frozen}),
+        stations=frozenset(station for station, _ in handed),
+        keys=frozenset(keys),
+        revealed=frozenset(
+            Plan.objects.filter(state=PlanState.REVEALED).values_list("evaluation_id", flat=True)
+        ),
+        at_work=frozenset(station for station, status in handed if status in UNFINISHED),
+        plans=f"{masked(f'{title} v{version}' for _, title, version, _ in found)} is blind until it is revealed",
+    )
+
+
+declare(hidden_from)
+
+
+def _why_not(plan: Plan, user: Any) -> str:
+    if plan.owner_id != user.pk and role_of(user) is not Role.ADMIN:
+        return f"{plan} is blind until its owner, {plan.owner.get_username()}, reveals it"
+    if plan.handouts.filter(trial__operator=user).exists():
+        return f"you have run trials of {plan}, which is blind: what they were of is shown after the reveal"
+    return ""

@@ -1,0 +1,26 @@
+"""The job of a preflight whose station does not run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from evaweb.jobs.kinds import Work, job_kind
+from evaweb.preflights.models import Preflight, PreflightStatus
+from evaweb.preflights.selectors import preflight_get
+from evaweb.preflights.services import preflight_ended
+
+LONGEST_S = 3600.0
+
+
+@job_kind("preflight")
+def preflight(work: Work) -> Mapping[str, Any]:
+    """Ask the checkpoint's server by the deployment file of the station; args: preflight."""
+    row: Preflight = preflight_get(id=work.args["preflight"])
+    from runtime.preflight.child import fly  # web processes know this kind too, and never do it
+
+    if row.status != PreflightStatus.RUNNING:
+        return {"verdict": row.verdict}
+    work.tell(f"asking the server of {row.checkpoint}")
+    asked = {"deployment": row.station.deployment, "changes": {"policy": row.policy}}
+    return {"verdict": preflight_ended(row=row, report=fly(asked, LONGEST_S)).verdict}

@@ -1,0 +1,31 @@
+"""Reads of preflights."""
+
+from __future__ import annotations
+
+from uuid import UUID
+
+from django.db.models import QuerySet
+
+from evaweb.errors import NotFound
+from evaweb.preflights.models import Preflight
+from evaweb.sight import EVERYTHING, Sight
+from evaweb.trials.models import Checkpoint
+
+
+def preflight_list(*, checkpoint: Checkpoint | None = None, sight: Sight = EVERYTHING) -> QuerySet[Preflight]:
+    """The newest first, of one checkpoint or of all; none of hidden ones, whose names they have."""
+    rows: QuerySet[Preflight] = sight.open(Preflight.objects.select_related("checkpoint", "station", "user"))
+    return rows if checkpoint is None else rows.filter(checkpoint=checkpoint)
+
+
+def preflight_get(*, id: UUID | str, sight: Sight = EVERYTHING) -> Preflight:
+    """That one; NotFound."""
+    found = preflight_list(sight=sight).filter(pk=id).first()
+    if found is None:
+        raise NotFound(f"preflight {id} does not exist")
+    return found
+
+
+def preflight_newest(*, checkpoint: Checkpoint) -> Preflight | None:
+    """What is known of a checkpoint now, None where it was never asked."""
+    return preflight_list(checkpoint=checkpoint).first()

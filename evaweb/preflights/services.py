@@ -1,0 +1,197 @@
+"""Preflights are asked for at a station; where it does not run, of the worker of its machine.
+
+The station's process is where the server has to be reached from: it has the keys, the tunnels and the deployment. It
+flies one at a time, never while it is at work, and keeps the report until it is fetched.
+"""
+
+from __future__ import annotations
+
+import logging
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from django.db import transaction
+from django.utils import timezone
+
+from evaweb.errors import Conflict, StationGone
+from evaweb.frames import plain
+from evaweb.jobs.models import JobStatus
+from evaweb.jobs.selectors import job_newest
+from evaweb.jobs.services import enqueue
+from evaweb.preflights.models import Preflight, PreflightStatus
+from evaweb.roles import Role, require
+from evaweb.stations.models import Station
+from evaweb.stations.selectors import station_list
+from evaweb.stations.wire import NoAnswer, wire_to
+from evaweb.trials.models import Checkpoint
+from runtime import deployment
+from runtime.deployment import ConfigurationError, server_of
+from runtime.messages import Command
+
+log = logging.getLogger(__name__)
+_AT_WORK = ("setting_up", "running", "holding")
+_LOOK_S = 0.5  # how long another station may take to say which server it uses
+_UNTOLD = timedelta(hours=1)  # after which one is over of which nobody said how long it may take
+
+
+def preflight_ask(*, user: Any, checkpoint: Checkpoint, station: Station | None = None) -> Preflight:
+    """Begin a preflight with the deployment of `station`, None: the first that can; its row, which is under way.
+
+    Never within a transaction. Raises NotAllowed, Conflict where the station or the server is at work, StationGone
+    where neither the station runs nor its deployment file is known.
+    """
+    require(user, Role.OPERATOR)
+    chosen = station or _first_station()
+    row = Preflight(checkpoint=checkpoint, station=chosen, user=user, policy=checkpoint.policy)
+    try:
+        server = _server_of_station(chosen, checkpoint)
+    except NoAnswer:
+        raise
+    except StationGone as gone:
+        return _of_worker(row, gone)
+    _require_free(server, chosen)
+    return _of_station(row)
+
+
+def preflight_settled(*, row: Preflight) -> Preflight:
+    """Find out how it went, where nobody has; leaves it as it is while it is under way, or nobody can know."""
+    if row.status != PreflightStatus.RUNNING:
+        return row
+    if row.by == Preflight.By.WORKER:
+        return _settled_by_job(row)
+    try:
+        ack = wire_to(row.station.name).request(
+            Command(str(uuid4()), "preflight_report", {"id": str(row.pk)}), timeout=_LOOK_S
+        )
+    except NoAnswer:
+        return _overdue(row, f"{row.station.name} has not answered since")
+    except StationGone as gone:
+        return preflight_ended(row=row, reason=str(gone))
+    if ack.status != "done":
+        return preflight_ended(row=row, reason=f"{row.station.name} was restarted meanwhile: ask again")
+    told = plain(ack.data)
+    if told["running"]:
+        return _overdue(row, "it did not end in time")
+    return preflight_ended(row=row, report=told["report"], reason=told["failure"])
+
+
+def preflights_settled(*, station: Station) -> int:
+    """Find out how those of a station went that nobody looked at; how many are over now."""
+    rows = Preflight.objects.filter(station=station, status=PreflightStatus.RUNNING)
+    settled = [preflight_settled(row=row) for row in rows.select_related("station", "checkpoint")]
+    return sum(row.status != PreflightStatus.RUNNING for row in settled)
+
+
+def preflight_ended(*, row: Preflight, report: dict[str, Any] | None = None, reason: str = "") -> Preflight:
+    """Keep what was found, or why there is nothing; the first that says so has said it."""
+    status = PreflightStatus.LOST if report is None else PreflightStatus.DONE
+    facts = {
+        "status": status,
+        "report": report,
+        "reason": "" if report else reason,
+        "ended_at": timezone.now(),
+    }
+    Preflight.objects.filter(pk=row.pk, status=PreflightStatus.RUNNING).update(**facts)
+    row.refresh_from_db()
+    return row
+
+
+def _first_station() -> Station:
+    """The first one that runs and is not at work, else the first whose deployment is known."""
+    stations = list(station_list())
+    for station in stations:
+        try:
+            if wire_to(station.name).status(timeout=_LOOK_S).get("state") not in _AT_WORK:
+                return station
+        except StationGone:
+            continue
+    known = next((station for station in stations if station.deployment), None)
+    if known is None:
+        raise Conflict(
+            "no station is free, and none has a deployment file for the worker: start a station, or wait for one"
+        )
+    return known
+
+
+def _server_of_station(station: Station, checkpoint: Checkpoint) -> str:
+    """The server that a preflight there would ask; "" where the table does not fit, which the report will say."""
+    ack = wire_to(station.name).request(Command(str(uuid4()), "policy_server", {"policy": checkpoint.policy}))
+    return str(ack.data["server"]) if ack.status == "done" else ""
+
+
+def _require_free(server: str, besides: Station) -> None:
+    """No other station may be at work with the same server: its answers would come late, or be somebody else's."""
+    if not server:
+        return
+    for other in station_list(all_of_them=True).exclude(pk=besides.pk):
+        try:
+            ack = wire_to(other.name).request(Command(str(uuid4()), "policy_server"), timeout=_LOOK_S)
+        except StationGone:
+            continue
+        if ack.data.get("server") == server and ack.data.get("state") in _AT_WORK:
+            raise Conflict(
+                f"{other} is {str(ack.data['state']).replace('_', ' ')} with the same policy server: a preflight would "
+                "disturb it; wait until its run is over"
+            )
+
+
+def _of_station(row: Preflight) -> Preflight:
+    """A row first, so that whatever the station begins is known."""
+    row.by = Preflight.By.STATION
+    row.save(force_insert=True)
+    checkpoint = {"id": row.checkpoint_id, "name": row.checkpoint.name}
+    args = {"id": str(row.pk), "policy": row.policy, "checkpoint": checkpoint}
+    username = row.user.get_username() if row.user else ""
+    command = Command(str(uuid4()), "preflight", args, user=username, holder=username)
+    try:
+        ack = wire_to(row.station.name).request(command)
+    except NoAnswer:
+        return row  # it may have begun: whoever looks next finds out
+    except StationGone:
+        row.delete()
+        raise
+    if ack.status != "done":
+        row.delete()
+        raise Conflict(ack.reason)
+    row.over_by = timezone.now() + timedelta(seconds=float(ack.data["longest_s"]))
+    Preflight.objects.filter(pk=row.pk).update(over_by=row.over_by)
+    return row
+
+
+def _of_worker(row: Preflight, gone: StationGone) -> Preflight:
+    """By the worker, with the deployment file of the station that does not run."""
+    file = row.station.deployment
+    if not file:
+        raise StationGone(
+            f"{gone}; its deployment file is not known here, so the worker cannot ask in its place"
+        )
+    try:
+        resolved = deployment.changed(deployment.load(Path(file)), {"policy": row.policy}, "the checkpoint")
+        _require_free(server_of(resolved.deployment), row.station)
+    except ConfigurationError as error:
+        log.info("%s: %s", row, error)  # what the report will say
+    row.by = Preflight.By.WORKER
+    with transaction.atomic():
+        row.save(force_insert=True)
+        enqueue(kind="preflight", key=_key(row), args={"preflight": str(row.pk)})
+    return row
+
+
+def _settled_by_job(row: Preflight) -> Preflight:
+    job = job_newest(key=_key(row))
+    if job is None:
+        return preflight_ended(row=row, reason="its job is gone: ask again")
+    if job.status == JobStatus.FAILED:
+        return preflight_ended(row=row, reason=job.error)
+    return _overdue(row, "no worker has done it: is one running?")
+
+
+def _overdue(row: Preflight, reason: str) -> Preflight:
+    over_by = row.over_by or row.asked_at + _UNTOLD
+    return preflight_ended(row=row, reason=reason) if timezone.now() > over_by else row
+
+
+def _key(row: Preflight) -> str:
+    return f"preflight:{row.pk}"

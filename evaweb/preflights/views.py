@@ -1,0 +1,50 @@
+"""One preflight, as a fragment of another page or as a page of its own."""
+
+from __future__ import annotations
+
+from typing import Any
+from uuid import UUID
+
+from django.http import HttpRequest, HttpResponse
+from django.shortcuts import render
+from django.utils import timezone
+from django.views.decorators.http import require_GET
+
+from evaweb.preflights import services
+from evaweb.preflights.models import Preflight, PreflightStatus
+from evaweb.preflights.reading import ago, read
+from evaweb.preflights.selectors import preflight_get, preflight_newest
+from evaweb.preflights.sight import shown
+from evaweb.sight import sight_for
+from evaweb.trials.selectors import checkpoint_get
+
+
+@require_GET
+def preflight(request: HttpRequest, id: UUID) -> HttpResponse:
+    """How it goes, or went."""
+    row = services.preflight_settled(row=preflight_get(id=id, sight=sight_for(request)))
+    fragment = request.headers.get("HX-Request")
+    return render(request, f"preflights/{'result' if fragment else 'page'}.html", context(row, request.user))
+
+
+@require_GET
+def newest(request: HttpRequest) -> HttpResponse:
+    """What is known of the checkpoint that the address names; nothing where it was never asked."""
+    checkpoint = checkpoint_get(name=request.GET.get("checkpoint", ""), sight=sight_for(request))
+    row = preflight_newest(checkpoint=checkpoint)
+    if row is None:
+        return render(request, "preflights/never.html", {"checkpoint": checkpoint})
+    settled = services.preflight_settled(row=row)
+    return render(request, "preflights/result.html", context(settled, request.user))
+
+
+def context(row: Preflight, user: Any) -> dict[str, Any]:
+    """What the template of a result needs."""
+    seen = shown(row, user)
+    return {
+        "preflight": row,
+        "seen": seen,
+        "read": read(seen.report),
+        "running": row.status == PreflightStatus.RUNNING,
+        "age": ago(row.asked_at, timezone.now()),
+    }

@@ -1,0 +1,1 @@
+"""What the trials of an evaluation say: tables, comparisons, plots, reports."""

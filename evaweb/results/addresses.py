@@ -1,0 +1,37 @@
+"""Where the trials behind a figure, a comparison and two recordings are found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from urllib.parse import urlencode
+
+from django.urls import reverse
+
+from evaweb.plans.models import Plan
+from evaweb.results.analysis import Comparison
+from evaweb.results.filters import Chosen
+from evaweb.results.selectors import Question
+
+
+def trials_address(plan: Plan, only: Chosen, **more: str) -> str:
+    """Where those trials are listed."""
+    question = Question(
+        scene=only.scene, position=only.position, station=only.station, operator=only.operator
+    )
+    address = reverse("result-plan-trials", args=[plan.name, plan.version])
+    return f"{address}?{replace(question, **more).query}"
+
+
+def compare_address(plan: Plan, found: Comparison, only: Chosen) -> str:
+    """Where both are side by side."""
+    query = urlencode({"first": found.first, "second": found.second})
+    address = reverse("result-compare", args=[plan.name, plan.version])
+    return f"{address}?{query}" + (f"&{only.query}" if only.query else "")
+
+
+def beside_address(episodes: Sequence[object]) -> str:
+    """Where recordings are played on one clock; "" where there are not two."""
+    if len(episodes) < 2:
+        return ""
+    return reverse("side-by-side") + "?" + urlencode([("show", str(uuid)) for uuid in episodes])

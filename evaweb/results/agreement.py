@@ -1,0 +1,127 @@
+"""Whether raters agree, and which checkpoint people prefer, as JSON; what cannot be said is null with its reason."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from evaweb.plans.models import Plan
+from evaweb.results.models import Preference, Rating
+from evaweb.statistics.base import StatisticsError
+from evaweb.statistics.preference import Comparison, NotIdentifiedError, preferences
+from evaweb.statistics.proportions import proportion
+from evaweb.statistics.raters import cohen_kappa, gwet_ac1, krippendorff_alpha
+from evaweb.trials.models import TrialStatus
+
+OUTCOMES = {"first", "second", "tie"}
+
+
+def agreement_of(plan: Plan) -> dict[str, Any] | None:
+    """Of first and second raters, on success and on each milestone; None where nobody rated again."""
+    rows = list(
+        Rating.objects.filter(trial__evaluation=plan.evaluation_id, trial__status=TrialStatus.SCORED)
+        .select_related("trial__verdict")
+        .prefetch_related("trial__verdict__outcomes")
+        .order_by("trial_id", "pk")
+    )
+    if not rows:
+        return None
+    verdicts = [(row.trial.verdict, row) for row in rows if row.trial.verdict]
+    return {
+        "trials": len({row.trial_id for row in rows}),
+        "ratings": len(rows),
+        "blind": sum(row.blind for row in rows),
+        "success": agreement([(first.success, second.success) for first, second in verdicts]),
+        "milestones": _milestones(verdicts),
+        "score_alpha": _alpha([[first.score, second.score] for first, second in verdicts]),
+    }
+
+
+def agreement(pairs: list[tuple[bool, bool]]) -> dict[str, Any]:
+    """Of two raters on yes and no: how often the same, beyond chance by Cohen, Gwet and Krippendorff."""
+    same = proportion(sum(one == other for one, other in pairs), len(pairs))
+    return {
+        "n": same.n,
+        "same": same.successes,
+        "wilson": [same.interval.low, same.interval.high] if same.interval else None,
+        "kappa": cohen_kappa(pairs),
+        "ac1": gwet_ac1(pairs),
+        "alpha": krippendorff_alpha([[float(one), float(other)] for one, other in pairs]),
+    }
+
+
+def _milestones(verdicts: list[tuple[Any, Rating]]) -> dict[str, Any]:
+    pairs: dict[str, list[tuple[bool, bool]]] = {}
+    for verdict, rating in verdicts:
+        again = {text: bool(reached) for text, reached in rating.milestones}
+        for row in verdict.outcomes.all():
+            if row.text in again:
+                pairs.setdefault(row.text, []).append((row.reached, again[row.text]))
+    return {text: agreement(found) for text, found in pairs.items()}
+
+
+def _alpha(units: list[list[float]]) -> float | None:
+    try:
+        return krippendorff_alpha(units, "interval")
+    except StatisticsError:
+        return None
+
+
+def comparisons_of(plan: Plan) -> list[Comparison]:
+    """What people preferred, by checkpoint."""
+    rows = Preference.objects.filter(plan=plan).order_by("pk")
+    named = rows.values_list("first__checkpoint__name", "second__checkpoint__name", "outcome")
+    return [Comparison(first, second, outcome) for first, second, outcome in named]
+
+
+def preferences_of(plan: Plan) -> dict[str, Any] | None:
+    """Bradley-Terry-Davidson of the plan's preferences; None where there is none.
+
+    Where no finite, unique ranking exists `ranking` is null, `reason` says why, and `groups` can be ranked among
+    themselves.
+    """
+    given = comparisons_of(plan)
+    if not given:
+        return None
+    counted = {"n": len(given), "ties": sum(row.outcome == "tie" for row in given)}
+    nothing = {"ranking": None, "contrasts": [], "tie": None, "order": None, "order_z": None, "groups": []}
+    try:
+        found = preferences(given, order_effect=True)
+    except StatisticsError:
+        try:
+            found = preferences(given)
+        except NotIdentifiedError as error:
+            return {
+                **counted,
+                **nothing,
+                "reason": str(error),
+                "groups": [list(part) for part in error.components],
+            }
+        except StatisticsError as error:
+            return {**counted, **nothing, "reason": str(error)}
+    return {
+        **counted,
+        "ranking": [
+            {
+                "checkpoint": name,
+                "worth": found.worth[name],
+                "error": found.error[name],
+                "rating": found.rating(name),
+            }
+            for name in found.ranking
+        ],
+        "contrasts": [
+            {
+                "first": one,
+                "second": other,
+                "difference": row.difference,
+                "win_probability": row.win_probability,
+                "interval": [row.win_interval.low, row.win_interval.high],
+            }
+            for (one, other), row in found.contrasts.items()
+        ],
+        "tie": found.tie,
+        "order": found.order,
+        "order_z": found.order_z,
+        "groups": [],
+        "reason": "",
+    }

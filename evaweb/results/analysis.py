@@ -1,0 +1,280 @@
+"""Everything that is said of an evaluation, computed once from its outcomes; pages, exports and reports only show it.
+
+Methods are those of docs/evaluation.md. What cannot be computed is None with its reason in `notes`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TypeVar
+
+from evaweb.results.outcomes import Interruption, Outcome, Pair, by_checkpoint, paired
+from evaweb.statistics import strata
+from evaweb.statistics.base import LEVEL, Interval, StatisticsError
+from evaweb.statistics.difference import Difference, ExactTest, barnard, newcombe, probability_better
+from evaweb.statistics.many import holm, letters
+from evaweb.statistics.paired import McNemar, cluster_bootstrap, mcnemar
+from evaweb.statistics.progress import Step, funnel
+from evaweb.statistics.proportions import Posterior, Proportion, clopper_pearson, posterior, proportion
+from evaweb.statistics.rates import Rate, rate
+from evaweb.statistics.sequential import Evidence, score_evidence, success_evidence
+from evaweb.statistics.survival import Curve, RestrictedMean, kaplan_meier, log_rank, restricted_mean
+
+SEED = 20_260  # of every bootstrap: the same data give the same interval
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Funnel:
+    """The milestones of one scene, with the words for each."""
+
+    scene: str
+    labels: tuple[str, ...]
+    steps: tuple[Step, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """One checkpoint: how often it succeeds, how far it comes, how long it takes.
+
+    `macro` is the mean of the scenes' success rates, each equally heavy; `cells` success by initial condition;
+    `speed` successes per hour of running, `interventions` how often a run was broken off. `curve` and `mean_time` are
+    of time to success [s], with trials that failed counted as cut off at their end.
+    """
+
+    checkpoint: str
+    success: Proportion
+    exact: Interval | None
+    posterior: Posterior
+    score: strata.Mean | None
+    macro: strata.Mean | None
+    scenes: dict[str, Proportion]
+    cells: dict[str, Proportion]
+    funnels: tuple[Funnel, ...]
+    curve: Curve | None
+    mean_time: RestrictedMean | None
+    speed: Rate | None
+    interventions: Rate | None
+    failures: tuple[tuple[str, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Two checkpoints: the first minus the second.
+
+    `test` is Barnard's and `corrected` its probability after Holm's correction for all pairs of the evaluation; valid
+    for a number of trials fixed beforehand. `evidence` and `score_evidence` may be looked at any time.
+    """
+
+    first: str
+    second: str
+    difference: Difference
+    test: ExactTest
+    corrected: float
+    better: float
+    pairs: int
+    paired: McNemar | None
+    clustered: Difference | None
+    stratified: strata.Stratified | None
+    evidence: Evidence
+    score_evidence: Evidence
+    log_rank: float | None
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Analysis:
+    """The evaluation: its arms, best first, all comparisons, and letters that sum those up."""
+
+    n: int
+    arms: tuple[Arm, ...]
+    comparisons: tuple[Comparison, ...]
+    letters: dict[str, str]
+    alpha: float
+    notes: tuple[str, ...]
+
+    def arm(self, checkpoint: str) -> Arm:
+        """That of a checkpoint."""
+        return next(arm for arm in self.arms if arm.checkpoint == checkpoint)
+
+    def compared(self, first: str, second: str) -> Comparison | None:
+        """Their comparison, whichever way round it was made; None where there is none."""
+        return next((c for c in self.comparisons if {c.first, c.second} == {first, second}), None)
+
+
+def analyse(
+    outcomes: Sequence[Outcome],
+    interruptions: Sequence[Interruption] = (),
+    *,
+    alpha: float = 0.05,
+    primary: tuple[str, str] | None = None,
+) -> Analysis:
+    """All of it; `primary` is compared in this direction, others the better one first.
+
+    `interruptions` count for how often a checkpoint needs somebody, and for nothing else.
+    """
+    arms = by_checkpoint(outcomes)
+    ranked = sorted(arms, key=lambda name: (-sum(o.success for o in arms[name]) / len(arms[name]), name))
+    couples = [_directed(couple, primary) for couple in combinations(ranked, 2)]
+    tests = [_test(arms[one], arms[other]) for one, other in couples]
+    corrected = holm([test.p for test in tests])
+    comparisons = tuple(
+        _comparison(one, other, arms[one], arms[other], test, p, alpha)
+        for (one, other), test, p in zip(couples, tests, corrected, strict=True)
+    )
+    apart = {frozenset((c.first, c.second)) for c in comparisons if c.corrected <= alpha}
+    return Analysis(
+        len(outcomes),
+        tuple(_arm(name, arms[name], [i for i in interruptions if i.checkpoint == name]) for name in ranked),
+        comparisons,
+        letters(ranked, apart),
+        alpha,
+        tuple(_imbalances(arms)),
+    )
+
+
+def _directed(couple: tuple[str, str], primary: tuple[str, str] | None) -> tuple[str, str]:
+    return primary if primary is not None and set(couple) == set(primary) else couple
+
+
+def _counts(trials: Sequence[Outcome]) -> tuple[int, int]:
+    return sum(o.success for o in trials), len(trials)
+
+
+def _test(first: Sequence[Outcome], second: Sequence[Outcome]) -> ExactTest:
+    return barnard(*_counts(first), *_counts(second))
+
+
+def _arm(name: str, trials: list[Outcome], interruptions: list[Interruption]) -> Arm:
+    successes, n = _counts(trials)
+    scenes, cells = _grouped(trials, lambda o: o.scene), _grouped(trials, lambda o: o.condition)
+    timed = [o for o in trials if o.duration is not None]
+    durations = [o.duration for o in timed if o.duration is not None]
+    succeeded = [o.success for o in timed]
+    return Arm(
+        name,
+        proportion(successes, n),
+        clopper_pearson(successes, n),
+        posterior(successes, n),
+        strata.macro_average({"all": [o.score for o in trials]}, seed=SEED),
+        strata.macro_average(
+            {key: [float(o.success) for o in rows] for key, rows in scenes.items()}, seed=SEED
+        ),
+        {key: proportion(*_counts(rows)) for key, rows in scenes.items()},
+        {key: proportion(*_counts(rows)) for key, rows in cells.items()},
+        tuple(_funnel(scene, rows) for scene, rows in scenes.items() if rows[0].milestones),
+        kaplan_meier(durations, succeeded) if timed else None,
+        restricted_mean(durations, succeeded, max(durations)) if timed and max(durations) > 0 else None,
+        rate(sum(succeeded), sum(durations)) if timed and sum(durations) > 0 else None,
+        _interventions(durations, interruptions),
+        tuple(Counter(o.failure for o in trials if not o.success and o.failure).most_common()),
+    )
+
+
+def _interventions(durations: list[float], interruptions: list[Interruption]) -> Rate | None:
+    exposure = sum(durations) + sum(i.duration for i in interruptions if i.duration is not None)
+    return rate(len(interruptions), exposure) if exposure > 0 else None
+
+
+def _funnel(scene: str, trials: Sequence[Outcome]) -> Funnel:
+    labels = trials[0].labels or tuple(str(i + 1) for i in range(len(trials[0].milestones)))
+    return Funnel(scene, labels, tuple(funnel([o.milestones for o in trials])))
+
+
+def _comparison(
+    one: str,
+    other: str,
+    first: list[Outcome],
+    second: list[Outcome],
+    test: ExactTest,
+    corrected: float,
+    alpha: float,
+) -> Comparison:
+    notes: list[str] = []
+    pairs = paired(first, second)
+    counts = (*_counts(first), *_counts(second))
+    return Comparison(
+        one,
+        other,
+        newcombe(*counts),
+        test,
+        corrected,
+        probability_better(*counts),
+        len(pairs),
+        mcnemar([(p.first.success, p.second.success) for p in pairs]) if pairs else None,
+        _said(notes, lambda: _clustered(first, second)),
+        _said(notes, lambda: _stratified(first, second)),
+        success_evidence([(p.first.success, p.second.success) for p in pairs], alpha),
+        score_evidence([(p.first.score, p.second.score) for p in pairs], alpha),
+        _log_rank(first, second),
+        (*notes, *_waiting(pairs, first, second)),
+    )
+
+
+def _clustered(first: Sequence[Outcome], second: Sequence[Outcome]) -> Difference:
+    ours, theirs = (
+        {key: [float(o.success) for o in rows] for key, rows in _grouped(arm, lambda o: o.condition).items()}
+        for arm in (first, second)
+    )
+    return cluster_bootstrap(ours, theirs, seed=SEED, level=LEVEL)
+
+
+def _stratified(first: Sequence[Outcome], second: Sequence[Outcome]) -> strata.Stratified | None:
+    ours, theirs = _grouped(first, lambda o: o.scene), _grouped(second, lambda o: o.scene)
+    shared = sorted(set(ours) & set(theirs))
+    if len(set(ours) | set(theirs)) < 2:
+        return None  # of one scene there is nothing to stratify
+    return strata.mantel_haenszel(
+        [strata.Table(*_counts(ours[key]), *_counts(theirs[key])) for key in shared]
+    )
+
+
+def _log_rank(first: Sequence[Outcome], second: Sequence[Outcome]) -> float | None:
+    def timed(arm: Sequence[Outcome]) -> tuple[list[float], list[bool]]:
+        known = [(o.duration, o.success) for o in arm if o.duration is not None]
+        return [d for d, _ in known], [ok for _, ok in known]
+
+    one, other = timed(first), timed(second)
+    return log_rank(one, other) if one[0] and other[0] else None
+
+
+def _waiting(pairs: Sequence[Pair], first: Sequence[Outcome], second: Sequence[Outcome]) -> list[str]:
+    left = len(first) + len(second) - 2 * len(pairs)
+    if not left:
+        return []
+    waiting = "1 trial has" if left == 1 else f"{left} trials have"
+    return [f"{waiting} no partner in the block yet, and no part in the evidence"]
+
+
+def _imbalances(arms: dict[str, list[Outcome]]) -> list[str]:
+    """Initial conditions that not all checkpoints were tried from equally often: pooled rates mislead then."""
+    cells = {name: Counter(o.condition for o in trials) for name, trials in arms.items()}
+    every = sorted({condition for counts in cells.values() for condition in counts})
+    uneven = [key for key in every if len({counts[key] for counts in cells.values()}) > 1]
+    if not uneven:
+        return []
+    return [
+        f"{len(uneven)} of {len(every)} initial conditions were not tried equally often with all checkpoints "
+        f"({uneven[0]} and others)"
+        if len(uneven) > 1
+        else f"{uneven[0]} was not tried equally often with all checkpoints"
+    ]
+
+
+def _grouped(trials: Sequence[Outcome], key: Callable[[Outcome], str]) -> dict[str, list[Outcome]]:
+    found: dict[str, list[Outcome]] = defaultdict(list)
+    for outcome in trials:
+        found[key(outcome)].append(outcome)
+    return dict(sorted(found.items()))
+
+
+def _said(notes: list[str], compute: Callable[[], T]) -> T | None:
+    """What it computes, or None with the reason among the notes."""
+    try:
+        return compute()
+    except StatisticsError as error:
+        notes.append(str(error))
+        return None

@@ -1,0 +1,16 @@
+"""Registers the app."""
+
+from django.apps import AppConfig
+
+
+class ResultsConfig(AppConfig):
+    """What trials of plans say, what second raters say of them, and which of two people prefer."""
+
+    name = "evaweb.results"
+    default_auto_field = "django.db.models.BigAutoField"
+
+    def ready(self) -> None:
+        from evaweb.guards import keep
+        from evaweb.results.guarded import GUARDS
+
+        keep(self, GUARDS)

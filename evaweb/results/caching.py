@@ -1,0 +1,85 @@
+"""Analyses that are kept as long as nothing they were made from has changed, in each process of the web.
+
+Nobody invalidates anything: what is kept carries a fingerprint of its rows, which is asked for again each time. A
+score, a correction or a void changes it, and so does the name of a checkpoint or of a scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from typing import Any
+
+from django.db.models import Count, Max, Q, Sum
+
+from evaweb.plans.models import Plan
+from evaweb.remembered import Kept
+from evaweb.results.analysis import Analysis, analyse
+from evaweb.results.filters import Chosen
+from evaweb.results.gathering import interruptions_of_plan, outcomes_of_plan
+from evaweb.results.outcomes import Interruption, Outcome
+from evaweb.trials.models import Scene, Trial, TrialStatus
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """What was run of a plan: the trials that count, and those that were broken off."""
+
+    outcomes: list[Outcome]
+    interruptions: list[Interruption]
+
+
+_runs: Kept[Runs] = Kept()
+_analyses: Kept[Analysis] = Kept()
+_pages: Kept[dict[str, Any]] = Kept()
+
+
+def fingerprint(plan: Plan) -> Hashable:
+    """Changes whenever an analysis of the plan would."""
+    trials = Trial.objects.filter(evaluation=plan.evaluation_id)
+    counted: dict[str, Any] = trials.aggregate(
+        n=Count("pk"),
+        scored=Count("pk", filter=Q(status=TrialStatus.SCORED)),
+        broken=Count("pk", filter=Q(status=TrialStatus.INTERRUPTED)),
+        verdicts=Sum("verdict_id", filter=Q(status=TrialStatus.SCORED)),
+        newest=Max("verdict_id"),
+        seconds=Sum("duration_s"),
+        changed=Max("changed_at"),
+    )
+    names = plan.checkpoints.order_by("pk").values_list("pk", "name")
+    scenes = Scene.objects.filter(positions__plan=plan.pk).order_by("pk").distinct().values_list("pk", "name")
+    return (*counted.values(), *names, *scenes)
+
+
+def runs_of(plan: Plan, at: Hashable = None) -> Runs:
+    """All runs of the plan; `at` is its fingerprint where that is known already."""
+    now = at or fingerprint(plan)
+    return _runs.get(
+        (plan.pk, plan.digest), now, lambda: Runs(outcomes_of_plan(plan), interruptions_of_plan(plan))
+    )
+
+
+def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> Analysis:
+    """What the plan's trials say, or those of them that are chosen."""
+    now = at or fingerprint(plan)
+    runs, which = runs_of(plan, now), only or Chosen()
+
+    def make() -> Analysis:
+        primary = (plan.first.name, plan.second.name) if plan.first and plan.second else None
+        return analyse(
+            which.apply(runs.outcomes), which.apply(runs.interruptions), alpha=plan.alpha, primary=primary
+        )
+
+    return _analyses.get((plan.pk, plan.digest, which), now, make)
+
+
+def page_of(plan: Plan, name: Hashable, at: Hashable, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What the page of that name shows of the plan's trials, figures included."""
+    return _pages.get((plan.pk, plan.digest, name), at, make)
+
+
+def forget() -> None:
+    """Drop what is kept: the next who ask wait for it to be made."""
+    _runs.clear()
+    _analyses.clear()
+    _pages.clear()

@@ -1,0 +1,183 @@
+"""What a reviewer asks of an evaluation, answered from the record: no answer is anybody's claim."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from django.db.models import Count, F, Min
+
+from evaweb.plans.models import Look, Plan, StoppingRule
+from evaweb.results.analysis import Analysis
+from evaweb.results.models import Rating
+from evaweb.trials.models import Score, Trial, TrialStatus
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """A practice, whether it was kept to ("yes", "partly", "no"), and what the record says."""
+
+    practice: str
+    kept: str
+    record: str
+
+
+def checklist(plan: Plan, analysis: Analysis) -> list[Item]:
+    """All of it."""
+    trials = Trial.objects.filter(evaluation=plan.evaluation_id)
+    return [
+        _beforehand(plan, trials),
+        _criteria(plan),
+        _order(plan),
+        _blind(plan),
+        _complete(plan, trials),
+        _voids(plan, trials),
+        _corrections(plan),
+        _second_rater(plan, trials),
+        _narrative(analysis),
+        _recorded(trials),
+        _configurations(trials),
+        Item(
+            "Rates with n and interval; all pairs corrected for how many there are",
+            "yes",
+            f"95 % Wilson and Clopper-Pearson; Holm over {len(analysis.comparisons)} comparisons",
+        ),
+        _spread(trials),
+    ]
+
+
+def _yes(kept: bool) -> str:
+    return "yes" if kept else "no"
+
+
+def _beforehand(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
+    begun = trials.aggregate(first=Min("prepared_at"))["first"]
+    before = bool(plan.frozen_at and (begun is None or plan.frozen_at <= begun))
+    said = bool(plan.question.strip() and plan.first and plan.second)
+    kept = "yes" if before and said else "partly" if before else "no"
+    words = plan.question.strip() or "no question was written down"
+    compared = (
+        f"compares {plan.first} and {plan.second}" if plan.first and plan.second else "names no comparison"
+    )
+    return Item(
+        "Question and comparison before the first trial",
+        kept,
+        f"“{words}”; {compared}; frozen {plan.frozen_at:%Y-%m-%d %H:%M} UTC",
+    )
+
+
+def _criteria(plan: Plan) -> Item:
+    scenes = (plan.document or {})["scenes"]
+    written = sum(bool(scene["criterion"].strip()) for scene in scenes)
+    stones = sum(bool(scene["milestones"]) for scene in scenes)
+    kept = "yes" if written == stones == len(scenes) else "partly" if written or stones else "no"
+    return Item(
+        "Criteria of success and milestones written down",
+        kept,
+        f"{written} of {len(scenes)} scenes have a criterion, {stones} have milestones",
+    )
+
+
+def _order(plan: Plan) -> Item:
+    return Item(
+        "Randomised, interleaved, balanced",
+        "yes",
+        f"blocks of one initial condition with every checkpoint; commitment {plan.commitment[:16]}…"
+        + (", verified at the reveal" if plan.revealed_at else ", not yet revealed"),
+    )
+
+
+def _blind(plan: Plan) -> Item:
+    looked = [look.user.get_username() for look in Look.objects.filter(plan=plan).select_related("user")]
+    if not plan.blind:
+        return Item("Operators blind", "no", "the plan was open")
+    words = (
+        f"looked before the reveal, and ran no trial: {', '.join(looked)}"
+        if looked
+        else "nobody looked before the reveal"
+    )
+    return Item("Operators blind", "yes", f"a fresh code for every trial; {words}")
+
+
+def _complete(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
+    foreseen, counted = plan.slots.count(), trials.filter(status=TrialStatus.SCORED).count()
+    rule = plan.get_stopping_display()
+    kept = "yes" if counted == foreseen or plan.stopping == StoppingRule.EVIDENCE else "partly"
+    closed = f"; closed because: {plan.closed_because}" if plan.closed_because else ""
+    return Item(
+        "As many trials as planned, or a rule to stop",
+        kept,
+        f"{counted} of {foreseen} count; stops {rule}{closed}",
+    )
+
+
+def _voids(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
+    voided = trials.filter(status=TrialStatus.VOIDED)
+    late = voided.filter(voided_at__gte=plan.revealed_at).count() if plan.revealed_at else 0
+    words = f"{voided.count()} voided, each with a reason, {late} of them after the reveal"
+    return Item("No trial left out after unblinding", _yes(late == 0), words)
+
+
+def _corrections(plan: Plan) -> Item:
+    scores = Score.objects.filter(trial__evaluation=plan.evaluation_id)
+    corrected = scores.exclude(reason="").count()
+    late = scores.filter(scored_at__gte=plan.revealed_at).count() if plan.revealed_at else 0
+    return Item(
+        "Scores kept as they were given",
+        _yes(late == 0),
+        f"{corrected} corrections, each a row of its own with author and reason, {late} scores after the reveal",
+    )
+
+
+def _second_rater(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
+    rated = (
+        Rating.objects.filter(trial__evaluation=plan.evaluation_id, blind=True)
+        .values("trial")
+        .distinct()
+        .count()
+    )
+    n = trials.filter(status=TrialStatus.SCORED).count()
+    wanted = round(plan.second_rater_share * n)
+    kept = "yes" if rated and rated >= wanted else "partly" if rated else "no"
+    return Item(
+        "A second, blind rater", kept, f"{rated} of {n} trials were rated again; planned were {wanted}"
+    )
+
+
+def _narrative(analysis: Analysis) -> Item:
+    failed = sum(arm.success.n - arm.success.successes for arm in analysis.arms)
+    named = sum(n for arm in analysis.arms for _, n in arm.failures)
+    kept = "yes" if named == failed else "partly" if named else "no"
+    return Item("Why trials failed", kept, f"{named} of {failed} failures have a reason")
+
+
+def _recorded(trials) -> Item:  # type: ignore[no-untyped-def]
+    counted = trials.filter(status=TrialStatus.SCORED)
+    n, recorded = counted.count(), counted.filter(episode__isnull=False).count()
+    kept = "yes" if recorded == n else "partly" if recorded else "no"
+    return Item("Every trial on record", kept, f"{recorded} of {n} trials that count have a recording")
+
+
+def _configurations(trials) -> Item:  # type: ignore[no-untyped-def]
+    rows = (
+        trials.filter(status=TrialStatus.SCORED, episode__isnull=False)
+        .values("checkpoint", "station")
+        .annotate(n=Count("episode__configuration_hash", distinct=True))
+    )
+    changed = [row for row in rows if row["n"] > 1]
+    if not rows:
+        return Item("One configuration throughout", "no", "no recording says which it was")
+    words = f"{len(changed)} of {len(rows)} combinations of checkpoint and station had more than one"
+    return Item("One configuration throughout", "yes" if not changed else "partly", words)
+
+
+def _spread(trials) -> Item:  # type: ignore[no-untyped-def]
+    counted = trials.filter(status=TrialStatus.SCORED).aggregate(
+        conditions=Count("position", distinct=True),
+        stations=Count("station", distinct=True),
+        operators=Count("operator", distinct=True),
+        days=Count(F("started_at__date"), distinct=True),
+    )
+    words = "{conditions} initial conditions, {stations} stations, {operators} operators, {days} days".format(
+        **counted
+    )
+    return Item("Tried under different conditions", _yes(counted["conditions"] > 1), words)

@@ -1,0 +1,151 @@
+"""An analysis as plain JSON: what REST answers, what a report holds, and what its script computes again.
+
+Intervals are [low, high]; those that a bootstrap drew stand under `bootstrap`, because whoever draws anew gets them
+only nearly. A list of curve points is [time, share, low, high, at risk].
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from evaweb.results.analysis import Analysis, Arm, Comparison
+from evaweb.statistics.base import Interval
+from evaweb.statistics.difference import Difference
+from evaweb.statistics.proportions import Proportion
+from evaweb.statistics.rates import Rate
+from evaweb.statistics.sequential import Evidence
+from evaweb.statistics.strata import Mean
+
+
+def analysis_document(analysis: Analysis) -> dict[str, Any]:
+    """All of it."""
+    return {
+        "n": analysis.n,
+        "alpha": analysis.alpha,
+        "letters": dict(analysis.letters),
+        "arms": {arm.checkpoint: arm_document(arm) for arm in analysis.arms},
+        "comparisons": [comparison_document(comparison) for comparison in analysis.comparisons],
+    }
+
+
+def arm_document(arm: Arm) -> dict[str, Any]:
+    """One checkpoint."""
+    return {
+        **proportion_document(arm.success),
+        "clopper_pearson": _ends(arm.exact),
+        "posterior": {
+            "a": arm.posterior.a,
+            "b": arm.posterior.b,
+            "interval": _ends(arm.posterior.interval()),
+        },
+        "score": _mean(arm.score),
+        "macro": _mean(arm.macro),
+        "scenes": {name: proportion_document(found) for name, found in arm.scenes.items()},
+        "positions": {name: proportion_document(found) for name, found in arm.cells.items()},
+        "milestones": {
+            funnel.scene: [
+                {
+                    "label": label,
+                    "of_all": proportion_document(step.of_all),
+                    "of_previous": proportion_document(step.of_previous),
+                }
+                for label, step in zip(funnel.labels, funnel.steps, strict=True)
+            ]
+            for funnel in arm.funnels
+        },
+        "time_to_success": _time(arm),
+        "successes_per_hour": _rate(arm.speed),
+        "interruptions_per_hour": _rate(arm.interventions),
+        "failures": dict(arm.failures),
+    }
+
+
+def comparison_document(found: Comparison) -> dict[str, Any]:
+    """Two checkpoints, the first minus the second."""
+    return {
+        "first": found.first,
+        "second": found.second,
+        "difference": {"value": found.difference.value, "newcombe": _ends(found.difference.interval)},
+        "barnard": {"statistic": found.test.statistic, "p": found.test.p, "holm": found.corrected},
+        "probability_better": found.better,
+        "pairs": found.pairs,
+        "mcnemar": found.paired
+        and {
+            "first_only": found.paired.first_only,
+            "second_only": found.paired.second_only,
+            "pairs": found.paired.pairs,
+            "p": found.paired.p,
+        },
+        "over_conditions": _clustered(found.clustered),
+        "over_scenes": found.stratified
+        and {
+            "odds_ratio": found.stratified.odds_ratio,
+            "p": found.stratified.p,
+            "crude": found.stratified.crude,
+            "stratified": found.stratified.stratified,
+            "reversed": found.stratified.reversed,
+        },
+        "evidence": _evidence(found.evidence),
+        "score_evidence": _evidence(found.score_evidence),
+        "log_rank": found.log_rank,
+    }
+
+
+def proportion_document(found: Proportion) -> dict[str, Any]:
+    """x of n with its Wilson interval; null where n is 0."""
+    return {
+        "successes": found.successes,
+        "n": found.n,
+        "rate": found.rate,
+        "wilson": _ends(found.interval),
+    }
+
+
+def _ends(interval: Interval | None) -> list[float] | None:
+    return None if interval is None else [interval.low, interval.high]
+
+
+def _mean(found: Mean | None) -> dict[str, Any] | None:
+    return None if found is None else {"value": found.value, "bootstrap": _ends(found.interval)}
+
+
+def _clustered(found: Difference | None) -> dict[str, Any] | None:
+    return None if found is None else {"value": found.value, "bootstrap": _ends(found.interval)}
+
+
+def _rate(found: Rate | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    return {
+        "events": found.events,
+        "exposure_s": found.exposure,
+        "per_hour": found.per_hour,
+        "garwood": _ends(found.interval),
+    }
+
+
+def _time(arm: Arm) -> dict[str, Any] | None:
+    curve, mean = arm.curve, arm.mean_time
+    if curve is None:
+        return None
+    points = zip(curve.times, curve.share, curve.low, curve.high, curve.at_risk, strict=True)
+    return {
+        "n": curve.n,
+        "successes": curve.successes,
+        "median_s": curve.median,
+        "curve": [list(point) for point in points],
+        "restricted_mean": mean
+        and {"value_s": mean.value, "interval": _ends(mean.interval), "until_s": mean.until},
+    }
+
+
+def _evidence(found: Evidence) -> dict[str, Any]:
+    return {
+        "pairs": found.pairs,
+        "log_e_first": list(found.first),
+        "log_e_second": list(found.second),
+        "p_first": found.p_first[-1] if found.pairs else 1.0,
+        "p_second": found.p_second[-1] if found.pairs else 1.0,
+        "stop": found.stop,
+        "winner": found.winner,
+    }

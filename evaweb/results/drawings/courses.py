@@ -1,0 +1,183 @@
+"""How trials went: milestones as a funnel, time to success as a curve, evidence pair by pair."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from evaweb.results.analysis import Arm, Funnel
+from evaweb.results.drawings.svg import (
+    LINE,
+    Drawing,
+    Scale,
+    drawing,
+    element,
+    label,
+    legend,
+    line,
+    link,
+    mark,
+    number,
+    percent_axis,
+    series,
+    ticks,
+    words,
+    wrapped,
+)
+from evaweb.results.wording import evidence_words, rate_words
+from evaweb.statistics.sequential import Evidence
+
+WIDTH = 600
+_LABELS = 180
+_LETTERS = 22  # of a milestone or a name in a line
+_LEGEND = 190  # right of a curve
+
+
+def funnel(
+    scene: str, found: Sequence[tuple[int, str, Funnel]], links: Mapping[tuple[str, int], str]
+) -> Drawing:
+    """Of each milestone a bar per checkpoint, each (series, name, its milestones), with its interval as a line.
+
+    `links` by checkpoint and place of the milestone lead to the trials that did not reach it.
+    """
+    steps = len(found[0][2].steps) if found else 0
+    bar, gap = 16, 16
+    whose, y = legend([(i, name) for i, name, _ in found], WIDTH)
+    height = y + steps * (bar * len(found) + gap) + 30
+    scale = Scale(0, 1, _LABELS, WIDTH - 160)
+    parts = [whose, percent_axis(scale, height - 26, y)]
+    for at in range(steps):
+        milestone = found[0][2].labels[at]
+        middle = y + bar * len(found) / 2
+        parts.append(
+            label(
+                _LABELS - 12, middle + 3, f"{at + 1} {milestone}", _LETTERS, "end", 2 if len(found) < 3 else 3
+            )
+        )
+        for i, name, rows in found:
+            of_all, before = rows.steps[at].of_all, rows.steps[at].of_previous
+            title = f"{name}, {milestone}: {rate_words(of_all)}; of those before: {rate_words(before)}"
+            row = ""
+            if of_all.rate is not None and of_all.interval is not None:
+                half = y + bar / 2 - 1
+                row += element(
+                    "rect", x=scale(0), y=y, width=scale(of_all.rate) - scale(0), height=float(bar - 3),
+                    class_=f"beam {series(i)}",
+                )  # fmt: skip
+                row += line(
+                    [(scale(of_all.interval.low), half), (scale(of_all.interval.high), half)], "error"
+                )
+            row += words(WIDTH - 150, y + bar - 4, rate_words(of_all), class_="value small")
+            parts.append(link(links.get((name, at), ""), title, row))
+            y += bar
+        y += gap
+    said = "; ".join(
+        f"{name}: "
+        + ", ".join(f"{t} {rate_words(s.of_all)}" for t, s in zip(rows.labels, rows.steps, strict=True))
+        for _, name, rows in found
+    )
+    return drawing(WIDTH, height, f"Milestones of {scene}, share of all trials", said, *parts, kind="funnel")
+
+
+def survival(arms: Sequence[Arm]) -> Drawing | None:
+    """Share that has not succeeded yet over time, with pointwise bands and a tick where trials were cut off."""
+    drawn = [(i, arm, arm.curve) for i, arm in enumerate(arms) if arm.curve is not None]
+    if not drawn:
+        return None
+    end = max(curve.times[-1] for _, _, curve in drawn)
+    height, bottom = 300, 250
+    x, y = Scale(0, end, 50, WIDTH - _LEGEND), Scale(0, 1, bottom, 14)
+    parts = []
+    for share in range(0, 101, 25):
+        parts.append(line([(x(0), y(share / 100)), (x(end), y(share / 100))], "grid"))
+        parts.append(words(42, y(share / 100) + 5, f"{share}", "end", "tick"))
+    parts += [words(x(t), bottom + 18, number(t), "middle", "tick") for t in ticks(0, end, 6)]
+    parts.append(words(x(end / 2), bottom + 38, "time [s]", "middle", "tick"))
+    said = []
+    labels: list[tuple[float, int, str]] = []
+    for i, arm, curve in drawn:
+        low, high = _steps(curve.times, curve.low), _steps(curve.times, curve.high)
+        parts.append(
+            element("path", d=_area([(x(a), y(b)) for a, b in high], [(x(a), y(b)) for a, b in low]),
+                    class_=f"shade {series(i)}")
+        )  # fmt: skip
+        parts.append(line([(x(a), y(b)) for a, b in _steps(curve.times, curve.share)], f"curve {series(i)}"))
+        labels.append((y(curve.share[-1]), i, arm.checkpoint))
+        median = f"half within {curve.median:.1f} s" if curve.median is not None else "half never"
+        said.append(f"{arm.checkpoint}: {median}, {curve.successes} of {curve.n} succeeded")
+    parts += _names(labels, x(end), bottom)
+    return drawing(
+        WIDTH, height, "Time to success: share in percent that has not succeeded yet", "; ".join(said), *parts,
+        kind="survival",
+    )  # fmt: skip
+
+
+def evidence(found: Evidence, first: str, second: str, foreseen: int | None = None) -> Drawing:
+    """The e-processes of both directions pair by pair, on a scale of powers, with the line at which they suffice."""
+    wanted = math.log10(2 / found.alpha)
+    paths = [[value / math.log(10) for value in path] for path in (found.first, found.second)]
+    end = max(found.pairs, foreseen or 0, 1)
+    values = [v for path in paths for v in path]
+    x = Scale(0, end, 60, WIDTH - _LEGEND)
+    y = Scale(
+        min(-2.0, max(-4.0, min(values, default=0.0))),
+        max(wanted + 1, *values, 0) if values else wanted + 1,
+        230,
+        14,
+    )
+    parts = []
+    for power in ticks(y.low, y.high, 6):
+        if power == int(power):
+            parts.append(line([(x(0), y(power)), (x(end), y(power))], "zero" if power == 0 else "grid"))
+            parts.append(words(52, y(power) + 5, f"{10.0**power:g}", "end", "tick"))
+    whole = [pair for pair in ticks(0, end, 6) if pair == int(pair)]
+    parts += [words(x(pair), 248, number(pair, 6), "middle", "tick") for pair in whole]
+    parts.append(words(x(end / 2), 268, "pairs", "middle", "tick"))
+    parts.append(line([(x(0), y(wanted)), (x(end), y(wanted))], "wanted"))
+    parts.append(words(x(end) + 8, y(wanted) + 5, f"suffices: {2 / found.alpha:g}", class_="tick"))
+    labels = []
+    for i, (path, name) in enumerate(zip(paths, (first, second), strict=True)):
+        parts.append(
+            line([(x(0), y(0)), *((x(k), y(v)) for k, v in enumerate(path, 1))], f"curve {series(i)}")
+        )
+        labels.append((y(path[-1] if path else 0), i, f"{name} better"))
+    if found.stop is not None:
+        parts.append(line([(x(found.stop), 14), (x(found.stop), 230)], "stop"))
+        parts.append(words(x(found.stop) + 5, 24, f"pair {found.stop}", class_="tick"))
+    parts += _names([*labels, (y(wanted), -1, "")], x(end), 262)
+    said = f"Evidence {evidence_words(found)}"
+    return drawing(WIDTH, 276, "Evidence (e-value) after each pair of trials", said, *parts, kind="evidence")
+
+
+def _steps(times: Sequence[float], values: Sequence[float]) -> list[tuple[float, float]]:
+    """A curve that keeps its value until the next time."""
+    points, before = [(0.0, 1.0)], 1.0
+    for t, value in zip(times, values, strict=True):
+        points += [(t, before), (t, value)]
+        before = value
+    return points
+
+
+def _area(upper: Sequence[tuple[float, float]], lower: Sequence[tuple[float, float]]) -> str:
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in [*upper, *reversed(lower)]) + "Z"
+
+
+def _names(labels: Sequence[tuple[float, int, str]], x: float, lowest: float) -> list[str]:
+    """Marks and names beside the ends of curves, each (height, series, name); a series below zero keeps its place."""
+    gap = 20 + LINE * (max(len(wrapped(name, _LETTERS)) for _, _, name in labels) - 1)
+    return [
+        mark(i, x + 14, at) + label(x + 26, at + 5, name, _LETTERS)
+        for at, i, name in _apart(labels, gap, lowest)
+        if i >= 0
+    ]
+
+
+def _apart(
+    labels: Sequence[tuple[float, int, str]], gap: float, lowest: float
+) -> list[tuple[float, int, str]]:
+    """Labels moved down until none covers another, and up again where they would leave the figure."""
+    placed: list[tuple[float, int, str]] = []
+    for y, i, name in sorted(labels):
+        placed.append((max(y, placed[-1][0] + gap) if placed else y, i, name))
+    last = len(placed) - 1
+    return [(min(y, lowest - gap * (last - at)), i, name) for at, (y, i, name) in enumerate(placed)]

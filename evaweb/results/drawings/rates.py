@@ -1,0 +1,116 @@
+"""How often checkpoints succeed: intervals in rows, posteriors as violins, one difference on its axis."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from evaweb.results.analysis import Arm, Comparison
+from evaweb.results.drawings.svg import (
+    LINE,
+    Drawing,
+    Scale,
+    drawing,
+    element,
+    label,
+    line,
+    link,
+    mark,
+    percent_axis,
+    series,
+    words,
+    wrapped,
+)
+from evaweb.results.wording import points, rate_words
+from evaweb.statistics.proportions import Proportion
+
+WIDTH = 600
+_NAMES = 180
+_LETTERS = 22  # of a name in a line
+_POINTS = 120  # of a violin's outline
+
+
+def intervals(title: str, rows: Sequence[tuple[str, Proportion, str]], order: Mapping[str, int]) -> Drawing:
+    """A row each of (name, x of n, address): mark at the rate, band over its 95 % interval, the numbers beside.
+
+    `order` says as which series a name is drawn; names without one share the first.
+    """
+    step = 36
+    height = step * len(rows) + 44
+    scale = Scale(0, 1, _NAMES, WIDTH - 170)
+    parts = [percent_axis(scale, height - 26, 6)]
+    for i, (name, found, address) in enumerate(rows):
+        y, at = 26 + step * i, order.get(name, 0)
+        row = label(_NAMES - 12, y + 5, name, _LETTERS, "end")
+        if found.rate is not None and found.interval is not None:
+            low, high = scale(found.interval.low), scale(found.interval.high)
+            row += element(
+                "rect", x=low, y=float(y - 5), width=high - low, height=10.0, class_=f"band {series(at)}"
+            )
+            row += mark(at, scale(found.rate), y)
+        row += words(WIDTH - 158, y + 5, rate_words(found), class_="value")
+        parts.append(link(address, f"{name}: {rate_words(found)}", row))
+    said = "; ".join(f"{name} {rate_words(found)}" for name, found, _ in rows)
+    return drawing(WIDTH, height, title, said, *parts, kind="intervals")
+
+
+def violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
+    """What is believed of each checkpoint's rate: the Beta posterior of a uniform prior, all of the same area."""
+    row = 64
+    height = row * len(arms) + 40
+    scale = Scale(0, 1, _NAMES, WIDTH - 60)
+    shares = [i / _POINTS for i in range(_POINTS + 1)]
+    densities = [arm.posterior.density(shares) for arm in arms]
+    highest = max((max(d) for d in densities), default=1.0)
+    parts = [percent_axis(scale, height - 26, 6)]
+    for i, (arm, density) in enumerate(zip(arms, densities, strict=True)):
+        y = 8 + row * (i + 0.5)
+        half = Scale(
+            0, math.sqrt(highest), 0, row * 0.46
+        )  # by the root: flat ones stay visible beside sharp ones
+        dense = [(p, d) for p, d in zip(shares, density, strict=True) if d > 1e-3 * highest]
+        upper = [(scale(p), y - half(math.sqrt(d))) for p, d in dense]
+        lower = [(x, 2 * y - top) for x, top in reversed(upper)]
+        interval = arm.posterior.interval()
+        lines = [(row, "") for row in wrapped(arm.checkpoint, _LETTERS)]
+        lines.append((f"{arm.success.successes}/{arm.success.n}", "tick"))
+        top = y + 5 - LINE * (len(lines) - 1) / 2
+        parts.append(
+            element("path", d=_outline([*upper, *lower]), class_=f"violin {series(i)}")
+            + line([(scale(interval.low), y), (scale(interval.high), y)], f"whisker {series(i)}")
+            + mark(i, scale(arm.posterior.mean), y, 4)
+            + "".join(
+                words(_NAMES - 12, top + LINE * at, row, "end", class_)
+                for at, (row, class_) in enumerate(lines)
+            )
+            + words(WIDTH - 48, y + 5, letters.get(arm.checkpoint, ""), class_="letters")
+        )
+    said = "; ".join(
+        f"{arm.checkpoint} mean {arm.posterior.mean:.0%}, 95 % from {arm.posterior.interval().low:.0%} to "
+        f"{arm.posterior.interval().high:.0%}, letters {letters.get(arm.checkpoint, '')}"
+        for arm in arms
+    )
+    return drawing(WIDTH, height, "Posterior of the success rates", said, *parts, kind="violins")
+
+
+def difference(found: Comparison) -> Drawing:
+    """The first minus the second in percentage points, with Newcombe's interval, on an axis around nothing."""
+    height = 74
+    scale = Scale(-1, 1, 30, WIDTH - 30)
+    interval = found.difference.interval
+    parts = []
+    for at in range(-100, 101, 25):
+        x = scale(at / 100)
+        parts.append(line([(x, 8), (x, 46)], "zero" if at == 0 else "grid"))
+        parts.append(words(x, 62, f"{at:+d}".replace("-", "−") if at else "0", "middle", "tick"))
+    low, high = scale(interval.low), scale(interval.high)
+    parts.append(element("rect", x=low, y=20.0, width=high - low, height=12.0, class_="band series-1"))
+    parts.append(mark(0, scale(found.difference.value), 26))
+    said = f"{found.first} minus {found.second}: {points(found.difference)}"
+    return drawing(
+        WIDTH, height, "Difference of the success rates in points", said, *parts, kind="difference"
+    )
+
+
+def _outline(dots: Sequence[tuple[float, float]]) -> str:
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in dots) + "Z"

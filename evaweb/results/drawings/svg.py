@@ -1,0 +1,180 @@
+"""A small language for SVG: elements with escaped text, scales, axes."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import count
+
+SERIES = 8  # how many the style sheet tells apart; further ones begin again
+LINE = 15.0  # from one line of a label to the next
+_LETTER = 7.6  # about as wide as one letter of a label is
+_numbers = count(1)
+
+
+class Drawing(str):
+    """A finished figure as markup; templates put it into the page as it is."""
+
+    heading: str
+    words: str
+
+    def __html__(self) -> str:
+        """Django's and Jinja's way to ask for markup that is safe."""
+        return self
+
+
+def drawing(width: float, height: float, title: str, words: str, *parts: str, kind: str = "") -> Drawing:
+    """A figure of `width` x `height` user units that shrinks with its page; `words` say what it shows."""
+    name = f"drawing-{next(_numbers)}"
+    inner = "".join(parts)
+    text = (
+        f'<svg class="drawing {escape(kind)}" viewBox="0 0 {_n(width)} {_n(height)}" role="img" '
+        f'aria-labelledby="{name}-t {name}-d" style="max-width:{_n(width)}px">'
+        f'<title id="{name}-t">{escape(title)}</title><desc id="{name}-d">{escape(words)}</desc>{inner}</svg>'
+    )
+    found = Drawing(text)
+    found.heading, found.words = title, words
+    return found
+
+
+def element(tag: str, content: str = "", /, **attributes: object) -> str:
+    """One element; `class_` is class, underscores become hyphens, `content` is markup already."""
+    written = "".join(
+        f' {name.rstrip("_").replace("_", "-")}="{escape(_n(value) if isinstance(value, float) else str(value))}"'
+        for name, value in attributes.items()
+        if value is not None
+    )
+    return f"<{tag}{written}>{content}</{tag}>" if content else f"<{tag}{written}/>"
+
+
+def words(x: float, y: float, text: str, anchor: str = "start", class_: str = "") -> str:
+    """A line of text."""
+    return element("text", escape(text), x=float(x), y=float(y), text_anchor=anchor, class_=class_ or None)
+
+
+def line(points: Sequence[tuple[float, float]], class_: str) -> str:
+    """Straight lines from point to point."""
+    return element("path", d=path(points), class_=class_)
+
+
+def path(points: Sequence[tuple[float, float]]) -> str:
+    """What a path's `d` says."""
+    return "".join(f"{'L' if i else 'M'}{_n(x)} {_n(y)}" for i, (x, y) in enumerate(points))
+
+
+def link(address: str, title: str, content: str) -> str:
+    """What leads to where its number was made from; without an address only the content, with its title."""
+    inner = element("title", escape(title)) + content
+    return element("a", inner, href=address) if address else element("g", inner)
+
+
+def series(i: int) -> str:
+    """The class of the i-th series."""
+    return f"series-{i % SERIES + 1}"
+
+
+def mark(i: int, x: float, y: float, r: float = 5) -> str:
+    """The mark of the i-th series: a shape of its own, because colour alone does not reach everybody."""
+    shapes = (
+        f"M{_n(x - r)} {_n(y)}a{_n(r)} {_n(r)} 0 1 0 {_n(2 * r)} 0a{_n(r)} {_n(r)} 0 1 0 {_n(-2 * r)} 0Z",
+        path([(x - r, y - r), (x + r, y - r), (x + r, y + r), (x - r, y + r)]) + "Z",
+        path([(x, y - r * 1.2), (x + r * 1.2, y + r), (x - r * 1.2, y + r)]) + "Z",
+        path([(x, y - r * 1.3), (x + r * 1.3, y), (x, y + r * 1.3), (x - r * 1.3, y)]) + "Z",
+    )
+    return element("path", d=shapes[i % len(shapes)], class_=f"mark {series(i)}")
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """From values `low` to `high` to places `start` to `end`."""
+
+    low: float
+    high: float
+    start: float
+    end: float
+
+    def __call__(self, value: float) -> float:
+        """The place of a value; what lies outside stands at the end."""
+        span = self.high - self.low
+        share = (
+            (min(max(value, min(self.low, self.high)), max(self.low, self.high)) - self.low) / span
+            if span
+            else 0.0
+        )
+        return self.start + share * (self.end - self.start)
+
+
+def ticks(low: float, high: float, wanted: int = 5) -> list[float]:
+    """Round values from `low` to `high`, about as many as wanted."""
+    span = high - low
+    if span <= 0:
+        return [low]
+    raw = span / wanted
+    power = 10 ** math.floor(math.log10(raw))
+    step = next(power * factor for factor in (1, 2, 2.5, 5, 10) if power * factor >= raw * 0.999)
+    first = math.ceil(low / step - 1e-9)
+    return [round((first + i) * step, 10) for i in range(int((high - first * step) / step + 1e-9) + 1)]
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A value of an axis."""
+    return f"{value:.{digits}g}".replace("-", "−")
+
+
+def percent_axis(scale: Scale, y: float, top: float, step: int = 25) -> str:
+    """Of shares, below the figure: hairlines from `top` to `y`, and the percent below."""
+    parts = []
+    for share in range(0, 101, step):
+        x = scale(share / 100)
+        parts.append(line([(x, top), (x, y)], "grid"))
+        parts.append(words(x, y + 16, f"{share}" + (" %" if share == 100 else ""), "middle", "tick"))
+    return "".join(parts)
+
+
+def wrapped(text: str, most: int, rows: int = 2) -> list[str]:
+    """In at most `rows` lines of at most `most` characters, broken behind a hyphen, a slash or a blank.
+
+    What does not fit is left out of the middle: names of checkpoints begin alike and differ in their ends.
+    """
+    found = [""]
+    for word in re.findall(r"[^\s\-_/]*[\s\-_/]?", text):
+        for piece in (word[i : i + most] for i in range(0, len(word), most)):
+            if len((found[-1] + piece).rstrip()) > most:
+                found.append("")
+            found[-1] += piece
+    if len(found) <= rows:
+        return [row.rstrip() for row in found]
+    kept = most * rows - 1
+    whole = text[: kept // 2] + "…" + text[len(text) - (kept - kept // 2) :]
+    return [whole[i : i + most] for i in range(0, len(whole), most)]
+
+
+def label(x: float, y: float, text: str, most: int, anchor: str = "start", rows: int = 2) -> str:
+    """A name in as few lines as it needs, the middle of them at the line `y`."""
+    found = wrapped(text, most, rows)
+    top = y - LINE * (len(found) - 1) / 2
+    return "".join(words(x, top + LINE * i, row, anchor) for i, row in enumerate(found))
+
+
+def legend(names: Sequence[tuple[int, str]], width: float) -> tuple[str, float]:
+    """Which colour is whose, each (series, name), in rows from the top of a figure; and how high they are."""
+    parts, x, y = [], 0.0, 12.0
+    for i, name in names:
+        wide = 24 + _LETTER * len(name) + 20
+        if x and x + wide > width:
+            x, y = 0.0, y + 20
+        parts.append(
+            element("rect", x=x, y=y - 10, width=16.0, height=12.0, class_=f"beam {series(i)}")
+            + words(x + 24, y, name)
+        )
+        x += wide
+    return "".join(parts), y + 14 if names else 0.0
+
+
+def _n(value: float | int) -> str:
+    if isinstance(value, int):
+        return str(value)
+    return f"{value:.2f}".rstrip("0").rstrip(".") or "0"

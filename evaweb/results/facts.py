@@ -1,0 +1,94 @@
+"""What a comparison of two checkpoints answers: each question with its method, all of it in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from evaweb.plans.models import Plan
+from evaweb.results.addresses import compare_address
+from evaweb.results.analysis import Analysis, Comparison
+from evaweb.results.drawings import rates
+from evaweb.results.filters import Chosen
+from evaweb.results.wording import evidence_words, missed, points, probability, verdict
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """A question that a comparison answers: how, and what came out."""
+
+    question: str
+    method: str
+    answer: str
+
+
+def primary_of(plan: Plan, analysis: Analysis) -> Comparison | None:
+    """The comparison that the plan is about, as far as both have trials."""
+    if not plan.first or not plan.second:
+        return None
+    return analysis.compared(plan.first.name, plan.second.name)
+
+
+def comparison_sentence(analysis: Analysis, found: Comparison) -> str:
+    """It in one sentence."""
+    one, other = analysis.arm(found.first).success, analysis.arm(found.second).success
+    return verdict(found, one, other, analysis.alpha)
+
+
+def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[str, Any]:
+    """The sentence, and each question that a comparison answers."""
+    return {
+        "sentence": comparison_sentence(analysis, found),
+        "facts": [*_of_the_rates(analysis, found), *_of_the_evidence(analysis, found), *_beyond(found)],
+        "notes": found.notes,
+        "reversed": bool(found.stratified and found.stratified.reversed),
+        "missed": missed_words(analysis, found),
+        "address": compare_address(plan, found, Chosen()),
+        "difference": rates.difference(found),
+    }
+
+
+def _of_the_rates(analysis: Analysis, found: Comparison) -> Iterator[Fact]:
+    yield Fact("How much better?", "Newcombe, 95 %", points(found.difference))
+    corrected = f", Holm {probability(found.corrected)}" if len(analysis.comparisons) > 1 else ""
+    chance = f"p = {probability(found.test.p)}{corrected}"
+    yield Fact("Could it be chance?", "Barnard, two-sided, n as planned", chance)
+    if found.paired:
+        split = (
+            f"only {found.first} {found.paired.first_only}, only {found.second} {found.paired.second_only}"
+        )
+        of_pairs = f"p = {probability(found.paired.p)} of {found.pairs} pairs ({split})"
+        yield Fact("The same, pair by pair?", "McNemar, exact", of_pairs)
+    if found.clustered:
+        yield Fact("Other initial conditions?", "bootstrap over conditions, 95 %", points(found.clustered))
+
+
+def _of_the_evidence(analysis: Analysis, found: Comparison) -> Iterator[Fact]:
+    yield Fact("May one stop?", f"e-process, alpha {analysis.alpha:g}", evidence_words(found.evidence))
+    yield Fact("With partial credit?", "betting e-process on scores", evidence_words(found.score_evidence))
+
+
+def _beyond(found: Comparison) -> Iterator[Fact]:
+    if found.stratified:
+        odds = found.stratified.odds_ratio
+        ratio = "without bound" if odds is None else f"{odds:.2g}"
+        points_over = f"{100 * found.stratified.stratified:+.0f} points".replace("-", "−")
+        chance = probability(found.stratified.p)
+        yield Fact("Over scenes?", "Mantel-Haenszel", f"{points_over}, odds ratio {ratio}, p = {chance}")
+    if found.log_rank is not None:
+        yield Fact("Sooner?", "log-rank on time to success", f"p = {probability(found.log_rank)}")
+    believed = f"{found.first} is better with probability {_chance(found.better)}"
+    yield Fact("What to believe?", "uniform priors", believed)
+
+
+def missed_words(analysis: Analysis, found: Comparison | None = None) -> str:
+    """What these trials could not have detected."""
+    arms = [arm for arm in analysis.arms if found is None or arm.checkpoint in (found.first, found.second)]
+    n = min(arm.success.n for arm in arms)
+    rate = min((arm.success.rate for arm in arms if arm.success.rate is not None), default=None)
+    return missed(n, rate, analysis.alpha)
+
+
+def _chance(p: float) -> str:
+    return "above 0.999" if p > 0.999 else "below 0.001" if p < 0.001 else f"{p:.3f}"

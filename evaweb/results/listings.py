@@ -1,0 +1,130 @@
+"""The tables of result pages: checkpoints, pairs, scenes and single trials."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from django.urls import reverse
+
+from evaweb.plans.models import Plan
+from evaweb.results import caching
+from evaweb.results.addresses import beside_address, trials_address
+from evaweb.results.analysis import Analysis, Arm
+from evaweb.results.filters import Chosen, choices
+from evaweb.results.outcomes import Outcome, paired
+from evaweb.results.wording import ends
+from evaweb.statistics.proportions import Proportion
+from evaweb.trials.models import Trial
+
+MOST_PAIRS = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A line of a table: what it is of, x of n, and where its trials are."""
+
+    name: str
+    found: Proportion
+    address: str
+
+
+def arm_rows(plan: Plan, analysis: Analysis, only: Chosen) -> list[dict[str, Any]]:
+    """The table of checkpoints, best first."""
+    return [
+        {
+            "arm": arm,
+            "letters": analysis.letters[arm.checkpoint],
+            "address": trials_address(plan, only, checkpoint=arm.checkpoint),
+            "successes": trials_address(plan, only, checkpoint=arm.checkpoint, success="yes"),
+            "exact": ends(arm.exact) if arm.exact else "",
+            "score": _mean(arm.score),
+            "macro": _mean(arm.macro),
+            "time": _time(arm),
+            "speed": arm.speed
+            and f"{arm.speed.per_hour:.1f} [{arm.speed.interval.low:.1f}, {arm.speed.interval.high:.1f}]",
+            "between": _between(arm),
+        }
+        for arm in analysis.arms
+    ]
+
+
+def scene_rows(plan: Plan, analysis: Analysis, scene: str, only: Chosen) -> list[Row]:
+    """Each checkpoint on one scene."""
+    return [
+        Row(
+            arm.checkpoint,
+            arm.scenes[scene],
+            trials_address(plan, only, checkpoint=arm.checkpoint, scene=scene),
+        )
+        for arm in analysis.arms
+        if scene in arm.scenes
+    ]
+
+
+def pair_rows(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[dict[str, Any]]:
+    """Both trials of each block, with where they are played side by side."""
+    pairs = paired(first, second)
+    episodes = dict(
+        Trial.objects.filter(
+            pk__in=[run.trial for pair in pairs[:MOST_PAIRS] for run in (pair.first, pair.second)],
+            episode__isnull=False,
+        ).values_list("pk", "episode_id")
+    )
+    rows = []
+    for number, pair in enumerate(pairs, start=1):
+        played = [episodes[run.trial] for run in (pair.first, pair.second) if run.trial in episodes]
+        rows.append({"number": number, "pair": pair, "beside": beside_address(played)})
+    return rows
+
+
+def trial_row(trial: Trial) -> dict[str, Any]:
+    """A trial of a list, and from which second on its recording shows what went wrong."""
+    outcomes = list(trial.verdict.outcomes.all()) if trial.verdict else []
+    times = [at for row in outcomes if row.reached and (at := getattr(row, "at_s", None)) is not None]
+    failed = bool(trial.verdict and not trial.verdict.success)
+    moment = max(times, default=None) if failed else None
+    replay = reverse("replay", args=[trial.episode_id]) if trial.episode_id else ""
+    return {
+        "trial": trial,
+        "reached": sum(row.reached for row in outcomes),
+        "milestones": len(outcomes),
+        "replay": replay + (f"?t={moment:.1f}" if replay and moment is not None else ""),
+        "moment": moment,
+    }
+
+
+def trial_choices(plan: Plan) -> dict[str, list[str]]:
+    """What the list of trials can be narrowed to."""
+    runs = caching.runs_of(plan).outcomes
+    return {
+        **choices(runs),
+        "checkpoint": sorted({run.checkpoint for run in runs}),
+        "failure": sorted({run.failure for run in runs if run.failure}),
+    }
+
+
+def _mean(found: Any) -> str:
+    if found is None:
+        return ""
+    interval = f" [{ends(found.interval)}]" if found.interval else " (all alike: no interval)"
+    return f"{100 * found.value:.0f} %{interval}"
+
+
+def _time(arm: Arm) -> str:
+    if arm.mean_time is None:
+        return ""
+    mean = arm.mean_time
+    return f"{mean.value:.1f} s [{mean.interval.low:.1f}, {mean.interval.high:.1f}], up to {mean.until:.0f} s"
+
+
+def _between(arm: Arm) -> str:
+    found = arm.interventions
+    if found is None:
+        return ""
+    low = f"{found.mean_time_interval.low / 60:.0f}"
+    if found.mean_time is None:
+        return f"none in {found.exposure / 3600:.1f} h, at least {low} min"
+    high = found.mean_time_interval.high
+    return f"{found.mean_time / 60:.0f} min [{low}, {high / 60:.0f}]"

@@ -1,0 +1,76 @@
+"""One scored trial, as all analyses take it; no Django, so that a report outside of it counts the same."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of one trial that counts.
+
+    `order` is when it was run among those of its evaluation, `block` names the initial condition and its repetition:
+    trials of one block met the same one. `milestones` are those of its scene in their order. `duration` is in s.
+    """
+
+    trial: int
+    order: int
+    block: str
+    checkpoint: str
+    scene: str
+    position: int
+    success: bool
+    score: float
+    duration: float | None = None
+    milestones: tuple[bool, ...] = ()
+    failure: str = ""
+    station: str = ""
+    operator: str = ""
+    labels: tuple[str, ...] = field(default=())  # of the milestones
+
+    @property
+    def condition(self) -> str:
+        """The initial condition, without its repetition."""
+        return f"{self.scene}/{self.position}"
+
+
+@dataclass(frozen=True, slots=True)
+class Interruption:
+    """A run that somebody or something broke off, and that is not scored: `duration` [s] where it is known."""
+
+    trial: int
+    checkpoint: str
+    scene: str
+    position: int
+    duration: float | None = None
+    station: str = ""
+    operator: str = ""
+
+
+def by_checkpoint(outcomes: Iterable[Outcome]) -> dict[str, list[Outcome]]:
+    """Each checkpoint's, in the order in which they were run."""
+    found: dict[str, list[Outcome]] = defaultdict(list)
+    for outcome in sorted(outcomes, key=lambda o: o.order):
+        found[outcome.checkpoint].append(outcome)
+    return dict(sorted(found.items()))
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """The trials of two checkpoints in one block."""
+
+    first: Outcome
+    second: Outcome
+
+
+def paired(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[Pair]:
+    """Both checkpoints' trials, block by block, in the order in which the blocks were completed.
+
+    A block in which one of them is missing waits. Of several trials in one block, only the last ones count.
+    """
+    others = {outcome.block: outcome for outcome in sorted(second, key=lambda o: o.order)}
+    ours = {outcome.block: outcome for outcome in sorted(first, key=lambda o: o.order)}
+    pairs = [Pair(outcome, others[block]) for block, outcome in ours.items() if block in others]
+    return sorted(pairs, key=lambda pair: max(pair.first.order, pair.second.order))

@@ -1,0 +1,173 @@
+"""What the pages of a plan show, computed here so that templates only place it."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from evaweb.errors import EvaError
+from evaweb.plans.models import Plan, StoppingRule
+from evaweb.results import caching
+from evaweb.results.addresses import compare_address, trials_address
+from evaweb.results.analysis import Analysis
+from evaweb.results.drawings import conditions, courses, rates
+from evaweb.results.drawings.svg import Drawing
+from evaweb.results.facts import comparison_facts, comparison_sentence, missed_words, primary_of
+from evaweb.results.filters import Chosen, choices
+from evaweb.results.listings import MOST_PAIRS, arm_rows, pair_rows, scene_rows
+from evaweb.results.outcomes import by_checkpoint
+from evaweb.results.wording import evidence_words
+
+
+def summary_page(plan: Plan, only: Chosen) -> dict[str, Any]:
+    """Everything that the plan's page shows of its results."""
+    at = caching.fingerprint(plan)
+    return caching.page_of(plan, ("summary", only), at, lambda: _summary(plan, only, at))
+
+
+def _summary(plan: Plan, only: Chosen, at: Hashable) -> dict[str, Any]:
+    outcomes = caching.runs_of(plan, at).outcomes
+    analysis = caching.analysis_of(plan, only, at)
+    order = {arm.checkpoint: i for i, arm in enumerate(analysis.arms)}
+    primary = primary_of(plan, analysis)
+    scenes = sorted({name for arm in analysis.arms for name in arm.scenes})
+    return {
+        "analysis": analysis,
+        "only": only,
+        "choices": choices(outcomes),
+        "primary": primary and comparison_facts(plan, analysis, primary),
+        "table": arm_rows(plan, analysis, only),
+        "intervals": _intervals(plan, "Success rates", analysis, order, only),
+        "violins": rates.violins(analysis.arms, analysis.letters) if analysis.arms else None,
+        "funnels": [drawn for scene in scenes if (drawn := _funnel(plan, analysis, scene, only))],
+        "survival": courses.survival(analysis.arms),
+        "grid": conditions.grid(analysis.arms, _grid_links(plan, analysis, only)),
+        "pareto": conditions.pareto(analysis.arms, _failure_links(plan, analysis, only)),
+        "scenes": [(scene, scene_rows(plan, analysis, scene, only)) for scene in scenes],
+        "others": [
+            (found, comparison_sentence(analysis, found), compare_address(plan, found, only))
+            for found in analysis.comparisons
+            if found is not primary
+        ],
+        "missed": [missed_words(analysis)] if analysis.arms else [],
+    }
+
+
+def comparison_page(plan: Plan, only: Chosen, first: str, second: str) -> dict[str, Any]:
+    """Two checkpoints side by side, condition by condition; EvaError says which there are."""
+    at = caching.fingerprint(plan)
+    return caching.page_of(
+        plan, ("comparison", only, first, second), at, lambda: _compared(plan, only, first, second, at)
+    )
+
+
+def _compared(plan: Plan, only: Chosen, first: str, second: str, at: Hashable) -> dict[str, Any]:
+    analysis = caching.analysis_of(plan, only, at)
+    names = [arm.checkpoint for arm in analysis.arms]
+    primary = primary_of(plan, analysis)
+    if not first and not second and primary:
+        first, second = primary.first, primary.second
+    found = analysis.compared(first, second)
+    if found is None:
+        raise EvaError(
+            f"no comparison of {first!r} and {second!r}; there are trials of: {', '.join(names) or 'none'}"
+        )
+    arms = (analysis.arm(found.first), analysis.arm(found.second))
+    runs = by_checkpoint(only.apply(caching.runs_of(plan, at).outcomes))
+    return {
+        "analysis": analysis,
+        "only": only,
+        "found": found,
+        "names": names,
+        "facts": comparison_facts(plan, analysis, found),
+        "difference": rates.difference(found),
+        "intervals": rates.intervals(
+            "Success rates",
+            [
+                (arm.checkpoint, arm.success, trials_address(plan, only, checkpoint=arm.checkpoint))
+                for arm in arms
+            ],
+            {arm.checkpoint: i for i, arm in enumerate(arms)},
+        ),
+        "violins": rates.violins(arms, analysis.letters),
+        "funnels": [
+            drawn
+            for scene in sorted({*arms[0].scenes, *arms[1].scenes})
+            if (drawn := _funnel(plan, replace(analysis, arms=arms), scene, only))
+        ],
+        "survival": courses.survival(arms),
+        "evidence": courses.evidence(found.evidence, found.first, found.second),
+        "pairs": pair_rows(runs.get(found.first, []), runs.get(found.second, []))[:MOST_PAIRS],
+        "most": MOST_PAIRS,
+    }
+
+
+def evidence_page(plan: Plan) -> dict[str, Any]:
+    """The meter of the plan's comparison, whether its rule says to stop, and what would be gained by going on."""
+    at = caching.fingerprint(plan)
+    return caching.page_of(plan, "evidence", at, lambda: _evidence(plan, at))
+
+
+def _evidence(plan: Plan, at: Hashable) -> dict[str, Any]:
+    analysis = caching.analysis_of(plan, None, at)
+    found = primary_of(plan, analysis)
+    if found is None:
+        return {"found": None, "analysis": analysis}
+    foreseen = plan.slots.filter(checkpoint=plan.first).count()
+    return {
+        "analysis": analysis,
+        "found": found,
+        "foreseen": foreseen,
+        "meter": courses.evidence(found.evidence, found.first, found.second, foreseen),
+        "score_meter": courses.evidence(found.score_evidence, found.first, found.second, foreseen),
+        "words": evidence_words(found.evidence),
+        "score_words": evidence_words(found.score_evidence),
+        "stop": found.evidence.stop is not None and plan.stopping == StoppingRule.EVIDENCE,
+        "winner": {"first": found.first, "second": found.second}.get(found.evidence.winner or "", ""),
+        "wanted": 2 / plan.alpha,
+        "missed": missed_words(analysis, found),
+    }
+
+
+def _intervals(
+    plan: Plan, title: str, analysis: Analysis, order: Mapping[str, int], only: Chosen
+) -> Drawing | None:
+    rows = [
+        (arm.checkpoint, arm.success, trials_address(plan, only, checkpoint=arm.checkpoint))
+        for arm in analysis.arms
+    ]
+    return rates.intervals(title, rows, order) if rows else None
+
+
+def _funnel(plan: Plan, analysis: Analysis, scene: str, only: Chosen) -> Drawing | None:
+    found = [
+        (i, arm.checkpoint, funnel)
+        for i, arm in enumerate(analysis.arms)
+        for funnel in arm.funnels
+        if funnel.scene == scene
+    ]
+    if not found or len({funnel.labels for _, _, funnel in found}) > 1:
+        return None
+    links = {
+        (name, at): trials_address(plan, only, checkpoint=name, scene=scene, missed=label)
+        for _, name, funnel in found
+        for at, label in enumerate(funnel.labels)
+    }
+    return courses.funnel(scene, found, links)
+
+
+def _grid_links(plan: Plan, analysis: Analysis, only: Chosen) -> dict[tuple[str, str], str]:
+    links = {}
+    for arm in analysis.arms:
+        for condition in arm.cells:
+            scene, _, position = condition.rpartition("/")
+            links[arm.checkpoint, condition] = trials_address(
+                plan, only, checkpoint=arm.checkpoint, scene=scene, position=position
+            )
+    return links
+
+
+def _failure_links(plan: Plan, analysis: Analysis, only: Chosen) -> dict[str, str]:
+    tags = {tag for arm in analysis.arms for tag, _ in arm.failures}
+    return {tag: trials_address(plan, only, failure=tag, success="no") for tag in tags}

@@ -1,0 +1,145 @@
+"""Computes every number of this report again and says which do not come out; exit code 0 where all do."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from .judged import agreement, preferences, score_alpha
+from .numbers import Drawn, Trial, numbers
+from .sealed import faults
+
+_SHOWN = 40
+_CLOSE = 1e-6  # relative: both ways to a number end in the last bits of different sums
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+_TAIL = 0.015  # of what was drawn anew, how much more or less than 2.5 % may lie beyond an end: six standard errors
+
+
+def main() -> int:
+    """Compare, tell."""
+    data = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[1] / "data"
+    plan, seal, shown = (
+        json.loads((data / name).read_text("utf-8")) for name in ("plan.json", "seal.json", "numbers.json")
+    )
+    rows, ratings, preferred = (_rows(data / f"{name}.csv") for name in ("trials", "ratings", "preferences"))
+    wrong = faults(seal, plan, rows)
+    found = {
+        **numbers([_trial(row) for row in rows], plan),
+        "agreement": _agreement(rows, ratings),
+        "preferences": preferences(
+            [(row["first_checkpoint"], row["second_checkpoint"], row["outcome"]) for row in preferred]
+        ),
+    }
+    seen = 0
+    for where, problem in differences(shown, found, ""):
+        seen += 1
+        if problem:
+            wrong.append(f"{where}: {problem}")
+    for line in wrong[:_SHOWN]:
+        print(line)
+    if len(wrong) > _SHOWN:
+        print(f"and {len(wrong) - _SHOWN} others")
+    kept = "with its key, schedule and codes" if seal["key"] else "by its digest"
+    print(f"{seen} numbers from {len(rows)} trials, and the plan {kept}: {len(wrong)} do not come out")
+    return 1 if wrong else 0
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return [{name: _text(value) for name, value in row.items()} for row in csv.DictReader(file)]
+
+
+def _agreement(rows: list[dict[str, str]], ratings: list[dict[str, str]]) -> dict[str, Any] | None:
+    """Of the scores that count and what second raters said of the same trials."""
+    first = {row["trial"]: row for row in rows if row["status"] == "scored"}
+    pairs = [(first[row["trial"]], row) for row in ratings if row["trial"] in first]
+    if not pairs:
+        return None
+    milestones: dict[str, list[tuple[bool, bool]]] = {}
+    for one, other in pairs:
+        again = dict(json.loads(other["milestones"]))
+        for text, reached in json.loads(one["milestones"]):
+            if text in again:
+                milestones.setdefault(text, []).append((reached, again[text]))
+    return {
+        "trials": len({row["trial"] for _, row in pairs}),
+        "ratings": len(pairs),
+        "blind": sum(row["blind"] == "true" for _, row in pairs),
+        "success": agreement([(a["success"] == "true", b["success"] == "true") for a, b in pairs]),
+        "milestones": {text: agreement(found) for text, found in milestones.items()},
+        "score_alpha": score_alpha([(float(a["score"]), float(b["score"])) for a, b in pairs]),
+    }
+
+
+def _text(cell: str) -> str:
+    """Without the apostrophe that keeps a spreadsheet from taking a text for a formula."""
+    return cell[1:] if cell.startswith("'") and cell[1:].startswith(_FORMULA) else cell
+
+
+def _trial(row: dict[str, str]) -> Trial:
+    return Trial(
+        order=int(row["order"]),
+        block=row["block"],
+        checkpoint=row["checkpoint"],
+        scene=row["scene"],
+        position=int(row["position"]),
+        status=row["status"],
+        success=row["success"] == "true",
+        score=float(row["score"] or 0),
+        duration=float(row["duration_s"]) if row["duration_s"] else None,
+        failure=row["failure"],
+        milestones=tuple((text, reached) for text, reached in json.loads(row["milestones"] or "[]")),
+    )
+
+
+def differences(shown: Any, found: Any, where: str) -> Iterator[tuple[str, str]]:
+    """Each number's place, and what is wrong with it or ""."""
+    if isinstance(found, Drawn):
+        yield where, _drawn(shown, found)
+    elif isinstance(shown, dict) and isinstance(found, dict):
+        for key in sorted({*shown, *found}):
+            place = f"{where}.{key}" if where else key
+            if key not in shown or key not in found:
+                yield (
+                    place,
+                    "is not in numbers.json" if key not in shown else "does not follow from the trials",
+                )
+            else:
+                yield from differences(shown[key], found[key], place)
+    elif isinstance(shown, list) and isinstance(found, list):
+        if len(shown) != len(found):
+            yield where, f"{len(shown)} entries are shown, {len(found)} come out"
+        for i, (one, other) in enumerate(zip(shown, found, strict=False)):
+            yield from differences(one, other, f"{where}[{i}]")
+    elif _number(shown) and _number(found):
+        close = math.isclose(shown, found, rel_tol=_CLOSE, abs_tol=1e-9)
+        yield where, "" if close else f"{shown} is shown, {found} comes out"
+    else:
+        yield where, "" if shown == found else f"{shown!r} is shown, {found!r} comes out"
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _drawn(shown: Any, drawn: Drawn) -> str:
+    if not (isinstance(shown, list) and len(shown) == 2 and all(map(_number, shown))):
+        return f"{shown!r} is shown; an interval comes out"
+    low, high = shown
+    n, slack = len(drawn), 1e-9
+    beyond = (sum(d < low - slack for d in drawn) / n, sum(d > high + slack for d in drawn) / n)
+    within = (sum(d <= low + slack for d in drawn) / n, sum(d >= high - slack for d in drawn) / n)
+    if max(beyond) > 0.025 + _TAIL or min(within) < 0.025 - _TAIL:
+        return (
+            f"{shown} is shown; of {n} means drawn anew {beyond[0]:.2%} are below and {beyond[1]:.2%} above"
+        )
+    return ""
+
+
+if __name__ == "__main__":
+    sys.exit(main())

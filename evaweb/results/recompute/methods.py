@@ -1,0 +1,294 @@
+"""The formulae, by way of elementary sums: binomial and Poisson tails where the lab has Beta and Gamma functions."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from itertools import combinations, pairwise
+from statistics import NormalDist
+
+Z = NormalDist().inv_cdf(0.975)
+Ends = list[float]
+
+
+def solve(rises: Callable[[float], float], wanted: float, low: float, high: float) -> float:
+    """Where a function that rises from `low` to `high` has the `wanted` value."""
+    for _ in range(200):
+        middle = (low + high) / 2
+        low, high = (middle, high) if rises(middle) < wanted else (low, middle)
+    return (low + high) / 2
+
+
+def mass(n: int, p: float) -> list[float]:
+    """The binomial distribution of `n` trials at rate `p`."""
+    if p in (0.0, 1.0):
+        return [float(k == (n if p else 0)) for k in range(n + 1)]
+    whole = math.lgamma(n + 1)
+    return [
+        math.exp(
+            whole - math.lgamma(k + 1) - math.lgamma(n - k + 1) + k * math.log(p) + (n - k) * math.log1p(-p)
+        )
+        for k in range(n + 1)
+    ]
+
+
+def wilson(x: int, n: int) -> Ends:
+    """The rates that a normal test at 5 % does not refuse: both roots of (x/n - p)^2 = z^2 p (1 - p) / n."""
+    a, b, c = 1 + Z * Z / n, -(2 * x / n + Z * Z / n), (x / n) ** 2
+    root = math.sqrt(max(0.0, b * b - 4 * a * c))
+    return [0.0 if x == 0 else (-b - root) / (2 * a), 1.0 if x == n else (-b + root) / (2 * a)]
+
+
+def clopper_pearson(x: int, n: int) -> Ends:
+    """The rates at which neither so many nor so few successes have a probability below 2.5 %."""
+    low = 0.0 if x == 0 else solve(lambda p: math.fsum(mass(n, p)[x:]), 0.025, 0.0, 1.0)
+    high = 1.0 if x == n else solve(lambda p: -math.fsum(mass(n, p)[: x + 1]), -0.025, 0.0, 1.0)
+    return [low, high]
+
+
+def beta_interval(a: int, b: int) -> Ends:
+    """The middle 95 % of Beta(a, b): its distribution is a binomial tail of a + b - 1 trials."""
+
+    def share(p: float) -> float:
+        return math.fsum(mass(a + b - 1, p)[a:])
+
+    return [solve(share, 0.025, 0.0, 1.0), solve(share, 0.975, 0.0, 1.0)]
+
+
+def garwood(events: int) -> Ends:
+    """The exact interval of a Poisson mean."""
+
+    def at_most(k: int, mean: float) -> float:
+        if mean <= 0:
+            return 1.0
+        return math.fsum(math.exp(i * math.log(mean) - mean - math.lgamma(i + 1)) for i in range(k + 1))
+
+    top = 10.0 * (events + 10)
+    low = solve(lambda m: 1 - at_most(events - 1, m), 0.025, 0.0, top) if events else 0.0
+    return [low, solve(lambda m: -at_most(events, m), -0.025, 0.0, top)]
+
+
+def newcombe(x1: int, n1: int, x2: int, n2: int) -> Ends:
+    """Method 10 of Newcombe (1998)."""
+    (l1, u1), (l2, u2), p1, p2 = wilson(x1, n1), wilson(x2, n2), x1 / n1, x2 / n2
+    down, up = math.hypot(p1 - l1, u2 - p2), math.hypot(u1 - p1, p2 - l2)
+    return [max(-1.0, p1 - p2 - down), min(1.0, p1 - p2 + up)]
+
+
+def barnard(x1: int, n1: int, x2: int, n2: int) -> tuple[float, float]:
+    """Statistic and two-sided probability; which tables are as extreme is decided in whole numbers."""
+    total = n1 + n2
+
+    def square(a: int, b: int) -> tuple[int, int]:
+        return (a * n2 - b * n1) ** 2, (a + b) * (total - a - b)
+
+    over, under = square(x1, x2)
+    if under == 0:
+        return 0.0, 1.0
+    z = (x1 / n1 - x2 / n2) / math.sqrt(under / total**2 * (1 / n1 + 1 / n2))
+    ends: list[tuple[int, int]] = []  # of each row: how many extreme tables at its beginning, and at its end
+    for a in range(n1 + 1):
+        extreme = [
+            (square(a, b)[0] * under >= over * square(a, b)[1]) if square(a, b)[1] else over == 0
+            for b in range(n2 + 1)
+        ]
+        first = next((b for b, it in enumerate(extreme) if not it), n2 + 1)
+        last = next((b for b, it in enumerate(reversed(extreme)) if not it), 0) if first <= n2 else 0
+        ends.append((first, last))
+
+    def tail(angle: float) -> float:
+        p = math.sin(angle) ** 2
+        one, two = mass(n1, p), mass(n2, p)
+        below, above = [0.0], [0.0]
+        for k in range(n2 + 1):
+            below.append(below[-1] + two[k])
+            above.append(above[-1] + two[n2 - k])
+        return math.fsum(m * (below[f] + above[e]) for m, (f, e) in zip(one, ends, strict=True))
+
+    return z, min(1.0, _highest(tail, 0.0, math.pi / 2, 300))
+
+
+def _highest(function: Callable[[float], float], low: float, high: float, parts: int) -> float:
+    """The maximum of a smooth function that may have several peaks."""
+    width = (high - low) / parts
+    values = [function(low + i * width) for i in range(parts + 1)]
+    best = max(values)
+    peaks = sorted(
+        (i for i in range(1, parts) if values[i] >= max(values[i - 1], values[i + 1])),
+        key=lambda i: -values[i],
+    )
+    for peak in peaks[:3]:
+        left, right = low + (peak - 1) * width, low + (peak + 1) * width
+        for _ in range(40):
+            third = (right - left) / 3
+            one, two = function(left + third), function(right - third)
+            best = max(best, one, two)
+            left, right = (left + third, right) if one < two else (left, right - third)
+    return best
+
+
+def better(x1: int, n1: int, x2: int, n2: int) -> float:
+    """The probability that the first rate is the higher, from uniform priors: Beta(a, b) above Beta(c, d)."""
+    a, b, c, d = x1 + 1, n1 - x1 + 1, x2 + 1, n2 - x2 + 1
+
+    def log_beta(p: float, q: float) -> float:
+        return math.lgamma(p) + math.lgamma(q) - math.lgamma(p + q)
+
+    return min(
+        1.0,
+        math.fsum(
+            math.exp(log_beta(c + i, b + d) - math.log(b + i) - log_beta(1 + i, b) - log_beta(c, d))
+            for i in range(a)
+        ),
+    )
+
+
+def mcnemar(first_only: int, second_only: int) -> float:
+    """Two-sided probability of so uneven a split of the pairs in which only one succeeded."""
+    n = first_only + second_only
+    if n == 0:
+        return 1.0
+    tail = sum(math.comb(n, k) for k in range(min(first_only, second_only) + 1))
+    return min(1.0, 2 * tail / 2**n)
+
+
+def holm(probabilities: Sequence[float]) -> list[float]:
+    """Corrected for how many there are."""
+    n, found = len(probabilities), list(probabilities)
+    for i, p in enumerate(probabilities):
+        smaller = [q for j, q in enumerate(probabilities) if (q, j) <= (p, i)]
+        ordered = sorted(smaller)
+        found[i] = max(min(1.0, (n - rank) * q) for rank, q in enumerate(ordered))
+    return found
+
+
+def letters(names: Sequence[str], apart: set[frozenset[str]]) -> dict[str, str]:
+    """One letter for each largest group of which no two are apart; found by trying all groups one member larger."""
+    groups = {frozenset([name]) for name in names}
+    grown = True
+    while grown:
+        larger = {
+            group | {name}
+            for group in groups
+            for name in names
+            if name not in group and not any(frozenset((name, other)) in apart for other in group)
+        }
+        kept = {group for group in groups if not any(group < other for other in larger)} | larger
+        grown, groups = kept != groups, kept
+    place = {name: i for i, name in enumerate(names)}
+    columns = sorted(groups, key=lambda group: sorted(place[name] for name in group))
+    signs = [chr(97 + i % 26) + (str(i // 26) if i >= 26 else "") for i in range(len(columns))]
+    return {
+        name: "".join(s for s, column in zip(signs, columns, strict=True) if name in column) for name in names
+    }
+
+
+def survival(durations: Sequence[float], succeeded: Sequence[bool]) -> list[list[float]]:
+    """Kaplan and Meier's curve: [time, share left, low, high, at risk], intervals on the scale log(-log)."""
+    ended = Counter(d for d, ok in zip(durations, succeeded, strict=True) if ok)
+    share, spread, points = 1.0, 0.0, []
+    for t in sorted(set(durations)):
+        risk = sum(d >= t for d in durations)
+        share *= 1 - ended[t] / risk
+        spread = spread + ended[t] / (risk * (risk - ended[t])) if risk > ended[t] else math.inf
+        if share >= 1:
+            low = high = 1.0
+        elif share <= 0:
+            low = high = 0.0
+        else:
+            half = Z * math.sqrt(spread) / abs(math.log(share))
+            low, high = (math.exp(math.log(share) * math.exp(s * half)) for s in (1, -1))
+        points.append([t, share, low, high, risk])
+    return points
+
+
+def restricted_mean(durations: Sequence[float], succeeded: Sequence[bool]) -> tuple[float, Ends, float]:
+    """The area below the curve up to the longest trial, its interval, and that trial's time."""
+    until = max(durations)
+    points = survival(durations, succeeded)
+
+    def area(start: float) -> float:
+        steps = [(0.0, 1.0), *((p[0], p[1]) for p in points), (until, 0.0)]
+        return math.fsum(
+            share * max(0.0, end - max(t, start)) for (t, share), (end, _) in pairwise(steps) if end > start
+        )
+
+    variance = 0.0
+    for t, _, _, _, risk in points:
+        events = sum(1 for d, ok in zip(durations, succeeded, strict=True) if ok and d == t)
+        if t < until and risk > events:
+            variance += area(t) ** 2 * events / (risk * (risk - events))
+    value, half = area(0.0), Z * math.sqrt(variance)
+    return value, [max(0.0, value - half), min(until, value + half)], until
+
+
+def log_rank(
+    first: tuple[Sequence[float], Sequence[bool]], second: tuple[Sequence[float], Sequence[bool]]
+) -> float:
+    """Two-sided probability that both curves are the same."""
+    if not any(first[1]) and not any(second[1]):
+        return 1.0
+    surplus = variance = 0.0
+    for t in sorted({d for arm in (first, second) for d, ok in zip(*arm, strict=True) if ok}):
+        n1, n2 = (sum(d >= t for d in arm[0]) for arm in (first, second))
+        d1, d2 = (sum(ok and d == t for d, ok in zip(*arm, strict=True)) for arm in (first, second))
+        n, d = n1 + n2, d1 + d2
+        surplus += d1 - d * n1 / n
+        variance += d * n1 * n2 * (n - d) / (n * n * (n - 1)) if n > 1 else 0.0
+    return math.erfc(abs(surplus) / math.sqrt(2 * variance)) if variance > 0 else 1.0
+
+
+def mantel_haenszel(tables: Sequence[tuple[int, int, int, int]]) -> dict[str, object]:
+    """Over scenes, each (successes, trials, successes, trials)."""
+    surplus = variance = above = below = weighted = weights = 0.0
+    for x1, n1, x2, n2 in tables:
+        n, x = n1 + n2, x1 + x2
+        surplus += x1 - n1 * x / n
+        variance += n1 * n2 * x * (n - x) / (n * n * (n - 1))
+        above, below = above + x1 * (n2 - x2) / n, below + x2 * (n1 - x1) / n
+        weights += n1 * n2 / n
+        weighted += n1 * n2 / n * (x1 / n1 - x2 / n2)
+    crude = sum(t[0] for t in tables) / sum(t[1] for t in tables) - sum(t[2] for t in tables) / sum(
+        t[3] for t in tables
+    )
+    stratified = weighted / weights
+    return {
+        "odds_ratio": above / below if below > 0 else None,
+        "p": math.erfc(abs(surplus) / math.sqrt(2 * variance)) if variance > 0 else 1.0,
+        "crude": crude,
+        "stratified": stratified,
+        "reversed": crude * stratified < 0 and min(abs(crude), abs(stratified)) > 1e-12,
+    }
+
+
+def success_bets(pairs: Sequence[tuple[bool, bool]]) -> list[float]:
+    """Log e after each pair (worse one's outcome, better one's outcome), of a bet that the latter is the better."""
+    log_e, path = 0.0, []
+    for t, (worse, better_one) in enumerate(pairs):
+        p = (1 + sum(w for w, _ in pairs[:t])) / (3 + t)
+        q = (2 + sum(b for _, b in pairs[:t])) / (3 + t)
+        if p < q:
+            m = (p + q) / 2
+            log_e += math.log((p if worse else 1 - p) / (m if worse else 1 - m))
+            log_e += math.log((q if better_one else 1 - q) / (m if better_one else 1 - m))
+        path.append(log_e)
+    return path
+
+
+def score_bets(differences: Sequence[float]) -> list[float]:
+    """Log e after each difference of scores, of a bet that their mean is above 0."""
+    log_e, path, seen, squares = 0.0, [], [0.5], 0.25
+    for difference in differences:
+        x, mean, variance = (difference + 1) / 2, sum(seen) / len(seen), squares / len(seen)
+        edge = mean - 0.5
+        log_e += math.log1p(min(max(edge / (variance + edge * edge), 0.0), 1.0) * (x - 0.5))
+        path.append(log_e)
+        seen.append(x)
+        squares += (x - sum(seen) / len(seen)) ** 2
+    return path
+
+
+def separated(names: Sequence[str], p: dict[frozenset[str], float], alpha: float) -> set[frozenset[str]]:
+    """Pairs that a corrected probability of at most `alpha` tells apart."""
+    return {frozenset(pair) for pair in combinations(names, 2) if p[frozenset(pair)] <= alpha}

@@ -1,0 +1,268 @@
+"""All numbers of a report from its trials; the same shape as the report's own `numbers.json`."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+from . import methods
+
+DRAWS = 4000
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One row of trials.csv."""
+
+    order: int
+    block: str
+    checkpoint: str
+    scene: str
+    position: int
+    status: str
+    success: bool
+    score: float
+    duration: float | None
+    failure: str
+    milestones: tuple[tuple[str, bool], ...]
+
+    @property
+    def condition(self) -> str:
+        """The initial condition."""
+        return f"{self.scene}/{self.position}"
+
+
+class Drawn(list[float]):
+    """What a bootstrap drew, to be held against an interval that another one drew."""
+
+
+Trials = Sequence[Trial]
+
+
+def numbers(trials: Trials, plan: Mapping[str, Any]) -> dict[str, Any]:
+    """Every number there is."""
+    alpha = plan["stopping"]["alpha"]
+    arms: dict[str, list[Trial]] = defaultdict(list)
+    broken: dict[str, list[Trial]] = defaultdict(list)
+    for trial in sorted(trials, key=lambda t: t.order):
+        if trial.status == "scored":
+            arms[trial.checkpoint].append(trial)
+        elif trial.status == "interrupted":
+            broken[trial.checkpoint].append(trial)
+    names = sorted(arms, key=lambda name: (-_rate(arms[name]), name))
+    wanted = plan["comparison"]
+    couples = [
+        tuple(wanted) if wanted and set(wanted) == set(couple) else couple
+        for couple in combinations(names, 2)
+    ]
+    compared = [_comparison(a, b, arms[a], arms[b], alpha) for a, b in couples]
+    for comparison, p in zip(compared, methods.holm([c["barnard"]["p"] for c in compared]), strict=True):
+        comparison["barnard"]["holm"] = p
+    corrected = {frozenset((c["first"], c["second"])): c["barnard"]["holm"] for c in compared}
+    return {
+        "n": sum(len(arm) for arm in arms.values()),
+        "alpha": alpha,
+        "letters": methods.letters(names, methods.separated(names, corrected, alpha)),
+        "arms": {name: _arm(arms[name], broken[name]) for name in names},
+        "comparisons": compared,
+    }
+
+
+def _rate(trials: Trials) -> float:
+    return sum(t.success for t in trials) / len(trials)
+
+
+def _counts(trials: Trials) -> tuple[int, int]:
+    return sum(t.success for t in trials), len(trials)
+
+
+def _proportion(x: int, n: int) -> dict[str, Any]:
+    return {
+        "successes": x,
+        "n": n,
+        "rate": x / n if n else None,
+        "wilson": methods.wilson(x, n) if n else None,
+    }
+
+
+def _by(trials: Trials, key: Callable[[Trial], str]) -> dict[str, list[Trial]]:
+    found: dict[str, list[Trial]] = defaultdict(list)
+    for trial in trials:
+        found[key(trial)].append(trial)
+    return dict(sorted(found.items()))
+
+
+def _arm(trials: Trials, broken: Trials) -> dict[str, Any]:
+    x, n = _counts(trials)
+    scenes, cells = _by(trials, lambda t: t.scene), _by(trials, lambda t: t.condition)
+    timed = [(t.duration, t.success) for t in trials if t.duration is not None]
+    exposure = sum(d for d, _ in timed)
+    whole = exposure + sum(t.duration for t in broken if t.duration is not None)
+    return {
+        **_proportion(x, n),
+        "clopper_pearson": methods.clopper_pearson(x, n),
+        "posterior": {
+            "a": x + 1,
+            "b": n - x + 1,
+            "interval": methods.beta_interval(x + 1, n - x + 1),
+        },
+        "score": _mean({"all": [t.score for t in trials]}),
+        "macro": _mean({name: [float(t.success) for t in rows] for name, rows in scenes.items()}),
+        "scenes": {name: _proportion(*_counts(rows)) for name, rows in scenes.items()},
+        "positions": {name: _proportion(*_counts(rows)) for name, rows in cells.items()},
+        "milestones": {name: _funnel(rows) for name, rows in scenes.items() if rows[0].milestones},
+        "time_to_success": _time([d for d, _ in timed], [ok for _, ok in timed]) if timed else None,
+        "successes_per_hour": _per_hour(sum(ok for _, ok in timed), exposure),
+        "interruptions_per_hour": _per_hour(len(broken), whole),
+        "failures": dict(Counter(t.failure for t in trials if not t.success and t.failure)),
+    }
+
+
+def _mean(scenes: Mapping[str, Sequence[float]]) -> dict[str, Any]:
+    means = [math.fsum(values) / len(values) for values in scenes.values()]
+    value = math.fsum(means) / len(means)
+    if all(min(values) == max(values) for values in scenes.values()):
+        return {"value": value, "bootstrap": None}
+    chance = random.Random(1)
+    counted = [
+        (list(Counter(values)), list(Counter(values).values()), len(values)) for values in scenes.values()
+    ]
+    drawn = Drawn(
+        sum(sum(chance.choices(levels, weights, k=n)) / n for levels, weights, n in counted) / len(counted)
+        for _ in range(DRAWS)
+    )
+    return {"value": value, "bootstrap": drawn}
+
+
+def _funnel(trials: Trials) -> list[dict[str, Any]]:
+    steps = []
+    for i, (label, _) in enumerate(trials[0].milestones):
+        before = [t for t in trials if i == 0 or t.milestones[i - 1][1]]
+        steps.append(
+            {
+                "label": label,
+                "of_all": _proportion(sum(t.milestones[i][1] for t in trials), len(trials)),
+                "of_previous": _proportion(sum(t.milestones[i][1] for t in before), len(before)),
+            }
+        )
+    return steps
+
+
+def _time(durations: list[float], succeeded: list[bool]) -> dict[str, Any]:
+    curve = methods.survival(durations, succeeded)
+    mean = None
+    if max(durations) > 0:
+        value, interval, until = methods.restricted_mean(durations, succeeded)
+        mean = {"value_s": value, "interval": interval, "until_s": until}
+    return {
+        "n": len(durations),
+        "successes": sum(succeeded),
+        "median_s": next((point[0] for point in curve if point[1] <= 0.5), None),
+        "curve": curve,
+        "restricted_mean": mean,
+    }
+
+
+def _per_hour(events: int, exposure: float) -> dict[str, Any] | None:
+    if exposure <= 0:
+        return None
+    hours = exposure / 3600
+    return {
+        "events": events,
+        "exposure_s": exposure,
+        "per_hour": events / hours,
+        "garwood": [end / hours for end in methods.garwood(events)],
+    }
+
+
+def _comparison(one: str, other: str, first: Trials, second: Trials, alpha: float) -> dict[str, Any]:
+    counts = (*_counts(first), *_counts(second))
+    pairs = _pairs(first, second)
+    statistic, p = methods.barnard(*counts)
+    only = (
+        sum(a.success and not b.success for a, b in pairs),
+        sum(b.success and not a.success for a, b in pairs),
+    )
+    return {
+        "first": one,
+        "second": other,
+        "difference": {"value": _rate(first) - _rate(second), "newcombe": methods.newcombe(*counts)},
+        "barnard": {"statistic": statistic, "p": p},
+        "probability_better": methods.better(*counts),
+        "pairs": len(pairs),
+        "mcnemar": {
+            "first_only": only[0],
+            "second_only": only[1],
+            "pairs": len(pairs),
+            "p": methods.mcnemar(*only),
+        }
+        if pairs
+        else None,
+        "over_conditions": _clustered(first, second),
+        "over_scenes": _stratified(first, second),
+        "evidence": _evidence(
+            methods.success_bets([(b.success, a.success) for a, b in pairs]),
+            methods.success_bets([(a.success, b.success) for a, b in pairs]),
+            alpha,
+        ),
+        "score_evidence": _evidence(
+            methods.score_bets([a.score - b.score for a, b in pairs]),
+            methods.score_bets([b.score - a.score for a, b in pairs]),
+            alpha,
+        ),
+        "log_rank": _log_rank(first, second),
+    }
+
+
+def _pairs(first: Trials, second: Trials) -> list[tuple[Trial, Trial]]:
+    ours, theirs = {t.block: t for t in first}, {t.block: t for t in second}
+    pairs = [(ours[block], theirs[block]) for block in ours if block in theirs]
+    return sorted(pairs, key=lambda pair: max(pair[0].order, pair[1].order))
+
+
+def _clustered(first: Trials, second: Trials) -> dict[str, Any] | None:
+    ours, theirs = (_by(arm, lambda t: t.condition) for arm in (first, second))
+    differences = [_rate(ours[key]) - _rate(theirs[key]) for key in ours if key in theirs]
+    if len(differences) < 2 or max(differences) - min(differences) < 1e-12:
+        return None
+    chance, k = random.Random(2), len(differences)
+    drawn = Drawn(sum(chance.choices(differences, k=k)) / k for _ in range(DRAWS))
+    return {"value": math.fsum(differences) / k, "bootstrap": drawn}
+
+
+def _stratified(first: Trials, second: Trials) -> dict[str, Any] | None:
+    ours, theirs = (_by(arm, lambda t: t.scene) for arm in (first, second))
+    shared = [key for key in ours if key in theirs]
+    if len({*ours, *theirs}) < 2 or not shared:
+        return None
+    return methods.mantel_haenszel([(*_counts(ours[key]), *_counts(theirs[key])) for key in shared])
+
+
+def _log_rank(first: Trials, second: Trials) -> float | None:
+    arms = []
+    for arm in (first, second):
+        timed = [(t.duration, t.success) for t in arm if t.duration is not None]
+        arms.append(([d for d, _ in timed], [ok for _, ok in timed]))
+    return methods.log_rank(*arms) if arms[0][0] and arms[1][0] else None
+
+
+def _evidence(first: list[float], second: list[float], alpha: float) -> dict[str, Any]:
+    p = [min(1.0, math.exp(-max(path, default=0.0))) for path in (first, second)]
+    bound = -math.log(alpha / 2)
+    stops = [next((i for i, e in enumerate(path, 1) if e >= bound), None) for path in (first, second)]
+    reached = [stop for stop in stops if stop is not None]
+    stop = min(reached, default=None)
+    return {
+        "pairs": len(first),
+        "log_e_first": first,
+        "log_e_second": second,
+        "p_first": p[0],
+        "p_second": p[1],
+        "stop": stop,
+        "winner": None if stop is None else ("first" if stops[0] == stop else "second"),
+    }

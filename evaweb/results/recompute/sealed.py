@@ -1,0 +1,94 @@
+"""Schedule, codes and commitment again, from the key that the reveal showed."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+_LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"
+
+
+def digest(document: Any) -> str:
+    """SHA-256 of the canonical form."""
+    text = json.dumps(_plain(document), sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    """A whole number is written without a point, whoever wrote it."""
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    return [_plain(inner) for inner in value] if isinstance(value, list) else value
+
+
+def _draws(key: bytes, name: str) -> Iterator[int]:
+    drawn = 0
+    while True:
+        yield int.from_bytes(hmac.new(key, f"{name}/{drawn}".encode(), hashlib.sha256).digest()[:8], "big")
+        drawn += 1
+
+
+def _below(draws: Iterator[int], n: int) -> int:
+    fair = 2**64 - 2**64 % n
+    return next(drawn % n for drawn in draws if drawn < fair)
+
+
+def _shuffled(draws: Iterator[int], items: Sequence[Any]) -> list[Any]:
+    found = list(items)
+    for i in reversed(range(1, len(found))):
+        j = _below(draws, i + 1)
+        found[i], found[j] = found[j], found[i]
+    return found
+
+
+def schedule(plan: Mapping[str, Any], key: bytes) -> list[list[Any]]:
+    """[index, block, checkpoint, scene, position, repetition] of every trial that the plan foresaw."""
+    names = [row["name"] for row in plan["checkpoints"]]
+    conditions = [(scene["name"], p["number"]) for scene in plan["scenes"] for p in scene["positions"]]
+    draws, k = _draws(key, "orders"), len(names)
+    orders: list[list[str]] = []
+    units: list[list[Any]] = []
+    block = 0
+    for repetition in range(1, plan["repetitions"] + 1):
+        for scene, position in _shuffled(_draws(key, f"conditions/{repetition}"), conditions):
+            if not orders:
+                rows, columns = _shuffled(draws, names), _shuffled(draws, range(k))
+                orders = _shuffled(draws, [[rows[(i + c) % k] for c in columns] for i in range(k)])
+            for checkpoint in orders.pop(0):
+                units.append([len(units), block, checkpoint, scene, position, repetition])
+            block += 1
+    return units
+
+
+def codes(key: bytes, count: int) -> list[str]:
+    """The codes in the order in which trials were handed out."""
+    draws, found = _draws(key, "codes"), dict[str, None]()
+    while len(found) < count:
+        found["".join(_LETTERS[_below(draws, len(_LETTERS))] for _ in range(5))] = None
+    return list(found)
+
+
+def faults(seal: Mapping[str, Any], plan: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) -> list[str]:
+    """What does not fit together of plan, commitment, key and trials; nothing where all does."""
+    found = []
+    if digest(plan) != seal["digest"]:
+        found.append(f"plan.json has the digest {digest(plan)}, the plan that was frozen {seal['digest']}")
+    if not seal["key"]:
+        return found
+    key = bytes.fromhex(seal["key"])
+    units = schedule(plan, key)
+    committed = hmac.new(key, f"{seal['digest']}\n{digest({'units': units})}".encode(), hashlib.sha256)
+    if committed.hexdigest() != seal["commitment"]:
+        found.append(f"the key makes the commitment {committed.hexdigest()}, shown was {seal['commitment']}")
+    known = codes(key, max((int(row["order"]) for row in rows), default=0))
+    for row in rows:
+        unit = units[int(row["slot"])]
+        said = [int(row["slot"]), int(row["block"]), row["checkpoint"], row["scene"], int(row["position"])]
+        if unit[:5] != said or row["code"] != known[int(row["order"]) - 1]:
+            found.append(f"trial {row['trial']} ({row['code']}) is not what the schedule foresaw: {unit}")
+    return found

@@ -1,0 +1,174 @@
+"""A plan's report: pages, data, and the program that computes all of it again; needs neither us nor a network."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from django.contrib.staticfiles import finders
+from django.template.loader import render_to_string
+from django.utils import timezone
+
+from evaweb.cells import csv_lines
+from evaweb.errors import EvaError
+from evaweb.plans.models import Plan, PlanState
+from evaweb.results import caching, facts, listings
+from evaweb.results.agreement import agreement_of, preferences_of
+from evaweb.results.analysis import Analysis
+from evaweb.results.checklist import checklist
+from evaweb.results.document import analysis_document
+from evaweb.results.drawings import conditions, courses, rates
+from evaweb.results.filters import Chosen
+from evaweb.results.models import Rating
+from evaweb.results.tables import COLUMNS, outcome_pages
+from evaweb.trials.models import Score
+
+_STYLES = ("css/tokens.css", "css/base.css", "result/result.css", "result/figures.css", "result/plans.css")
+_PROGRAM = Path(__file__).parent / "recompute"
+_RATINGS = ("trial", "rater", "success", "score", "milestones", "failure", "note", "blind", "at")
+_PREFERENCES = (
+    "first",
+    "second",
+    "first_checkpoint",
+    "second_checkpoint",
+    "outcome",
+    "why",
+    "rater",
+    "blind",
+    "at",
+)
+_SCORES = ("trial", "rater", "source", "success", "score", "failure", "note", "reason", "scored_at")
+
+
+def write_report(plan: Plan, out: Path) -> Path:
+    """Everything into the new folder `out`; its first page. EvaError where it exists and is not empty."""
+    if out.exists() and any(out.iterdir()):
+        raise EvaError(f"{out} is not empty: name a new folder, so that reports are not mixed")
+    if plan.state == PlanState.DRAFT:
+        raise EvaError(f"{plan} is a draft: there is nothing to report before it is frozen")
+    analysis = caching.analysis_of(plan)
+    data = out / "data"
+    data.mkdir(parents=True, exist_ok=True)
+    _json(data / "plan.json", plan.document or {})
+    _json(data / "seal.json", seal_of(plan))
+    _json(data / "numbers.json", numbers_of(plan, analysis))
+    _csv(data / "trials.csv", list(COLUMNS), outcome_pages(plan))
+    _csv(data / "scores.csv", _SCORES, _scores(plan))
+    _csv(data / "ratings.csv", _RATINGS, _ratings(plan))
+    _csv(data / "preferences.csv", _PREFERENCES, _preferences(plan))
+    shutil.copytree(_PROGRAM, out / "recompute", ignore=shutil.ignore_patterns("__pycache__"))
+    page = out / "index.html"
+    page.write_text(render_to_string("results/report.html", report_context(plan, analysis)), "utf-8")
+    return page
+
+
+def numbers_of(plan: Plan, analysis: Analysis) -> dict[str, Any]:
+    """Every number of the report, and only such as the program computes again."""
+    preferred = preferences_of(plan)
+    words = ("reason", "groups")
+    return {
+        **analysis_document(analysis),
+        "agreement": agreement_of(plan),
+        "preferences": preferred and {name: value for name, value in preferred.items() if name not in words},
+    }
+
+
+def seal_of(plan: Plan) -> dict[str, str]:
+    """Digest and commitment, and the key once it was revealed."""
+    shown = plan.state == PlanState.REVEALED
+    return {
+        "digest": plan.digest,
+        "commitment": plan.commitment,
+        "key": bytes(plan.key or b"").hex() if shown else "",
+    }
+
+
+def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
+    """What the report's page shows; its figures lead nowhere, because there is nothing behind them."""
+    arms = analysis.arms
+    order = {arm.checkpoint: i for i, arm in enumerate(arms)}
+    primary = facts.primary_of(plan, analysis)
+    scenes = sorted({name for arm in arms for name in arm.scenes})
+    runs = caching.runs_of(plan)
+    return {
+        "plan": plan,
+        "document": plan.document,
+        "seal": seal_of(plan),
+        "analysis": analysis,
+        "styles": "\n".join(_style(name) for name in _STYLES),
+        "made": timezone.now(),
+        "primary": primary and facts.comparison_facts(plan, analysis, primary),
+        "table": listings.arm_rows(plan, analysis, Chosen()),
+        "others": [
+            (found, facts.comparison_sentence(analysis, found))
+            for found in analysis.comparisons
+            if found is not primary
+        ],
+        "intervals": rates.intervals("Success rates", [(a.checkpoint, a.success, "") for a in arms], order)
+        if arms
+        else None,
+        "violins": rates.violins(arms, analysis.letters) if arms else None,
+        "funnels": [
+            courses.funnel(
+                scene,
+                [(i, a.checkpoint, f) for i, a in enumerate(arms) for f in a.funnels if f.scene == scene],
+                {},
+            )
+            for scene in scenes
+            if any(f.scene == scene for a in arms for f in a.funnels)
+        ],
+        "survival": courses.survival(arms),
+        "grid": conditions.grid(arms, {}),
+        "pareto": conditions.pareto(arms, {}),
+        "evidence": primary and courses.evidence(primary.evidence, primary.first, primary.second),
+        "agreement": agreement_of(plan),
+        "preferences": preferences_of(plan),
+        "checklist": checklist(plan, analysis),
+        "runs": runs.outcomes,
+    }
+
+
+def _style(name: str) -> str:
+    found = finders.find(name)
+    if not isinstance(found, str):
+        raise EvaError(f"the style sheet {name} is not where it was installed")
+    return Path(found).read_text("utf-8")
+
+
+def _scores(plan: Plan) -> Iterator[list[dict[str, Any]]]:
+    rows = Score.objects.filter(trial__evaluation=plan.evaluation_id).order_by("pk")
+    fields = [{"trial": "trial_id", "rater": "rater__username"}.get(name, name) for name in _SCORES]
+    yield [dict(zip(_SCORES, row, strict=True)) for row in rows.values_list(*fields)]
+
+
+def _ratings(plan: Plan) -> Iterator[list[dict[str, Any]]]:
+    rows = Rating.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
+    yield [
+        {
+            **{name: getattr(row, name) for name in _RATINGS},
+            "trial": row.trial_id,
+            "rater": row.rater.get_username(),
+            "milestones": json.dumps(row.milestones, ensure_ascii=False),
+        }
+        for row in rows
+    ]
+
+
+def _preferences(plan: Plan) -> Iterator[list[dict[str, Any]]]:
+    fields = ("first_id", "second_id", "first__checkpoint__name", "second__checkpoint__name")
+    rows = plan.preferences.order_by("pk").values_list(
+        *fields, "outcome", "why", "rater__username", "blind", "at"
+    )
+    yield [dict(zip(_PREFERENCES, row, strict=True)) for row in rows]
+
+
+def _json(path: Path, content: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", "utf-8")
+
+
+def _csv(path: Path, columns: Sequence[str], rows: Iterator[list[dict[str, Any]]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        file.writelines(csv_lines(columns, rows))

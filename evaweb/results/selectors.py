@@ -1,0 +1,202 @@
+"""What the result pages list: plans with their progress, trials of a plan, what goes on in the lab."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from typing import Any
+from urllib.parse import urlencode
+
+from django.db.models import Case, Count, Exists, IntegerField, Max, Min, OuterRef, Q, QuerySet, Value, When
+
+from evaweb.errors import EvaError, NotFound
+from evaweb.plans.models import Plan, PlanState, Slot
+from evaweb.stations.models import Station
+from evaweb.trials.models import MilestoneOutcome, Trial, TrialStatus
+from evaweb.trials.selectors import UNFINISHED
+
+_HOUR = 3600
+_ORDER = Case(
+    When(state=PlanState.FROZEN, then=Value(0)),
+    When(state=PlanState.DRAFT, then=Value(2)),
+    default=Value(1),
+    output_field=IntegerField(),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class PlanRow:
+    """A plan and how far it is: trials that it foresees, trials that count, attempts, and when those were made."""
+
+    plan: Plan
+    foreseen: int
+    counted: int
+    attempts: int
+    since: datetime | None
+    until: datetime | None
+
+    @property
+    def share(self) -> int:
+        """Whole percent of the trials foreseen that count."""
+        return round(100 * self.counted / self.foreseen) if self.foreseen else 0
+
+    @property
+    def hours_left(self) -> float | None:
+        """At the pace from the first trial to the newest; None where nothing is left, or before there is a pace."""
+        left = self.foreseen - self.counted
+        if (
+            self.counted < 2
+            or left < 1
+            or self.since is None
+            or self.until is None
+            or self.until <= self.since
+        ):
+            return None  # clocks of stations differ: a pace backwards is none
+        return float((self.until - self.since).total_seconds() / _HOUR / self.counted * left)
+
+
+@dataclass(frozen=True, slots=True)
+class StationNow:
+    """A station and the trial that is not finished there."""
+
+    station: Station
+    trial: Trial | None
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """Which trials of a plan are meant; "" where it does not matter.
+
+    `success` is yes or no, `missed` and `reached` are the words of a milestone. Without a `status` those that count.
+    """
+
+    checkpoint: str = ""
+    scene: str = ""
+    position: str = ""
+    station: str = ""
+    operator: str = ""
+    status: str = TrialStatus.SCORED.value
+    success: str = ""
+    failure: str = ""
+    missed: str = ""
+    reached: str = ""
+
+    @property
+    def query(self) -> str:
+        """As it stands in an address."""
+        return urlencode({name: value for name, value in asdict(self).items() if value})
+
+
+def plan_get(*, name: str, version: int | None = None) -> Plan:
+    """That version of the plan, or its newest; NotFound says which versions there are."""
+    rows = Plan.objects.select_related("owner", "first", "second", "evaluation", "revealed_by", "amends")
+    versions = list(rows.filter(name=name).order_by("-version"))
+    found = [row for row in versions if version in (None, row.version)]
+    if not found:
+        there = ", ".join(str(row.version) for row in versions)
+        raise NotFound(
+            f"plan {name!r:.80} has no version {version}; there are: {there}"
+            if there
+            else f"plan {name!r:.80} does not exist"
+        )
+    return found[0]
+
+
+def plan_list(state: str = "", words: str = "") -> QuerySet[Plan]:
+    """Plans: those that run, then those that have run, then drafts, the newest of each first."""
+    rows = Plan.objects.select_related("owner").defer("document", "key").order_by(_ORDER, "-frozen_at", "-pk")
+    if state and state not in PlanState.values:
+        raise EvaError(f"state = {state!r:.80}; allowed: {', '.join(PlanState.values)}")
+    rows = rows.filter(state=state) if state else rows
+    return rows.filter(Q(title__icontains=words) | Q(name__icontains=words)) if words else rows
+
+
+def plan_rows(plans: Iterable[Plan]) -> list[PlanRow]:
+    """Each with its progress, in two queries for all; it tells nothing of any checkpoint."""
+    given = list(plans)
+    slots = Slot.objects.filter(plan__in=given).order_by().values_list("plan").annotate(n=Count("pk"))
+    foreseen: dict[int, int] = dict(slots)
+    trials = Trial.objects.filter(evaluation__in=[plan.evaluation_id for plan in given if plan.evaluation_id])
+    made = (
+        trials.order_by()
+        .values("evaluation")
+        .annotate(
+            attempts=Count("pk"),
+            counted=Count("pk", filter=Q(status=TrialStatus.SCORED)),
+            since=Min("prepared_at"),
+            until=Max("ended_at"),
+        )
+    )
+    found = {row.pop("evaluation"): row for row in made}
+    nothing: dict[str, Any] = {"attempts": 0, "counted": 0, "since": None, "until": None}
+    return [
+        PlanRow(plan, foreseen.get(plan.pk, 0), **found.get(plan.evaluation_id, nothing)) for plan in given
+    ]
+
+
+def trials_of_plan(plan: Plan, question: Question) -> QuerySet[Trial]:
+    """Those that fit, in the order in which they were handed out; EvaError says what is allowed."""
+    named = ("checkpoint", "scene", "position", "station", "operator", "verdict", "episode", "handout")
+    rows = (
+        Trial.objects.filter(evaluation=plan.evaluation_id).select_related(*named).order_by("handout__number")
+    )
+    fields = {
+        "checkpoint": "checkpoint__name",
+        "scene": "scene__name",
+        "station": "station__name",
+        "operator": "operator__username",
+        "failure": "verdict__failure",
+    }
+    for name, field in fields.items():
+        if value := getattr(question, name):
+            rows = rows.filter(**{field: value})
+    if question.position:
+        rows = rows.filter(position__number=_whole("position", question.position))
+    if question.status:
+        if question.status not in TrialStatus.values:
+            raise EvaError(f"status = {question.status!r:.80}; allowed: {', '.join(TrialStatus.values)}")
+        rows = rows.filter(status=question.status)
+    if question.success:
+        if question.success not in ("yes", "no"):
+            raise EvaError(f"success = {question.success!r:.80}; allowed: yes, no")
+        rows = rows.filter(verdict__success=question.success == "yes")
+    for name, reached in (("missed", False), ("reached", True)):
+        if value := getattr(question, name):
+            rows = rows.filter(
+                Exists(
+                    MilestoneOutcome.objects.filter(score=OuterRef("verdict"), text=value, reached=reached)
+                )
+            )
+    return rows
+
+
+def _whole(name: str, value: str) -> int:
+    if not (value.isascii() and value.isdecimal() and len(value) < 7):
+        raise EvaError(f"{name} = {value!r:.80}; allowed: a number")
+    return int(value)
+
+
+def stations_now() -> list[StationNow]:
+    """Every active station with what goes on there."""
+    stations = list(Station.objects.filter(active=True).order_by("name"))
+    open_ones = Trial.objects.filter(station__in=stations, status__in=UNFINISHED).select_related(
+        "scene", "position", "checkpoint", "evaluation", "operator", "handout__plan"
+    )
+    found = {trial.station_id: trial for trial in open_ones.order_by("pk")}
+    return [StationNow(station, found.get(station.pk)) for station in stations]
+
+
+def trials_recent(limit: int = 12) -> QuerySet[Trial]:
+    """The newest that were run."""
+    named = (
+        "scene",
+        "position",
+        "checkpoint",
+        "evaluation",
+        "station",
+        "operator",
+        "verdict",
+        "handout__plan",
+    )
+    return Trial.objects.filter(started_at__isnull=False).select_related(*named).order_by("-pk")[:limit]

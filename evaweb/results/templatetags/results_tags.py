@@ -1,0 +1,105 @@
+"""How results are written on their pages."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from django import template
+from django.urls import reverse
+from django.utils.html import format_html, format_html_join
+from django.utils.safestring import SafeString
+
+from evaweb.plans.models import Plan, PlanState
+from evaweb.results import wording
+from evaweb.results.filters import Chosen
+from evaweb.results.outcomes import Outcome
+from evaweb.statistics.proportions import Proportion
+
+register = template.Library()
+_TONES = {
+    PlanState.DRAFT: "ready",
+    PlanState.FROZEN: "running",
+    PlanState.CLOSED: "holding",
+    PlanState.REVEALED: "idle",
+}
+
+
+@register.filter
+def plan_tone(plan: Plan) -> str:
+    """The colour of a plan's state, by the name the style sheets have for it."""
+    return _TONES[PlanState(plan.state)]
+
+
+@register.filter
+def rate_words(found: Proportion) -> str:
+    """x/n, percent and interval."""
+    return wording.rate_words(found)
+
+
+@register.filter
+def probability(p: float) -> str:
+    """A probability as papers write it."""
+    return wording.probability(p)
+
+
+@register.filter
+def outcome_words(run: Outcome) -> str:
+    """Success or failure, and the score where that says more."""
+    said = "success" if run.success else f"failure{f': {run.failure}' if run.failure else ''}"
+    return f"{said}, {100 * run.score:.0f} % of points" if 0 < run.score < 1 else said
+
+
+@register.filter
+def twice_over(alpha: float) -> str:
+    """At how large an e-value one of two directions may be believed."""
+    return f"{2 / alpha:g}"
+
+
+@register.filter
+def chosen_items(only: Chosen) -> list[tuple[str, str]]:
+    """What is chosen, name and value."""
+    return [(name, value) for name, value in asdict(only).items() if value]
+
+
+@register.filter
+def words(text: str) -> list[str]:
+    """The words of a text."""
+    return text.split()
+
+
+@register.simple_tag
+def export_links(plan: Plan, only: Chosen) -> SafeString:
+    """To the plan's trials as tables, and to its report."""
+    address = reverse("api:plan-outcomes", args=[plan.name, plan.version])
+    query = f"&{only.query}" if only.query else ""
+    links = [(f"{address}?format={kind}{query}", label) for kind, label in _FORMATS]
+    links.append((reverse("result-report", args=[plan.name, plan.version]), "Report, offline"))
+    return format_html("{}", format_html_join(" ", '<a href="{}">{}</a>', links))
+
+
+_FORMATS = (("csv", "Trials as CSV"), ("parquet", "as Parquet"), ("json", "as JSON"))
+
+
+@register.filter
+def points(share: float) -> str:
+    """A difference of shares as whole points."""
+    return f"{100 * share:.0f}"
+
+
+@register.filter
+def same_words(found: dict[str, Any]) -> str:
+    """How often two raters said the same, with n and interval."""
+    low, high = found["wilson"]
+    share = 100 * found["same"] / found["n"]
+    return f"{found['same']}/{found['n']}, {share:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+@register.filter
+def contrast_words(found: dict[str, Any]) -> str:
+    """With what probability the first is preferred to the second."""
+    low, high = found["interval"]
+    return (
+        f"{found['first']} is preferred to {found['second']} with probability {found['win_probability']:.2f} "
+        f"[{low:.2f}, {high:.2f}]"
+    )

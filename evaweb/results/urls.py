@@ -1,0 +1,27 @@
+"""Addresses of the pages of results."""
+
+from __future__ import annotations
+
+from django.urls import path
+
+from evaweb.results import views, views_judging, views_lab
+
+_PLAN = "result/plans/<slug:name>/<int:version>/"
+urlpatterns = [
+    path("result/lab/", views_lab.dashboard, name="lab-dashboard"),
+    path("result/wall/", views_lab.wall, name="lab-wall"),
+    path("result/planner/", views_lab.planner, name="result-planner"),
+    path("result/rate/", views_judging.rate, name="rate"),
+    path("result/prefer/", views_judging.prefer, name="prefer"),
+    path("result/plans/", views.plans, name="result-plans"),
+    path("result/plans/<slug:name>/", views.plan, name="result-plan-newest"),
+    path(_PLAN, views.plan, name="result-plan"),
+    path(_PLAN + "compare/", views.compare, name="result-compare"),
+    path(_PLAN + "evidence/", views.evidence, name="result-evidence"),
+    path(_PLAN + "report.zip", views.report, name="result-report"),
+    path(_PLAN + "trials/", views.trials, name="result-plan-trials"),
+    *(
+        path(f"{_PLAN}{what}", views.act, {"what": what}, name=f"result-{what}")
+        for what in ("freeze", "amend", "close", "reveal", "look")
+    ),
+]

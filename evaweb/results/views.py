@@ -1,0 +1,210 @@
+"""The pages of a plan: what its trials say, comparison, evidence, the trials themselves, what its owner does."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from django.core.paginator import Paginator
+from django.http import HttpRequest, HttpResponse
+from django.shortcuts import redirect, render
+from django.urls import reverse
+from django.views.decorators.http import require_GET, require_POST
+
+from evaweb.errors import EvaError
+from evaweb.plans import services
+from evaweb.plans.models import Plan, PlanState
+from evaweb.plans.sight import look, may_look
+from evaweb.results import caching, listings, pages, selectors
+from evaweb.results.agreement import agreement_of, preferences_of
+from evaweb.results.filters import chosen
+from evaweb.results.reporting import write_report
+from evaweb.results.seen import has_results, require_seen, why_sealed
+from evaweb.results.selectors import Question
+from evaweb.roles import Role, role_of
+from evaweb.sight import sight_for
+from evaweb.trials.models import TrialStatus
+
+PER_PAGE = 50
+PLANS_PER_PAGE = 25
+
+
+@require_GET
+def plans(request: HttpRequest) -> HttpResponse:
+    """All plans with their progress."""
+    state, words, fault = request.GET.get("state", ""), request.GET.get("words", "").strip(), None
+    try:
+        rows = selectors.plan_list(state, words)
+    except EvaError as error:
+        rows, fault = selectors.plan_list(), error
+    page = Paginator(rows, PLANS_PER_PAGE).get_page(request.GET.get("page"))
+    context = {
+        "page": page,
+        "rows": selectors.plan_rows(page),
+        "states": PlanState.choices,
+        "state": state,
+        "words": words,
+        "fault": fault,
+        "here": "plans",
+    }
+    return render(request, "results/plans.html", context)
+
+
+@require_GET
+def plan(request: HttpRequest, name: str, version: int | None = None) -> HttpResponse:
+    """What the plan found; where that is sealed, or is not there yet, how far it is."""
+    return _plan_page(request, _found(name, version))
+
+
+@require_GET
+def compare(request: HttpRequest, name: str, version: int) -> HttpResponse:
+    """Two checkpoints of it side by side."""
+    found = _found(name, version)
+    sealed = _sealed_page(request, found)
+    if sealed:
+        return sealed
+    try:
+        only = chosen(request.GET, caching.runs_of(found).outcomes)
+        context = pages.comparison_page(
+            found, only, request.GET.get("first", ""), request.GET.get("second", "")
+        )
+    except EvaError as fault:
+        return _plan_page(request, found, fault)
+    return render(request, "results/compare.html", {**context, **_common(request, found)})
+
+
+@require_GET
+def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
+    """The evidence so far, for who may look; with HX-Request the meter alone, to be put into the page."""
+    found = _found(name, version)
+    sealed = _sealed_page(request, found)
+    if sealed:
+        return sealed
+    context = {**pages.evidence_page(found), **_common(request, found)}
+    fragment = bool(request.headers.get("HX-Request"))
+    return render(request, "results/meter.html" if fragment else "results/evidence.html", context)
+
+
+@require_GET
+def trials(request: HttpRequest, name: str, version: int) -> HttpResponse:
+    """The trials that a number was made from."""
+    found = _found(name, version)
+    sealed = _sealed_page(request, found)
+    if sealed:
+        return sealed
+    given = {
+        row.name: request.GET.get(row.name, "").strip() for row in fields(Question) if row.name in request.GET
+    }
+    try:
+        question = Question(**given)
+        rows = selectors.trials_of_plan(found, question).prefetch_related("verdict__outcomes")
+    except EvaError as fault:
+        return _plan_page(request, found, fault)
+    page = Paginator(rows, PER_PAGE).get_page(request.GET.get("page"))
+    context = {
+        "page": page,
+        "rows": [listings.trial_row(trial) for trial in page],
+        "question": question,
+        "statuses": TrialStatus.choices,
+        "choices": listings.trial_choices(found),
+        **_common(request, found),
+    }
+    return render(request, "results/trials.html", context)
+
+
+@require_GET
+def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
+    """The offline report as one archive."""
+    found = _found(name, version)
+    require_seen(found, request.user)
+    title = f"{found.name}-v{found.version}"
+    with TemporaryDirectory() as folder:
+        write_report(found, Path(folder) / title)
+        packed = shutil.make_archive(f"{folder}/packed", "zip", folder, title)
+        content = Path(packed).read_bytes()
+    return HttpResponse(
+        content,
+        content_type="application/zip",
+        headers={"Content-Disposition": f'attachment; filename="{title}.zip"'},
+    )
+
+
+@require_POST
+def act(request: HttpRequest, name: str, version: int, what: str) -> HttpResponse:
+    """Freeze, amend, close or reveal it, or look behind the blind: by its owner, with a reason where one is due."""
+    found = _found(name, version)
+    user: Any = request.user
+    reason = request.POST.get("reason", "")
+    acts: Mapping[str, Callable[[], Plan | None]] = {
+        "freeze": lambda: services.plan_freeze(user=user, plan=found),
+        "amend": lambda: services.plan_amend(user=user, plan=found, reason=reason),
+        "close": lambda: services.plan_close(user=user, plan=found, reason=reason),
+        "reveal": lambda: services.plan_reveal(user=user, plan=found),
+        "look": lambda: look(found, user),
+    }
+    try:
+        made = acts[what]()
+    except EvaError as fault:
+        return _plan_page(request, found, fault, typed=reason)
+    shown = made or found
+    return redirect("result-plan", name=shown.name, version=shown.version)
+
+
+def _found(name: str, version: int | None) -> Plan:
+    return selectors.plan_get(name=name, version=version)
+
+
+def _plan_page(
+    request: HttpRequest, found: Plan, fault: EvaError | None = None, typed: str = ""
+) -> HttpResponse:
+    sealed = _sealed_page(request, found, fault, typed)
+    if sealed:
+        return sealed
+    try:
+        only = chosen(request.GET, caching.runs_of(found).outcomes)
+    except EvaError as problem:
+        only, fault = chosen({}, ()), fault or problem
+    judged = {"agreement": agreement_of(found), "preferences": preferences_of(found)}
+    context = {
+        **pages.summary_page(found, only),
+        **judged,
+        **_common(request, found),
+        "fault": fault,
+        "typed": typed,
+    }
+    return render(request, "results/plan.html", context, status=fault.status if fault else 200)
+
+
+def _sealed_page(
+    request: HttpRequest, found: Plan, fault: EvaError | None = None, typed: str = ""
+) -> HttpResponse | None:
+    """What is shown in place of results that this user does not see, or that there cannot be; None where they do."""
+    why = why_sealed(found, request.user, sight_for(request)) if has_results(found) else ""
+    if has_results(found) and not why:
+        return None
+    context = {
+        **_common(request, found),
+        "why": why,
+        "may_look": found.sealed and may_look(found, request.user),
+        "fault": fault,
+        "typed": typed,
+    }
+    return render(request, "results/sealed.html", context, status=fault.status if fault else 200)
+
+
+def _common(request: HttpRequest, found: Plan) -> dict[str, Any]:
+    role = role_of(request.user)
+    managed = role is Role.ADMIN or (found.owner_id == request.user.pk and role is not Role.VIEWER)
+    return {
+        "plan": found,
+        "row": selectors.plan_rows([found])[0],
+        "events": found.events.select_related("by"),
+        "key": bytes(found.key or b"").hex() if found.state == PlanState.REVEALED else "",
+        "may_manage": managed,
+        "here": "plans",
+        "home": reverse("result-plan", args=[found.name, found.version]),
+    }

@@ -1,0 +1,132 @@
+"""Pages of those who look at videos without knowing what they see: a trial rated again, one of two preferred."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from django.http import HttpRequest, HttpResponse, QueryDict
+from django.shortcuts import redirect, render
+from django.views.decorators.http import require_http_methods
+
+from evaweb.episodes.models import Episode
+from evaweb.episodes.selectors import stage_of
+from evaweb.errors import EvaError
+from evaweb.plans.models import Handout
+from evaweb.results import judging
+from evaweb.results.models import Preference
+from evaweb.results.selectors import plan_get
+from evaweb.roles import Role, role_of
+
+_ANSWERS = {"yes": True, "no": False}
+
+
+@require_http_methods(["GET", "POST"])
+def rate(request: HttpRequest) -> HttpResponse:
+    """The next trial to be rated again, by its code only."""
+    fault = None
+    if request.method == "POST":
+        try:
+            _rated(request)
+        except EvaError as error:
+            fault = error
+        else:
+            return redirect("rate")
+    user: Any = request.user
+    handout, left = judging.to_rate(user)
+    milestones = list(handout.trial.scene.milestones.order_by("order")) if handout else []
+    typed = request.POST if handout and request.POST.get("code") == handout.code else QueryDict()
+    ticked = typed.getlist("milestone")
+    view = _view(handout)
+    context = {
+        "handout": handout,
+        "left": left,
+        "view": view,
+        "milestones": [(milestone, str(milestone.pk) in ticked) for milestone in milestones],
+        "implied": any(milestone.required for milestone in milestones),
+        "unable": _unable(user, [view]),
+        "fault": fault,
+        "typed": typed,
+        "here": "rate",
+    }
+    return render(request, "results/rate.html", context, status=fault.status if fault else 200)
+
+
+@require_http_methods(["GET", "POST"])
+def prefer(request: HttpRequest) -> HttpResponse:
+    """The next two trials of one initial condition: which was the better one, and why?"""
+    fault = None
+    if request.method == "POST":
+        try:
+            _preferred(request)
+        except EvaError as error:
+            fault = error
+        else:
+            return redirect("prefer")
+    user: Any = request.user
+    pair, left = judging.to_prefer(user)
+    codes = (pair.first.code, pair.second.code) if pair else ()
+    views = [_view(pair.first), _view(pair.second)] if pair else []
+    context = {
+        "pair": pair,
+        "left": left,
+        "views": views,
+        "outcomes": Preference.Outcome.choices,
+        "unable": _unable(user, views),
+        "fault": fault,
+        "typed": request.POST if (request.POST.get("first"), request.POST.get("second")) == codes else {},
+        "here": "prefer",
+    }
+    return render(request, "results/prefer.html", context, status=fault.status if fault else 200)
+
+
+def _rated(request: HttpRequest) -> None:
+    plan = plan_get(name=request.POST.get("plan", ""), version=_version(request))
+    code = request.POST.get("code", "")
+    handout = plan.handouts.filter(code=code).select_related("trial__scene").first()
+    ticked = set(request.POST.getlist("milestone"))
+    keys = handout.trial.scene.milestones.values_list("pk", flat=True) if handout else ()
+    user: Any = request.user
+    judging.rate(
+        user=user,
+        plan=plan,
+        code=code,
+        milestones={key: str(key) in ticked for key in keys},
+        success=_ANSWERS.get(request.POST.get("success", "")),
+        failure=request.POST.get("failure", ""),
+        note=request.POST.get("note", ""),
+    )
+
+
+def _preferred(request: HttpRequest) -> None:
+    user: Any = request.user
+    judging.prefer(
+        user=user,
+        plan=plan_get(name=request.POST.get("plan", ""), version=_version(request)),
+        **{name: request.POST.get(name, "") for name in ("first", "second", "outcome", "why")},
+    )
+
+
+def _version(request: HttpRequest) -> int:
+    given = request.POST.get("version", "")
+    if not (given.isascii() and given.isdecimal() and len(given) < 7):
+        raise EvaError(f"version = {given!r:.20}; allowed: a number")
+    return int(given)
+
+
+def _view(handout: Handout | None) -> dict[str, Any] | None:
+    """A recording as it is shown to somebody who must not know what it is of."""
+    episode: Episode | None = handout.trial.episode if handout else None
+    if handout is None or episode is None:
+        return None
+    stage = stage_of(episode=episode)
+    seen = stage.name == "ready" and bool(episode.cameras)
+    return {"code": handout.code, "episode": episode, "stage": stage, "seen": seen}
+
+
+def _unable(user: Any, views: Sequence[dict[str, Any] | None]) -> str:
+    """Why nothing can be saved now; "" where it can."""
+    if role_of(user) is Role.VIEWER:
+        return "operators judge: you may look"
+    unseen = [view["code"] for view in views if view is not None and not view["seen"]]
+    return f"without pictures nobody can judge {' and '.join(unseen)}" if unseen else ""

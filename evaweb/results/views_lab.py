@@ -1,0 +1,68 @@
+"""The lab at one look: what runs where, how far evaluations are, what was tried last; and the planner."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django.http import HttpRequest, HttpResponse
+from django.shortcuts import render
+from django.views.decorators.http import require_GET
+
+from evaweb.errors import EvaError
+from evaweb.plans.models import PlanState
+from evaweb.results import selectors
+from evaweb.results.planner import question_of, table_of
+from evaweb.results.seen import why_sealed
+from evaweb.sight import Sight, sight_for
+
+RUNNING = 12  # plans on one page; all of them are in the list
+RECENT = 12
+
+
+@require_GET
+def dashboard(request: HttpRequest) -> HttpResponse:
+    """Evaluations that run, stations, recent trials; with HX-Request that alone, to be put into the page."""
+    fragment = bool(request.headers.get("HX-Request"))
+    return render(request, "results/lab_body.html" if fragment else "results/lab.html", _lab(request))
+
+
+@require_GET
+def wall(request: HttpRequest) -> HttpResponse:
+    """The same for a big screen: large, without anything to press."""
+    fragment = bool(request.headers.get("HX-Request"))
+    return render(request, "results/wall_body.html" if fragment else "results/wall.html", _lab(request))
+
+
+@require_GET
+def planner(request: HttpRequest) -> HttpResponse:
+    """Trials and robot hours for a wanted difference, and what cannot be detected."""
+    fault = None
+    try:
+        question = question_of(request.GET)
+        table = table_of(question)
+    except EvaError as error:
+        fault, question = error, question_of({})
+        table = table_of(question)
+    context = {"question": question, "table": table, "fault": fault, "here": "planner"}
+    return render(request, "results/planner.html", context, status=fault.status if fault else 200)
+
+
+def _lab(request: HttpRequest) -> dict[str, Any]:
+    sight = sight_for(request)
+    running = selectors.plan_rows(selectors.plan_list(PlanState.FROZEN)[:RUNNING])
+    ended = selectors.plan_rows(
+        selectors.plan_list().exclude(state__in=(PlanState.FROZEN, PlanState.DRAFT))[:5]
+    )
+    return {
+        "running": running,
+        "ended": [(row, why_sealed(row.plan, request.user, sight)) for row in ended],
+        "stations": [(now, _label(sight, now.trial)) for now in selectors.stations_now()],
+        "recent": [
+            (trial, sight.label(trial), sight.hides(trial)) for trial in selectors.trials_recent(RECENT)
+        ],
+        "here": "lab",
+    }
+
+
+def _label(sight: Sight, trial: Any) -> str:
+    return sight.label(trial) if trial is not None else ""

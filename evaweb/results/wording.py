@@ -1,0 +1,77 @@
+"""How results are said: a percentage with its n and interval, a comparison in one sentence."""
+
+from __future__ import annotations
+
+from evaweb.results.analysis import Comparison
+from evaweb.statistics.base import Interval
+from evaweb.statistics.difference import Difference
+from evaweb.statistics.planning import POWER, detectable
+from evaweb.statistics.proportions import Proportion
+from evaweb.statistics.sequential import Evidence
+
+
+def rate_words(found: Proportion) -> str:
+    """ "46/50, 92 % [81, 97]"; a percentage never stands without n and interval."""
+    if found.rate is None or found.interval is None:
+        return "no trial"
+    return f"{found.successes}/{found.n}, {100 * found.rate:.0f} % [{ends(found.interval)}]"
+
+
+def ends(interval: Interval, factor: float = 100) -> str:
+    """Both ends in percent."""
+    return f"{_signed(factor * interval.low)}, {_signed(factor * interval.high)}"
+
+
+def points(found: Difference) -> str:
+    """ "36 points [19, 51]"."""
+    return f"{_signed(100 * found.value)} points [{ends(found.interval)}]"
+
+
+def probability(p: float) -> str:
+    """A probability as papers write it."""
+    return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
+
+
+def verdict(found: Comparison, one: Proportion, other: Proportion, alpha: float) -> str:
+    """The comparison in one sentence, with its evidence; says only what the corrected exact test says."""
+    counts = (
+        f"{one.successes}/{one.n} against {other.successes}/{other.n}, difference {points(found.difference)}"
+    )
+    if found.corrected <= alpha:
+        better, worse = (
+            (found.first, found.second) if found.difference.value > 0 else (found.second, found.first)
+        )
+        return f"{better} succeeded more often than {worse}: {counts}"
+    return f"{found.first} and {found.second} are not told apart: {counts}"
+
+
+def missed(n: int, rate: float | None, alpha: float) -> str:
+    """What so many trials of each arm could not have detected, from that rate."""
+    if rate is None or n < 1:
+        return "Without trials nothing could be detected."
+    gain = detectable(n, min(rate, 0.999), POWER, alpha)
+    base = f"With {n} trials of each checkpoint, and a rate of {100 * rate:.0f} % for the weaker one"
+    if gain is None:
+        return f"{base}, no gain at all would be found in {POWER:.0%} of evaluations."
+    return (
+        f"{base}, a gain below {100 * gain:.0f} points would be missed in more than one evaluation of five "
+        f"(alpha {alpha:g}, power {POWER:.0%})."
+    )
+
+
+def evidence_words(found: Evidence) -> str:
+    """How far the evidence is, and whether it suffices."""
+    if found.stop is not None:
+        return f"suffices since pair {found.stop}"
+    if not found.pairs:
+        return "no pair yet"
+    e = max(found.first[-1], found.second[-1])
+    return f"not enough after {found.pairs} pairs (e = {_power(e)}, wanted {2 / found.alpha:.0f})"
+
+
+def _power(log_e: float) -> str:
+    return f"{2.718281828459045**log_e:.2g}" if log_e < 12 else f"10^{log_e / 2.302585:.0f}"
+
+
+def _signed(value: float) -> str:
+    return f"{value:.0f}".replace("-0", "0").replace("-", "−")

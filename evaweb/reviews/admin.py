@@ -1,0 +1,51 @@
+"""Reviews in the admin pages: to look at. Rows are written by services alone, after the disk."""
+
+from __future__ import annotations
+
+from django.contrib import admin
+from django.http import HttpRequest
+
+from evaweb.reviews.models import Review, Segment, Standing
+
+
+class _Kept(admin.ModelAdmin):
+    """Nothing is added, changed or removed here."""
+
+    def has_add_permission(self, request: HttpRequest) -> bool:
+        return False
+
+    def has_change_permission(self, request: HttpRequest, obj: object = None) -> bool:
+        return False
+
+    def has_delete_permission(self, request: HttpRequest, obj: object = None) -> bool:
+        return False
+
+
+@admin.register(Review)
+class ReviewAdmin(_Kept):
+    """What people said of episodes."""
+
+    list_display = ("episode", "verdict", "note", "reviewer", "at")
+    list_filter = ("verdict", "reviewer")
+    search_fields = ("episode__uuid", "note")
+    list_select_related = ("episode", "reviewer")
+
+
+@admin.register(Segment)
+class SegmentAdmin(_Kept):
+    """Annotated parts."""
+
+    list_display = ("episode", "first", "last", "label", "milestone", "annotator", "at")
+    list_filter = ("annotator",)
+    search_fields = ("episode__uuid", "label", "milestone")
+    list_select_related = ("episode", "annotator")
+
+
+@admin.register(Standing)
+class StandingAdmin(_Kept):
+    """What the checks found, and which verdict counts."""
+
+    list_display = ("episode", "worst", "flags", "checked_at", "review")
+    list_filter = ("worst", "clean")
+    search_fields = ("episode__uuid",)
+    list_select_related = ("episode", "review")

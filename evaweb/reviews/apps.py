@@ -1,0 +1,17 @@
+"""Registers the app."""
+
+from django.apps import AppConfig
+
+
+class ReviewsConfig(AppConfig):
+    """Quality reports, verdicts and annotations of episodes."""
+
+    name = "evaweb.reviews"
+    default_auto_field = "django.db.models.BigAutoField"
+
+    def ready(self) -> None:
+        from evaweb.guards import keep
+        from evaweb.reviews import beside, restoring  # noqa: F401  they declare themselves to apps below
+        from evaweb.reviews.guarded import GUARDS
+
+        keep(self, GUARDS)

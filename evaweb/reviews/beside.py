@@ -1,0 +1,32 @@
+"""What goes beside an episode into its dataset: verdicts and annotations, a line each."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from uuid import UUID
+
+from evaweb.episodes.beside import gives_sides
+from evaweb.reviews.kept import KeptReview, Line, kept_lines, segments_of
+
+
+def said_of(uuid: UUID) -> dict[str, Sequence[Line]]:
+    """What is said of the episode, by kind of side file."""
+    lines = kept_lines(uuid)
+    return {
+        "reviews": [line for line in lines if isinstance(line, KeptReview)],
+        "annotations": segments_of(lines),
+    }
+
+
+@gives_sides
+def written(uuid: UUID, folder: Path) -> Mapping[str, Path]:
+    """The files of that, in `folder`; none of a kind of which nothing is said."""
+    made = {}
+    for kind, said in said_of(uuid).items():
+        if said:
+            made[kind] = folder / f"{kind}.jsonl"
+            lines = (json.dumps(line.model_dump(mode="json", exclude={"kind"})) + "\n" for line in said)
+            made[kind].write_text("".join(lines), "utf-8")
+    return made

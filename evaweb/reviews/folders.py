@@ -1,0 +1,23 @@
+"""Where what is said of an episode lies in the data folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from uuid import UUID
+
+from evaweb.episodes.folders import data_dir
+
+
+def report_file(uuid: UUID) -> Path:
+    """What the checks found in an episode."""
+    return data_dir() / "quality" / f"{uuid}.json"
+
+
+def reviews_file(uuid: UUID) -> Path:
+    """What people said of an episode and of its parts, a line each."""
+    return data_dir() / "reviews" / f"{uuid}.jsonl"
+
+
+def bounds_file() -> Path:
+    """Other bounds of the checks than the usual ones, for all episodes of this lab."""
+    return data_dir() / "quality.toml"

@@ -1,0 +1,104 @@
+"""The jobs of reviews: checks of episodes, what is said of them beside the dataset; and who looks for both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+from uuid import UUID
+
+from django.db import transaction
+from django.utils import timezone
+
+from evaweb.episodes.folders import data_dir, journal_folder
+from evaweb.episodes.models import Episode
+from evaweb.jobs.kinds import Work, chore, job_kind
+from evaweb.jobs.services import enqueue
+from evaweb.reviews import selectors, services
+from evaweb.reviews.beside import said_of, written
+from evaweb.reviews.folders import bounds_file, report_file
+from evaweb.reviews.models import Standing
+from runtime.datasets.sides import attach
+from runtime.recording.files import document, read_document, write_whole
+
+if TYPE_CHECKING:
+    from runtime.quality.report import Report
+    from runtime.quality.settings import QualitySettings
+
+AT_ONCE = 20  # asked for in one look
+
+
+@job_kind("quality")
+def quality(work: Work) -> Mapping[str, Any]:
+    """Look the episode through and keep the report; args: uuid."""
+    # Web processes know this kind too, and never do it.
+    from runtime.quality.settings import QualitySettings, read_settings
+
+    episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
+    bounds = bounds_file()
+    settings = read_settings(bounds) if bounds.exists() else QualitySettings()
+    work.tell("every frame and picture is looked at")
+    found = _inspected(episode, settings).document()
+    path = report_file(episode.uuid)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, document(found, "the report"))
+    services.quality_found(
+        episode=episode, document=found, at=datetime.fromtimestamp(path.stat().st_mtime, UTC)
+    )
+    return {"clean": found["clean"], "worst": found["worst"], "counts": found["counts"]}
+
+
+def _inspected(episode: Episode, settings: QualitySettings) -> Report:
+    """One that was imported is judged as its dataset has it: its folder has other times, and pictures coded again."""
+    from runtime.datasets.identities import uuids_of
+    from runtime.quality.inspection import inspect, inspect_dataset
+
+    folder = journal_folder(episode.uuid)
+    told = read_document(folder / "manifest.json").get("imported")
+    if isinstance(told, Mapping):
+        dataset = data_dir() / (episode.dataset or str(told["dataset"]))
+        index = next((index for index, uuid in uuids_of(dataset).items() if uuid == str(episode.uuid)), None)
+        if index is not None:
+            return inspect_dataset(
+                dataset, index, settings, state=str(told["state"]), robot=str(told["robot"])
+            )
+    return inspect(folder, settings)
+
+
+@job_kind("sides")
+def sides(work: Work) -> Mapping[str, Any]:
+    """Put verdicts and annotations beside the published episode; args: uuid."""
+    episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
+    if episode.dataset_index is None:
+        return {"attached": False, "why": "it is in no dataset"}
+    dataset = data_dir() / episode.dataset
+    with TemporaryDirectory() as folder:
+        said = written(episode.uuid, Path(folder))
+        for kind in ("reviews", "annotations"):
+            attach(dataset, str(episode.uuid), kind, said.get(kind))
+    counts = {kind: len(kept) for kind, kept in said_of(episode.uuid).items()}
+    return {"attached": True, **counts}
+
+
+@chore("episodes to be checked")
+def look_for_unchecked() -> int:
+    """Episodes that were closed, here or elsewhere, since the last look."""
+    found = list(selectors.unchecked()[:AT_ONCE])
+    for episode in found:
+        services.quality_asked(episode=episode)
+    return len(found)
+
+
+@chore("reviews to be published")
+def look_for_outdated() -> int:
+    """Published episodes of which something was said since, or that were published after it was said."""
+    found = list(selectors.outdated()[:AT_ONCE])
+    for standing in found:
+        with transaction.atomic():
+            # Asked for once, however it ends: a job that failed is there to be seen and to be tried again.
+            Standing.objects.filter(pk=standing.pk).update(attached_at=timezone.now())
+            uuid = str(standing.episode_id)
+            enqueue(kind="sides", key=f"sides:{uuid}", args={"uuid": uuid})
+    return len(found)

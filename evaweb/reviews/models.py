@@ -1,0 +1,101 @@
+"""What is said of an episode: by the checks, by people, and of its parts. The disk is the authority of all three."""
+
+from __future__ import annotations
+
+import uuid
+
+from django.conf import settings
+from django.db import models
+from django.utils import timezone
+
+from evaweb.episodes.models import Episode
+
+
+class Verdict(models.TextChoices):
+    """What a reviewer says; a note leaves the verdict as it is."""
+
+    PASS = "pass", "pass"
+    FAIL = "fail", "fail"
+    NOTE = "note", "note"
+
+
+DECIDES = (Verdict.PASS, Verdict.FAIL)
+
+
+class Review(models.Model):
+    """What one person said of an episode at one time; the newest pass or fail counts, all are kept."""
+
+    uuid = models.UUIDField(primary_key=True, default=uuid.uuid4, editable=False)
+    episode = models.ForeignKey(Episode, on_delete=models.PROTECT, related_name="reviews")
+    verdict = models.CharField(max_length=4, choices=Verdict)
+    note = models.TextField(blank=True)
+    reviewer = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="reviews")
+    at = models.DateTimeField(default=timezone.now)
+
+    class Meta:
+        ordering = ("-at",)
+        indexes = [models.Index(fields=("episode", "-at"))]
+
+    def __str__(self) -> str:
+        return f"{self.verdict} by {self.reviewer}"
+
+
+class Segment(models.Model):
+    """A part of an episode as one annotator sees it: frames `first` to `last`, both included."""
+
+    uuid = models.UUIDField(primary_key=True, default=uuid.uuid4, editable=False)
+    episode = models.ForeignKey(Episode, on_delete=models.PROTECT, related_name="segments")
+    first = models.PositiveIntegerField()
+    last = models.PositiveIntegerField()
+    label = models.CharField(max_length=120)
+    milestone = models.CharField(max_length=200, blank=True, help_text="What is reached at its last frame.")
+    annotator = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="segments")
+    at = models.DateTimeField(default=timezone.now)
+
+    class Meta:
+        ordering = ("first", "last", "at")
+        constraints = [
+            models.CheckConstraint(
+                condition=models.Q(last__gte=models.F("first")), name="segment_ends_after_it_begins"
+            )
+        ]
+
+    def __str__(self) -> str:
+        return f"{self.label}: {self.first} to {self.last}"
+
+
+class Severity(models.TextChoices):
+    """The worst that the checks found in an episode."""
+
+    NOTHING = "", "clean"
+    INFO = "info", "clean, with remarks"
+    WARNING = "warning", "warnings"
+    ERROR = "error", "errors"
+
+
+class Standing(models.Model):
+    """Where an episode stands: the checks asked for and done, the verdict that counts, what its dataset has of it."""
+
+    episode = models.OneToOneField(
+        Episode, on_delete=models.CASCADE, primary_key=True, related_name="standing"
+    )
+    asked_at = models.DateTimeField(null=True, blank=True, help_text="When the checks were asked for.")
+    checked_at = models.DateTimeField(null=True, blank=True)
+    clean = models.BooleanField(null=True)
+    worst = models.CharField(max_length=8, choices=Severity, blank=True)
+    flags = models.PositiveIntegerField(default=0, help_text="Findings, remarks included.")
+    review = models.ForeignKey(
+        Review,
+        null=True,
+        blank=True,
+        on_delete=models.PROTECT,
+        related_name="+",
+        help_text="The one that counts.",
+    )
+    changed_at = models.DateTimeField(null=True, blank=True, help_text="The newest review or annotation.")
+    attached_at = models.DateTimeField(
+        null=True, blank=True, help_text="When these were last put beside the published episode."
+    )
+
+    def __str__(self) -> str:
+        return f"{self.episode_id}: {self.worst or 'clean'}"

@@ -1,0 +1,91 @@
+"""Reads of what is said of episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+from uuid import UUID
+
+from django.db.models import F, Q, QuerySet
+
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.recorded import CLOSED
+from evaweb.errors import Conflict, NotFound
+from evaweb.reviews.folders import report_file
+from evaweb.reviews.models import Review, Segment, Standing
+from runtime.recording.files import RecordingError, read_document
+
+
+def standing_of(*, episode: Episode) -> Standing:
+    """Where the episode stands; one of which nothing is known stands at the beginning."""
+    return Standing.objects.filter(episode=episode).select_related("review__reviewer").first() or Standing(
+        episode=episode
+    )
+
+
+def report_of(*, uuid: UUID) -> Mapping[str, Any] | None:
+    """What the checks found, as it was written down; None where they were not done. Conflict if it is damaged."""
+    path = report_file(uuid)
+    try:
+        return read_document(path) if path.exists() else None
+    except RecordingError as error:
+        raise Conflict(f"{error}: have the episode checked again") from None
+
+
+def report_get(*, uuid: UUID) -> Mapping[str, Any]:
+    """The same; NotFound where the checks were not done."""
+    found = report_of(uuid=uuid)
+    if found is None:
+        raise NotFound(f"episode {uuid} has not been checked yet: POST to this address has it done")
+    return found
+
+
+def reviews_of(*, episode: Episode) -> QuerySet[Review]:
+    """All that people said of it, the newest first."""
+    return Review.objects.filter(episode=episode).select_related("reviewer").order_by("-at")
+
+
+def segments_of(*, episode: Episode) -> QuerySet[Segment]:
+    """Its annotated parts, in order."""
+    return Segment.objects.filter(episode=episode).select_related("annotator")
+
+
+def unreviewed() -> QuerySet[Episode]:
+    """Closed episodes with pictures or rows to look at that nobody has passed or failed, the newest first."""
+    newest = (F("started_at").desc(nulls_last=True), "-created_at", "uuid")
+    closed = Episode.objects.filter(status__in=CLOSED, frames__gt=0)
+    return closed.filter(standing__review=None).order_by(*newest)
+
+
+def unreviewed_next(*, after: UUID | None) -> tuple[Episode | None, int]:
+    """The next one after that episode in the list, from its top where there is none below; and how many there are.
+
+    Without `after` the first. The episode itself is never the next.
+    """
+    waiting = unreviewed()
+    count = waiting.count()
+    here = Episode.objects.filter(uuid=after).first() if after else None
+    if here is None:
+        return waiting.first(), count
+    others = waiting.exclude(uuid=here.uuid)
+    below = others
+    if here.started_at is not None:
+        same = Q(started_at=here.started_at, created_at__lt=here.created_at)
+        below = others.filter(Q(started_at__lt=here.started_at) | Q(started_at=None) | same)
+    return below.first() or others.first(), count
+
+
+def unchecked() -> QuerySet[Episode]:
+    """Closed episodes of which no checks were ever asked for, the oldest first."""
+    return Episode.objects.filter(status__in=CLOSED, standing__asked_at=None).order_by("created_at")
+
+
+def outdated() -> QuerySet[Standing]:
+    """Those whose published episode has not the newest of what is said of it."""
+    published = Standing.objects.exclude(episode__published_at=None).exclude(changed_at=None)
+    older = (
+        Q(attached_at=None)
+        | Q(attached_at__lt=F("changed_at"))
+        | Q(attached_at__lt=F("episode__published_at"))
+    )
+    return published.filter(older).exclude(episode__status=EpisodeStatus.MISSING)

@@ -1,0 +1,167 @@
+"""What a user may see while a plan is blind: the one seam that pages, REST, live sockets, downloads and exports ask.
+
+A plan is blind for everybody who has not looked behind it, until it is revealed. Hidden are its checkpoints, and with
+them whatever tells one from another: names, addresses, figures of the policy, texts in which a server is named. Who
+hides what is declared from above (evaweb.plans.sight); without that nobody is shown anything.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from django.core.exceptions import ImproperlyConfigured
+
+from evaweb.errors import NotAllowed
+
+HIDDEN = "hidden until the reveal"
+
+# Sentences that no checkpoint has a part in. All others may name a server, a time or a number of rows.
+_HARMLESS = re.compile(
+    r"""
+    \w+\ by\ [\w.@+-]+
+    | (stop|halt|resume|run|setup|home)
+    | (run\ )?stopped(\ by\ the\ operator)?
+    | the\ run's\ [\d.e+]+\ s\ are\ over
+    | ended\ while\ the\ web\ was\ away
+    | the\ station\ was\ restarted\ during\ the\ run
+    | (abandoned|chosen\ again)(\ \([\w.@+-]+\))?
+    | the\ e-stop\ was\ (pressed|released)[\w .,:@+-]*
+    | lease\ [\w .,]*
+    """,
+    re.VERBOSE,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What is hidden from one user: checkpoints by id and by name, in trials, episodes and at stations.
+
+    `stations` are those, by name, at which a trial of such a plan was handed out; `at_work` those at which one is not
+    finished; `plans` says of which, in words, `keys` by their ids. `revealed`: evaluations of plans that were, whose
+    trials are told whatever other plan has their checkpoints too.
+    """
+
+    checkpoints: frozenset[int] = frozenset()
+    names: frozenset[str] = frozenset()
+    stations: frozenset[str] = frozenset()
+    at_work: frozenset[str] = frozenset()
+    keys: frozenset[int] = frozenset()
+    revealed: frozenset[int] = frozenset()
+    plans: str = ""
+
+    @property
+    def clear(self) -> bool:
+        """Whether nothing is hidden."""
+        return not self.checkpoints
+
+    def hides_plan(self, plan: Any) -> bool:
+        """Whether the user is not to read what the plan says of its checkpoints: question, digest, what was amended."""
+        return plan.pk in self.keys
+
+    # --- trials and checkpoints ------------------------------------------------------------------------------
+
+    def hides(self, trial: Any) -> bool:
+        """Whether the user is not to know which checkpoint this trial is of."""
+        return trial.checkpoint_id in self.checkpoints and trial.evaluation_id not in self.revealed
+
+    def label(self, trial: Any) -> str:
+        """What the user knows a trial's checkpoint by: its name; of a hidden one the code of the trial."""
+        if not self.hides(trial):
+            return str(trial.checkpoint.name)
+        return code_of(trial) or HIDDEN
+
+    def reason(self, trial: Any) -> str:
+        """Why the trial is where it is. What a person wrote is theirs; what the station said may tell."""
+        if not self.hides(trial) or trial.status in ("voided", "abandoned"):
+            return str(trial.reason)
+        return self.told(trial.reason)
+
+    def told(self, text: str) -> str:
+        """A station's sentence as somebody may read it from whom something is hidden."""
+        return text if not text or _HARMLESS.fullmatch(text) else HIDDEN
+
+    def open(self, rows: Any, checkpoint: str = "checkpoint") -> Any:
+        """The rows of a query that are of no hidden checkpoint; `checkpoint` leads to it."""
+        if self.clear:
+            return rows
+        return rows.exclude(**{f"{checkpoint}__in": self.checkpoints})
+
+    # --- episodes ---------------------------------------------------------------------------------------------
+
+    def hides_episode(self, episode: Any) -> bool:
+        """Whether the user is not to know which policy made this recording."""
+        trial = getattr(episode, "trial", None)
+        return self.hides(trial) if trial is not None else episode.checkpoint in self.names
+
+    def policy_of(self, episode: Any) -> str:
+        """What the user knows the policy of a recording by."""
+        trial = getattr(episode, "trial", None)
+        if not self.hides_episode(episode):
+            return str(trial.checkpoint.name if trial is not None else episode.checkpoint)
+        return self.label(trial) if trial is not None else HIDDEN
+
+    def require_episode(self, episode: Any) -> None:
+        """NotAllowed for the parts of a recording that tell which policy made it."""
+        if self.hides_episode(episode):
+            raise NotAllowed(f"this part of the recording tells which checkpoint it is of: {self.plans}")
+
+    # --- stations -----------------------------------------------------------------------------------------------
+
+    def veils(self, station: str, snapshot: Mapping[str, Any] | None) -> bool:
+        """Whether the station's state is shown without what tells which checkpoint it is set up for."""
+        if self.clear:
+            return False
+        loaded = (snapshot or {}).get("checkpoint") or {}
+        if (
+            loaded.get("id") in self.checkpoints
+            or loaded.get("name") in self.names
+            or station in self.at_work
+        ):
+            return True
+        # What the station said of a hidden checkpoint stands there until it is set up for another one.
+        another = loaded.get("id") is not None and bool((snapshot or {}).get("validated"))
+        return station in self.stations and not another
+
+    def veils_events(self, station: str) -> bool:
+        """Whether events of the station may be about a hidden checkpoint; also those of earlier trials."""
+        return station in self.stations
+
+
+EVERYTHING = Sight()
+
+_find: Callable[[Any], Sight] | None = None
+
+
+def declare(find: Callable[[Any], Sight]) -> None:
+    """`find` says what is hidden from a user."""
+    global _find
+    _find = find
+
+
+def sight_of(user: Any) -> Sight:
+    """What is hidden from this user now."""
+    if _find is None:
+        raise ImproperlyConfigured("nobody has declared what is hidden from whom (evaweb.plans.sight does)")
+    return _find(user)
+
+
+def sight_for(request: Any) -> Sight:
+    """What is hidden from who asks, by login or by token; looked up once per request."""
+    if not hasattr(request, "_eva_sight"):
+        request._eva_sight = sight_of(getattr(request, "auth", None) or request.user)
+    found: Sight = request._eva_sight
+    return found
+
+
+def code_of(trial: Any) -> str:
+    """The code under which a trial was handed out, "" for one that is of no plan."""
+    handout = getattr(trial, "handout", None)
+    return str(handout.code) if handout is not None else ""
+
+
+def masked(rows: Iterable[Any]) -> str:
+    """The titles of plans, as a sentence says them."""
+    return ", ".join(dict.fromkeys(map(str, rows)))

@@ -1,0 +1,60 @@
+"""What templates show of trials and recordings: a name, or what somebody knows it by to whom it is hidden."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django import template
+
+from evaweb.sight import code_of, sight_for
+
+register = template.Library()
+
+
+@register.simple_tag(takes_context=True)
+def checkpoint_of(context: Any, trial: Any) -> str:
+    """The name of a trial's checkpoint, or the trial's code."""
+    return sight_for(context["request"]).label(trial)
+
+
+@register.simple_tag(takes_context=True)
+def policy_of(context: Any, episode: Any) -> str:
+    """The name of the checkpoint that a recording is of, or the code of its trial."""
+    return sight_for(context["request"]).policy_of(episode)
+
+
+@register.simple_tag(takes_context=True)
+def reason_of(context: Any, trial: Any) -> str:
+    """Why a trial is where it is; nothing of none."""
+    return sight_for(context["request"]).reason(trial) if trial else ""
+
+
+@register.simple_tag(takes_context=True)
+def hidden(context: Any, trial: Any) -> bool:
+    """Whether it is hidden which checkpoint a trial is of."""
+    return sight_for(context["request"]).hides(trial)
+
+
+@register.simple_tag(takes_context=True)
+def hidden_plan(context: Any, plan: Any) -> bool:
+    """Whether it is hidden what a plan says of its checkpoints."""
+    return sight_for(context["request"]).hides_plan(plan)
+
+
+@register.simple_tag(takes_context=True)
+def hidden_recording(context: Any, episode: Any) -> bool:
+    """Whether it is hidden which policy made a recording."""
+    return sight_for(context["request"]).hides_episode(episode)
+
+
+@register.simple_tag(takes_context=True)
+def told(context: Any, episode: Any) -> str:
+    """Why a recording ended."""
+    seen = sight_for(context["request"])
+    return seen.told(episode.reason) if seen.hides_episode(episode) else str(episode.reason)
+
+
+@register.filter
+def code(trial: Any) -> str:
+    """The code under which a trial was handed out, "" for one of no plan."""
+    return code_of(trial)

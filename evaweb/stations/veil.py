@@ -1,0 +1,113 @@
+"""What a station says, without what tells which checkpoint it is set up for: pure functions on its messages.
+
+What is shown is listed, so that whatever a runtime says besides is covered by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from evaweb.sight import Sight
+
+# Of a snapshot: the robot, the bench, who commands; nothing of the policy, its times and its chunks.
+_SHOWN = (
+    "boot",
+    "sequence",
+    "clock",
+    "station",
+    "robot",
+    "state",
+    "allowed",
+    "guarded",
+    "mode",
+    "sim_state",
+    "grippers",
+    "drives",
+    "collect",
+    "simulated",
+    "truth",
+    "transport",
+    "lease",
+    "estop",
+    "run",
+    "link",
+    "newest_event",
+    "facts",
+)
+_COVERED: Mapping[str, Any] = {
+    "phase": "",
+    "stage": "idle",
+    "stages": [],
+    "first_action": {},
+    "proposal": {},
+    "validated": "",
+    "task": "",
+    "checkpoint": {},
+    "policy": {"kind": "", "name": "", "answers": 0, "lost": False, "retry_in_s": 0.0, "rtc": {}},
+    "strategy": "",
+    "tuning": {},
+    "last_run": {},
+}
+_CONTROL = ("rate", "engaged", "scheduling", "records_lost")
+_CONTROL_COVERED = {"step": 0, "behaviour": "", "remaining": 0, "ticks": 0, "missed": 0}
+_FACTS = ("strategies", "strategy")  # what the policy is asked by
+_JOINTS = ("measured", "commanded", "simulated", "engaged", "limited", "clock")
+
+# Kinds of events, of which nothing but the sentence is shown; of all others nothing.
+_EVENTS = ("camera_back", "camera_lost", "drives", "estopped", "labelled", "released", "truth")
+
+
+def state(snapshot: Mapping[str, Any], sight: Sight) -> dict[str, Any]:
+    """A snapshot, in the same shape: what would tell is empty, and "veiled" says that it is."""
+    shown = {key: snapshot[key] for key in _SHOWN if key in snapshot}
+    shown["reason"] = sight.told(str(snapshot.get("reason") or ""))
+    shown |= {key: empty for key, empty in _COVERED.items() if key in snapshot}
+    if shown.get("state") == "setting_up":
+        shown["stage"] = "setting up"
+    if isinstance(snapshot.get("facts"), Mapping):
+        shown["facts"] = {key: value for key, value in snapshot["facts"].items() if key not in _FACTS}
+    if isinstance(snapshot.get("control"), Mapping):
+        control = snapshot["control"]
+        shown["control"] = _CONTROL_COVERED | {key: control[key] for key in _CONTROL if key in control}
+    if isinstance(snapshot.get("recording"), Mapping):
+        shown["recording"] = dict(snapshot["recording"])
+    if isinstance(snapshot.get("episode"), Mapping):
+        shown["episode"] = {key: snapshot["episode"][key] for key in ("uuid",) if key in snapshot["episode"]}
+    return shown | {"veiled": True}
+
+
+def events(rows: Iterable[Mapping[str, Any]], sight: Sight) -> list[dict[str, Any]]:
+    """Events that name no policy; the others are left out, and with them when they were."""
+    return [shown for row in rows if (shown := _event(row, sight)) is not None]
+
+
+def joints(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The robot's joints without what the policy wanted, and without which chunk made a step."""
+    return {key: content[key] for key in _JOINTS if key in content}
+
+
+def answer(data: Mapping[str, Any]) -> dict[str, Any]:
+    """What comes back with the answer to a command."""
+    return {key: data[key] for key in ("episode", "bench") if key in data}
+
+
+def _event(row: Mapping[str, Any], sight: Sight) -> dict[str, Any] | None:
+    kind, text = row.get("kind"), str(row.get("text") or "")
+    kept = {key: row[key] for key in ("number", "time", "wall") if key in row}
+    if kind in _EVENTS:
+        return {**kept, "kind": kind, "text": text, "data": {}}
+    if kind == "command":  # "stop by ann: accepted", "setup by ann: refused, the reason"
+        said, _, reason = text.partition(", ")
+        return {**kept, "kind": kind, "text": f"{said}, {sight.told(reason)}" if reason else said, "data": {}}
+    if kind == "state":  # "running -> holding: the reason"
+        moved, _, reason = text.partition(": ")
+        return {
+            **kept,
+            "kind": kind,
+            "text": f"{moved}: {sight.told(reason)}" if reason else moved,
+            "data": {},
+        }
+    if kind in ("episode_opened", "episode_closed"):
+        return {**kept, "kind": kind, "text": str(kind).replace("_", " "), "data": {}}
+    return None

@@ -1,0 +1,132 @@
+"""Whether one of two arms succeeds more often, each with trials of its own: interval, posterior, exact test.
+
+Formulae: Newcombe (1998), method 10, for the interval of a difference; Barnard (1945), pooled statistic, for the exact
+unconditional test; the closed form for integer counts of the probability that one Beta variable exceeds another.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+from evaweb.statistics.base import LEVEL, Interval, check_counts
+from evaweb.statistics.proportions import posterior, wilson
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+_REMEMBERED = 4096  # tables whose test is kept
+# The common rate at which a table is likeliest is looked for on an even grid of angles, on which binomial masses are
+# equally wide everywhere, and then around its highest peaks.
+_RATES = 400
+_PEAKS = 4
+_ZOOMS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """How much more often the first arm succeeds than the second, in shares (-1 to 1), with its interval."""
+
+    value: float
+    interval: Interval
+
+
+@dataclass(frozen=True, slots=True)
+class ExactTest:
+    """A statistic and the two-sided probability of one as extreme where the arms are equal."""
+
+    statistic: float
+    p: float
+
+
+def newcombe(x1: int, n1: int, x2: int, n2: int, level: float = LEVEL) -> Difference:
+    """x1/n1 - x2/n2 with the interval made of both Wilson intervals; sensible also at 0/n and n/n."""
+    first, second = wilson(x1, n1, level), wilson(x2, n2, level)
+    p1, p2 = x1 / n1, x2 / n2
+    down = math.hypot(p1 - first.low, second.high - p2)
+    up = math.hypot(first.high - p1, p2 - second.low)
+    return Difference(p1 - p2, Interval(max(-1.0, p1 - p2 - down), min(1.0, p1 - p2 + up), level))
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def barnard(x1: int, n1: int, x2: int, n2: int) -> ExactTest:
+    """Barnard's exact test, two-sided and pooled, of x1/n1 against x2/n2.
+
+    For a number of trials fixed beforehand: looked at again and again, it finds differences that are not there
+    (`sequential` is for that). Where all or none succeeded in both arms there is nothing to tell: statistic 0, p 1.
+    """
+    check_counts(x1, n1)
+    check_counts(x2, n2)
+    if x1 + x2 in (0, n1 + n2):
+        return ExactTest(0.0, 1.0)
+    import numpy as np
+
+    z = _statistics(n1, n2)
+    # Tables as extreme as this one belong to it: what differs in the last bits is not less extreme.
+    bound = abs(z[x1, x2]) * (1 - 1e-12)
+    # Along a row the statistic falls: what is extreme are so many tables at its beginning, and so many at its end.
+    tails = (
+        ((z >= bound).sum(axis=1), (z <= -bound).sum(axis=1))
+        if bound
+        else ([n2 + 1] * (n1 + 1), [0] * (n1 + 1))
+    )
+    extreme = np.array(tails)
+    angles = np.linspace(0, math.pi / 2, _RATES + 2)[1:-1]
+    p = _tail(extreme, n2, angles)
+    peaks = [i for i in np.argsort(-p)[: _RATES // 8] if p[i] >= p[max(0, i - 1) : i + 2].max()][:_PEAKS]
+    highest = float(p.max())
+    for peak in peaks:
+        middle, width = angles[peak], angles[1] - angles[0]
+        for _ in range(_ZOOMS):
+            near = np.clip(np.linspace(middle - width, middle + width, 21), 1e-9, math.pi / 2 - 1e-9)
+            found = _tail(extreme, n2, near)
+            middle, width = near[found.argmax()], width / 10
+            highest = max(highest, float(found.max()))
+    return ExactTest(float(z[x1, x2]), min(1.0, highest))
+
+
+def _statistics(n1: int, n2: int) -> NDArray[np.float64]:
+    """The pooled statistic of every table: float64 [n1 + 1, n2 + 1]; 0 where all or none succeeded."""
+    import numpy as np
+
+    x1, x2 = np.arange(n1 + 1)[:, None], np.arange(n2 + 1)[None, :]
+    pooled = (x1 + x2) / (n1 + n2)
+    spread = np.sqrt(pooled * (1 - pooled) * (1 / n1 + 1 / n2))
+    return np.divide(x1 / n1 - x2 / n2, spread, out=np.zeros(spread.shape), where=spread > 0)
+
+
+def _tail(extreme: NDArray[np.int64], n2: int, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The probability of extreme tables where both arms succeed at a rate of sin(angle)^2: float64 [angles].
+
+    `extreme` [2, n1 + 1] counts those at the beginning and at the end of each row of tables.
+    """
+    import numpy as np
+    from scipy.special import gammaln
+
+    share, rest = np.log(np.sin(angles))[:, None], np.log(np.cos(angles))[:, None]
+
+    def mass(n: int) -> NDArray[np.float64]:
+        x = np.arange(n + 1)
+        ways = gammaln(n + 1) - gammaln(x + 1) - gammaln(n - x + 1)
+        return np.asarray(np.exp(ways + 2 * x * share + 2 * (n - x) * rest))
+
+    first, second = mass(extreme.shape[1] - 1), mass(n2)
+    nothing = np.zeros((len(angles), 1))
+    below = np.hstack([nothing, np.cumsum(second, axis=1)])[:, extreme[0]]
+    above = np.hstack([nothing, np.cumsum(second[:, ::-1], axis=1)])[:, extreme[1]]
+    return np.asarray((first * (below + above)).sum(axis=1))
+
+
+def probability_better(x1: int, n1: int, x2: int, n2: int) -> float:
+    """The posterior probability that the first arm's success rate is the higher, from uniform priors."""
+    from scipy.special import betaln
+
+    a, b = posterior(x2, n2), posterior(x1, n1)
+    terms = [
+        math.exp(betaln(a.a + i, b.b + a.b) - math.log(b.b + i) - betaln(1 + i, b.b) - betaln(a.a, a.b))
+        for i in range(round(b.a))
+    ]
+    return min(1.0, math.fsum(terms))

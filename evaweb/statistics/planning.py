@@ -1,0 +1,111 @@
+"""How many trials a wanted difference needs, and what cannot be seen with those that there is time for.
+
+Formulae: the normal approximation for two proportions, checked by the exact power of Barnard's test, whose
+probabilities are taken over all tables at once.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+from evaweb.statistics.base import StatisticsError, check_alpha, check_share, z_of
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+ALPHA = 0.05
+POWER = 0.8
+MOST = 250  # trials an arm: all tables of more would not fit into a page's time
+_RATES = 400  # common success rates at which a table's probability is taken; the largest counts
+
+
+def trials_needed(p1: float, p2: float, power: float = POWER, alpha: float = ALPHA) -> int:
+    """Trials of each arm to find, with probability `power`, that success rates `p1` and `p2` differ (two-sided)."""
+    _check(p1, p2, alpha)
+    check_share("power", power)
+    middle = (p1 + p2) / 2
+    z_alpha, z_power = z_of(1 - alpha), z_of(2 * power - 1) if power > 0.5 else -z_of(1 - 2 * power)
+    spread = z_alpha * math.sqrt(2 * middle * (1 - middle)) + z_power * math.sqrt(
+        p1 * (1 - p1) + p2 * (1 - p2)
+    )
+    return max(1, math.ceil(spread**2 / (p1 - p2) ** 2 - 1e-9))
+
+
+def approximate_power(n: int, p1: float, p2: float, alpha: float = ALPHA) -> float:
+    """With what probability `n` trials of each arm show that success rates `p1` and `p2` differ, by the normal law."""
+    _check(p1, p2, alpha)
+    from scipy.special import ndtr
+
+    middle = (p1 + p2) / 2
+    above = abs(p1 - p2) * math.sqrt(n) - z_of(1 - alpha) * math.sqrt(2 * middle * (1 - middle))
+    spread = math.sqrt(p1 * (1 - p1) + p2 * (1 - p2))
+    return float(ndtr(above / spread)) if spread > 0 else float(above > 0)
+
+
+def exact_power(n: int, p1: float, p2: float, alpha: float = ALPHA) -> float:
+    """The same by Barnard's exact test, for at most 250 trials an arm."""
+    check_share("p1", p1)
+    check_share("p2", p2)
+    check_alpha(alpha)
+    if not 1 <= n <= MOST:
+        raise StatisticsError(f"n = {n} trials of each arm; allowed: 1 to {MOST}")
+    import numpy as np
+    from scipy.stats import binom
+
+    counts = np.arange(n + 1)
+    weights = np.outer(binom.pmf(counts, n, p1), binom.pmf(counts, n, p2))
+    return float(weights[_barnard_tables(n) <= alpha].sum())
+
+
+def detectable(n: int, p: float, power: float = POWER, alpha: float = ALPHA) -> float | None:
+    """The smallest gain over success rate `p` that `n` trials of each arm show with probability `power`.
+
+    None where not even the step to 1 is shown.
+    """
+    check_share("p", p)
+    if p >= 1 or approximate_power(n, p, 1.0, alpha) < power:
+        return None
+    low, high = p, 1.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        if middle > p and approximate_power(n, p, middle, alpha) >= power:
+            high = middle
+        else:
+            low = middle
+    return high - p
+
+
+@lru_cache(maxsize=16)
+def _barnard_tables(n: int) -> NDArray[np.float64]:
+    """Two-sided probability of Barnard's pooled test for every table of two arms of `n` trials: float64 [n+1, n+1]."""
+    import numpy as np
+    from scipy.stats import binom
+
+    x = np.arange(n + 1)
+    p1, p2 = x[:, None] / n, x[None, :] / n
+    pooled = (p1 + p2) / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = np.abs(p1 - p2) / np.sqrt(2 * pooled * (1 - pooled) / n)
+    z = np.where(np.isfinite(z), z, 0.0).ravel().round(10)  # tables as extreme as each other stay together
+    order = np.argsort(-z, kind="stable")
+    # Of each common rate: the probability of all tables at least as extreme, at the end of each group of equals.
+    last = np.searchsorted(-z[order], -z[order], side="right") - 1
+    worst = np.zeros(z.size)
+    for rate in np.linspace(0, 1, _RATES + 2)[1:-1]:
+        pmf = binom.pmf(x, n, rate)
+        tail = np.cumsum(np.outer(pmf, pmf).ravel()[order])
+        np.maximum(worst, tail[last], out=worst)
+    found = np.empty(z.size)
+    found[order] = np.minimum(worst, 1.0)
+    return found.reshape(n + 1, n + 1)
+
+
+def _check(p1: float, p2: float, alpha: float) -> None:
+    check_share("p1", p1)
+    check_share("p2", p2)
+    check_alpha(alpha)
+    if p1 == p2:
+        raise StatisticsError(f"p1 = p2 = {p1}: no number of trials shows a difference that is not there")

@@ -1,0 +1,262 @@
+"""Which of several policies people prefer, from comparisons of two with ties, and with an effect of who was seen first.
+
+Model: Bradley and Terry (1952), ties by Davidson (1970), order by Davidson and Beaver (1977). With log-worths t, of a
+comparison of i (seen first) and j the three outcomes have the log-weights t_i + g/2, t_j - g/2 and
+log 2 + f + (t_i + t_j)/2. A multinomial logit, fitted by Newton's method; where no finite estimate exists nothing is
+ranked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING, Literal
+
+from evaweb.statistics.base import LEVEL, Interval, StatisticsError, check_level, z_of
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+Outcome = Literal["first", "second", "tie"]
+_STEPS = 100
+_CLOSE = 1e-8  # largest component of the gradient at the solution
+
+
+class NotIdentifiedError(StatisticsError):
+    """The comparisons determine no ranking; `components` are sets of policies that can be ranked among themselves.
+
+    They are in an order in which no later one was ever preferred to an earlier one, where there is such.
+    """
+
+    def __init__(self, text: str, components: Sequence[Sequence[str]]) -> None:
+        super().__init__(text)
+        self.components = tuple(tuple(part) for part in components)
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """`first` was run or shown first, `second` second, and this was preferred."""
+
+    first: str
+    second: str
+    outcome: Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class Contrast:
+    """How much better the first policy is: difference of log-worths, and as probability to win where no tie is."""
+
+    difference: float
+    error: float
+    interval: Interval
+    win_probability: float
+    win_interval: Interval
+
+
+@dataclass(frozen=True, slots=True)
+class Preferences:
+    """The fit.
+
+    `worth` and `error` by policy are centred log-worths with their standard errors; `contrasts` are by pair
+    (alphabetical); `tie` is nu (None without any tie), at which equal policies tie with probability nu / (1 + nu);
+    `order` is the log odds that being first adds, with its z (None where it was not fitted).
+    """
+
+    worth: Mapping[str, float]
+    error: Mapping[str, float]
+    contrasts: Mapping[tuple[str, str], Contrast]
+    tie: float | None
+    order: float | None
+    order_z: float | None
+    log_likelihood: float
+
+    @property
+    def ranking(self) -> list[str]:
+        """Best first; those that are equal but for rounding by their names."""
+        return sorted(self.worth, key=lambda name: (-round(self.worth[name], 6), name))
+
+    def rating(self, name: str) -> float:
+        """1500 + 200 times the centred log-worth, as RoboArena shows it; not the slope of chess ratings."""
+        return 1500 + 200 * self.worth[name]
+
+
+def preferences(
+    comparisons: Sequence[Comparison], *, order_effect: bool = False, level: float = LEVEL
+) -> Preferences:
+    """Fit all `comparisons`; Wald intervals of contrasts.
+
+    Raises NotIdentifiedError where they determine no finite, unique ranking.
+    """
+    check_level(level)
+    import numpy as np
+
+    design = _Design(comparisons, order_effect)
+    design.check()
+    x, log_likelihood, information = _fit(design)
+    k = len(design.names)
+    covariance = np.zeros((k, k))
+    inverse = np.linalg.inv(information)
+    covariance[1:, 1:] = inverse[: k - 1, : k - 1]
+    centring = np.eye(k) - 1 / k
+    centred = centring @ np.concatenate([[0.0], x[: k - 1]])
+    spread = centring @ covariance @ centring.T
+    errors = np.sqrt(np.diag(spread))
+    z = z_of(level)
+    contrasts = {}
+    for (i, one), (j, other) in combinations(enumerate(design.names), 2):
+        difference = float(centred[i] - centred[j])
+        error = math.sqrt(spread[i, i] + spread[j, j] - 2 * spread[i, j])
+        ends = (difference - z * error, difference + z * error)
+        contrasts[one, other] = Contrast(
+            difference,
+            error,
+            Interval(*ends, level),
+            _logistic(difference),
+            Interval(_logistic(ends[0]), _logistic(ends[1]), level),
+        )
+    gamma = float(x[-1]) if order_effect else None
+    return Preferences(
+        dict(zip(design.names, centred.tolist(), strict=True)),
+        dict(zip(design.names, errors.tolist(), strict=True)),
+        contrasts,
+        math.exp(x[k - 1]) if design.ties else None,
+        gamma,
+        gamma / math.sqrt(inverse[-1, -1]) if gamma is not None else None,
+        log_likelihood,
+    )
+
+
+class _Design:
+    """Comparisons as cells of a multinomial logit, linear in x = (log-worths but the first, f, g)."""
+
+    def __init__(self, comparisons: Sequence[Comparison], order_effect: bool) -> None:
+        import numpy as np
+
+        for given in comparisons:
+            if given.first == given.second:
+                raise StatisticsError(f"{given.first!r} compared with itself")
+            if given.outcome not in ("first", "second", "tie"):
+                raise StatisticsError(f"outcome {given.outcome!r}; allowed: first, second, tie")
+        self.names = sorted({name for given in comparisons for name in (given.first, given.second)})
+        if len(self.names) < 2:
+            raise StatisticsError("no comparison of two policies")
+        self.wins = Counter(
+            (given.first, given.second) if given.outcome == "first" else (given.second, given.first)
+            for given in comparisons
+            if given.outcome != "tie"
+        )
+        self.ties = any(given.outcome == "tie" for given in comparisons)
+        cells: Counter[tuple[str, str, Outcome]] = Counter(
+            (given.first, given.second, given.outcome) for given in comparisons
+        )
+        shown = sorted({(first, second) for first, second, _ in cells})
+        outcomes: tuple[Outcome, ...] = ("first", "second", "tie") if self.ties else ("first", "second")
+        k = len(self.names)
+        self.size = k - 1 + self.ties + order_effect
+        self.vectors = np.zeros((len(shown), len(outcomes), self.size))
+        self.counts = np.array([[float(cells[*pair, o]) for o in outcomes] for pair in shown])
+        self.offsets = np.array([0.0, 0.0, math.log(2)][: len(outcomes)])
+        place = {name: i - 1 for i, name in enumerate(self.names)}  # the first policy has no slot
+        for row, (first, second) in zip(self.vectors, shown, strict=True):
+            for name, outcome in ((first, 0), (second, 1)):
+                if place[name] >= 0:
+                    row[outcome, place[name]] += 1
+                    if self.ties:
+                        row[2, place[name]] += 0.5
+            if self.ties:
+                row[2, k - 1] = 1
+            if order_effect:
+                row[0, -1], row[1, -1] = 0.5, -0.5
+
+    def check(self) -> None:
+        """Raise NotIdentifiedError unless a finite, unique estimate exists: exact, by rank and linear program."""
+        import numpy as np
+        from scipy.optimize import linprog
+
+        steps = [
+            observed - other
+            for vectors, counts in zip(self.vectors, self.counts, strict=True)
+            for o, observed in enumerate(vectors)
+            if counts[o] > 0
+            for a, other in enumerate(vectors)
+            if a != o
+        ]
+        d = np.array(steps)
+        if np.linalg.matrix_rank(d) < self.size:
+            raise NotIdentifiedError(
+                "the comparisons do not connect all policies, or always showed them in the same order: "
+                "no common ranking",
+                self.components(),
+            )
+        found = linprog(-d.sum(axis=0), A_ub=-d, b_ub=np.zeros(len(d)), bounds=[(-1, 1)] * self.size)
+        if not found.success:
+            raise StatisticsError(f"whether a ranking exists could not be decided: {found.message}")
+        if -found.fun > 1e-9 * len(d):
+            raise NotIdentifiedError(
+                "some policies, or those seen first, never lost to the rest: how much better they are has no bound",
+                self.components(),
+            )
+
+    def components(self) -> list[list[str]]:
+        """Policies that are mutually reachable by wins, those that were never beaten from outside first."""
+        reach = {name: {name} | {other for (w, other) in self.wins if w == name} for name in self.names}
+        for via in self.names:
+            for name in self.names:
+                if via in reach[name]:
+                    reach[name] |= reach[via]
+        parts: list[list[str]] = []
+        for name in self.names:
+            if not any(name in part for part in parts):
+                parts.append([o for o in self.names if o in reach[name] and name in reach[o]])
+        return sorted(parts, key=lambda part: (-len(reach[part[0]]), part))
+
+
+def _fit(design: _Design) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
+    """The maximum of the log-likelihood: where, how high, and the information there."""
+    import numpy as np
+
+    x = np.zeros(design.size)
+    if design.ties:
+        x[len(design.names) - 1] = math.log(0.5)
+    height, gradient, information = _likelihood(design, x)
+    for _ in range(_STEPS):
+        if np.abs(gradient).max() < _CLOSE:
+            return x, height, information
+        step = np.linalg.solve(information, gradient)
+        length, slope = 1.0, float(gradient @ step)
+        while True:
+            tried = _likelihood(design, x + length * step)
+            if tried[0] >= height + 1e-4 * length * slope or length < 1e-10:
+                break
+            length /= 2
+        x = x + length * step
+        height, gradient, information = tried
+    raise StatisticsError(
+        f"the fit did not converge: gradient {np.abs(gradient).max():g} after {_STEPS} steps"
+    )
+
+
+def _likelihood(
+    design: _Design, x: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    import numpy as np
+
+    weights = design.vectors @ x + design.offsets
+    highest = weights.max(axis=1, keepdims=True)
+    normal = highest + np.log(np.exp(weights - highest).sum(axis=1, keepdims=True))
+    p = np.exp(weights - normal)
+    n = design.counts.sum(axis=1)
+    mean = np.einsum("co,cop->cp", p, design.vectors)
+    height = float((design.counts * (weights - normal)).sum())
+    gradient = np.einsum("co,cop->p", design.counts, design.vectors) - n @ mean
+    second = np.einsum("co,cop,coq->cpq", p, design.vectors, design.vectors)
+    information = np.einsum("c,cpq->pq", n, second - np.einsum("cp,cq->cpq", mean, mean))
+    return height, gradient, information
+
+
+def _logistic(value: float) -> float:
+    return 1 / (1 + math.exp(-value)) if value >= 0 else math.exp(value) / (1 + math.exp(value))

@@ -1,0 +1,116 @@
+"""How often something succeeds: the rate of `successes` out of `n`, its intervals and its posterior.
+
+Formulae: Wilson (1927) for the interval of a proportion; Clopper and Pearson (1934) where a guarantee is wanted;
+the Beta posterior of a uniform prior (Bayes, Laplace) where a distribution is drawn.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import median
+
+from evaweb.statistics.base import LEVEL, Interval, StatisticsError, check_counts, check_level, z_of
+
+__all__ = ["LEVEL", "Interval", "Posterior", "Proportion", "StatisticsError", "Summary"]
+
+
+@dataclass(frozen=True, slots=True)
+class Proportion:
+    """`successes` out of `n`; `rate` and `interval` are None where n is 0: nothing is known then."""
+
+    successes: int
+    n: int
+    rate: float | None
+    interval: Interval | None
+
+
+@dataclass(frozen=True, slots=True)
+class Posterior:
+    """What is believed of a success rate after x of n, all equally likely before: Beta(1 + x, 1 + n - x)."""
+
+    a: float
+    b: float
+
+    @property
+    def mean(self) -> float:
+        """Its expectation, (x + 1) / (n + 2)."""
+        return self.a / (self.a + self.b)
+
+    def interval(self, level: float = LEVEL) -> Interval:
+        """The equal-tailed credible interval."""
+        check_level(level)
+        from scipy.special import betaincinv
+
+        tail = (1 - level) / 2
+        return Interval(
+            float(betaincinv(self.a, self.b, tail)), float(betaincinv(self.a, self.b, 1 - tail)), level
+        )
+
+    def density(self, rates: Sequence[float]) -> list[float]:
+        """Its density at each of `rates` (0 to 1), for a violin."""
+        from scipy.stats import beta
+
+        return [float(value) for value in beta.pdf(rates, self.a, self.b)]
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a set of scored trials says; the figures are None where there is nothing they could be made from."""
+
+    success: Proportion
+    mean_score: float | None
+    median_duration_s: float | None
+
+
+def proportion(successes: int, n: int, level: float = LEVEL) -> Proportion:
+    """`successes` out of `n` with its Wilson interval."""
+    if n == 0 and successes == 0:
+        return Proportion(0, 0, None, None)
+    interval = wilson(successes, n, level)
+    return Proportion(successes, n, successes / n, interval)
+
+
+def wilson(successes: int, n: int, level: float = LEVEL) -> Interval:
+    """Wilson's score interval of a proportion; never wider than 0 to 1, sensible also at 0/n and n/n.
+
+    Raises StatisticsError for n below 1 and successes outside 0 to n.
+    """
+    check_counts(successes, n)
+    check_level(level)
+    z2 = z_of(level) ** 2
+    p = successes / n
+    centre = (p + z2 / (2 * n)) / (1 + z2 / n)
+    half = math.sqrt(z2) / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
+    low = 0.0 if successes == 0 else max(0.0, centre - half)  # exact there, rounding would leave 1e-17
+    high = 1.0 if successes == n else min(1.0, centre + half)
+    return Interval(low, high, level)
+
+
+def clopper_pearson(successes: int, n: int, level: float = LEVEL) -> Interval:
+    """The exact interval of a proportion: covers with at least `level` whatever the truth is."""
+    check_counts(successes, n)
+    check_level(level)
+    from scipy.special import betaincinv
+
+    tail = (1 - level) / 2
+    low = 0.0 if successes == 0 else float(betaincinv(successes, n - successes + 1, tail))
+    high = 1.0 if successes == n else float(betaincinv(successes + 1, n - successes, 1 - tail))
+    return Interval(low, high, level)
+
+
+def posterior(successes: int, n: int) -> Posterior:
+    """What `successes` out of `n` leave to believe; n may be 0."""
+    if n != 0 or successes != 0:
+        check_counts(successes, n)
+    return Posterior(1.0 + successes, 1.0 + n - successes)
+
+
+def summary(outcomes: Sequence[bool], scores: Sequence[float], durations: Sequence[float]) -> Summary:
+    """Of the scored trials of one cell: success, score (0 to 1) and duration [s] of each, where it is known."""
+    return Summary(
+        proportion(sum(map(bool, outcomes)), len(outcomes)),
+        math.fsum(scores) / len(scores) if scores else None,
+        float(median(durations)) if durations else None,
+    )

@@ -1,0 +1,98 @@
+"""Whether two people who scored the same trials agree beyond what chance would do.
+
+Formulae: Cohen (1960; weighted 1968), Gwet's AC1 (2008) beside it because kappa collapses where nearly all trials end
+the same way, Krippendorff's alpha (2004) where ratings are missing.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable, Sequence
+from itertools import permutations
+from typing import Literal
+
+from evaweb.statistics.base import StatisticsError
+
+Weights = Literal["none", "linear", "quadratic"]
+Metric = Literal["nominal", "interval"]
+
+
+def cohen_kappa(pairs: Sequence[tuple[Hashable, Hashable]]) -> float:
+    """Agreement of two raters on unordered categories, 1 where they always agree, about 0 where by chance."""
+    _some(pairs)
+    n = len(pairs)
+    observed = sum(one == other for one, other in pairs) / n
+    first, second = Counter(one for one, _ in pairs), Counter(other for _, other in pairs)
+    chance = sum(first[name] * second[name] for name in first) / (n * n)
+    return _beyond(observed, chance)
+
+
+def weighted_kappa(pairs: Sequence[tuple[int, int]], levels: int, weights: Weights = "linear") -> float:
+    """Agreement on levels 0 to `levels` - 1, where being one level apart is less wrong than being two."""
+    _some(pairs)
+    if levels < 2:
+        raise StatisticsError(f"{levels} levels; allowed: 2 or more")
+    for pair in pairs:
+        for level in pair:
+            if not 0 <= level < levels:
+                raise StatisticsError(f"level {level}; allowed: 0 to {levels - 1}")
+    n = len(pairs)
+    first, second = Counter(one for one, _ in pairs), Counter(other for _, other in pairs)
+    apart = {(i, j): _distance(i, j, levels, weights) for i in range(levels) for j in range(levels) if i != j}
+    observed = sum(apart.get(pair, 0.0) for pair in pairs) / n
+    expected = sum(apart[i, j] * first[i] * second[j] for i, j in apart) / (n * n)
+    return 1.0 if observed == 0 else 1 - observed / expected
+
+
+def _distance(i: int, j: int, levels: int, weights: Weights) -> float:
+    share = abs(i - j) / (levels - 1)
+    return {"none": 1.0, "linear": share, "quadratic": share * share}[weights]
+
+
+def gwet_ac1(pairs: Sequence[tuple[Hashable, Hashable]], categories: int = 2) -> float:
+    """Agreement of two raters that stays readable where one category is rare."""
+    _some(pairs)
+    used = Counter(name for pair in pairs for name in pair)
+    if len(used) > categories or categories < 2:
+        raise StatisticsError(
+            f"{len(used)} categories were used, {categories} are declared; at least 2 are needed"
+        )
+    n = len(pairs)
+    observed = sum(one == other for one, other in pairs) / n
+    shares = [count / (2 * n) for count in used.values()]
+    chance = sum(share * (1 - share) for share in shares) / (categories - 1)
+    return _beyond(observed, chance)
+
+
+def krippendorff_alpha(units: Sequence[Sequence[float | None]], metric: Metric = "nominal") -> float:
+    """Agreement of any number of raters; `units` are trials, each with what each rater said, None where nothing."""
+    rated = [[value for value in unit if value is not None] for unit in units]
+    rated = [unit for unit in rated if len(unit) > 1]
+    if not rated:
+        raise StatisticsError("no trial was rated by two people")
+
+    def apart(one: float, other: float) -> float:
+        return float(one != other) if metric == "nominal" else (one - other) ** 2
+
+    coincidences: Counter[tuple[float, float]] = Counter()
+    for unit in rated:
+        for pair in permutations(unit, 2):
+            coincidences[pair] += 1 / (len(unit) - 1)  # type: ignore[assignment]
+    totals: Counter[float] = Counter()
+    for (one, _), weight in coincidences.items():
+        totals[one] += weight
+    n = sum(totals.values())
+    observed = sum(weight * apart(*pair) for pair, weight in coincidences.items()) / n
+    expected = sum(totals[one] * totals[other] * apart(one, other) for one in totals for other in totals) / (
+        n * (n - 1)
+    )
+    return 1.0 if observed == 0 else 1 - observed / expected
+
+
+def _some(pairs: Sequence[object]) -> None:
+    if not pairs:
+        raise StatisticsError("no trial was rated by both")
+
+
+def _beyond(observed: float, chance: float) -> float:
+    return 1.0 if observed == 1 else (observed - chance) / (1 - chance)

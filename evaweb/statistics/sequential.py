@@ -1,0 +1,128 @@
+"""Evidence that may be looked at after every pair of trials, and stopped on, without finding what is not there.
+
+An e-process is a bet against "both arms are equal" whose expected worth is at most 1 as long as that is true; by
+Ville's inequality it reaches 1/alpha with probability at most alpha, however often one looks. Two directions are
+watched at alpha/2 each. Sources: Turner and Gruenwald (2023), safe two-sample tests, for success and failure;
+Waudby-Smith and Ramdas (2023), betting, for partial credit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from evaweb.statistics.base import check_alpha, check_share
+
+ALPHA = 0.05
+_CAUTION = 0.5  # of what could be lost with one pair, how much is ever bet
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What a sequence of pairs shows, for both directions, after each pair.
+
+    `first` and `second` [pairs] are log e-values that the first, and the second, arm is the better; `p_first` and
+    `p_second` [pairs] the anytime-valid probabilities min over time of 1/e. `stop` is the number of pairs after which
+    one of them was first at most alpha/2, None where none was; `winner` is which ("first" or "second").
+    """
+
+    first: tuple[float, ...]
+    second: tuple[float, ...]
+    p_first: tuple[float, ...]
+    p_second: tuple[float, ...]
+    alpha: float
+    stop: int | None
+    winner: str | None
+
+    @property
+    def pairs(self) -> int:
+        """How many were looked at."""
+        return len(self.first)
+
+    @property
+    def p(self) -> float:
+        """Two-sided: twice the smaller of both, at most 1; 1 before the first pair."""
+        return min(1.0, 2 * min(self.p_first[-1], self.p_second[-1])) if self.pairs else 1.0
+
+
+def success_evidence(pairs: Iterable[tuple[bool, bool]], alpha: float = ALPHA) -> Evidence:
+    """Of pairs (first succeeded, second succeeded) in the order in which they were run.
+
+    Each pair may have a success rate of its own, as when both arms start from the same initial condition: the bet is
+    fair whatever the common rate is. The order matters, and must be the true one; pairs must not be left out.
+    """
+    check_alpha(alpha)
+    first, second = [], []
+    log_first = log_second = 0.0
+    n = wins1 = wins2 = 0
+    for one, other in pairs:
+        # Who is bet on has the prior Beta(2, 1), the other Beta(1, 2): before any trial the bet is already placed.
+        log_first += _factor((1 + wins2) / (3 + n), (2 + wins1) / (3 + n), other, one)
+        log_second += _factor((1 + wins1) / (3 + n), (2 + wins2) / (3 + n), one, other)
+        first.append(log_first)
+        second.append(log_second)
+        n, wins1, wins2 = n + 1, wins1 + bool(one), wins2 + bool(other)
+    return _evidence(first, second, alpha)
+
+
+def _factor(p: float, q: float, worse: bool, better: bool) -> float:
+    """What log e gains by the outcome of one pair, with the rates that were predicted before it."""
+    if p >= q:
+        return 0.0
+    m = (p + q) / 2
+    return _log(p, worse) + _log(q, better) - _log(m, worse) - _log(m, better)
+
+
+def _log(rate: float, success: bool) -> float:
+    return math.log(rate if success else 1 - rate)
+
+
+def score_evidence(pairs: Iterable[tuple[float, float]], alpha: float = ALPHA) -> Evidence:
+    """Of pairs (score of the first, score of the second), each 0 to 1, in the order in which they were run."""
+    check_alpha(alpha)
+    given = list(pairs)
+    for one, other in given:
+        check_share("score", one)
+        check_share("score", other)
+    return _evidence(_bets([a - b for a, b in given]), _bets([b - a for a, b in given]), alpha)
+
+
+def _bets(differences: Sequence[float]) -> list[float]:
+    """Log worth after each of `differences` (-1 to 1) of a gambler who bets that their mean is above 0."""
+    log_e, path = 0.0, []
+    total, squares = (
+        0.5,
+        0.25,
+    )  # one made-up observation at the middle, with the largest variance there can be
+    for t, d in enumerate(differences, start=1):
+        mean, variance = total / t, squares / t  # of what was before: a bet must not know its outcome
+        x, edge = (d + 1) / 2, mean - 0.5
+        stake = min(max(edge / (variance + edge * edge), 0.0), _CAUTION / 0.5)
+        log_e += math.log1p(stake * (x - 0.5))
+        path.append(log_e)
+        total += x
+        squares += (x - total / (t + 1)) ** 2
+    return path
+
+
+def _evidence(first: list[float], second: list[float], alpha: float) -> Evidence:
+    p_first, p_second = _anytime(first), _anytime(second)
+    for pair, (one, other) in enumerate(zip(p_first, p_second, strict=True), start=1):
+        if min(one, other) <= alpha / 2:
+            winner = "first" if one <= other else "second"
+            return Evidence(tuple(first), tuple(second), tuple(p_first), tuple(p_second), alpha, pair, winner)
+    return Evidence(tuple(first), tuple(second), tuple(p_first), tuple(p_second), alpha, None, None)
+
+
+def _anytime(path: Sequence[float]) -> list[float]:
+    lowest, found = 1.0, []
+    for log_e in path:
+        lowest = min(lowest, math.exp(-log_e) if log_e > 0 else 1.0)
+        found.append(lowest)
+    return found
+
+
+def in_pairs(first: Sequence[bool], second: Sequence[bool]) -> list[tuple[bool, bool]]:
+    """The k-th trial of one arm beside the k-th of the other; those one arm is ahead by wait for the other."""
+    return list(zip(first, second, strict=False))

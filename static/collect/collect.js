@@ -1,0 +1,272 @@
+// The Collect page: a session opened or resumed, episodes armed, recorded, labelled, discarded; the queue and the dataset.
+
+import { config } from "../console/config.js";
+import { post, RequestFailed } from "../site/api.js";
+import { armWords, big, discarding, leaderWords, subject, Twice, whyNotDiscard, whyNotLabel, whyNotStart } from "./moments.js";
+import { gamepads } from "./pads.js";
+
+const ASK_MS = 4000; // for which "again to discard" stands
+const SETTLE_MS = 600; // a Start that took the place of Stop is not yet pressed by the hand that pressed Stop
+const REST_MS = 10000; // for the robot to be at rest before it is recorded again
+const QUEUE_MS = 2000;
+
+export class CollectPanel {
+  #store;
+  #commands;
+  #busy = "";
+  #twice = new Twice(ASK_MS);
+  #seen = ""; // the newest episode that this page knows of
+  #closed = ""; // the newest that is on disk
+  #kind = "run";
+  #changed = -Infinity;
+  #drawnQueue = 0;
+
+  constructor(store, commands) {
+    this.#store = store;
+    this.#commands = commands;
+    document.addEventListener("click", (event) => this.#clicked(event));
+    document.addEventListener("submit", (event) => event.target.matches("#open-session, #publish") && event.preventDefault());
+    document.addEventListener("change", ({ target }) => target.id === "session-tasks" && this.#picked(target));
+    store.on(["snapshot", "second"], () => this.draw());
+    document.body.addEventListener("htmx:afterSettle", () => this.draw());
+    store.on("second", () => this.#follow());
+    gamepads((action) => this.#pressed(action));
+    this.draw();
+  }
+
+  /** The uuid of the open session, "" for none. */
+  get session() {
+    return document.querySelector("[data-session-uuid]")?.dataset.sessionUuid ?? "";
+  }
+
+  /** Fetch both fragments anew. */
+  refresh() {
+    for (const id of ["session", "progress"]) window.htmx.trigger(`#${id}`, "eva:collect");
+  }
+
+  /** While the worker is at it, what is left changes without anything in the database. */
+  #follow() {
+    if (!document.querySelector('[data-queue="active"]') || performance.now() - this.#drawnQueue < QUEUE_MS) return;
+    this.#drawnQueue = performance.now();
+    window.htmx.trigger("#progress", "eva:collect");
+  }
+
+  // --- what is shown -------------------------------------------------------------------------------------------
+
+  draw() {
+    const { snapshot } = this.#store;
+    const { collect } = snapshot ?? {};
+    this.#notice(collect);
+    document.getElementById("collects-nothing").hidden = !snapshot || Boolean(collect);
+    const task = document.querySelector("[data-session-uuid]")?.dataset.task;
+    write("prompt", task ? `“${task}”` : "No session is open.");
+    write("armed", armWords(snapshot ?? {}));
+    const { text, weight } = leaderWords(collect);
+    write("leader", text);
+    show("leader").dataset.weight = weight;
+    this.#drawArm(collect);
+    this.#drawBig(snapshot);
+    this.#drawEpisode(snapshot ?? {}, collect);
+    for (const button of document.querySelectorAll('[data-collect="setup"]')) button.dataset.blocked = this.session ? "" : "open or resume a session first";
+    this.#commands.gate();
+  }
+
+  /** The open episode is the newest, and stays so until another one was closed. */
+  #notice(collect) {
+    const closed = collect?.last?.uuid ?? "";
+    if (collect?.episode) this.#seen = collect.episode;
+    else if (closed !== this.#closed) this.#seen = closed;
+    this.#closed = closed;
+  }
+
+  #drawArm(collect) {
+    const button = document.getElementById("arm");
+    button.setAttribute("aria-checked", String(Boolean(collect?.armed)));
+    button.dataset.gate = collect?.armed ? "disarm" : "arm";
+    button.dataset.blocked = collect?.armed || !collect ? "" : this.session ? (collect.set_up ? "" : "set up first") : "open or resume a session first";
+    write("arm", collect?.armed ? "Armed" : "Arm");
+  }
+
+  #drawBig(snapshot) {
+    const button = document.getElementById("big");
+    const { kind, text } = big(snapshot ?? {});
+    if (kind !== this.#kind) {
+      this.#kind = kind;
+      this.#changed = performance.now();
+      setTimeout(() => this.draw(), SETTLE_MS + 20);
+    }
+    button.toggleAttribute("data-settling", kind === "run" && performance.now() - this.#changed < SETTLE_MS);
+    button.dataset.gate = kind;
+    button.dataset.blocked = kind === "run" ? whyNotStart(snapshot, this.session) : "";
+    button.classList.toggle("button-halt", kind === "stop");
+    button.classList.toggle("button-primary", kind === "run");
+    write("big", text);
+  }
+
+  #drawEpisode(snapshot, collect) {
+    const episode = subject(collect, this.#seen);
+    const said = collect?.last?.uuid === episode ? collect.last : null;
+    const busy = this.#busy === "rerecord" ? "the robot comes to rest first" : "";
+    for (const button of document.querySelectorAll('[data-collect="label"]')) {
+      button.dataset.blocked = whyNotLabel(snapshot, episode);
+      button.setAttribute("aria-pressed", String(said?.result === button.dataset.result && !said.discarded));
+    }
+    for (const name of ["discard", "rerecord"]) {
+      document.querySelector(`[data-collect="${name}"]`).dataset.blocked = busy || whyNotDiscard(snapshot, episode);
+      document.querySelector(`[data-collect="${name}"]`).toggleAttribute("data-asks", this.#twice.asks(name));
+    }
+    write("discard", this.#twice.asks("discard") ? "Again: discard" : "Discard");
+    write("rerecord", this.#twice.asks("rerecord") ? "Again: re-record" : "Re-record");
+    write("result", collect?.episode ? "recording" : said ? (said.discarded ? "discarded" : said.result ? "" : "how did it go?") : "");
+  }
+
+  // --- what is pressed -----------------------------------------------------------------------------------------
+
+  #picked(select) {
+    if (!select.value) return;
+    const field = document.getElementById("session-task");
+    field.value = select.value;
+    field.dispatchEvent(new Event("input", { bubbles: true })); // a draft of it
+    select.value = "";
+  }
+
+  /** A gamepad presses what a finger would. */
+  #pressed(action) {
+    const place = ["success", "partial", "fail"].includes(action) ? `[data-result="${action}"][data-collect]` : `[data-collect="${action}"]`;
+    document.querySelector(place)?.click();
+  }
+
+  #clicked(event) {
+    const button = event.target.closest("[data-collect]");
+    if (!button) return;
+    const what = button.dataset.collect;
+    if (button.getAttribute("aria-disabled") === "true") {
+      this.#commands.say(`${nameOf(button)}: ${button.title}`, "refused");
+      return;
+    }
+    if (!["discard", "rerecord"].includes(what)) this.#twice.clear();
+    const stops = what === "big" && this.#kind === "stop";
+    if (this.#busy && !stops) this.#commands.say(`${nameOf(button)}: not yet, ${this.#busy} is on its way`, "refused");
+    else this.#do(what, button);
+  }
+
+  async #do(what, button) {
+    const acts = {
+      setup: () => this.#give("setup", this.#bench()),
+      arm: () => this.#commands.give(button.dataset.gate),
+      big: () => (this.#kind === "stop" ? this.#commands.give("stop") : this.#start()),
+      discard: () => this.#discard(),
+      rerecord: () => this.#rerecord(),
+      label: () => this.#commands.give("label", { episode: this.#episode, result: button.dataset.result }),
+      open: () => this.#ask("Open", config.sessions, opening()),
+      close: () => this.#ask("Close", `${config.session}/${this.session}/close`),
+      resume: () => this.#ask("Resume", `${config.session}/${document.getElementById("session-earlier").value}/resume`),
+      publish: () => this.#ask("Publish", `${config.session}/${this.session}/publish`, publishing()),
+      retry: () => this.#ask("Retry", `${config.jobs}/${button.dataset.job}/retry`),
+    };
+    const before = this.#busy;
+    this.#busy = what;
+    if (document.activeElement?.matches("#seed, #open-session input")) document.activeElement.blur(); // the keys are free again
+    try {
+      await acts[what]();
+    } finally {
+      this.#busy = before;
+      this.draw();
+    }
+  }
+
+  get #episode() {
+    return subject(this.#store.snapshot?.collect, this.#seen);
+  }
+
+  #give(kind, args = {}) {
+    return this.#commands.give(kind, args, { session: this.session });
+  }
+
+  #bench() {
+    const seed = document.getElementById("seed");
+    return seed && seed.value !== "" ? { bench: { seed: seed.valueAsNumber } } : {};
+  }
+
+  async #start() {
+    const answer = await this.#give("run");
+    if (answer?.data?.episode) this.#seen = answer.data.episode;
+    return answer;
+  }
+
+  async #discard() {
+    if (!this.#twice.press("discard")) {
+      this.#commands.say("Discard: press again to discard the episode; its files stay, it is never published", "pressed");
+      return;
+    }
+    await this.#commands.give("discard", discarding(this.#store.snapshot?.collect, this.#episode));
+  }
+
+  async #rerecord() {
+    if (!this.#twice.press("rerecord")) {
+      this.#commands.say("Re-record: press again to discard the episode and start the next at once", "pressed");
+      return;
+    }
+    this.draw();
+    const answer = await this.#commands.give("discard", discarding(this.#store.snapshot?.collect, this.#episode));
+    if (!answer) return;
+    const why = await this.#rested();
+    if (why) this.#commands.say(`Re-record: discarded, not started: ${why}`, "refused");
+    else await this.#start();
+  }
+
+  /** Wait until an episode can start; why it cannot after all, "" where it can. */
+  async #rested() {
+    const until = performance.now() + REST_MS;
+    let why = "";
+    while (performance.now() < until) {
+      const { snapshot } = this.#store;
+      why = whyNotStart(snapshot, this.session) || this.#commands.reason("run");
+      const open = Boolean(snapshot?.collect?.episode) || snapshot?.state === "running";
+      if (!open && !why) return "";
+      if (!open && snapshot?.state !== "holding" && why === "arm first") return snapshot.collect.why_not || why;
+      await new Promise((resolve) => setTimeout(resolve, 50));
+    }
+    return why || "the robot is not at rest";
+  }
+
+  /** One request to the web, with its outcome on the page. */
+  async #ask(name, address, content = {}) {
+    this.#commands.say(`${name}: pressed …`, "pressed");
+    try {
+      await post(address, content);
+      this.#commands.say(`${name}: done`, "accepted");
+      const form = name === "Open" && document.getElementById("open-session");
+      if (form) form.dispatchEvent(new Event("eva:saved", { bubbles: true }));
+    } catch (error) {
+      if (!(error instanceof RequestFailed)) throw error;
+      this.#commands.fail(name, error);
+    } finally {
+      this.refresh();
+    }
+  }
+}
+
+function opening() {
+  const { task, dataset, target } = document.getElementById("open-session").elements;
+  return { task: task.value, dataset: dataset.value.trim(), target: target.value === "" ? null : target.valueAsNumber };
+}
+
+function publishing() {
+  const { failures, version } = document.getElementById("publish").elements;
+  return { results: ["success", "partial", ...(failures?.checked ? ["fail"] : [])], version: version.disabled ? "" : version.value };
+}
+
+function show(name) {
+  return document.querySelector(`[data-collect-show="${name}"]`);
+}
+
+/** What a button is called, without its key. */
+function nameOf(button) {
+  return button.textContent.replace(/\s+\S+$/, "").trim();
+}
+
+function write(name, text) {
+  const element = show(name);
+  if (element.textContent !== text) element.textContent = text;
+}

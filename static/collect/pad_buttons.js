@@ -1,0 +1,70 @@
+// The buttons of gamepads as presses: of a button that went down while we looked, never of one that was held before.
+
+/** What can be pressed by a pad, and which button does it as delivered (numbers of the standard mapping). */
+export const ACTIONS = {
+  arm: { name: "Arm, disarm", button: 9 },
+  big: { name: "Start; stop and save", button: 0 },
+  discard: { name: "Discard", button: 1 },
+  rerecord: { name: "Re-record", button: 3 },
+  success: { name: "Success", button: 12 },
+  partial: { name: "Partial", button: 15 },
+  fail: { name: "Fail", button: 13 },
+};
+
+const NAMES = ["A", "B", "X", "Y", "LB", "RB", "LT", "RT", "Back", "Start", "left stick", "right stick", "up", "down", "left", "right", "Guide"];
+
+/** A button as it stands on a pad of the standard mapping, else its number. */
+export function buttonName(button, mapping) {
+  if (button === null || button === undefined) return "none";
+  return mapping === "standard" && NAMES[button] ? `${NAMES[button]} (${button})` : `button ${button}`;
+}
+
+export function delivered() {
+  return Object.fromEntries(Object.entries(ACTIONS).map(([action, { button }]) => [action, button]));
+}
+
+/** `mapping` with `action` on `button`; whatever was on that button before is on none. */
+export function assigned(mapping, action, button) {
+  const freed = Object.entries(mapping).map(([other, at]) => [other, at === button ? null : at]);
+  return { ...Object.fromEntries(freed), [action]: button };
+}
+
+/** What was kept, as far as it is a mapping; the delivered one for the rest. */
+export function restored(text) {
+  let kept = {};
+  try {
+    kept = JSON.parse(text ?? "{}") ?? {};
+  } catch {
+    kept = {};
+  }
+  const fits = (at) => at === null || (Number.isInteger(at) && at >= 0 && at < 64);
+  return Object.fromEntries(Object.entries(delivered()).map(([action, at]) => [action, fits(kept[action]) ? kept[action] : at]));
+}
+
+/** Follows pads from look to look. */
+export class Presses {
+  #held = new Map(); // index -> {id, buttons}
+
+  /** The buttons that went down since the last look: [{pad, button}]. A pad that is new, or another, only begins. */
+  look(pads) {
+    const pressed = [];
+    const there = new Set();
+    for (const pad of pads) {
+      if (!pad?.connected) continue;
+      there.add(pad.index);
+      const now = pad.buttons.map((button) => button.pressed);
+      const before = this.#held.get(pad.index);
+      if (before?.id === pad.id) {
+        now.forEach((down, button) => down && before.buttons[button] === false && pressed.push({ pad, button }));
+      }
+      this.#held.set(pad.index, { id: pad.id, buttons: now });
+    }
+    for (const index of this.#held.keys()) if (!there.has(index)) this.#held.delete(index);
+    return pressed;
+  }
+
+  /** Begin anew: whatever is held now does nothing. */
+  forget() {
+    this.#held.clear();
+  }
+}

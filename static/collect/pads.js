@@ -1,0 +1,77 @@
+// A gamepad at the Collect page: looked at while the page is visible, its buttons shown and changed.
+
+import { ACTIONS, assigned, buttonName, delivered, Presses, restored } from "./pad_buttons.js";
+
+const KEY = "eva-pad";
+const LATE_MS = 500; // between two looks: what happened meanwhile is nobody's press
+
+/** `press(action)` hears what is pressed; resolves nothing, goes on as long as the page lives. */
+export function gamepads(press) {
+  const presses = new Presses();
+  const part = (name) => document.querySelector(`[data-pad="${name}"]`);
+  const list = document.getElementById("pad-list");
+  let mapping = restored(localStorage.getItem(KEY));
+  let changing = ""; // the action that waits for its button
+  let shown = "";
+  let looked = -Infinity;
+
+  const rows = Object.entries(ACTIONS).map(([action, { name }]) => {
+    const row = document.getElementById("pad-row").content.cloneNode(true).firstElementChild;
+    row.querySelector(".pad-name").textContent = name;
+    row.dataset.action = action;
+    row.querySelector("button").addEventListener("click", () => {
+      changing = changing === action ? "" : action;
+      draw();
+    });
+    list.append(row);
+    return row;
+  });
+  part("reset").addEventListener("click", () => keep(delivered()));
+
+  function keep(next) {
+    mapping = next;
+    changing = "";
+    localStorage.setItem(KEY, JSON.stringify(mapping));
+    draw();
+  }
+
+  function pads() {
+    return [...(navigator.getGamepads?.() ?? [])].filter((pad) => pad?.connected);
+  }
+
+  function draw() {
+    const [first] = pads();
+    for (const row of rows) {
+      row.querySelector(".pad-button").textContent = changing === row.dataset.action ? "press a button …" : buttonName(mapping[row.dataset.action], first?.mapping);
+      row.querySelector("button").textContent = changing === row.dataset.action ? "Cancel" : "Change";
+    }
+    part("state").textContent = first ? first.id.slice(0, 32) : "none connected: press a button on it";
+  }
+
+  function pressed(button) {
+    if (changing) {
+      keep(assigned(mapping, changing, button));
+      return;
+    }
+    const action = Object.keys(mapping).find((one) => mapping[one] === button);
+    part("said").textContent = `${buttonName(button, pads()[0]?.mapping)}: ${action ? ACTIONS[action].name : "does nothing"}`;
+    if (action) press(action);
+  }
+
+  function look() {
+    requestAnimationFrame(look);
+    const now = performance.now();
+    if (document.hidden || now - looked > LATE_MS) presses.forget();
+    looked = now;
+    const there = pads();
+    const names = there.map(({ id }) => id).join();
+    if (names !== shown) {
+      shown = names;
+      draw();
+    }
+    for (const { button } of presses.look(there)) pressed(button);
+  }
+
+  draw();
+  look();
+}

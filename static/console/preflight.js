@@ -1,0 +1,76 @@
+// Preflights: the chosen checkpoint's server is asked without the robot, and what was last found stands below the button.
+
+import { post } from "../site/api.js";
+import { setReason } from "./commands.js";
+import { config } from "./config.js";
+import { whyNoPreflight } from "./reasons.js";
+
+const TIMEOUT_MS = 15000; // other stations are asked first which server they use
+
+/** Keeps buttons with data-preflight-ask and the results beside them true. */
+export function preflights(store, commands) {
+  const draw = () => {
+    for (const button of document.querySelectorAll("[data-preflight-ask]")) {
+      const checkpoint = chosen(button);
+      setReason(button, whyNoPreflight(store, checkpoint));
+      const result = resultOf(button);
+      if (result.dataset.of === checkpoint) continue;
+      result.dataset.of = checkpoint;
+      if (checkpoint) show(result, `${config.preflights.newest}?checkpoint=${encodeURIComponent(checkpoint)}`);
+      else result.replaceChildren();
+    }
+  };
+  document.addEventListener("click", (event) => {
+    const button = event.target.closest("[data-preflight-ask]");
+    if (button) ask(button, commands);
+  });
+  document.addEventListener("change", draw);
+  document.body.addEventListener("htmx:afterSettle", ({ target }) => {
+    draw();
+    if (target.dataset?.asked) told(target, commands);
+  });
+  store.on(["snapshot", "second"], draw);
+  draw();
+}
+
+async function ask(button, commands) {
+  if (button.getAttribute("aria-disabled") === "true") {
+    commands.say(`Preflight: ${button.title}`, "refused");
+    return;
+  }
+  if ("pressed" in button.dataset) return;
+  button.dataset.pressed = "";
+  commands.say("Preflight: pressed …", "pressed");
+  try {
+    const asked = await post(config.preflights.ask, { checkpoint: chosen(button), station: config.station }, { timeout: TIMEOUT_MS });
+    commands.say("Preflight: under way", "accepted");
+    const result = resultOf(button);
+    result.dataset.asked = asked.id;
+    show(result, `${config.preflights.result}${asked.id}/`);
+  } catch (error) {
+    commands.fail("Preflight", error, "Look below the button before you repeat it.");
+  } finally {
+    delete button.dataset.pressed;
+  }
+}
+
+/** Say how one that was asked for on this page has ended. */
+function told(result, commands) {
+  const shown = result.querySelector("[data-preflight]");
+  if (shown?.dataset.preflight !== result.dataset.asked || shown.dataset.status === "running") return;
+  delete result.dataset.asked;
+  commands.say(`Preflight: ${shown.querySelector(".state").textContent}`, shown.dataset.verdict === "ok" ? "accepted" : "refused");
+}
+
+function chosen(button) {
+  const { checkpoint, checkpointChoice } = button.dataset;
+  return checkpoint ?? document.querySelector(checkpointChoice)?.value ?? "";
+}
+
+function resultOf(button) {
+  return button.closest(".preflight-here").querySelector("[data-preflight-result]");
+}
+
+function show(result, address) {
+  window.htmx.ajax("GET", address, { target: result, swap: "innerHTML" });
+}

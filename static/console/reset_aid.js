@@ -1,0 +1,122 @@
+// The position's reference picture over the live cameras, and how well the bench matches it.
+
+import { below, correlation, grey, HEIGHT, WIDTH } from "./match.js";
+
+const LOOK_MS = 500;
+const BLINK_MS = 500;
+// What is drawn over the live picture: with which composite operation, and how dense.
+const MODES = { blend: ["source-over", 0.5], minimum: ["darken", 1], difference: ["difference", 1], blink: ["source-over", 1], edges: ["screen", 1] };
+
+/** Keeps the overlays of the panel's reference pictures; `say` is not needed: the match stands in the panel. */
+export function resetAid() {
+  const pictures = new Map(); // address -> {image, edges}
+  let mode = "";
+  const chosen = () => document.getElementById("aid-mode");
+  document.addEventListener("change", (event) => {
+    if (event.target.id !== "aid-mode") return;
+    mode = event.target.value;
+    look();
+  });
+  document.body.addEventListener("htmx:afterSettle", () => {
+    if (chosen()) chosen().value = mode;
+    look();
+  });
+  const look = () => {
+    const aid = references();
+    for (const figure of document.querySelectorAll("[data-camera]")) {
+      const reference = aid[figure.dataset.camera];
+      if (reference && !pictures.has(reference)) load(pictures, reference, look);
+      cover(figure, reference && mode ? pictures.get(reference) : null, mode);
+    }
+    tell(aid, pictures);
+  };
+  setInterval(look, LOOK_MS);
+  look();
+}
+
+function references() {
+  const element = document.getElementById("aid-pictures");
+  return element ? JSON.parse(element.textContent) : {};
+}
+
+function load(pictures, address, then) {
+  pictures.set(address, null);
+  const image = new Image();
+  image.onload = () => {
+    pictures.set(address, { image, edges: edgesOf(image) });
+    then();
+  };
+  image.onerror = () => pictures.delete(address); // asked for again
+  image.src = address;
+}
+
+/** Draw the reference over the camera's picture, or take it away. The canvas below stays as it is. */
+function cover(figure, picture, mode) {
+  const live = figure.querySelector("canvas");
+  let over = figure.querySelector("canvas.aid-over");
+  if (!picture) {
+    over?.remove();
+    return;
+  }
+  if (!over) {
+    over = document.createElement("canvas");
+    over.className = "aid-over";
+    live.after(over);
+  }
+  if (over.width !== live.width || over.height !== live.height) Object.assign(over, { width: live.width, height: live.height });
+  Object.assign(over.style, { left: `${live.offsetLeft}px`, top: `${live.offsetTop}px`, width: `${live.offsetWidth}px`, height: `${live.offsetHeight}px` });
+  const [operation, alpha] = MODES[mode];
+  const paper = over.getContext("2d");
+  paper.globalCompositeOperation = "source-over";
+  paper.globalAlpha = 1;
+  paper.drawImage(live, 0, 0);
+  if (mode === "blink" && Math.floor(performance.now() / BLINK_MS) % 2) return;
+  paper.globalCompositeOperation = operation;
+  paper.globalAlpha = alpha;
+  paper.drawImage(mode === "edges" ? picture.edges : picture.image, 0, 0, over.width, over.height);
+}
+
+/** The match of each camera that has a reference, in words; what is below the least is marked. */
+function tell(aid, pictures) {
+  const line = document.getElementById("aid-match");
+  if (!line) return;
+  const matches = {};
+  for (const [camera, address] of Object.entries(aid)) {
+    const live = document.querySelector(`[data-camera="${CSS.escape(camera)}"] canvas`);
+    const picture = pictures.get(address);
+    if (live && picture) matches[camera] = correlation(small(live), small(picture.image));
+  }
+  const least = Number(document.getElementById("aid").dataset.least || Number.NaN);
+  const low = new Set(below(matches, least).map(([camera]) => camera));
+  const words = Object.entries(matches).map(([camera, value]) => `${camera} ${value.toFixed(2)}${low.has(camera) ? " !" : ""}`);
+  line.textContent = words.length ? `Match: ${words.join(", ")}${Number.isFinite(least) ? ` (wanted ${least})` : ""}` : "Match: waiting for pictures";
+  line.toggleAttribute("data-low", low.size > 0);
+}
+
+function small(source) {
+  const paper = new OffscreenCanvas(WIDTH, HEIGHT).getContext("2d", { willReadFrequently: true });
+  paper.imageSmoothingQuality = "high";
+  paper.drawImage(source, 0, 0, WIDTH, HEIGHT);
+  return grey(paper.getImageData(0, 0, WIDTH, HEIGHT).data);
+}
+
+/** White lines on black where the picture changes most. */
+function edgesOf(image) {
+  const { naturalWidth: width, naturalHeight: height } = image;
+  const canvas = new OffscreenCanvas(width, height);
+  const paper = canvas.getContext("2d");
+  paper.drawImage(image, 0, 0);
+  const data = paper.getImageData(0, 0, width, height);
+  const values = grey(data.data);
+  for (let y = 0; y < height; y += 1) {
+    for (let x = 0; x < width; x += 1) {
+      const k = y * width + x;
+      const across = values[k] - values[x + 1 < width ? k + 1 : k];
+      const down = values[k] - values[y + 1 < height ? k + width : k];
+      const edge = Math.min(255, 6 * Math.hypot(across, down));
+      data.data.set([edge, edge, edge, 255], 4 * k);
+    }
+  }
+  paper.putImageData(data, 0, 0);
+  return canvas;
+}

@@ -1,0 +1,21 @@
+// What tells which policy runs is not on the page while the station is veiled for who looks at it.
+
+/** Take every [data-tells] off the page while snapshots say "veiled", and put it back afterwards. */
+export function veil(store) {
+  const taken = []; // [what stands for it, the element]
+  const draw = () => {
+    const veiled = Boolean(store.snapshot?.veiled);
+    document.body.toggleAttribute("data-veiled", veiled);
+    if (!veiled) {
+      for (const [mark, element] of taken.splice(0)) mark.replaceWith(element);
+      return;
+    }
+    for (const element of document.querySelectorAll("[data-tells]")) {
+      const mark = document.createComment("");
+      element.replaceWith(mark);
+      taken.push([mark, element]);
+    }
+  };
+  store.on("snapshot", draw);
+  document.body.addEventListener("htmx:afterSettle", draw);
+}

@@ -1,0 +1,19 @@
+// The episodes that are chosen in the list go along with a deletion.
+
+const form = document.getElementById("delete");
+const chosen = () => [...document.querySelectorAll("[data-episode-index]:checked")];
+
+if (form) {
+  const count = form.querySelector("[data-count]");
+  const show = () => (count.textContent = String(chosen().length));
+  document.getElementById("chosen").addEventListener("change", show);
+  window.addEventListener("pageshow", show); // a browser that comes back fills its fields again
+  form.addEventListener("submit", (event) => {
+    if (!chosen().length) {
+      event.preventDefault();
+      count.closest("button").title = "Choose episodes in the list first";
+      return;
+    }
+    for (const { dataset } of chosen()) form.append(Object.assign(document.createElement("input"), { type: "hidden", name: "episodes", value: dataset.episodeIndex }));
+  });
+}

@@ -1,0 +1,9 @@
+// Whose numbers an episode has is said anew: the page is shown with that robot.
+
+const select = document.getElementById("robot");
+select.addEventListener("change", () => {
+  const address = new URL(window.location.href);
+  if (select.value) address.searchParams.set("robot", select.value);
+  else address.searchParams.delete("robot");
+  window.location.assign(address);
+});

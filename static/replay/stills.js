@@ -1,0 +1,35 @@
+// Cameras whose pictures lie one by one in a column: the newest that has come is shown, and the next is asked for then.
+
+export class Stills {
+  #clock;
+
+  /** `pictures`: [{element, address}] of images. */
+  constructor(pictures, clock) {
+    this.#clock = clock;
+    for (const picture of pictures) {
+      const follow = () => this.#follow(picture);
+      for (const kind of ["tick", "seek"]) clock.addEventListener(kind, follow);
+      picture.element.addEventListener("load", () => this.#came(picture));
+      picture.element.addEventListener("error", () => this.#failed(picture));
+      follow();
+    }
+  }
+
+  #follow(picture) {
+    const { row } = this.#clock;
+    if (picture.coming || picture.row === row) return;
+    const glue = picture.address.includes("?") ? "&" : "?";
+    Object.assign(picture, { coming: true, row });
+    picture.element.src = `${picture.address}${glue}row=${row}`;
+  }
+
+  #came(picture) {
+    picture.coming = false;
+    this.#follow(picture);
+  }
+
+  #failed(picture) {
+    picture.coming = false;
+    picture.element.parentElement.querySelector("[data-fault]").textContent = `picture ${picture.row} cannot be shown`;
+  }
+}

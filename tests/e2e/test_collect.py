@@ -1,0 +1,208 @@
+"""Collecting in a real browser: a session by keyboard, episodes, a gamepad, the queue, the dataset, another day."""
+
+import json
+
+import pytest
+
+from tests.e2e.bench_page import BenchPage
+from tests.e2e.conftest import SETS
+from tests.e2e.lab import STATION, TABLET, Demo
+from tests.processes import eventually
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(420)]
+TASK = "put the block on the plate"
+# A pad in the page's hand: `held` are its buttons that are down, "" where it is not there.
+_PAD = """
+window.held = null;
+navigator.getGamepads = () => window.held === null ? [null] : [{
+  index: 0, id: "test pad", connected: true, mapping: "standard",
+  buttons: Array.from({length: 17}, (_, button) => ({pressed: window.held.includes(button)})),
+}];
+"""
+_OTHER_DAY = """
+from datetime import timedelta
+from evaweb.collect.models import CollectSession
+newest = CollectSession.objects.get()
+setup = {**newest.setup, "fps": 50.0, "cameras": {**newest.setup["cameras"], "cam_high": {"width": 320, "height": 240}}}
+then = newest.opened_at - timedelta(days=3)
+CollectSession.objects.create(
+    station=newest.station, dataset="older", task="fold", operator=newest.operator, setup=setup,
+    opened_at=then, closed_at=then,
+)
+"""
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    lab = Demo(tmp_path_factory.mktemp("collect"), "--collect", "--set=collection.max_age_s=2", *SETS).start()
+    yield lab
+    assert lab.end() == 0, (lab.folder / "demo.log").read_text()[-2000:]
+
+
+class Collector(BenchPage):
+    """A person who collects, at a tablet."""
+
+    def said(self, words):
+        eventually(
+            lambda: words in self.page.locator("#outcome").inner_text(), 20, f"the page says {words!r}"
+        )
+
+    def key(self, key):
+        self.page.keyboard.press(key)
+
+    @property
+    def collect(self):
+        return self.api(f"stations/{STATION}")["snapshot"]["collect"]
+
+    def counts(self):
+        uuid = self.page.locator("[data-session-uuid]").get_attribute("data-session-uuid")
+        return self.api(f"sessions/{uuid}")["counts"]
+
+    def record(self):
+        """An episode of more than a second, by Space; returns its uuid."""
+        self.page.locator("#big[aria-disabled=false]").wait_for()
+        self.key("Space")
+        self.reaches("RUNNING")
+        eventually(
+            lambda: self.api(f"stations/{STATION}")["snapshot"]["run"]["elapsed"] > 1.5, 30, "it is led"
+        )
+        uuid = self.collect["episode"]
+        self.key("Space")
+        self.closed(uuid)
+        return uuid
+
+    def closed(self, uuid):
+        self.reaches("READY")
+        eventually(lambda: (self.collect["last"] or {}).get("uuid") == uuid, 20, "the episode is on disk")
+
+
+@pytest.fixture(scope="module")
+def ann(browser, demo):
+    bench = Collector(browser, demo, "operator", TABLET)
+    bench.page.add_init_script(_PAD)
+    bench.open(f"/stations/{STATION}/collect/")
+    bench.reaches("IDLE")
+    bench.take()
+    yield bench
+    assert [error for error in bench.errors if "409" not in error] == []  # what is refused is said so
+    bench.close()
+
+
+def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(ann, demo):
+    page = ann.page
+    ann.key("Shift+T")
+    page.keyboard.type(TASK)
+    page.fill("#session-target", "5")
+    page.locator("[data-collect=open]").click()
+    page.locator("[data-session-uuid]").wait_for()
+    assert TASK in page.locator(".prompt").inner_text()
+    page.fill("#seed", "1")
+    page.keyboard.press("Enter")
+    ann.key("u")
+    ann.reaches("READY")
+    page.locator("#big:not([data-settling])").wait_for()
+    ann.key("Space")
+    ann.said("Start: arm first")
+    assert ann.state() == "READY"
+    ann.key("a")
+    page.locator("#arm[aria-checked=true]").wait_for()
+
+    first = ann.record()
+    ann.key("1")
+    page.locator("[data-result=success][aria-pressed=true]").wait_for()
+    second = ann.record()
+    ann.key("3")
+    page.locator("[data-result=fail][aria-pressed=true]").wait_for()
+    eventually(lambda: page.locator("#saved").inner_text() == "2", 20, "two are saved")
+    assert "1 success · 0 partial · 1 fail" in page.locator("#results").inner_text()
+
+    eventually(
+        lambda: (
+            page.locator("#last-episode .episode-quality").count() == 1
+            and page.locator("#queue-words").inner_text().startswith("4 of 4 done")
+        ),
+        90,
+        "both are checked and prepared",
+    )
+    page.locator("#publish-version").select_option("v3.0")
+    ann.key("p")
+    eventually(lambda: ann.counts()["published"] == 1, 60, "the success is published")
+    dataset = demo.data / "datasets" / "tabletop_demonstrations-simulated"
+    lines = [json.loads(line) for line in (dataset / "meta" / "eva_episodes.jsonl").read_text().splitlines()]
+    assert [(line["uuid"], line["success"]) for line in lines] == [(first, True)]
+    assert json.loads((dataset / "meta" / "info.json").read_text())["codebase_version"] == "v3.0"
+    told = ann.api(f"episodes/{second}")
+    assert (told["kind"], told["task"], told["dataset_index"]) == ("demonstration", TASK, None)
+
+
+def test_what_went_wrong_is_discarded_and_recorded_again_also_with_a_gamepad(ann):
+    page = ann.page
+    page.evaluate("window.held = [0]")  # pressed before anybody looked
+    eventually(lambda: "test pad" in page.locator("[data-pad=state]").inner_text(), 20, "the pad is seen")
+    page.wait_for_timeout(700)
+    assert (ann.state(), ann.collect["episode"]) == ("READY", None)
+
+    looks = "() => new Promise((seen) => requestAnimationFrame(() => requestAnimationFrame(seen)))"
+
+    def press(button):
+        for held in ([], [button], []):
+            page.evaluate("held => { window.held = held }", held)
+            page.evaluate(looks)
+
+    page.locator("#big[aria-disabled=false]").wait_for()
+    press(0)
+    ann.reaches("RUNNING")
+    begun = ann.collect["episode"]
+    press(3)
+    ann.said("press again")
+    assert ann.collect["episode"] == begun
+    press(3)
+    eventually(lambda: ann.collect["episode"] not in (None, begun), 30, "the next episode is open")
+    again = ann.collect["episode"]
+    eventually(lambda: ann.api(f"stations/{STATION}")["snapshot"]["run"]["elapsed"] > 1.2, 30, "it is led")
+    press(0)
+    ann.closed(again)
+    press(15)
+    page.locator("[data-result=partial][aria-pressed=true]").wait_for()
+
+    ann.key("d")
+    ann.said("press again")
+    assert not ann.collect["last"]["discarded"]
+    ann.key("d")
+    eventually(lambda: ann.collect["last"]["discarded"], 20, "the last one is discarded")
+    eventually(
+        lambda: (ann.counts()["saved"], ann.counts()["discarded"]) == (2, 2), 20, "two and two are counted"
+    )
+
+    ann.key("m")
+    page.locator(".pad-row[data-action=fail] button").click()
+    press(5)
+    assert "RB (5)" in page.locator(".pad-row[data-action=fail] .pad-button").inner_text()
+    page.evaluate("window.held = null")
+    ann.key("m")
+
+
+def test_another_day_the_session_goes_on_and_one_of_another_set_up_is_refused(ann, demo):
+    page = ann.page
+    mine = page.locator("[data-session-uuid]").get_attribute("data-session-uuid")
+    ann.key("Shift+C")
+    page.locator("#open-session").wait_for()
+    demo.python(_OTHER_DAY)
+    page.reload()
+    ann.at_rest()
+    ann.take_again()
+    page.locator("#session-earlier").select_option(index=1)
+    page.locator("[data-collect=resume]").click()
+    ann.said("Resume refused")
+    said = page.locator("#outcome").inner_text()
+    assert "fps = 30, allowed 50" in said
+    assert "camera cam_high = 640x480, allowed 320x240" in said
+    page.locator("#session-earlier").select_option(mine)
+    ann.key("Shift+O")
+    page.locator(f"[data-session-uuid='{mine}']").wait_for()
+    kinds = [event["kind"] for event in ann.api(f"sessions/{mine}")["events"]]
+    assert kinds == ["opened", "published", "closed", "resumed"]
+    page.locator("[data-open-keys]").dispatch_event("click")
+    shown = page.locator("#keys-list").inner_text()
+    assert "Start; stop and save" in shown
+    assert "E-stop, outside text fields" not in shown

@@ -1,0 +1,82 @@
+"""Datasets in a real browser: an episode played from its place in a shared file, several beside each other."""
+
+import pytest
+
+from tests.e2e.by_hand import SOON_S, ByHand
+from tests.e2e.lab import WIDE
+from tests.processes import eventually
+from tests.runtime.datasets.foreign import Plan, shown, write
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+FPS, LENGTHS = 10.0, (40, 50, 60)
+# The number that the test's pictures show: the brightness in the middle of the video.
+NUMBER = """(video) => {
+  const canvas = new OffscreenCanvas(4, 4).getContext("2d");
+  canvas.drawImage(video, 0, 0, 4, 4);
+  return Math.round((canvas.getImageData(1, 1, 1, 1).data[0] - 30) / 5);
+}"""
+
+
+@pytest.fixture(scope="module")
+def cups(patient):
+    """A dataset of somebody else: three episodes in one file for each camera."""
+    folder = patient.data / "datasets" / "cups"
+    write(folder, Plan("v3.0", lengths=LENGTHS, fps=FPS, gop=10, per_data=9, per_video=9))
+    return folder
+
+
+@pytest.fixture
+def viewer(browser, patient):
+    page = ByHand(browser, patient, "ann", WIDE)
+    yield page
+    assert page.errors == []
+    page.close()
+
+
+def row(page):
+    return page.locator("#scrub").evaluate("(scrub) => Number(scrub.value)")
+
+
+def numbers(page):
+    return page.locator("video[data-camera]").evaluate_all(f"(all) => all.map({NUMBER})")
+
+
+def test_an_episode_is_played_from_its_place_in_a_file_and_the_address_says_how(viewer, cups):
+    page = viewer.open("/replay/datasets/").page
+    page.locator("[data-dataset='datasets/cups'] a").click()
+    page.locator("[data-index='2'] a").first.click()
+    page.wait_for_url(lambda url: url.endswith("/replay/datasets/cups/-/2/"))
+    viewer.open("/replay/datasets/cups/-/2/?t=3&from=2&to=4&loop=1&speed=2")
+    eventually(lambda: row(page) == 30, SOON_S, "the row of the address is shown")
+    eventually(
+        lambda: numbers(page) == [shown(2, 30)] * 2, SOON_S, "both cameras show that row of that episode"
+    )
+    page.keyboard.press("ArrowRight")
+    eventually(lambda: numbers(page) == [shown(2, 31)] * 2, SOON_S, "both cameras show the next row")
+    page.locator("#curves canvas").wait_for()
+
+    page.keyboard.press("Space")
+    seen = {row(page) for _ in range(60) if not page.wait_for_timeout(50)}
+    page.keyboard.press("Space")
+    assert seen <= set(range(20, 40))
+    assert len(seen) > 3
+    page.keyboard.press("r")
+    page.keyboard.press("Home")
+    for _ in range(4):
+        page.keyboard.press("ArrowRight")
+    page.keyboard.press("o")
+    page.wait_for_url(lambda url: "from=0&to=0.5" in url and "t=0.4" in url and "speed=2" in url)
+    assert page.locator("#range").is_visible()
+
+
+def test_two_episodes_are_seen_beside_each_other_on_one_clock(viewer, cups):
+    page = viewer.open("/replay/side-by-side/?show=cups:0&show=cups:1&offset=0,1&t=2").page
+    one, other = (page.locator(f"[data-episode='datasets/cups:{index}'] [data-row]") for index in (0, 1))
+    eventually(lambda: one.inner_text() == "row 20 of 40", SOON_S, "the first one stands at its row")
+    assert other.inner_text() == "row 10 of 50"
+    expected = [shown(0, 20)] * 2 + [shown(1, 10)] * 2
+    eventually(lambda: numbers(page) == expected, SOON_S, "all cameras show their own row")
+    page.locator("#curves .u-over").wait_for()
+    page.keyboard.press("End")
+    eventually(lambda: other.inner_text() == "row 49 of 50", SOON_S, "the longer one is at its end")
+    assert one.inner_text() == "is over"

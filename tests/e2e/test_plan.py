@@ -1,0 +1,123 @@
+"""Trials of a blind plan in a real browser: cameras confirmed, handed out, given back, ticked live, scored, next."""
+
+import re
+
+import pytest
+
+from tests.e2e.bench_page import BenchPage
+from tests.e2e.conftest import SETS
+from tests.e2e.lab import STATION, WIDE, Demo
+from tests.processes import eventually
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(400),
+]
+PLAN = "block-on-plate-blind"
+TELLING = re.compile(r"pick-place-\d+k-evaluated|ws://|latency|delay_steps", re.IGNORECASE)
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    lab = Demo(tmp_path_factory.mktemp("plan"), *SETS).start()
+    yield lab
+    assert lab.end() == 0, (lab.folder / "demo.log").read_text()[-2000:]
+
+
+@pytest.fixture(scope="module")
+def operator(browser, demo):
+    bench = BenchPage(browser, demo, "operator", WIDE)
+    bench.said = []  # every text and frame that the live socket sent
+    bench.page.on(
+        "websocket", lambda socket: socket.on("framereceived", lambda frame: bench.said.append(frame))
+    )
+    bench.open(f"/stations/{STATION}/eval/")
+    yield bench
+    assert bench.errors == []
+    bench.close()
+
+
+def shown(operator):
+    """The code of the trial that is on the page."""
+    return operator.page.locator(".plan-code").inner_text()
+
+
+def handed(operator):
+    """The code of the next trial, which is handed out and set up."""
+    operator.page.locator("[data-next]:not([aria-disabled=true])").click()
+    operator.page.locator(".plan-code").wait_for()
+    operator.reaches("READY")
+    operator.page.locator("#steps[data-set-up=yes]").wait_for()
+    return shown(operator)
+
+
+def started(operator):
+    """The next trial is handed out, set up, and runs."""
+    handed(operator)
+    operator.press("run")
+    operator.reaches("RUNNING")
+    operator.page.locator("#live input[name=milestone]").first.wait_for()
+    return shown(operator)
+
+
+def scored(operator, ticks):
+    """The run is stopped, and what is ticked is saved."""
+    operator.page.locator("[data-command=stop][data-trial]:visible").click()
+    operator.page.locator("#score").wait_for()
+    for key in ticks:
+        box = operator.page.locator("#score input[name=milestone]").nth(key - 1)
+        if not box.is_checked():
+            box.check()
+    operator.page.locator("button[form=score]").click()
+    operator.page.locator("[data-next]").wait_for()
+
+
+def test_trials_of_a_blind_plan_are_made_through_the_tab(operator, demo):
+    page = operator.page
+    operator.reaches("IDLE")
+    operator.take()
+    assert page.locator("#checkpoint-choice option").all_inner_texts() == ["pick-place-40k", "pick-place-8k"]
+    page.select_option("#plan-choice", PLAN)
+    blocked = page.locator("[data-next][aria-disabled=true]")
+    blocked.wait_for()
+    eventually(
+        lambda: "confirm the cameras first" in blocked.get_attribute("title"),
+        20,
+        "it is said what is missing",
+    )
+    page.locator("[data-confirm-cameras]").click()
+    first = started(operator)
+    eventually(lambda: page.locator("body[data-veiled]").count() == 1, 10, "what tells is gone")
+    assert page.locator("[data-tells]").count() == 0
+    page.keyboard.press("1")
+    eventually(lambda: page.locator("#live input[name=milestone]").first.is_checked(), 10, "it is ticked")
+    eventually(
+        lambda: "at " in page.locator("#live [data-at]").first.inner_text(), 10, "the tick has its time"
+    )
+    scored(operator, ticks=(1, 2))
+    outcomes = operator.api("trials?limit=1")["items"][0]
+    assert (outcomes["code"], outcomes["checkpoint"], outcomes["success"]) == (first, first, False)
+    reached = operator.api(f"trials/{outcomes['id']}")["scores"][0]["milestones"]
+    assert [one["reached"] for one in reached] == [True, True, False, False]
+    assert reached[0]["at_s"] is not None
+    assert reached[1]["at_s"] is None
+
+    second = handed(operator)
+    assert second != first
+    page.locator("summary", has_text="Give it back").click()
+    page.fill("#return-why", "the block fell off the table")
+    page.locator("[data-return]").click()
+    page.locator("[data-next]").wait_for()
+    third = started(operator)
+    assert third not in (first, second)
+    assert "attempt 2" in page.locator(".plan-trial").inner_text()
+    scored(operator, ticks=(1,))
+    assert "2 of 24" in page.locator(".plan-progress").inner_text()
+
+    frames = "".join(one if isinstance(one, str) else one.decode("utf-8", "replace") for one in operator.said)
+    assert '"veiled"' in frames
+    assert "-evaluated" not in frames
+    assert not TELLING.search(page.content())
+    page.goto(f"{demo.url}/result/trials/{outcomes['id']}/")
+    assert first in page.locator("h1").inner_text()
+    assert not TELLING.search(page.locator("main").inner_text())

@@ -1,0 +1,218 @@
+"""A blind plan with recognisable secrets, and one trial of it through its stages.
+
+The secrets are such that no clock, port or identifier has them by chance.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import uuid as uuids
+
+import numpy as np
+from django.utils import timezone
+
+from evaweb.episodes.job_kinds import publish_episode
+from evaweb.episodes.models import Episode
+from evaweb.jobs.kinds import Work
+from evaweb.jobs.models import Job
+from evaweb.plans.handing import hand_out
+from evaweb.plans.models import Plan
+from evaweb.plans.services import plan_close, plan_freeze
+from evaweb.preflights.models import Preflight
+from evaweb.stations.models import Command
+from evaweb.trials import services as trials
+from evaweb.trials.models import Checkpoint, Trial
+from runtime.recording.export import export
+from runtime.transitions import Happening
+from tests.evaweb.trials import builders
+
+NAMES = ("pi0-secret-alder", "pi0-secret-birch")
+KEYS = (6606001, 6606002)  # in the database
+FIGURE = 660606066060.6  # a latency [ms], recognisable also when it is rounded or shown in seconds
+AIM = np.float32(31415.9)  # what the policy wants of a joint [rad]
+ROWS = 57  # of a chunk
+DIGEST = "c0ffee" * 10 + "beef"
+LATENCY = "660606066"
+SECRETS = (
+    *("secret-alder", "secret-birch", "host-alder", "host-birch", ":64611", ":64622"),  # no ephemeral ports
+    *("did not answer", f"{ROWS} rows", LATENCY, DIGEST, *map(str, KEYS)),
+)
+ERROR = "ws://host-alder.example:64611 did not answer within 5 s"
+
+
+class Lab:
+    """One trial of a blind plan, stage by stage; `checkpoint` is the one that it is of."""
+
+    def __init__(self, station, runtime, operator, folder, data):
+        self.station, self.runtime, self.operator, self._folder, self._data = (
+            station,
+            runtime,
+            operator,
+            folder,
+            data,
+        )
+        self.owner = builders.user("olga")
+        self.scene = builders.scene()
+        policies = [
+            {"url": f"ws://host-{name[-5:]}.example:646{n}{n}"} for n, name in enumerate(NAMES, start=1)
+        ]
+        rows = [
+            Checkpoint.objects.create(pk=pk, name=name, policy=policy)
+            for pk, name, policy in zip(KEYS, NAMES, policies, strict=True)
+        ]
+        draft = Plan.objects.create(
+            name="blocks", title="Blocks", question=f"is {NAMES[0]} better?", owner=self.owner
+        )
+        draft.checkpoints.set(rows)
+        draft.positions.set(self.scene.positions.all())
+        self.plan = plan_freeze(user=self.owner, plan=draft)
+        self.trial = self.command = self.episode = None
+        self.dataset = ""
+        for row in rows:
+            Preflight.objects.create(
+                checkpoint=row,
+                station=station,
+                user=self.owner,
+                by="station",
+                policy=row.policy,
+                status="done",
+                report={"verdict": "ok", "url": row.policy["url"], "round_trip_ms": FIGURE},
+            )
+
+    def handed(self):
+        """The next trial; the station is being set up for it."""
+        self.trial = hand_out(user=self.operator, station=self.station, plan=self.plan).trial
+        self.runtime.do(
+            lambda: setattr(self.runtime, "snapshot", self._snapshot(type(self.runtime).snapshot))
+        )
+        self.command = Command.objects.create(
+            uuid=uuids.uuid4(),
+            station=self.station,
+            kind="setup",
+            user=self.operator,
+            status="refused",
+            reason=ERROR,
+            args={
+                "policy": self.trial.checkpoint.policy,
+                "checkpoint": {"id": self.trial.checkpoint_id, "name": NAMES[0]},
+            },
+            data={"latency_ms": FIGURE, "name": NAMES[0]},
+            issued_at=timezone.now(),
+        )
+        Trial.objects.filter(pk=self.trial.pk).update(setup=self.command.pk)
+        self.runtime.say("setup", "connecting to the policy")
+        self.runtime.say("setup_note", f"{NAMES[0]} answers {ROWS} rows in {FIGURE} ms")
+
+    def _snapshot(self, plain):
+        def told():
+            own = plain(self.runtime)
+            return own | {
+                "checkpoint": {"id": self.trial.checkpoint_id, "name": self.trial.checkpoint.name},
+                "validated": f"{ROWS} rows in {FIGURE} ms",
+                "reason": ERROR,
+                "policy": {
+                    "kind": "openpi",
+                    "name": NAMES[0],
+                    "latency_p50_ms": FIGURE,
+                    "latencies_ms": [FIGURE],
+                },
+                "tuning": {"execution_horizon": ROWS, "digest": DIGEST},
+                "strategy": "rtc",
+                "stages": [{"name": "warming up the policy", "state": "done", "seconds": FIGURE}],
+                "first_action": {"distance": FIGURE, "joint": NAMES[0], "far": False},
+                "episode": {"uuid": "", "reason": ERROR},
+                "last_run": {"reason": ERROR},
+                "something_new": ERROR,
+            }
+
+        return told
+
+    def running(self):
+        """Its run goes on, with chunks of the policy."""
+        Trial.objects.filter(pk=self.trial.pk).update(status="running", started_at=timezone.now())
+        self.publish()
+
+    def publish(self):
+        joints = np.full(14, 0.1, np.float32)
+        told = {"step": 7, "chunk": 3, "chunks": 2, "measured": joints, "commanded": joints, "engaged": True}
+        self.runtime.publish(
+            "joints", told | {"raw": np.full(14, AIM), "planned": np.full(14, AIM), "who": NAMES[0]}
+        )
+        chunk = {
+            "chunk": 3,
+            "run": 1,
+            "state": ERROR,
+            "rows": np.full((ROWS, 14), 0.1),
+            "targets": list(range(ROWS)),
+        }
+        self.runtime.publish("chunk", chunk | {"ik": {"name": NAMES[0]}})
+
+    def failed(self):
+        """The policy's server is lost."""
+        self.runtime.say("policy_failed", ERROR)
+        self.runtime.enter(Happening.CONNECTED, ERROR)
+        Trial.objects.filter(pk=self.trial.pk).update(status="interrupted", reason=f"policy lost: {ERROR}")
+        self._record()
+
+    def _record(self):
+        folder = self._data / "episodes" / self._folder.name
+        shutil.copytree(self._folder, folder)
+        for name in ("manifest.json", "outcome.json"):
+            content = json.loads((folder / name).read_text())
+            content |= {
+                "checkpoint": {"name": NAMES[0]},
+                "error": ERROR,
+                "policy": {"latency_ms": FIGURE, "url": ERROR},
+            }
+            (folder / name).write_text(json.dumps(content))
+        with (folder / "events.jsonl").open("a") as events:
+            events.write(json.dumps({"kind": "policy_failed", "text": ERROR, "time": 1.0}) + "\n")
+            events.write(
+                json.dumps({"kind": "command", "text": f"stop by ann: failed, {ERROR}", "time": 1.0}) + "\n"
+            )
+        export(folder, self._data)
+        self.episode = Episode.objects.create(
+            uuid=folder.name,
+            station=self.station,
+            status="finished",
+            reason=ERROR,
+            strategy="rtc",
+            robot="agilex_piper",
+            mode="continuous",
+            checkpoint=NAMES[0],
+            cameras=["cam_high"],
+            fps=30.0,
+            frames=24,
+            duration_s=0.8,
+            configuration_hash=DIGEST,
+            control={"late_ms": FIGURE},
+            policy={
+                "latency_ms": {"p50": FIGURE, "p90": FIGURE, "max": FIGURE},
+                "delay_steps": {"p50": 3, "max": 9},
+                "answers": 5,
+            },
+            started_at=timezone.now(),
+        )
+        (self._data / "previews" / folder.name).mkdir(parents=True)
+        Trial.objects.filter(pk=self.trial.pk).update(
+            episode=self.episode, duration_s=0.8, ended_at=timezone.now()
+        )
+        for key, facts in (
+            ("publish", {"error": ERROR}),
+            ("export", {"progress": ERROR, "result": {"name": NAMES[0]}}),
+        ):
+            Job.objects.create(kind=key, key=f"{key}:{folder.name}", **facts)
+
+    def scored(self):
+        """Somebody has scored it."""
+        self.trial.refresh_from_db()
+        ticks = dict.fromkeys(self.scene.milestones.values_list("pk", flat=True), True)
+        trials.trial_score(user=self.operator, trial=self.trial, milestones=ticks, note="fine")
+        if not self.dataset:
+            told = publish_episode(Work({"uuid": str(self.episode.uuid)}, lambda text: None))
+            self.dataset = told["dataset"].removeprefix("datasets/")
+
+    def closed(self):
+        """No more trials are handed out."""
+        self.plan = plan_close(user=self.owner, plan=self.plan, reason="enough")

@@ -1,0 +1,90 @@
+"""A station that collects, a session there, and demonstrations of it that were really recorded."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import pytest
+from django.contrib.auth.models import User
+
+from evaweb.collect import following, services
+from evaweb.collect.models import CollectSession, Demonstration
+from evaweb.episodes import services as episodes
+from evaweb.stations.models import Station
+from runtime.recording.export import export
+from runtime.recording.labels import Label, append
+from tests.evaweb.episodes.conftest import data, recorded, station
+from tests.evaweb.trials.builders import Wire
+
+__all__ = ["data", "recorded", "station"]
+
+JOINTS = ["left_arm.joint0", "left_arm.joint1"]
+SETUP = {
+    "robot": "agilex_piper",
+    "groups": ["left_arm"],
+    "joints": JOINTS,
+    "cameras": {"cam_high": {"width": 64, "height": 48}},
+    "fps": 30.0,
+    "streams": {"qvel": False, "effort": False, "eef": True, "eef_action": True},
+}
+
+
+def collecting(**changes: Any) -> dict[str, Any]:
+    """What a station's snapshot says of collecting."""
+    return {"dataset": "cups", "cameras": ["cam_high"], "episode": None, "setup": SETUP, **changes}
+
+
+@pytest.fixture
+def at(monkeypatch: pytest.MonkeyPatch) -> Wire:
+    """What stands where wires to runtimes stand: a station that collects, and that nobody commands."""
+    made = Wire()
+    made.snapshot = {**made.snapshot, "collect": collecting(), "lease": {"holder": "", "epoch": 0}}
+    for place in ("stations.commands", "collect.services", "collect.bench"):
+        monkeypatch.setattr(f"evaweb.{place}.wire_to", lambda name: made)
+    return made
+
+
+@pytest.fixture
+def session(at: Wire, data: Path, station: Station, ann: User) -> CollectSession:
+    return services.session_begin(user=ann, station=station, task="stack the cups", target=20)
+
+
+Demonstrate = Callable[..., Demonstration]
+
+
+@pytest.fixture
+def demonstrate(data: Path, recorded: dict[str, Path], session: CollectSession) -> Demonstrate:
+    """Lay an episode of the session into the data folder as the station does, and let the station tell of it."""
+
+    def do(
+        result: str | None = None, *, status: str = "finished", of: CollectSession | None = None
+    ) -> Demonstration:
+        chosen, uuid = of or session, str(uuid4())
+        target = data / "episodes" / uuid
+        shutil.copytree(recorded[status], target)
+        path = target / "manifest.json"
+        manifest = json.loads(path.read_text())
+        told = {"kind": "demonstration", "mode": "collect", "task": chosen.task, "operator": "ann"}
+        named = {"uuid": str(chosen.pk), "dataset": chosen.dataset}
+        path.write_text(json.dumps(manifest | told | {"uuid": uuid, "session": named}))
+        export(target, data)
+        event = {"kind": "episode_closed", "data": {"uuid": uuid, "status": status}}
+        episodes.episode_closed(station=chosen.station, data=event["data"])
+        made = following.demonstration_told(event=event)
+        assert made is not None
+        return made if result is None else labelled(data, made, result)
+
+    return do
+
+
+def labelled(data: Path, made: Demonstration, result: str | None, **said: Any) -> Demonstration:
+    """As the station writes it down and tells of it."""
+    append(data, str(made.pk), Label(1_700_000_000.0, "ann", result, **said))
+    told = following.demonstration_told(event={"kind": "labelled", "data": {"episode": str(made.pk)}})
+    assert told is not None
+    return told

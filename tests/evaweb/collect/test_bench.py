@@ -1,0 +1,104 @@
+"""Commands of a session take task and session from it, and a station that is not as it was is not run."""
+
+from __future__ import annotations
+
+from typing import Any
+from uuid import uuid4
+
+import pytest
+from django.contrib.auth.models import User
+
+from evaweb.collect import services
+from evaweb.collect.bench import session_command
+from evaweb.collect.models import CollectSession, Demonstration
+from evaweb.errors import Conflict, EvaError
+from evaweb.stations.models import Command, CommandStatus
+from tests.evaweb.collect.conftest import SETUP, collecting
+from tests.evaweb.trials.builders import Wire
+
+pytestmark = pytest.mark.django_db
+
+
+def give(session: CollectSession, user: User, kind: str, **given: Any) -> Command:
+    told = {"page": "p1", "epoch": 1, "boot": "b", "sequence": 1}
+    return session_command(user=user, session=session, kind=kind, **{**told, **given})
+
+
+def test_a_set_up_is_one_to_collect_for_the_sessions_task(
+    session: CollectSession, at: Wire, ann: User
+) -> None:
+    row = give(session, ann, "setup", args={"bench": {"seed": 3}})
+    assert row.args == {"bench": {"seed": 3}, "collect": True, "task": "stack the cups"}
+
+
+def test_a_run_names_the_session_and_its_episode_is_one_of_it(
+    session: CollectSession, at: Wire, ann: User
+) -> None:
+    row = give(session, ann, "run")
+    assert row.args == {
+        "mode": "collect",
+        "task": "stack the cups",
+        "operator": "ann",
+        "session": {"uuid": str(session.pk), "dataset": "cups"},
+    }
+    made = Demonstration.objects.get()
+    assert (str(made.pk), made.session, made.episode.kind, made.episode.task) == (
+        row.data["episode"],
+        session,
+        "demonstration",
+        "stack the cups",
+    )
+
+
+def test_a_refused_run_has_no_episode(session: CollectSession, at: Wire, ann: User) -> None:
+    at.status_word, at.reason = "refused", "not armed"
+    assert give(session, ann, "run").status == CommandStatus.REFUSED
+    assert not Demonstration.objects.exists()
+
+
+def test_a_station_that_has_changed_is_not_run_and_the_differences_are_listed(
+    session: CollectSession, at: Wire, ann: User
+) -> None:
+    at.snapshot = {**at.snapshot, "collect": collecting(setup={**SETUP, "robot": "g2"})}
+    with pytest.raises(Conflict, match=r"session stack the cups \(cups\): robot = g2, allowed agilex_piper"):
+        give(session, ann, "run")
+    assert not Command.objects.exists()
+
+
+def test_a_closed_session_is_not_run(session: CollectSession, at: Wire, ann: User) -> None:
+    services.session_close(user=ann, session=session)
+    with pytest.raises(Conflict, match="is closed: resume it first"):
+        give(session, ann, "run")
+
+
+def test_the_same_uuid_again_gets_the_first_answer_whatever_has_changed_meanwhile(
+    session: CollectSession, at: Wire, ann: User
+) -> None:
+    uuid = uuid4()
+    first = give(session, ann, "run", uuid=uuid)
+    services.session_close(user=ann, session=session)
+    assert give(session, ann, "run", uuid=uuid).data == first.data
+    assert Demonstration.objects.count() == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "args", "said"),
+    [
+        ("run", {"task": "x"}, "args say task beside the session"),
+        ("stop", {}, "stop takes no session; allowed: setup, run"),
+    ],
+)
+def test_what_a_session_does_not_take_is_refused(
+    session: CollectSession, at: Wire, ann: User, kind: str, args: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(EvaError, match=said):
+        give(session, ann, kind, args=args)
+
+
+def test_an_episode_that_is_being_recorded_keeps_its_session_open(
+    session: CollectSession, at: Wire, ann: User
+) -> None:
+    episode = give(session, ann, "run").data["episode"]
+    at.snapshot = {**at.snapshot, "collect": collecting(episode=episode)}
+    with pytest.raises(Conflict, match="stop it first"):
+        services.session_close(user=ann, session=session)

@@ -1,0 +1,84 @@
+"""What a station tells of demonstrations comes into the database, once; and what is lost there, from the disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from uuid import uuid4
+
+import pytest
+from django.contrib.auth.models import User
+from django.db import connection
+
+from evaweb.collect import following, services
+from evaweb.collect.guarded import GUARDS
+from evaweb.collect.kept import session_file
+from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
+from evaweb.episodes.models import Episode
+from evaweb.episodes.reconcile import reconcile
+from evaweb.guards import install, removal
+from tests.evaweb.collect.conftest import SETUP, Demonstrate, labelled
+
+pytestmark = pytest.mark.django_db
+
+
+def test_the_newest_label_counts_and_a_discarded_one_stays_so(demonstrate: Demonstrate, data: Path) -> None:
+    made = demonstrate("fail")
+    assert (made.result, made.labelled_by, made.discarded) == ("fail", "ann", False)
+    assert labelled(data, made, "partial", note="slipped").note == "slipped"
+    assert labelled(data, made, "partial", discarded=True).discarded
+
+
+def test_told_twice_it_is_one_demonstration(demonstrate: Demonstrate, session: CollectSession) -> None:
+    made = demonstrate()
+    event = {"kind": "episode_closed", "data": {"uuid": str(made.pk)}}
+    assert following.demonstration_told(event=event) == made
+    assert Demonstration.objects.count() == 1
+
+
+@pytest.mark.parametrize("data_of", [{}, {"uuid": "none"}, {"episode": str(uuid4())}])
+def test_what_is_of_no_session_is_left_alone(data_of: dict, session: CollectSession) -> None:
+    assert following.demonstration_told(event={"kind": "labelled", "data": data_of}) is None
+
+
+def lost() -> None:
+    """The database, but for its guards' opinion."""
+    with connection.cursor() as cursor:
+        for guard in GUARDS:
+            for statement in removal(connection, guard):
+                cursor.execute(statement)
+    Demonstration.objects.all().delete()
+    SessionEvent.objects.all().delete()
+    CollectSession.objects.all().delete()
+    install(connection, GUARDS)
+
+
+def test_sessions_and_labels_come_back_from_the_disk(
+    session: CollectSession, demonstrate: Demonstrate, ann: User
+) -> None:
+    made = demonstrate("success")
+    services.session_target(user=ann, session=session, target=7)
+    services.session_close(user=ann, session=session)
+    lost()
+    assert reconcile().problems == ()
+    again = CollectSession.objects.get()
+    assert (again.pk, again.task, again.dataset, again.setup) == (session.pk, session.task, "cups", SETUP)
+    assert (again.target, again.operator, again.station) == (7, ann, session.station)
+    assert again.closed_at is not None
+    assert [event.kind for event in again.events.all()] == ["opened", "target", "closed"]
+    assert Demonstration.objects.get().result == made.result == "success"
+    assert reconcile().restored == 0
+
+
+def test_without_its_own_file_a_session_is_what_its_episodes_say(
+    session: CollectSession, demonstrate: Demonstrate
+) -> None:
+    made = demonstrate("partial")
+    session_file(session.pk).unlink()
+    lost()
+    assert reconcile().problems == ()
+    again = CollectSession.objects.get()
+    assert (again.pk, again.dataset, again.task, again.target) == (session.pk, "cups", "stack the cups", None)
+    assert again.setup["robot"] == "agilex_piper"
+    assert len(again.setup["joints"]) == 14
+    assert again.closed_at is not None
+    assert Demonstration.objects.get().episode == Episode.objects.get(pk=made.pk)

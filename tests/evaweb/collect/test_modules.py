@@ -1,0 +1,148 @@
+"""What the buttons of the Collect page mean, and presses of gamepads: the page's own modules, run by Node."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.evaweb.console.test_modules import pytestmark, run
+
+__all__ = ["pytestmark"]
+MOMENTS, PADS = "../collect/moments.js", "../collect/pad_buttons.js"
+COLLECT = {"set_up": True, "armed": True, "why_not": "", "episode": None, "last": None, "leader": None}
+
+
+def call(name: str, *given: Any) -> Any:
+    return run(MOMENTS, f"return m.{name}(...given);", list(given))
+
+
+@pytest.mark.parametrize("state", ["setting_up", "running", "holding"])
+def test_wherever_the_robot_moves_the_big_button_stops_it(state: str) -> None:
+    assert call("big", {"state": state})["kind"] == "stop"
+
+
+@pytest.mark.parametrize("state", ["ready", "idle", "faulted", "disconnected"])
+def test_at_rest_it_starts(state: str) -> None:
+    assert call("big", {"state": state}) == {"kind": "run", "text": "Start"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "session", "said"),
+    [
+        ({}, "s", ""),
+        ({}, "", "open or resume a session first"),
+        ({"set_up": False}, "s", "set up first"),
+        ({"armed": False}, "s", "arm first"),
+    ],
+)
+def test_nothing_starts_without_session_set_up_and_arm(
+    changes: dict[str, Any], session: str, said: str
+) -> None:
+    assert call("whyNotStart", {"collect": {**COLLECT, **changes}}, session) == said
+
+
+def test_a_station_that_collects_nothing_starts_nothing() -> None:
+    assert call("whyNotStart", {"collect": None}, "s") == "this station collects nothing"
+
+
+def test_what_is_said_is_about_the_open_episode_else_the_newest() -> None:
+    last = {"uuid": "c", "result": None, "discarded": False}
+    assert call("subject", {**COLLECT, "episode": "a", "last": last}, "b") == "a"
+    assert call("subject", {**COLLECT, "last": last}, "b") == "b"
+    assert call("subject", {**COLLECT, "last": last}, None) == "c"
+
+
+def test_a_discarded_episode_is_not_labelled_and_not_discarded_again() -> None:
+    snapshot = {"state": "ready", "collect": {**COLLECT, "last": {"uuid": "a", "discarded": True}}}
+    assert call("whyNotLabel", snapshot, "a") == "the episode is discarded"
+    assert call("whyNotDiscard", snapshot, "a") == "the episode is discarded already"
+    assert call("whyNotLabel", snapshot, "b") == ""
+
+
+def test_the_open_episode_is_not_named_where_it_is_discarded() -> None:
+    assert call("discarding", {**COLLECT, "episode": "a"}, "a") == {}
+    assert call("discarding", COLLECT, "a") == {"episode": "a"}
+
+
+def test_an_episode_is_labelled_once_it_is_over() -> None:
+    assert (
+        call("whyNotLabel", {"state": "running", "collect": {**COLLECT, "episode": "a"}}, "a")
+        == "stop and save first"
+    )
+
+
+def test_the_step_to_do_is_the_result_until_somebody_has_said_it() -> None:
+    last = {"uuid": "a", "result": None, "discarded": False}
+    ready = {"state": "ready", "collect": {**COLLECT, "last": last}}
+    assert call("step", ready, None) == "session"
+    assert call("step", ready, "s") == "result"
+    assert (
+        call("step", {"state": "ready", "collect": {**COLLECT, "last": {**last, "result": "fail"}}}, "s")
+        == "record"
+    )
+    assert call("step", {"state": "idle", "collect": COLLECT}, "s") == "setup"
+
+
+def test_what_cannot_be_taken_back_is_asked_once_and_not_for_long() -> None:
+    program = """
+    let now = 0;
+    const twice = new m.Twice(4000, () => now);
+    const pressed = [twice.press("discard"), twice.press("discard"), twice.press("discard")];
+    now = 5000;
+    pressed.push(twice.press("discard"), twice.press("rerecord"), twice.press("rerecord"));
+    twice.press("discard");
+    twice.clear();
+    return [...pressed, twice.press("discard")];
+    """
+    assert run(MOMENTS, program) == [False, True, False, False, False, True, False]
+
+
+def looks(*frames: list[dict[str, Any]]) -> list[list[int]]:
+    """The buttons pressed in each look; a frame is the pads that are there."""
+    program = """
+    const presses = new m.Presses();
+    return given.map((pads) => presses.look(pads).map(({ button }) => button));
+    """
+    return run(PADS, program, list(frames))
+
+
+def pad(*down: int, id: str = "pad", connected: bool = True) -> dict[str, Any]:
+    return {
+        "index": 0,
+        "id": id,
+        "connected": connected,
+        "buttons": [{"pressed": n in down} for n in range(17)],
+    }
+
+
+def test_a_button_that_goes_down_is_one_press_however_long_it_is_held() -> None:
+    assert looks([pad()], [pad(0)], [pad(0)], [pad(0, 1)], [pad()], [pad(0)]) == [[], [0], [], [1], [], [0]]
+
+
+def test_a_button_held_while_the_pad_connects_does_nothing_until_it_was_let_go() -> None:
+    assert looks([pad(0)], [pad(0)], [pad()], [pad(0)]) == [[], [], [], [0]]
+
+
+@pytest.mark.parametrize("between", [[], [pad(0, connected=False)], [pad(0, id="another")]])
+def test_a_pad_that_was_away_begins_anew(between: list[dict[str, Any]]) -> None:
+    assert looks([pad()], between, [pad(0)], [pad(0)]) == [[], [], [], []]
+
+
+def test_after_a_while_of_not_looking_nothing_counts_as_pressed() -> None:
+    program = "const p = new m.Presses(); p.look([given[0]]); p.forget(); return p.look([given[1]]).length;"
+    assert run(PADS, program, [pad(), pad(0)]) == 0
+
+
+def test_a_button_does_one_thing_and_what_was_kept_badly_is_as_delivered() -> None:
+    changed = run(PADS, "return m.assigned(m.delivered(), 'arm', 0);")
+    assert (changed["arm"], changed["big"], changed["discard"]) == (0, None, 1)
+    kept = '{"arm": 4, "big": null, "discard": "x", "fail": -1, "other": 3}'
+    found = run(PADS, "return m.restored(given);", kept)
+    assert (found["arm"], found["big"], found["discard"], found["fail"]) == (4, None, 1, 13)
+    assert run(PADS, "return m.restored('{');") == run(PADS, "return m.delivered();")
+    assert run(PADS, "return [m.buttonName(0, 'standard'), m.buttonName(9, ''), m.buttonName(null)];") == [
+        "A (0)",
+        "button 9",
+        "none",
+    ]

@@ -1,0 +1,264 @@
+"""Datasets of others become episodes of this lab: replayed, checked, reviewed, annotated, converted there and back."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from django.core.management import CommandError, call_command
+from django.test import Client
+from django.urls import reverse
+
+from evaweb.datasets.importing import imported
+from evaweb.datasets.job_kinds import dataset as run_order
+from evaweb.episodes.job_kinds import preview, publish_episode
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.reconcile import reconcile
+from evaweb.frames import decode
+from evaweb.jobs.kinds import Work
+from evaweb.jobs.models import Job
+from evaweb.reviews.job_kinds import look_for_outdated, look_for_unchecked, quality, sides
+from evaweb.reviews.models import Standing
+from evaweb.reviews.selectors import report_get
+from evaweb.reviews.services import review_add, segment_put
+from evaweb.stations.models import Station
+from runtime.datasets.consistency import check
+from runtime.datasets.operations import convert
+from runtime.datasets.reader import open_dataset
+from runtime.errors import RecordingError
+from tests.evaweb.conftest import person
+from tests.runtime.datasets.foreign import Plan, column, write
+from tests.runtime.datasets.small import JOINTS
+
+pytestmark = pytest.mark.django_db
+Foreign = Callable[..., Path]
+SAMPLE = os.environ.get("EVA_SAMPLE_EPISODE")
+
+
+def silently(kind: Callable[[Work], Any], uuid: object) -> Any:
+    return kind(Work({"uuid": str(uuid)}, lambda _: None))
+
+
+def theirs(tmp_path: Path, **plan: Any) -> Path:
+    folder = tmp_path / "elsewhere" / "cups"
+    write(folder, Plan(**{"lengths": (6, 8), "fps": 10.0, "gop": 3, "b_frames": 0, "smooth": True, **plan}))
+    return folder
+
+
+@pytest.mark.parametrize("version", ["v2.0", "v2.1", "v3.0"])
+def test_episodes_of_any_version_are_those_of_the_lab_and_of_its_dataset(
+    data: Path, tmp_path: Path, version: str
+) -> None:
+    source = theirs(tmp_path, version=version)
+    done = imported(source)
+    assert (done.dataset, done.made, done.problems) == ("datasets/cups", 2, ())
+    second = Episode.objects.get(uuid=done.episodes[1])
+    assert (second.status, second.kind, second.frames, second.fps) == (
+        EpisodeStatus.FINISHED,
+        "imported",
+        8,
+        10.0,
+    )
+    assert (second.dataset, second.dataset_index) == ("datasets/cups", 1)
+    assert second.cameras == ["cam_high", "cam_wrist"]
+    assert Station.objects.filter(active=True).count() == 0
+    assert check(data / "datasets" / "cups") == []
+    for index in (0, 1):
+        assert rows(data / "datasets" / "cups", index) == rows(source, index)
+
+    again = imported(source)
+    assert (again.episodes, again.made) == (done.episodes, 0)
+    assert reconcile().problems == ()
+
+
+def test_it_is_replayed_with_its_own_numbers(browser: Client, tmp_path: Path) -> None:
+    uuid = imported(theirs(tmp_path)).episodes[1]
+    silently(preview, uuid)
+    page = browser.get(reverse("replay", args=[uuid]))
+    told = page.context["config"]
+    assert (told["frames"], told["geometry"]) == (8, "")
+    assert "import it with --robot" in told["why"]
+    curves = decode(browser.get(told["curves"]).content)
+    plan = Plan(smooth=True)
+    assert np.array_equal(curves.array("ticks", "measured").T, column(1, "observation.state", 8, plan))
+    assert np.array_equal(curves.array("ticks", "executed").T, column(1, "action", 8, plan))
+    assert curves.header["held"] == []
+    video = browser.get(told["videos"][0]["address"])
+    assert video.status_code == 200
+
+
+def test_pictures_in_columns_are_played_too(data: Path, tmp_path: Path) -> None:
+    done = imported(theirs(tmp_path, videos=("cam_high",), images=("cam_wrist",)))
+    assert sorted(Episode.objects.get(uuid=done.episodes[0]).cameras) == ["cam_high", "cam_wrist"]
+
+
+def test_what_is_said_of_it_travels_with_its_dataset_through_conversions(data: Path, tmp_path: Path) -> None:
+    done = imported(theirs(tmp_path))
+    uuid = done.episodes[1]
+    episode, ann = Episode.objects.get(uuid=uuid), person("ann", "operator")
+    review_add(user=ann, episode=episode, verdict="fail", note="dropped")
+    segment_put(user=ann, episode=episode, first=2, last=5, label="reach", milestone="cup touched")
+    assert look_for_outdated() == 1
+    assert silently(sides, uuid)["attached"]
+    home = data / "datasets" / "cups"
+    convert(home, tmp_path / "other", "v3.0")
+    convert(tmp_path / "other", tmp_path / "back", "v2.1")
+    for dataset in (home, tmp_path / "other", tmp_path / "back"):
+        (verdict,) = lines(dataset / "eva" / "reviews" / f"{uuid}.jsonl")
+        assert (verdict["verdict"], verdict["note"], verdict["by"]) == ("fail", "dropped", "ann")
+        (segment,) = lines(dataset / "eva" / "annotations" / f"{uuid}.jsonl")
+        assert (segment["first"], segment["last"], segment["label"]) == (2, 5, "reach")
+        assert rows(dataset, 1) == rows(home, 1)
+
+
+def test_it_is_judged_as_its_dataset_has_it(data: Path, tmp_path: Path) -> None:
+    done = imported(theirs(tmp_path, lengths=(12,)))
+    assert look_for_unchecked() == 1
+    silently(quality, done.episodes[0])
+    report = report_get(uuid=done.episodes[0])
+    assert report["frames"] == 12
+    assert any("limits are not checked" in sentence for sentence in report["unchecked"])
+    assert Standing.objects.get(episode=done.episodes[0]).checked_at is not None
+    path = next((data / "datasets" / "cups").glob("data/*/*.parquet"))
+    table = pq.read_table(path)
+    times = table["timestamp"].to_numpy().copy()
+    times[5] += 0.01
+    place = table.column_names.index("timestamp")
+    pq.write_table(table.set_column(place, table.schema.field(place), [times]), path)
+    silently(quality, done.episodes[0])
+    assert "time_grid" in {flag["kind"] for flag in report_get(uuid=done.episodes[0])["flags"]}
+
+
+def test_one_that_lies_in_the_lab_already_gets_its_uuids_in_place(data: Path, foreign: Foreign) -> None:
+    folder = foreign("cups", version="v2.1")
+    before = rows(folder, 2)
+    out = StringIO()
+    call_command("dataset", "import", "cups", stdout=out)
+    assert "imported: 3 episodes, 3 of them new" in out.getvalue()
+    assert rows(folder, 2) == before
+    told = lines(folder / "meta" / "eva_episodes.jsonl")
+    assert [line["episode_index"] for line in told] == [0, 1, 2]
+    assert {line["uuid"] for line in told} == {
+        str(uuid) for uuid in Episode.objects.values_list("uuid", flat=True)
+    }
+
+
+def test_an_import_that_was_cut_short_is_gone_on_with(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from evaweb.datasets import importing
+
+    real, calls = importing.bring, []
+
+    def cut(*args: Any) -> Any:
+        calls.append(args)
+        if len(calls) == 2:
+            raise RecordingError("the disk is full")
+        return real(*args)
+
+    monkeypatch.setattr(importing, "bring", cut)
+    source = theirs(tmp_path)
+    with pytest.raises(RecordingError, match="the disk is full"):
+        imported(source)
+    assert Episode.objects.count() == 1
+    assert (imported(source).made, Episode.objects.count()) == (1, 2)
+
+
+def test_a_page_has_it_done_by_the_worker(browser: Client, foreign: Foreign) -> None:
+    foreign("cups", version="v3.0")
+    form = {"what": "import", "dataset": "cups", "robot": "", "state": "observation.state"}
+    assert browser.post(reverse("dataset-ask"), form).status_code == 302
+    job = Job.objects.get(kind="dataset")
+    found = run_order(Work(job.args, lambda _: None))
+    assert found == {"done": True, "dataset": "datasets/cups", "episodes": 3, "made": 3, "problems": []}
+    assert Episode.objects.filter(dataset="datasets/cups").count() == 3
+    browser.post(reverse("dataset-ask"), form | {"robot": "hal"})
+    assert Job.objects.filter(kind="dataset").count() == 1
+    page = browser.get(reverse("dataset", args=["cups"])).content.decode()
+    assert "robot = &#x27;hal&#x27;; allowed: agibot_g2" in page
+    assert "Import cups" in page
+    refused = run_order(Work(job.args | {"state": "joints"}, lambda _: None))
+    assert not refused["done"]
+    assert "has no column joints" in refused["why"]
+
+
+def test_it_is_published_nowhere_else(data: Path, tmp_path: Path) -> None:
+    done = imported(theirs(tmp_path))
+    told = silently(publish_episode, done.episodes[0])
+    assert not told["published"]
+    assert "it was imported" in told["why"]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--state", "joints"], "has no column joints of measured joints: name one of observation.state"),
+        (["--robot", "hal"], "robot 'hal' does not exist; there are: agibot_g2"),
+        (["--to", "episodes/x"], "names no dataset"),
+        (["--to", "elsewhere/x"], "what is reviewed lies there"),
+        (["--rename", "a="], "expected OLD=NEW"),
+        (["--to", "taken"], "holds other episodes: import"),
+    ],
+)
+def test_what_cannot_be_imported_says_why_and_leaves_nothing(
+    foreign: Foreign, data: Path, tmp_path: Path, options: list[str], said: str
+) -> None:
+    foreign("taken")
+    with pytest.raises(CommandError, match=said.replace("(", r"\(")):
+        call_command("dataset", "import", str(theirs(tmp_path)), *options)
+    assert Episode.objects.count() == 0
+    assert [path.name for path in (data / "datasets").iterdir()] == ["taken"]
+
+
+def test_a_robot_of_as_many_joints_may_be_named(data: Path, tmp_path: Path) -> None:
+    width = len(JOINTS)
+    with pytest.raises(
+        RecordingError, match=f"observation.state has {width} numbers, agilex_piper has 14 joints"
+    ):
+        imported(theirs(tmp_path), robot="agilex_piper")
+
+
+@pytest.mark.skipif(not SAMPLE, reason="EVA_SAMPLE_EPISODE does not name the real episode")
+def test_the_real_episode_is_imported_reviewed_and_converted_there_and_back(
+    browser: Client, data: Path, tmp_path: Path
+) -> None:
+    assert SAMPLE is not None
+    done = imported(Path(SAMPLE), to="real", robot="agilex_piper")
+    (uuid,) = done.episodes
+    silently(preview, uuid)
+    silently(quality, uuid)
+    report = report_get(uuid=uuid)
+    assert report["frames"] == 398
+    assert not report["unchecked"]
+    told = browser.get(reverse("replay", args=[uuid])).context["config"]
+    assert browser.get(told["geometry"]).status_code == 200
+    episode, ann = Episode.objects.get(uuid=uuid), person("ann", "operator")
+    review_add(user=ann, episode=episode, verdict="pass")
+    segment_put(user=ann, episode=episode, first=0, last=100, label="reach")
+    silently(sides, uuid)
+    home = data / "datasets" / "real"
+    convert(home, tmp_path / "v3", "v3.0")
+    convert(tmp_path / "v3", tmp_path / "back", "v2.1")
+    for dataset in (home, tmp_path / "v3", tmp_path / "back"):
+        assert rows(dataset, 0) == rows(Path(SAMPLE), 0)
+        assert lines(dataset / "eva" / "reviews" / f"{uuid}.jsonl")[0]["verdict"] == "pass"
+        assert lines(dataset / "eva" / "annotations" / f"{uuid}.jsonl")[0]["label"] == "reach"
+
+
+def rows(dataset: Path, index: int) -> dict[str, list[Any]]:
+    """Every number of an episode, by column; the task by its text."""
+    opened = open_dataset(dataset)
+    table = opened.table(index)
+    found = {name: table[name].to_pylist() for name in table.column_names if name not in ("task_index",)}
+    return found | {"task": [opened.tasks[number] for number in table["task_index"].to_pylist()]}
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]

@@ -1,0 +1,164 @@
+import tomllib
+
+import pytest
+from django.core.exceptions import ValidationError
+
+from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.plans.documents import document_of
+from evaweb.plans.exchange import exported, imported
+from evaweb.plans.models import Plan
+from evaweb.plans.services import plan_freeze
+from evaweb.trials.models import Checkpoint, Scene
+from tests.evaweb.trials import builders
+
+
+@pytest.fixture
+def admin(db):
+    return builders.user("adam", "admin")
+
+
+def test_what_was_exported_is_the_same_when_it_is_read_again(draft, admin):
+    draft.strategy = {"kind": "async", "blend_window": 4}
+    draft.stations.add(builders.Station.objects.get(name="bench-1"))
+    draft.save()
+    text = exported(plans=[draft])
+    before = document_of(draft)
+    assert imported(user=admin, text=text) == [
+        "scene block-on-plate: the same",
+        "checkpoint pi0-block: the same",
+        "checkpoint pi0-new: the same",
+        "plan blocks: draft changed",
+    ]
+    assert document_of(Plan.objects.get(pk=draft.pk)) == before
+
+
+def test_another_lab_reads_it(draft, admin):
+    text = exported(plans=[draft])
+    before = document_of(draft)
+    draft.delete()
+    Scene.objects.all().delete()
+    Checkpoint.objects.all().delete()
+    assert [line.split(": ")[1] for line in imported(user=admin, text=text)] == [
+        "new",
+        "new",
+        "new",
+        "new draft",
+    ]
+    found = Plan.objects.get()
+    assert found.owner == admin
+    assert document_of(found) == {**before, "owner": "adam"}
+    assert plan_freeze(user=admin, plan=found).slots.count() == 12
+
+
+def test_what_trials_were_made_with_is_not_changed_by_a_file(bench, admin):
+    text = exported(scenes=[bench.scene]).replace("points = 2", "points = 3")
+    assert imported(user=admin, text=text) == ["scene block-on-plate: changed"]
+    assert list(bench.scene.milestones.values_list("points", flat=True)) == [1, 1, 3]
+    bench.scored()
+    with pytest.raises(Conflict, match=r"has trials .*milestone\[2\]\.points: 3 -> 4"):
+        imported(user=admin, text=text.replace("points = 3", "points = 4"))
+    policy = exported(checkpoints=[bench.checkpoint]).replace("8000", "8009")
+    with pytest.raises(Conflict, match="checkpoint pi0-block has trials"):
+        imported(user=admin, text=policy)
+
+
+def test_a_frozen_plan_is_not_changed_by_a_file(draft, owner, admin):
+    text = exported(plans=[plan_freeze(user=owner, plan=draft)])
+    with pytest.raises(Conflict, match="plan blocks is running: amend it"):
+        imported(user=admin, text=text)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[[scene", "this is not TOML"),
+        (
+            "[[scene]]\nname='a'\ntitle='A'\ninstruction='go'\ncolour='red'\n[[scene.position]]\nnumber=1",
+            "colour",
+        ),
+        ("[[scene]]\nname='a'\ntitle='A'\ninstruction='go'", "position"),
+        (
+            "[[scene]]\nname='a b'\ntitle='A'\ninstruction='go'\n[[scene.position]]\nnumber=1",
+            "scene a b: name",
+        ),
+        ("[[checkpoint]]\nname='x'\n[checkpoint.policy]\nkind='nobody'", "nobody"),
+        (
+            "[[plan]]\nname='p'\ntitle='P'\npositions=[{scene='none',number=1}]\ncheckpoints=['pi0-block']",
+            "position 1 of scene 'none' does not exist",
+        ),
+        (
+            "[[plan]]\nname='p'\ntitle='P'\npositions=[{scene='block-on-plate',number=1}]\ncheckpoints=['gone']",
+            "checkpoint 'gone' does not exist",
+        ),
+    ],
+)
+def test_a_file_that_cannot_be_taken_is_refused_whole(bench, admin, text, said):
+    good = "[[checkpoint]]\nname='good'\n"
+    with pytest.raises(EvaError, match=said):
+        imported(user=admin, text=good + text)
+    assert not Checkpoint.objects.filter(name="good").exists()
+
+
+def test_only_administrators_import(bench):
+    with pytest.raises(NotAllowed):
+        imported(user=bench.operator, text="")
+
+
+def test_the_export_is_toml_that_people_read(draft):
+    read = tomllib.loads(exported(plans=[draft]))
+    assert set(read) == {"scene", "checkpoint", "plan"}
+    assert read["scene"][0]["position"][0]["bench"] == {"block": [0.1, 0.3, 0], "plate": [-0.1, 0.3]}
+    assert read["plan"][0]["comparison"] == ["pi0-new", "pi0-block"]
+
+
+def test_weights_lineage_and_tags_travel_the_older_before_the_younger(draft, admin):
+    old = Checkpoint.objects.create(name="zero", policy={}, tags=["pretrained"])
+    Checkpoint.objects.filter(name="pi0-new").update(
+        parent=old, digest="sha256:0123abcd", tags=["block", "v2"]
+    )
+    text = exported(plans=[draft])
+    assert [row["name"] for row in tomllib.loads(text)["checkpoint"]] == ["pi0-block", "zero", "pi0-new"]
+    assert set(imported(user=admin, text=exported(checkpoints=[Checkpoint.objects.get(name="pi0-new")]))) == {
+        "checkpoint zero: the same",
+        "checkpoint pi0-new: the same",
+    }
+    draft.delete()
+    Checkpoint.objects.filter(name="pi0-new").delete()
+    Checkpoint.objects.all().delete()
+    imported(user=admin, text=text)
+    found = Checkpoint.objects.get(name="pi0-new")
+    assert (found.lineage, found.digest, found.tags) == (
+        [Checkpoint.objects.get(name="zero")],
+        "sha256:0123abcd",
+        ["block", "v2"],
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ('parent = "nobody"', "checkpoint a: parent = 'nobody' does not exist"),
+        ('digest = "abc"', "checkpoint a: digest: abc was given; allowed: 7 to 128"),
+        ('tags = ["x y"]', "checkpoint a: tags: .*words of at most 40"),
+        ('tags = ["x", "x"]', "checkpoint a: tags: .*each tag once"),
+    ],
+)
+def test_weights_lineage_and_tags_that_cannot_be_are_named(admin, line, says):
+    with pytest.raises(EvaError, match=says):
+        imported(user=admin, text=f'[[checkpoint]]\nname = "a"\n{line}\n')
+    assert not Checkpoint.objects.exists()
+
+
+def test_nothing_is_trained_on_from_itself(db):
+    first = Checkpoint.objects.create(name="first", policy={})
+    first.parent = Checkpoint.objects.create(name="second", policy={}, parent=first)
+    with pytest.raises(ValidationError, match="second was trained on from first"):
+        first.full_clean()
+
+
+def test_other_weights_are_another_document_and_other_tags_are_not(draft):
+    before = document_of(draft)
+    Checkpoint.objects.filter(name="pi0-new").update(tags=["v3"])
+    assert document_of(Plan.objects.get(pk=draft.pk)) == before
+    Checkpoint.objects.filter(name="pi0-new").update(digest="sha256:0123abcd")
+    assert document_of(Plan.objects.get(pk=draft.pk)) != before

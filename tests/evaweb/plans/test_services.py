@@ -1,0 +1,267 @@
+from collections import Counter
+
+import pytest
+from django.db import IntegrityError, transaction
+
+from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.plans.blinding import commitment, schedule_digest
+from evaweb.plans.canonical import digest
+from evaweb.plans.documents import conditions_of
+from evaweb.plans.guarded import GUARDS
+from evaweb.plans.handing import give_back, hand_out, progress
+from evaweb.plans.models import Look, Plan, PlanState
+from evaweb.plans.schedule import schedule
+from evaweb.plans.services import plan_amend, plan_close, plan_freeze, plan_reveal
+from evaweb.plans.sight import look, sealed_for
+from evaweb.sight import sight_of
+from evaweb.stations.models import Station
+from evaweb.trials import services as trials
+from evaweb.trials.models import Trial
+from tests.evaweb.trials import builders
+from tests.evaweb.unguarded import unguarded
+
+
+def done(bench, trial, success=True):
+    """As if it had been run and scored."""
+    Trial.objects.filter(pk=trial.pk).update(status="ended", duration_s=10.0)
+    trial.refresh_from_db()
+    trials.trial_score(user=bench.operator, trial=trial, milestones=bench.ticks(True, success, success))
+
+
+@pytest.fixture
+def plan(draft, owner):
+    return plan_freeze(user=owner, plan=draft)
+
+
+def test_frozen_it_is_a_document_with_a_schedule(plan):
+    assert plan.state == PlanState.FROZEN
+    assert plan.digest == digest(plan.document)
+    assert plan.document["scenes"][0]["milestones"][2]["text"] == "on the plate"
+    assert [(row["name"], row["policy"]["url"]) for row in plan.document["checkpoints"]] == [
+        ("pi0-block", "ws://127.0.0.1:8000"),
+        ("pi0-new", "ws://127.0.0.1:8001"),
+    ]
+    assert plan.slots.count() == 12
+    cells = Counter(plan.slots.values_list("checkpoint__name", "position__number"))
+    assert set(cells.values()) == {3}
+    assert plan.commitment in plan.events.get(what="frozen").text
+    assert plan.evaluation.kind == "plan"
+
+
+def test_what_is_missing_is_said_before_it_is_frozen(draft, owner, bench):
+    draft.positions.clear()
+    with pytest.raises(EvaError, match="has no position"):
+        plan_freeze(user=owner, plan=draft)
+    draft.positions.set(bench.scene.positions.all())
+    Plan.objects.filter(pk=draft.pk).update(second=None)
+    with pytest.raises(EvaError, match="needs two checkpoints, or none"):
+        plan_freeze(user=owner, plan=draft)
+    Plan.objects.filter(pk=draft.pk).update(first=None, stopping="evidence")
+    with pytest.raises(EvaError, match="needs the comparison"):
+        plan_freeze(user=owner, plan=draft)
+    draft.checkpoints.clear()
+    with pytest.raises(EvaError, match="has no checkpoint"):
+        plan_freeze(user=owner, plan=draft)
+    assert Plan.objects.get(pk=draft.pk).state == PlanState.DRAFT
+
+
+def test_only_its_owner_or_an_administrator_freezes_it(draft):
+    with pytest.raises(NotAllowed, match="is olga's"):
+        plan_freeze(user=builders.user("eve"), plan=draft)
+    with pytest.raises(NotAllowed, match="needs an operator"):
+        plan_freeze(user=builders.user("vera", "viewer"), plan=draft)
+    assert plan_freeze(user=builders.user("adam", "admin"), plan=draft).state == PlanState.FROZEN
+
+
+def test_trials_come_in_the_order_of_the_plan_each_under_a_code_of_its_own(bench, plan):
+    handed = []
+    for _ in range(12):
+        handout = hand_out(user=bench.operator, station=bench.station, plan=plan)
+        handed.append(handout)
+        done(bench, handout.trial)
+    assert [h.slot.index for h in handed] == list(range(12))
+    assert len({h.code for h in handed}) == 12
+    assert [h.trial.checkpoint_id for h in handed] == list(plan.slots.values_list("checkpoint_id", flat=True))
+    with pytest.raises(Conflict, match="all 12 trials of Blocks v1 are made"):
+        hand_out(user=bench.operator, station=bench.station, plan=plan)
+    assert (progress(plan).counted, progress(plan).attempts) == (12, 12)
+
+
+def test_one_block_meets_the_same_conditions(bench, plan):
+    first = hand_out(user=bench.operator, station=bench.station, plan=plan)
+    done(bench, first.trial)
+    second = hand_out(user=bench.operator, station=bench.station, plan=plan)
+    assert first.trial.checkpoint_id != second.trial.checkpoint_id
+    for name in ("position_id", "number", "seed", "instruction"):
+        assert getattr(first.trial, name) == getattr(second.trial, name)
+
+
+def test_what_does_not_count_is_repeated_under_another_code(bench, plan):
+    first = hand_out(user=bench.operator, station=bench.station, plan=plan)
+    Trial.objects.filter(pk=first.trial_id).update(status="interrupted", reason="the e-stop was pressed")
+    again = hand_out(user=bench.operator, station=bench.station, plan=plan)
+    assert again.slot == first.slot
+    assert again.trial.attempt == 2
+    assert again.code != first.code
+    assert again.reason == "attempt 1 was interrupted: the e-stop was pressed"
+
+
+def test_a_station_with_an_unfinished_trial_gets_no_other(bench, plan):
+    hand_out(user=bench.operator, station=bench.station, plan=plan)
+    with pytest.raises(Conflict, match="is prepared: run it, or abandon it"):
+        hand_out(user=bench.operator, station=bench.station, plan=plan)
+    assert plan.handouts.count() == 1
+
+
+def test_several_stations_share_a_plan_block_by_block(bench, plan):
+    other = Station.objects.create(name="bench-2", robot="agilex_piper", simulated=True, boot="b")
+    blocks = {bench.station.pk: set(), other.pk: set()}
+    for _ in range(6):
+        for station in (bench.station, other):
+            handout = hand_out(user=bench.operator, station=station, plan=plan)
+            blocks[station.pk].add(handout.slot.block)
+            done(bench, handout.trial)
+    assert not blocks[bench.station.pk] & blocks[other.pk]
+    assert len(blocks[bench.station.pk]) == len(blocks[other.pk]) == 3
+
+
+def test_what_a_broken_station_has_not_begun_is_given_to_others(bench, plan, owner):
+    other = Station.objects.create(name="bench-2", robot="agilex_piper", simulated=True, boot="b")
+    done(bench, hand_out(user=bench.operator, station=bench.station, plan=plan).trial)
+    assert give_back(user=owner, plan=plan, station=bench.station, reason="its gripper broke") == 1
+    handout = hand_out(user=bench.operator, station=other, plan=plan)
+    assert (handout.slot.index, handout.trial.station) == (1, other)
+
+
+def test_a_plan_for_some_stations_is_not_carried_out_on_others(bench, draft, owner):
+    other = Station.objects.create(name="bench-2", robot="agilex_piper", simulated=True, boot="b")
+    draft.stations.set([other])
+    plan = plan_freeze(user=owner, plan=draft)
+    with pytest.raises(Conflict, match="is for bench-2, not for bench-1"):
+        hand_out(user=bench.operator, station=bench.station, plan=plan)
+
+
+def test_a_scene_or_a_checkpoint_that_was_changed_stops_the_plan(bench, plan):
+    milestone = bench.scene.milestones.first()
+    milestone.points = 5
+    milestone.save()
+    with pytest.raises(Conflict, match="scene block-on-plate was changed since"):
+        hand_out(user=bench.operator, station=bench.station, plan=plan)
+    milestone.points = 1
+    milestone.save()
+    for checkpoint in plan.checkpoints.all():
+        checkpoint.policy = {"url": "ws://127.0.0.1:9"}
+        checkpoint.save()
+    with pytest.raises(Conflict, match="a checkpoint was changed since") as said:
+        hand_out(user=bench.operator, station=bench.station, plan=plan)
+    assert not any(row.name in str(said.value) for row in plan.checkpoints.all())
+    plan.checkpoints.update(active=False)
+    with pytest.raises(Conflict, match="is switched off") as said:
+        hand_out(user=bench.operator, station=bench.station, plan=plan)
+    assert not any(row.name in str(said.value) for row in plan.checkpoints.all())
+
+
+def test_an_amendment_is_the_next_version_and_ends_the_one_before(bench, plan, owner):
+    with pytest.raises(EvaError, match="reason is empty"):
+        plan_amend(user=owner, plan=plan, reason=" ")
+    draft = plan_amend(user=owner, plan=plan, reason="the plate was replaced")
+    assert (draft.version, draft.state) == (2, PlanState.DRAFT)
+    done(bench, hand_out(user=bench.operator, station=bench.station, plan=plan).trial)  # it goes on meanwhile
+    draft.repetitions = 5
+    draft.save()
+    frozen = plan_freeze(user=owner, plan=draft)
+    plan.refresh_from_db()
+    assert plan.state == PlanState.CLOSED
+    assert "the plate was replaced" in plan.closed_because
+    assert "repetitions: 3 -> 5" in frozen.events.get(what="frozen").text
+    assert frozen.key != plan.key
+    handout = hand_out(user=bench.operator, station=bench.station, plan=frozen)
+    assert (handout.trial.evaluation.version, handout.trial.number, handout.trial.attempt) == (2, 1, 1)
+    with pytest.raises(Conflict, match="no trial of it is handed out"):
+        hand_out(user=bench.operator, station=bench.station, plan=plan)
+    with pytest.raises(Conflict, match="is amended by version 2 already"):
+        plan_amend(user=owner, plan=plan, reason="again")
+
+
+def test_it_is_revealed_once_closed_by_its_owner_and_anybody_can_check(bench, plan, owner):
+    handout = hand_out(user=bench.operator, station=bench.station, plan=plan)
+    with pytest.raises(Conflict, match="it is closed first"):
+        plan_reveal(user=owner, plan=plan)
+    with pytest.raises(Conflict, match=f"{handout.code} on bench-1 is prepared"):
+        plan_close(user=owner, plan=plan, reason="enough")
+    done(bench, handout.trial)
+    plan_close(user=owner, plan=plan, reason="enough")
+    with pytest.raises(NotAllowed):
+        plan_reveal(user=bench.operator, plan=plan)
+    assert plan.sealed
+    plan = plan_reveal(user=owner, plan=plan)
+    assert not plan.sealed
+    key = bytes.fromhex(plan.events.get(what="revealed").text[4:68])
+    units = schedule(
+        checkpoints=[row["name"] for row in plan.document["checkpoints"]],
+        conditions=conditions_of(plan.document),
+        repetitions=plan.document["repetitions"],
+        key=key,
+    )
+    assert commitment(digest(plan.document), units, key) == plan.commitment
+    assert len(schedule_digest(units)) == 64
+    with pytest.raises(Conflict, match="make another plan"):
+        plan_amend(user=owner, plan=plan, reason="more")
+
+
+def test_the_database_itself_keeps_what_was_frozen_and_done(bench, plan):
+    handout = hand_out(user=bench.operator, station=bench.station, plan=plan)
+    for change in (
+        lambda: Plan.objects.filter(pk=plan.pk).update(document={**plan.document, "question": "?"}),
+        lambda: Plan.objects.filter(pk=plan.pk).update(blind=False),
+        lambda: type(handout).objects.filter(pk=handout.pk).update(code="AAAAA"),
+        lambda: handout.delete(),
+        lambda: plan.events.all().delete(),
+    ):
+        with pytest.raises(IntegrityError, match="never"), transaction.atomic():
+            change()
+
+
+def test_a_changed_document_is_not_revealed(plan, owner):
+    plan_close(user=owner, plan=plan, reason="enough")
+    document = {**plan.document, "question": "Is old better?"}
+    with unguarded(GUARDS):
+        Plan.objects.filter(pk=plan.pk).update(document=document)
+    with pytest.raises(EvaError, match="somebody has changed the database"):
+        plan_reveal(user=owner, plan=plan)
+    assert Plan.objects.get(pk=plan.pk).state == PlanState.CLOSED
+
+
+def test_who_runs_trials_does_not_look_and_who_looked_runs_none(bench, plan, owner):
+    admin = builders.user("adam", "admin")
+    assert sealed_for(plan, bench.operator)
+    with pytest.raises(NotAllowed, match="blind until its owner, olga, reveals it"):
+        look(plan, bench.operator)
+    assert sealed_for(plan, owner)
+    assert sight_of(owner).names == {"pi0-block", "pi0-new"}
+    look(plan, owner)
+    look(plan, owner)
+    assert not sealed_for(plan, owner)
+    assert sight_of(owner).clear
+    assert plan.events.filter(what="looked", by=owner).count() == 1
+    assert Look.objects.filter(plan=plan, user=owner).count() == 1
+    with pytest.raises(NotAllowed, match="you have seen results"):
+        hand_out(user=owner, station=bench.station, plan=plan)
+    hand_out(user=admin, station=bench.station, plan=plan)
+    with pytest.raises(NotAllowed, match="you have run trials of Blocks v1"):
+        look(plan, admin)
+
+
+def test_an_open_plan_hides_nothing(bench, draft, owner):
+    draft.blind = False
+    draft.save()
+    plan = plan_freeze(user=owner, plan=draft)
+    assert not sealed_for(plan, bench.operator)
+    look(plan, bench.operator)
+    assert not plan.looks.exists()
+    assert hand_out(user=bench.operator, station=bench.station, plan=plan).number == 1
+
+
+def test_the_database_keeps_a_frozen_plan_with_its_document(plan):
+    with pytest.raises(IntegrityError):
+        Plan.objects.filter(pk=plan.pk).update(document=None)

@@ -1,0 +1,77 @@
+import pytest
+
+from evaweb.episodes.models import Episode
+from evaweb.plans.handing import hand_out
+from evaweb.plans.models import Plan
+from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
+from evaweb.results import caching
+from evaweb.trials import services
+from evaweb.trials.models import Checkpoint, Trial
+from tests.evaweb.trials import builders
+
+
+@pytest.fixture(autouse=True)
+def _alone(settings, tmp_path):
+    settings.DATA_DIR = tmp_path
+    caching.forget()
+
+
+@pytest.fixture
+def bench(db):
+    return builders.bench()
+
+
+@pytest.fixture
+def owner(db):
+    return builders.user("olga")
+
+
+@pytest.fixture
+def plan(bench, owner):
+    """Two checkpoints at two positions, four times each: 16 trials, blind, not begun."""
+    other = Checkpoint.objects.create(name="pi0-new", policy={})
+    made = Plan.objects.create(
+        name="blocks",
+        title="Blocks",
+        question="Is new better?",
+        owner=owner,
+        repetitions=4,
+        second_rater_share=0.5,
+        first=other,
+        second=bench.checkpoint,
+    )
+    made.checkpoints.set([bench.checkpoint, other])
+    made.positions.set(bench.scene.positions.all())
+    return plan_freeze(user=owner, plan=made)
+
+
+@pytest.fixture
+def carry_out(bench):
+    """Makes the next trials of a plan; the new checkpoint succeeds three times of four, the old one once of four."""
+
+    def carry(plan, n, recorded=True):
+        for _ in range(n):
+            trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+            new = trial.checkpoint.name == "pi0-new"
+            ok = (trial.number + trial.position.number) % 4 != 0 if new else trial.number == 1
+            episode = Episode.objects.create(station=bench.station, status="finished") if recorded else None
+            Trial.objects.filter(pk=trial.pk).update(
+                status="ended", duration_s=8.0 + trial.number + 0.25 * new, episode=episode
+            )
+            trial.refresh_from_db()
+            services.trial_score(
+                user=bench.operator,
+                trial=trial,
+                milestones=bench.ticks(True, ok or new, ok),
+                failure="" if ok else "=dropped",
+            )
+
+    return carry
+
+
+@pytest.fixture
+def revealed(plan, owner, carry_out):
+    """All of it carried out, closed and revealed."""
+    carry_out(plan, 16)
+    plan_close(user=owner, plan=plan, reason="all made")
+    return plan_reveal(user=owner, plan=plan)

@@ -1,0 +1,141 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from evaweb.results.analysis import analyse
+from evaweb.results.outcomes import Outcome, paired
+
+LABELS = ("held", "lifted", "on the plate")
+
+
+def trials(rates, blocks=40, scenes=("cups",), seed=3):
+    """Blocks of all checkpoints, one after the other, as a plan hands them out."""
+    random = np.random.default_rng(seed)
+    found = []
+    for block in range(blocks):
+        for name, rate in rates.items():
+            success = bool(random.random() < rate)
+            lifted = success or bool(random.random() < 0.5)
+            found.append(
+                Outcome(
+                    trial=len(found) + 1,
+                    order=len(found),
+                    block=str(block),
+                    checkpoint=name,
+                    scene=scenes[block % len(scenes)],
+                    position=block % 5,
+                    success=success,
+                    score=1.0 if success else 0.5 * lifted,
+                    duration=float(random.uniform(5, 30)),
+                    milestones=(True, lifted, success),
+                    failure="" if success else ("dropped" if lifted else "missed"),
+                    labels=LABELS,
+                )
+            )
+    return found
+
+
+def test_the_better_one_comes_first_with_everything_that_is_said_of_it():
+    found = analyse(trials({"old": 0.4, "new": 0.9}))
+    assert [arm.checkpoint for arm in found.arms] == ["new", "old"]
+    new = found.arm("new")
+    assert new.success.n == 40
+    assert new.exact.low < new.success.interval.low
+    assert sum(cell.n for cell in new.cells.values()) == 40
+    assert [step.of_all.n for step in new.funnels[0].steps] == [40, 40, 40]
+    assert new.funnels[0].labels == LABELS
+    assert new.curve.successes == new.success.successes == new.speed.events
+    assert dict(found.arm("old").failures).keys() == {"dropped", "missed"}
+    assert found.letters == {"new": "a", "old": "b"}
+    assert found.notes == ()
+
+
+def test_a_comparison_has_all_its_evidence():
+    found = analyse(trials({"old": 0.4, "new": 0.9}), primary=("old", "new"))
+    compared = found.compared("new", "old")
+    assert (compared.first, compared.second) == ("old", "new")
+    assert compared.difference.value < 0
+    assert compared.difference.interval.high < 0
+    assert compared.test.p == compared.corrected < 0.001
+    assert compared.better < 0.001
+    assert compared.pairs == compared.paired.pairs == 40
+    assert compared.clustered.interval.high < 0
+    assert compared.stratified is None
+    assert compared.evidence.winner == compared.score_evidence.winner == "second"
+
+
+def test_three_checkpoints_are_corrected_for_three_comparisons():
+    found = analyse(trials({"a": 0.9, "b": 0.85, "c": 0.2}))
+    assert len(found.comparisons) == 3
+    smallest = min(found.comparisons, key=lambda c: c.test.p)
+    assert smallest.corrected == pytest.approx(3 * smallest.test.p)
+    assert found.letters["a"] == found.letters["b"] == "a"
+    assert found.letters["c"] == "b"
+
+
+def test_the_same_outcomes_say_the_same():
+    one, other = analyse(trials({"a": 0.5, "b": 0.6})), analyse(trials({"a": 0.5, "b": 0.6})[::-1])
+    assert one == other
+
+
+def test_several_scenes_are_stratified_and_a_reversal_is_seen():
+    easy = [
+        (f"e{i}", name, "easy", ok)
+        for name, n, x in (("a", 87, 81), ("b", 270, 234))
+        for i, ok in enumerate([True] * x + [False] * (n - x))
+    ]
+    hard = [
+        (f"h{i}", name, "hard", ok)
+        for name, n, x in (("a", 263, 192), ("b", 80, 55))
+        for i, ok in enumerate([True] * x + [False] * (n - x))
+    ]
+    outcomes = [
+        Outcome(i, i, block, name, scene, 1, ok, float(ok))
+        for i, (block, name, scene, ok) in enumerate(easy + hard)
+    ]
+    found = analyse(outcomes)
+    compared = found.compared("a", "b")
+    assert compared.stratified.reversed
+    assert "2 of 2 initial conditions were not tried equally often" in found.notes[0]
+    assert found.arm("a").macro.value > found.arm("b").macro.value
+
+
+def test_a_block_that_is_not_complete_waits():
+    outcomes = trials({"old": 0.5, "new": 0.5}, blocks=10)[:-1]
+    compared = analyse(outcomes).comparisons[0]
+    assert (compared.pairs, compared.evidence.pairs) == (9, 9)
+    assert any("1 trial has no partner" in note for note in compared.notes)
+
+
+def test_pairs_are_in_the_order_in_which_they_were_completed():
+    def one(checkpoint, block, order):
+        return Outcome(order, order, block, checkpoint, "cups", 1, True, 1.0)
+
+    first = [one("a", "x", 0), one("a", "y", 1)]
+    second = [one("b", "y", 2), one("b", "x", 3)]
+    assert [pair.first.block for pair in paired(first, second)] == ["y", "x"]
+
+
+def test_what_cannot_be_computed_says_why():
+    outcomes = [Outcome(1, 0, "x", "a", "cups", 1, True, 1.0), Outcome(2, 1, "x", "b", "cups", 1, False, 0.0)]
+    found = analyse(outcomes)
+    compared = found.comparisons[0]
+    assert compared.clustered is None
+    assert any("at least 2 are needed" in note for note in compared.notes)
+    assert found.arm("a").curve is None
+    assert found.arm("a").funnels == ()
+
+
+def test_one_checkpoint_is_described_and_nothing_compared():
+    found = analyse(trials({"only": 0.5}))
+    assert found.comparisons == ()
+    assert found.letters == {"only": "a"}
+    assert analyse([]).arms == ()
+
+
+def test_it_is_computed_without_django():
+    program = "import sys, evaweb.results.analysis; print('django' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

@@ -1,0 +1,84 @@
+import pytest
+
+from evaweb.plans.handing import hand_out
+from evaweb.plans.models import Plan
+from evaweb.plans.services import plan_freeze
+from evaweb.results.analysis import analyse
+from evaweb.results.gathering import outcomes_of, outcomes_of_plan
+from evaweb.trials import services
+from evaweb.trials.models import Checkpoint, Trial
+from tests.evaweb.trials import builders
+
+
+@pytest.fixture(autouse=True)
+def _data_dir(settings, tmp_path):
+    settings.DATA_DIR = tmp_path
+
+
+@pytest.fixture
+def bench(db):
+    return builders.bench()
+
+
+@pytest.fixture
+def plan(bench):
+    made = Plan.objects.create(name="blocks", title="Blocks", owner=builders.user("olga"), repetitions=4)
+    made.checkpoints.set([bench.checkpoint, Checkpoint.objects.create(name="pi0-new", policy={})])
+    made.positions.set(bench.scene.positions.all())
+    return plan_freeze(user=made.owner, plan=made)
+
+
+def carry_out(bench, plan, n, success):
+    for _ in range(n):
+        trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+        Trial.objects.filter(pk=trial.pk).update(status="ended", duration_s=10.0)
+        trial.refresh_from_db()
+        ok = success(trial)
+        services.trial_score(
+            user=bench.operator,
+            trial=trial,
+            milestones=bench.ticks(True, ok, ok),
+            failure="" if ok else "dropped",
+        )
+
+
+def test_outcomes_of_a_plan_are_what_was_scored_in_its_order(bench, plan):
+    carry_out(bench, plan, 16, lambda trial: trial.checkpoint.name == "pi0-new")
+    found = outcomes_of_plan(plan)
+    assert [outcome.order for outcome in found] == list(range(1, 17))
+    assert len({outcome.block for outcome in found}) == 8
+    assert all(outcome.success == (outcome.checkpoint == "pi0-new") for outcome in found)
+    assert found[0].labels == ("held", "lifted", "on the plate")
+    assert {outcome.failure for outcome in found if not outcome.success} == {"dropped"}
+    compared = analyse(found).comparisons[0]
+    assert (compared.first, compared.pairs) == ("pi0-new", 8)
+
+
+def test_a_correction_counts_and_a_void_does_not(bench, plan):
+    carry_out(bench, plan, 4, lambda trial: True)
+    first, second = (h.trial for h in plan.handouts.all()[:2])
+    services.trial_score(
+        user=bench.operator, trial=first, milestones=bench.ticks(True, False, False), reason="it fell later"
+    )
+    services.trial_void(user=bench.operator, trial=second, reason="the camera had moved")
+    found = {outcome.trial: outcome for outcome in outcomes_of_plan(plan)}
+    assert not found[first.pk].success
+    assert found[first.pk].milestones == (True, False, False)
+    assert second.pk not in found
+
+
+def test_the_number_of_queries_does_not_grow(bench, plan, django_assert_num_queries):
+    carry_out(bench, plan, 2, lambda trial: True)
+    with django_assert_num_queries(4):
+        outcomes_of_plan(plan)
+    carry_out(bench, plan, 6, lambda trial: False)
+    with django_assert_num_queries(4):
+        outcomes_of_plan(plan)
+
+
+def test_trials_outside_any_plan_are_told_too(bench):
+    bench.scored()
+    bench.scored(success=False, position=2)
+    found = outcomes_of(Trial.objects.all())
+    assert [outcome.success for outcome in found] == [True, False]
+    assert [outcome.block for outcome in found] == ["block-on-plate/1/1", "block-on-plate/2/1"]

@@ -1,0 +1,317 @@
+import io
+import zipfile
+from dataclasses import replace
+from datetime import timedelta
+
+import pytest
+from django.db import connection
+from django.test import Client
+from django.test.utils import CaptureQueriesContext
+from django.utils import timezone
+
+from evaweb.plans.services import plan_close
+from evaweb.results import caching, judging
+from evaweb.results.selectors import PlanRow
+from evaweb.trials import services
+from evaweb.trials.models import Checkpoint
+from tests.evaweb.trials import builders
+
+PLAN = "/result/plans/blocks/1/"
+
+
+@pytest.fixture
+def as_():
+    def login(user):
+        client = Client()
+        client.force_login(user)
+        return client
+
+    return login
+
+
+@pytest.fixture
+def viewer(db):
+    return builders.user("vera", "viewer")
+
+
+SEALED = [PLAN, f"{PLAN}compare/", f"{PLAN}evidence/", f"{PLAN}trials/", "/result/plans/blocks/"]
+
+
+@pytest.mark.parametrize("address", SEALED)
+def test_before_the_reveal_nobody_sees_a_result(plan, owner, bench, carry_out, as_, viewer, address):
+    carry_out(plan, 16)
+    for user in (bench.operator, viewer, owner):
+        page = as_(user).get(address)
+        text = page.content.decode()
+        assert page.status_code == 200
+        assert "Sealed" in text
+        assert "16/16" in text
+        assert plan.commitment in text
+        for secret in (
+            plan.question,
+            "pi0-new",
+            "pi0-block",
+            "<svg class",
+            "succeeded",
+            bytes(plan.key).hex(),
+        ):
+            assert secret not in text
+
+
+@pytest.mark.parametrize(
+    "rest",
+    [
+        "results",
+        "results/pi0-new",
+        "comparison?first=a&second=b",
+        "outcomes",
+        "outcomes?format=csv",
+        "scores",
+        "ratings",
+        "preferences",
+    ],
+)
+def test_nor_does_a_program(plan, owner, carry_out, as_, rest):
+    carry_out(plan, 4)
+    answer = as_(owner).get(f"/api/v1/plans/blocks/1/{rest}")
+    assert answer.status_code == 403
+    assert "is blind until it is revealed" in answer.json()["error"]
+    assert as_(owner).get(f"{PLAN}report.zip").status_code == 403
+
+
+def test_the_owner_looks_by_an_act_of_their_own(plan, owner, bench, carry_out, as_):
+    carry_out(plan, 16)
+    client = as_(owner)
+    assert "Look behind the blind" in client.get(PLAN).content.decode()
+    assert as_(bench.operator).post(f"{PLAN}look").status_code == 403
+    assert client.post(f"{PLAN}look").status_code == 302
+    assert "pi0-new" in client.get(PLAN).content.decode()
+    meter = client.get(f"{PLAN}evidence/").content.decode()
+    assert "Evidence (e-value) after each pair" in meter
+    assert "do not show this page" in meter
+    assert "Sealed" in as_(bench.operator).get(f"{PLAN}evidence/").content.decode()
+
+
+def test_closed_and_revealed_on_the_page(plan, owner, carry_out, as_, viewer):
+    carry_out(plan, 16)
+    client = as_(owner)
+    refused = client.post(f"{PLAN}reveal")
+    assert refused.status_code == 409
+    assert "closed first" in refused.content.decode()
+    assert client.post(f"{PLAN}close", {"reason": ""}).status_code == 400
+    assert client.post(f"{PLAN}close", {"reason": "all made"}).status_code == 302
+    assert client.post(f"{PLAN}reveal").status_code == 302
+    text = as_(viewer).get(PLAN).content.decode()
+    assert bytes(plan.key).hex() in text
+    assert "pi0-new" in text
+
+
+def test_the_page_says_the_comparison_with_n_and_interval(revealed, as_, viewer):
+    text = as_(viewer).get(PLAN).content.decode()
+    found = caching.analysis_of(revealed).comparisons[0]
+    assert f"difference {100 * found.difference.value:.0f} points [" in text
+    for method in ("Newcombe", "Barnard", "McNemar", "e-process", "uniform priors", "would be missed"):
+        assert method in text
+    assert text.count('<svg class="drawing') >= 7
+    assert "Clopper-Pearson" in text
+    assert "Holm" in text
+
+
+def test_every_number_leads_to_its_trials(revealed, as_, viewer):
+    client = as_(viewer)
+    arm = caching.analysis_of(revealed).arms[0]
+    listed = client.get(f"{PLAN}trials/?checkpoint={arm.checkpoint}&success=yes")
+    assert f'Trials <span class="muted small">{arm.success.successes}</span>' in listed.content.decode()
+    failed = client.get(f"{PLAN}trials/?failure=%3Ddropped&success=no").content.decode()
+    assert "=dropped" in failed
+    assert "success</span>" not in failed
+    missed = client.get(f"{PLAN}trials/?missed=lifted").content.decode()
+    assert "Without the milestone" in missed
+    wrong = client.get(f"{PLAN}trials/?success=maybe")
+    assert wrong.status_code == 400
+    assert "allowed: yes, no" in wrong.content.decode()
+
+
+def test_filters_are_in_the_address_and_wrong_ones_are_named(revealed, as_, viewer):
+    client = as_(viewer)
+    part = client.get(f"{PLAN}?position=1").content.decode()
+    assert "Only a part of the trials" in part
+    assert "/4, " in part
+    wrong = client.get(f"{PLAN}?scene=none")
+    assert wrong.status_code == 400
+    assert "allowed: block-on-plate" in wrong.content.decode()
+    assert client.get(f"{PLAN}compare/?first=pi0-new&second=nobody").status_code == 400
+    assert client.get("/result/plans/blocks/7/").status_code == 404
+
+
+def test_side_by_side_lists_pairs_of_the_same_condition(revealed, as_, viewer):
+    text = as_(viewer).get(f"{PLAN}compare/").content.decode()
+    assert "8 pairs" in text
+    assert text.count("block-on-plate/") >= 8
+
+
+def test_a_correction_and_a_void_are_seen_at_once(plan, owner, bench, carry_out, as_):
+    carry_out(plan, 16)
+    client = as_(owner)
+    client.post(f"{PLAN}look")
+    assert "16/16" in client.get(PLAN).content.decode()
+    before = caching.analysis_of(plan)
+    assert caching.analysis_of(plan) is before
+    trial = plan.handouts.first().trial
+    flipped = not trial.verdict.success
+    services.trial_score(
+        user=bench.operator,
+        trial=trial,
+        milestones=bench.ticks(True, flipped, flipped),
+        reason="seen on the video",
+    )
+    after = caching.analysis_of(plan)
+    assert sum(a.success.successes for a in after.arms) != sum(a.success.successes for a in before.arms)
+    services.trial_void(user=bench.operator, trial=plan.handouts.last().trial, reason="a camera had moved")
+    assert caching.analysis_of(plan).n == 15
+    Checkpoint.objects.filter(name="pi0-new").update(name="renamed")
+    plan.refresh_from_db()
+    assert "renamed" in {arm.checkpoint for arm in caching.analysis_of(plan).arms}
+
+
+def test_another_blind_plan_of_the_same_checkpoint_hides_the_results(revealed, owner, bench, as_, viewer):
+    from evaweb.plans.models import Plan
+    from evaweb.plans.services import plan_freeze
+
+    again = Plan.objects.create(name="again", title="Again", owner=owner)
+    again.checkpoints.set(revealed.checkpoints.all())
+    again.positions.set(bench.scene.positions.all())
+    plan_freeze(user=owner, plan=again)
+    text = as_(viewer).get(PLAN).content.decode()
+    assert "compared blind in another plan" in text
+    assert "pi0-new" not in text
+    plan_close(user=owner, plan=again, reason="not now")
+
+
+def test_lab_and_wall_name_no_checkpoint_of_a_blind_plan(plan, bench, carry_out, as_):
+    carry_out(plan, 3)
+    client = as_(bench.operator)
+    for address in ("/result/lab/", "/result/wall/"):
+        for headers in ({}, {"HTTP_HX_REQUEST": "true"}):
+            text = client.get(address, **headers).content.decode()
+            assert "Blocks" in text
+            assert "pi0-new" not in text
+            assert "pi0-block" not in text
+    assert "<button" not in client.get("/result/wall/", HTTP_HX_REQUEST="true").content.decode()
+    assert "success" not in client.get("/result/lab/", HTTP_HX_REQUEST="true").content.decode()
+
+
+def test_queries_do_not_grow_with_trials(plan, owner, carry_out, as_):
+    client = as_(owner)
+    client.post(f"{PLAN}look")
+
+    def asked():
+        caching.forget()
+        found = []
+        for address in (PLAN, f"{PLAN}compare/", f"{PLAN}trials/", "/result/lab/", "/result/plans/"):
+            with CaptureQueriesContext(connection) as captured:
+                assert client.get(address).status_code == 200
+            found.append(len(captured))
+        return found
+
+    carry_out(plan, 4)
+    few = asked()
+    carry_out(plan, 12)
+    assert asked() == few
+    assert max(few) <= 30
+
+
+def test_the_report_comes_as_an_archive(revealed, as_, viewer):
+    answer = as_(viewer).get(f"{PLAN}report.zip")
+    names = zipfile.ZipFile(io.BytesIO(answer.content)).namelist()
+    assert {"blocks-v1/index.html", "blocks-v1/data/numbers.json", "blocks-v1/recompute/__main__.py"} <= set(
+        names
+    )
+
+
+def test_rating_again_shows_the_code_and_nothing_that_was_said(plan, carry_out, as_):
+    carry_out(plan, 16)
+    rater = builders.user("rita")
+    client = as_(rater)
+    handout, _ = judging.to_rate(rater)
+    text = client.get("/result/rate/").content.decode()
+    assert handout.code in text
+    for secret in ("pi0-new", "pi0-block", "dropped", f"/result/trials/{handout.trial_id}"):
+        assert secret not in text
+    given = {"plan": "blocks", "version": "1", "code": handout.code, "success": ""}
+    assert client.post("/result/rate/", given).status_code == 302
+    assert handout.trial.ratings.get().success is False
+    assert client.post("/result/rate/", given).status_code == 409
+    assert client.post("/result/rate/", {**given, "version": "x"}).status_code == 400
+
+
+def test_a_rating_that_is_refused_keeps_its_ticks_and_another_trial_gets_none_of_them(
+    plan, carry_out, as_, bench
+):
+    carry_out(plan, 16)
+    rater = builders.user("rita")
+    client = as_(rater)
+    handout, _ = judging.to_rate(rater)
+    first = bench.scene.milestones.order_by("order").first()
+    given = {
+        "plan": "blocks",
+        "version": "1",
+        "code": handout.code,
+        "milestone": first.pk,
+        "note": "n" * 9000,
+    }
+    ticked = f'value="{first.pk}" checked'
+    refused = client.post("/result/rate/", given)
+    assert refused.status_code == 400
+    assert ticked in refused.content.decode()
+    assert client.post("/result/rate/", {**given, "note": "slow"}).status_code == 302
+    twice = client.post("/result/rate/", {**given, "note": "slow"}).content.decode()
+    assert ticked not in twice
+    assert "slow" not in twice
+
+
+def test_without_pictures_nothing_is_judged(plan, carry_out, as_):
+    carry_out(plan, 16)
+    client = as_(builders.user("rita"))
+    for page in ("rate", "prefer"):
+        text = client.get(f"/result/{page}/").content.decode()
+        assert "without pictures nobody can judge" in text
+        assert 'disabled aria-describedby="unable"' in text
+
+
+def test_preferring_asks_why(plan, carry_out, as_):
+    carry_out(plan, 16)
+    rater = builders.user("rita")
+    client = as_(rater)
+    pair, _ = judging.to_prefer(rater)
+    text = client.get("/result/prefer/").content.decode()
+    assert pair.first.code in text
+    assert "pi0" not in text
+    given = {
+        "plan": "blocks",
+        "version": "1",
+        "first": pair.first.code,
+        "second": pair.second.code,
+        "outcome": "first",
+    }
+    assert client.post("/result/prefer/", {**given, "why": ""}).status_code == 400
+    assert client.post("/result/prefer/", {**given, "why": "gentler"}).status_code == 302
+    assert plan.preferences.count() == 1
+
+
+def test_the_planner_answers_and_names_what_is_not_allowed(as_, viewer):
+    client = as_(viewer)
+    text = client.get("/result/planner/?rate=0.5&better=0.7").content.decode()
+    assert "93 trials of each checkpoint" in text
+    for query in ("rate=2", "rate=x", "rate=0.5&better=0.5", "stations=0"):
+        wrong = client.get(f"/result/planner/?{query}")
+        assert wrong.status_code == 400
+        assert 'role="alert"' in wrong.content.decode()
+
+
+def test_a_pace_that_runs_backwards_is_none(plan):
+    begun = timezone.now()
+    row = PlanRow(plan, 16, 4, 4, begun, begun + timedelta(hours=2))
+    assert row.hours_left == pytest.approx(6.0)
+    assert replace(row, until=begun - timedelta(hours=2)).hours_left is None
+    assert replace(row, counted=16).hours_left is None

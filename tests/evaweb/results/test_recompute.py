@@ -1,0 +1,131 @@
+"""Two ways to every number, written apart: the lab's own, and that of the report's program."""
+
+import json
+import random
+
+import pytest
+
+from evaweb.results.analysis import analyse
+from evaweb.results.document import analysis_document
+from evaweb.results.outcomes import Interruption, Outcome
+from evaweb.results.recompute import judged, methods
+from evaweb.results.recompute.__main__ import differences
+from evaweb.results.recompute.numbers import Trial, numbers
+from evaweb.statistics.many import holm, letters
+from evaweb.statistics.preference import Comparison, NotIdentifiedError, preferences
+from evaweb.statistics.raters import cohen_kappa, gwet_ac1, krippendorff_alpha
+
+
+def outcomes(checkpoints, n, scenes, seed):
+    chance, found, block = random.Random(seed), [], 0
+    while len(found) < n:
+        scene, position, block = chance.randrange(scenes), chance.randint(1, 3), block + 1
+        for name in chance.sample(range(checkpoints), checkpoints):
+            ok = chance.random() < 0.4 + 0.15 * name
+            reached = (True, ok or chance.random() < 0.5, ok)
+            found.append(
+                Outcome(
+                    len(found),
+                    len(found),
+                    str(block),
+                    f"c{name}",
+                    f"s{scene}",
+                    position,
+                    ok,
+                    sum(reached) / 3,
+                    chance.choice((10.0, 12.5, chance.uniform(5, 40))) if chance.random() < 0.95 else None,
+                    reached,
+                    "" if ok else chance.choice("ab"),
+                    labels=("one", "two", "three"),
+                )
+            )
+    return found
+
+
+def as_rows(runs):
+    return [
+        Trial(
+            r.order,
+            r.block,
+            r.checkpoint,
+            r.scene,
+            r.position,
+            "scored",
+            r.success,
+            r.score,
+            r.duration,
+            r.failure,
+            tuple(zip(r.labels, r.milestones, strict=True)),
+        )
+        for r in runs
+    ]
+
+
+@pytest.mark.parametrize(
+    ("checkpoints", "n", "scenes", "seed"),
+    [(2, 80, 2, 1), (3, 45, 1, 2), (4, 40, 3, 3), (2, 2, 1, 4), (1, 5, 2, 5)],
+)
+def test_both_ways_come_to_the_same(checkpoints, n, scenes, seed):
+    runs = outcomes(checkpoints, n, scenes, seed)
+    primary = ("c0", "c1") if checkpoints > 1 else None
+    broken = [Interruption(9000, "c0", "s0", 1, 12.5)]
+    shown = json.loads(json.dumps(analysis_document(analyse(runs, broken, primary=primary))))
+    rows = [*as_rows(runs), Trial(9000, "x", "c0", "s0", 1, "interrupted", False, 0.0, 12.5, "", ())]
+    plan = {"stopping": {"alpha": 0.05}, "comparison": list(primary) if primary else None}
+    wrong = [(where, problem) for where, problem in differences(shown, numbers(rows, plan), "") if problem]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_preferences_come_to_the_same(seed):
+    chance, names = random.Random(seed), "abc"
+    rows = []
+    for _ in range(60):
+        one, other = chance.sample(names, 2)
+        rows.append((one, other, chance.choice(("first", "first", "second", "tie"))))
+    mine = judged.preferences(rows)
+    lab = preferences([Comparison(*row) for row in rows], order_effect=True)
+    assert {line["checkpoint"]: line["worth"] for line in mine["ranking"]} == pytest.approx(
+        dict(lab.worth), abs=1e-6
+    )
+    assert {line["checkpoint"]: line["error"] for line in mine["ranking"]} == pytest.approx(
+        dict(lab.error), abs=1e-6
+    )
+    assert (mine["tie"], mine["order"], mine["order_z"]) == pytest.approx(
+        (lab.tie, lab.order, lab.order_z), abs=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [[("a", "b", "first")] * 5, [("a", "b", "first")] * 5 + [("a", "b", "tie")] * 5, [("a", "b", "tie")] * 3],
+)
+def test_what_cannot_be_ranked_is_ranked_by_neither(rows):
+    assert judged.preferences(rows)["ranking"] is None
+    with pytest.raises(NotIdentifiedError):
+        preferences([Comparison(*row) for row in rows])
+
+
+def test_agreement_comes_to_the_same():
+    pairs = [(True, True)] * 20 + [(True, False)] * 5 + [(False, True)] * 10 + [(False, False)] * 15
+    mine = judged.agreement(pairs)
+    assert mine["kappa"] == pytest.approx(0.4)
+    assert mine["kappa"] == pytest.approx(cohen_kappa(pairs))
+    assert mine["ac1"] == pytest.approx(gwet_ac1(pairs))
+    assert mine["alpha"] == pytest.approx(krippendorff_alpha([[float(a), float(b)] for a, b in pairs]))
+
+
+def test_letters_and_holm_come_to_the_same():
+    apart = {frozenset(pair) for pair in ("AC", "AD", "BD")}
+    assert (
+        methods.letters("ABCD", apart) == letters("ABCD", apart) == {"A": "a", "B": "ab", "C": "bc", "D": "c"}
+    )
+    assert methods.holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx(holm([0.01, 0.04, 0.03, 0.005]))
+
+
+def test_published_values():
+    assert methods.wilson(81, 263) == pytest.approx([0.2553, 0.3662], abs=5e-5)
+    assert methods.clopper_pearson(15, 148) == pytest.approx([0.0578, 0.1617], abs=5e-5)
+    assert methods.newcombe(56, 70, 48, 80) == pytest.approx([0.0524, 0.3339], abs=5e-5)
+    assert methods.barnard(43, 53, 40, 79) == pytest.approx((3.555406780, 0.000362832), abs=1e-8)
+    assert methods.mcnemar(8, 2) == 0.109375

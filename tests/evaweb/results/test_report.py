@@ -1,0 +1,132 @@
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from django.core.management import CommandError, call_command
+
+from evaweb.results import judging
+from evaweb.results.caching import analysis_of
+from evaweb.results.checklist import checklist
+from tests.evaweb.trials import builders
+
+
+def recompute(folder):
+    """What the report's own program says, with no package within reach."""
+    words = [sys.executable, "-E", "-s", "-S", "-m", "recompute"]
+    return subprocess.run(words, cwd=folder, env={"PATH": os.environ["PATH"]}, capture_output=True, text=True)
+
+
+@pytest.fixture
+def report(revealed, tmp_path, bench):
+    rater = builders.user("rita")
+    for index, handout in enumerate(revealed.handouts.filter(slot__index__in=judging.sample_of(revealed))):
+        milestones = bench.ticks(True, True, index % 2 == 0)
+        judging.rate(user=rater, plan=revealed, code=handout.code, milestones=milestones)
+    for index in range(8):
+        pair, _ = judging.to_prefer(rater, [revealed])
+        codes = {"first": pair.first.code, "second": pair.second.code}
+        # By checkpoint and not by place, which is drawn: where one wins every time, there is nothing to fit.
+        won_by_new = index % 4 in (0, 3)
+        new_is_first = pair.first.slot.checkpoint.name == "pi0-new"
+        outcome = "tie" if index % 4 == 2 else "first" if won_by_new == new_is_first else "second"
+        judging.prefer(user=rater, plan=revealed, outcome=outcome, why="smoother", **codes)
+    call_command("eval_report", "blocks", "--out", str(tmp_path / "report"))
+    return tmp_path / "report"
+
+
+def test_a_program_without_us_computes_every_number_again(report):
+    found = recompute(report)
+    assert found.returncode == 0, found.stdout + found.stderr
+    numbers = json.loads((report / "data" / "numbers.json").read_text("utf-8"))
+    assert numbers["n"] == 16
+    assert numbers["agreement"]["ratings"] == 8
+    assert numbers["preferences"]["n"] == 8
+    assert "schedule and codes: 0 do not come out" in found.stdout
+
+
+@pytest.mark.parametrize(
+    "way",
+    [
+        ("arms", "pi0-new", "wilson", 0),
+        ("arms", "pi0-new", "time_to_success", "restricted_mean", "value_s"),
+        ("comparisons", 0, "barnard", "p"),
+        ("comparisons", 0, "evidence", "log_e_first", 3),
+        ("agreement", "success", "ac1"),
+        ("preferences", "contrasts", 0, "difference"),
+        ("letters", "pi0-new"),
+    ],
+)
+def test_a_number_that_was_changed_is_named(report, way):
+    path = report / "data" / "numbers.json"
+    numbers = json.loads(path.read_text("utf-8"))
+    place = numbers
+    for key in way[:-1]:
+        place = place[key]
+    place[way[-1]] = "z" if way[0] == "letters" else place[way[-1]] + 0.01
+    path.write_text(json.dumps(numbers), "utf-8")
+    found = recompute(report)
+    assert found.returncode == 1
+    name = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in way)[1:]
+    assert f"{name}: " in found.stdout
+
+
+def test_an_interval_of_a_bootstrap_that_was_narrowed_is_named(report):
+    path = report / "data" / "numbers.json"
+    numbers = json.loads(path.read_text("utf-8"))
+    low, high = numbers["arms"]["pi0-new"]["macro"]["bootstrap"]
+    numbers["arms"]["pi0-new"]["macro"]["bootstrap"] = [low + 0.15, high]
+    path.write_text(json.dumps(numbers), "utf-8")
+    assert "arms.pi0-new.macro.bootstrap: " in recompute(report).stdout
+
+
+def test_a_trial_that_was_taken_out_or_of_another_checkpoint_is_found(report):
+    path = report / "data" / "trials.csv"
+    lines = path.read_text("utf-8").splitlines(keepends=True)
+    path.write_text("".join(lines[:-1]), "utf-8")
+    assert recompute(report).returncode == 1
+    swapped = [
+        line.replace("pi0-new", "X").replace("pi0-block", "pi0-new").replace("X", "pi0-block")
+        for line in lines
+    ]
+    path.write_text("".join(swapped), "utf-8")
+    assert "is not what the schedule foresaw" in recompute(report).stdout
+
+
+def test_the_page_needs_no_network_and_shows_the_checklist(report):
+    page = (report / "index.html").read_text("utf-8")
+    assert "<svg" in page
+    assert "src=" not in page
+    assert "<link" not in page
+    assert 'href="/' not in page
+    assert "A second, blind rater" in page
+    assert "was better" not in page
+
+
+def test_what_is_blind_is_reported_only_where_that_is_meant(plan, tmp_path, carry_out):
+    carry_out(plan, 4)
+    with pytest.raises(CommandError, match="is blind until it is revealed"):
+        call_command("eval_report", "blocks", "--out", str(tmp_path / "report"))
+    call_command("eval_report", "blocks/1", "--sealed", "--out", str(tmp_path / "report"))
+    assert json.loads((tmp_path / "report" / "data" / "seal.json").read_text())["key"] == ""
+    found = recompute(tmp_path / "report")
+    assert found.returncode == 0
+    assert "by its digest: 0 do not come out" in found.stdout
+
+
+def test_a_folder_that_is_not_empty_is_not_written_to(revealed, tmp_path):
+    (tmp_path / "report").mkdir()
+    (tmp_path / "report" / "mine").write_text("x")
+    with pytest.raises(CommandError, match="is not empty"):
+        call_command("eval_report", "blocks", "--out", str(tmp_path / "report"))
+    with pytest.raises(CommandError, match="plan 'none' does not exist"):
+        call_command("eval_report", "none", "--out", str(tmp_path / "other"))
+
+
+def test_the_checklist_says_what_the_record_says(revealed):
+    kept = {item.practice: item for item in checklist(revealed, analysis_of(revealed))}
+    assert kept["As many trials as planned, or a rule to stop"].kept == "yes"
+    assert kept["Every trial on record"].record == "16 of 16 trials that count have a recording"
+    assert kept["A second, blind rater"].kept == "no"
+    assert kept["Question and comparison before the first trial"].kept == "yes"

@@ -1,0 +1,97 @@
+"""A lost database has its reviews, segments and reports again after reconcile; a second run changes nothing."""
+
+import json
+
+import pytest
+from django.contrib.auth.models import User
+
+from evaweb.episodes.models import Episode
+from evaweb.episodes.reconcile import reconcile
+from evaweb.guards import removal
+from evaweb.jobs.models import Job
+from evaweb.jobs.services import work
+from evaweb.reviews import services
+from evaweb.reviews.guarded import GUARDS
+from evaweb.reviews.models import Review, Segment, Standing
+
+pytestmark = pytest.mark.django_db
+
+
+def everything():
+    return [
+        list(model.objects.order_by("pk").values(*fields))
+        for model, fields in (
+            (Review, ("uuid", "episode", "verdict", "note", "reviewer__username", "at")),
+            (
+                Segment,
+                ("uuid", "episode", "first", "last", "label", "milestone", "annotator__username", "at"),
+            ),
+            (Standing, ("episode", "clean", "worst", "flags", "review", "changed_at", "checked_at")),
+        )
+    ]
+
+
+@pytest.fixture
+def spoken(closed, ann, bob):
+    """An episode that was checked, reviewed twice and annotated."""
+    episode = closed()
+    services.quality_asked(episode=episode)
+    services.review_add(user=ann, episode=episode, verdict="pass")
+    services.review_add(user=bob, episode=episode, verdict="fail", note="it slips")
+    kept = services.segment_put(
+        user=ann, episode=episode, first=0, last=9, label="reach", milestone="touched"
+    )
+    gone = services.segment_put(user=ann, episode=episode, first=10, last=12, label="wrong")
+    services.segment_put(user=ann, episode=episode, first=1, last=9, label="reach", segment=kept.uuid)
+    services.segment_remove(user=ann, episode=episode, segment=gone.uuid)
+    work("lab")
+    return episode
+
+
+def lose():
+    """All rows, as a database that was lost has none; no trigger stands in the way."""
+    from django.db import connection
+
+    with connection.cursor() as cursor:
+        for guard in GUARDS:
+            for statement in removal(connection, guard):
+                cursor.execute(statement)
+    for model in (Standing, Segment, Review, Episode, Job, User):
+        model.objects.all().delete()
+
+
+def test_what_was_said_comes_back_from_the_disk(spoken):
+    before = everything()
+    lose()
+    report = reconcile()
+    assert report.problems == ()
+    assert report.restored == 3
+    assert everything() == before
+    assert not User.objects.filter(is_active=True).exists(), "people that are gone come back switched off"
+    assert reconcile().restored == 0
+    assert everything() == before
+
+
+def test_a_row_that_the_disk_knows_better_is_brought_up_to_it(spoken):
+    before = everything()
+    Segment.objects.update(label="from a backup")
+    assert reconcile().restored == 1
+    assert everything() == before
+
+
+def test_a_torn_line_never_counted_and_a_wrong_one_is_named(spoken, data):
+    path = data / "reviews" / f"{spoken.uuid}.jsonl"
+    before = everything()
+    path.write_bytes(path.read_bytes() + b'{"kind": "review", "uu')
+    assert reconcile().problems == ()
+    assert everything() == before
+    path.write_text(json.dumps({"kind": "review", "uuid": str(spoken.uuid), "verdict": "perhaps"}) + "\n")
+    (problem,) = reconcile().problems
+    assert "line 1 of its reviews: review.verdict is 'perhaps'" in problem
+
+
+def test_a_damaged_report_is_named(spoken, data):
+    Standing.objects.update(checked_at=None)
+    (data / "quality" / f"{spoken.uuid}.json").write_text("{}")
+    (problem,) = reconcile().problems
+    assert "is no report" in problem

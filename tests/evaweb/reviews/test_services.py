@@ -1,0 +1,145 @@
+"""Verdicts and annotations: on the disk before the row, never changed, each by somebody."""
+
+import json
+
+import pytest
+from django.db import DatabaseError, transaction
+
+from evaweb.episodes import lines as disk
+from evaweb.episodes.models import EpisodeStatus
+from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
+from evaweb.reviews import selectors, services
+from evaweb.reviews.models import Review, Segment, Standing
+from tests.evaweb.episodes.conftest import FRAMES
+
+pytestmark = pytest.mark.django_db
+
+
+def said(data, episode):
+    return [
+        json.loads(line) for line in (data / "reviews" / f"{episode.uuid}.jsonl").read_text().splitlines()
+    ]
+
+
+def test_the_newest_pass_or_fail_counts_and_all_are_kept(closed, data, ann, bob):
+    episode = closed()
+    services.review_add(user=ann, episode=episode, verdict="pass")
+    services.review_add(user=bob, episode=episode, verdict="fail", note="  it slips  ")
+    services.review_add(user=ann, episode=episode, verdict="note", note="look at row 12")
+    standing = selectors.standing_of(episode=episode)
+    assert (standing.review.verdict, standing.review.note, standing.review.reviewer) == (
+        "fail",
+        "it slips",
+        bob,
+    )
+    history = [(review.verdict, str(review.reviewer)) for review in selectors.reviews_of(episode=episode)]
+    assert history == [("note", "ann"), ("fail", "bob"), ("pass", "ann")]
+    assert [(line["verdict"], line["by"]) for line in said(data, episode)] == [
+        ("pass", "ann"),
+        ("fail", "bob"),
+        ("note", "ann"),
+    ]
+
+
+def test_the_database_itself_keeps_what_was_said(closed, ann):
+    review = services.review_add(user=ann, episode=closed(), verdict="pass")
+    with pytest.raises(DatabaseError, match="never changed"), transaction.atomic():
+        Review.objects.filter(pk=review.pk).update(verdict="fail")
+    with pytest.raises(DatabaseError, match="never changed"), transaction.atomic():
+        Review.objects.filter(pk=review.pk)._raw_delete("default")
+
+
+def test_where_the_disk_does_not_take_it_nothing_is_changed(closed, ann, monkeypatch):
+    episode = closed()
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(disk.os, "fsync", full)
+    with pytest.raises(disk.NotKept, match="No space left"):
+        services.review_add(user=ann, episode=episode, verdict="pass")
+    with pytest.raises(disk.NotKept, match="No space left"):
+        services.segment_put(user=ann, episode=episode, first=0, last=1, label="reach")
+    assert not Review.objects.exists()
+    assert not Segment.objects.exists()
+    assert not Standing.objects.exclude(review=None).exists()
+
+
+@pytest.mark.parametrize(
+    ("verdict", "note", "sentence"),
+    [
+        ("maybe", "", "verdict = 'maybe'; allowed: pass, fail, note"),
+        ("note", "  ", "a note needs words"),
+        ("pass", "x" * 8001, "at most 8000"),
+        ("fail", "a\x00b", "U\\+0000"),
+    ],
+)
+def test_what_cannot_be_said_is_refused(closed, ann, verdict, note, sentence):
+    with pytest.raises(EvaError, match=sentence):
+        services.review_add(user=ann, episode=closed(), verdict=verdict, note=note)
+
+
+def test_viewers_say_nothing(closed, vera):
+    episode = closed()
+    with pytest.raises(NotAllowed):
+        services.review_add(user=vera, episode=episode, verdict="pass")
+    with pytest.raises(NotAllowed):
+        services.segment_put(user=vera, episode=episode, first=0, last=1, label="reach")
+
+
+def test_what_is_being_recorded_is_not_reviewed(closed, ann):
+    episode = closed()
+    type(episode).objects.update(status=EpisodeStatus.RECORDING)
+    episode.refresh_from_db()
+    with pytest.raises(Conflict, match="still being recorded"):
+        services.review_add(user=ann, episode=episode, verdict="pass")
+    with pytest.raises(Conflict, match="still being recorded"):
+        services.quality_asked(episode=episode)
+
+
+def test_several_annotators_mark_the_same_frames_each_their_own(closed, data, ann, bob, alma):
+    episode = closed()
+    reach = services.segment_put(
+        user=ann, episode=episode, first=0, last=9, label="reach", milestone="cup touched"
+    )
+    services.segment_put(user=bob, episode=episode, first=2, last=11, label="approach")
+    changed = services.segment_put(
+        user=ann, episode=episode, first=0, last=8, label="reach", segment=reach.uuid
+    )
+    assert changed.uuid == reach.uuid
+    told = [
+        (row.first, row.last, row.label, str(row.annotator)) for row in selectors.segments_of(episode=episode)
+    ]
+    assert told == [(0, 8, "reach", "ann"), (2, 11, "approach", "bob")]
+    with pytest.raises(NotAllowed, match="ann's"):
+        services.segment_remove(user=bob, episode=episode, segment=reach.uuid)
+    services.segment_remove(user=alma, episode=episode, segment=reach.uuid)
+    assert [line["kind"] for line in said(data, episode)] == ["segment"] * 3 + ["segment_removed"]
+    with pytest.raises(NotFound):
+        services.segment_remove(user=ann, episode=episode, segment=reach.uuid)
+
+
+@pytest.mark.parametrize(("first", "last"), [(-1, 3), (5, 4), (0, FRAMES)])
+def test_segments_lie_within_the_episode(closed, ann, first, last):
+    with pytest.raises(EvaError, match=f"allowed: frames 0 to {FRAMES - 1}"):
+        services.segment_put(user=ann, episode=closed(), first=first, last=last, label="reach")
+
+
+def test_a_segment_has_a_label(closed, ann):
+    with pytest.raises(EvaError, match="label is empty"):
+        services.segment_put(user=ann, episode=closed(), first=0, last=1, label=" ")
+
+
+def test_the_next_unreviewed_goes_down_the_list_and_begins_again_at_its_top(closed, ann):
+    newer, older = sorted(
+        (closed("finished"), closed("interrupted")), key=lambda one: one.started_at, reverse=True
+    )
+    assert selectors.unreviewed_next(after=None) == (newer, 2)
+    assert selectors.unreviewed_next(after=newer.uuid) == (older, 2)
+    assert selectors.unreviewed_next(after=older.uuid) == (newer, 2)
+    services.review_add(user=ann, episode=older, verdict="note", note="odd")
+    assert selectors.unreviewed_next(after=newer.uuid) == (older, 2), "a note decides nothing"
+    services.review_add(user=ann, episode=older, verdict="pass")
+    assert selectors.unreviewed_next(after=newer.uuid) == (None, 1)
+    services.review_add(user=ann, episode=newer, verdict="fail")
+    assert selectors.unreviewed_next(after=None) == (None, 0)

@@ -1,0 +1,74 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evaweb.statistics.base import StatisticsError
+from evaweb.statistics.progress import funnel, score_posterior
+from evaweb.statistics.raters import cohen_kappa, gwet_ac1, krippendorff_alpha, weighted_kappa
+
+RATED = st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=1, max_size=40)
+
+
+def table(both, first, second, neither):
+    return [(1, 1)] * both + [(1, 0)] * first + [(0, 1)] * second + [(0, 0)] * neither
+
+
+def test_the_published_values():
+    assert cohen_kappa(table(20, 5, 10, 15)) == pytest.approx(0.4)
+    assert cohen_kappa(table(118, 5, 2, 0)) == pytest.approx(-0.0234, abs=5e-5)
+    assert gwet_ac1(table(118, 5, 2, 0)) == pytest.approx(0.9408, abs=5e-5)
+
+
+def test_krippendorff_of_his_own_example():
+    # Computing Krippendorff's alpha-reliability (2011), part C: four observers, values missing.
+    a = [1, 2, 3, 3, 2, 1, 4, 1, 2, None, None, None]
+    b = [1, 2, 3, 3, 2, 2, 4, 1, 2, 5, None, 3]
+    c = [None, 3, 3, 3, 2, 3, 4, 2, 2, 5, 1, None]
+    d = [1, 2, 3, 3, 2, 4, 4, 1, 2, 5, 1, None]
+    units = list(zip(a, b, c, d, strict=True))
+    assert krippendorff_alpha(units) == pytest.approx(0.743, abs=5e-4)
+    assert krippendorff_alpha(units, "interval") == pytest.approx(0.849, abs=5e-4)
+
+
+@given(RATED)
+def test_unweighted_is_cohens_kappa_and_agreement_is_1(pairs):
+    if len({level for pair in pairs for level in pair}) > 1:
+        assert weighted_kappa(pairs, 4, "none") == pytest.approx(cohen_kappa(pairs), abs=1e-9)
+    same = [(one, one) for one, _ in pairs]
+    assert cohen_kappa(same) == gwet_ac1(same, 4) == weighted_kappa(same, 4) == 1.0
+    assert krippendorff_alpha(same) == 1.0
+
+
+def test_being_one_level_apart_is_less_wrong():
+    near, far = [(0, 1), (1, 2), (2, 2), (0, 0)], [(0, 2), (2, 0), (2, 2), (0, 0)]
+    assert weighted_kappa(near, 3) > weighted_kappa(far, 3)
+
+
+def test_ratings_that_cannot_be_are_refused():
+    with pytest.raises(StatisticsError, match="no trial"):
+        cohen_kappa([])
+    with pytest.raises(StatisticsError, match="level 4; allowed: 0 to 3"):
+        weighted_kappa([(0, 4)], 4)
+    with pytest.raises(StatisticsError, match="rated by two people"):
+        krippendorff_alpha([[1, None], [None, 2]])
+    with pytest.raises(StatisticsError, match="3 categories were used, 2 are declared"):
+        gwet_ac1([(0, 1), (2, 2)])
+
+
+def test_a_funnel_counts_of_all_and_of_those_that_came_so_far():
+    steps = funnel([[True, True, False], [True, False, False], [False, False, False], [True, True, True]])
+    assert [(s.of_all.successes, s.of_all.n) for s in steps] == [(3, 4), (2, 4), (1, 4)]
+    assert [(s.of_previous.successes, s.of_previous.n) for s in steps] == [(3, 4), (2, 3), (1, 2)]
+    assert funnel([]) == []
+    with pytest.raises(StatisticsError, match="the same number in each"):
+        funnel([[True], [True, False]])
+
+
+def test_the_published_posterior_of_a_score():
+    found = score_posterior([2, 1, 3, 4, 10], [0, 0.25, 0.5, 0.75, 1])
+    assert found.mean == pytest.approx(0.69)
+    assert found.deviation == pytest.approx(0.068332, abs=1e-6)
+    assert found.interval.low < 0.69 < found.interval.high
+    assert found.interval.high - found.interval.low == pytest.approx(4 * 0.068332, rel=0.05)
+    with pytest.raises(StatisticsError, match="2 counts of 3 levels"):
+        score_posterior([1, 2], [0, 0.5, 1])

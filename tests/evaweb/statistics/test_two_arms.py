@@ -1,0 +1,160 @@
+import math
+from fractions import Fraction
+from math import comb
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import barnard_exact
+
+from evaweb.statistics.base import StatisticsError
+from evaweb.statistics.difference import barnard, newcombe, probability_better
+from evaweb.statistics.paired import cluster_bootstrap, mcnemar
+from evaweb.statistics.proportions import posterior
+from evaweb.statistics.strata import Table, macro_average, mantel_haenszel
+
+COUNTS = st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
+
+
+@pytest.mark.parametrize(
+    ("counts", "low", "high"),
+    [((56, 70, 48, 80), 0.0524, 0.3339), ((9, 10, 3, 10), 0.1705, 0.8090), ((5, 56, 0, 29), -0.0381, 0.1926)],
+)
+def test_newcombe_gives_the_published_intervals(counts, low, high):
+    found = newcombe(*counts)
+    assert (found.interval.low, found.interval.high) == pytest.approx((low, high), abs=5e-5)
+
+
+@given(COUNTS, COUNTS)
+def test_the_difference_lies_in_its_interval_and_turns_with_the_arms(one, other):
+    there, back = newcombe(*one, *other), newcombe(*other, *one)
+    assert -1 <= there.interval.low <= there.value + 1e-12 <= there.interval.high + 2e-12 <= 1 + 2e-12
+    assert (back.value, back.interval.low) == pytest.approx((-there.value, -there.interval.high), abs=1e-12)
+
+
+def test_barnard_gives_the_published_value():
+    found = barnard(43, 53, 40, 79)  # columns of [[43, 40], [10, 39]]
+    assert found.statistic == pytest.approx(3.555406780, abs=1e-8)
+    assert found.p == pytest.approx(0.000362832, abs=1e-8)
+
+
+def test_barnard_is_scipys_where_no_other_table_is_as_extreme():
+    for table in ((30, 40, 11, 40), (3, 17, 9, 23), (45, 50, 33, 52), (1, 29, 9, 31)):
+        x1, n1, x2, n2 = table
+        oracle = barnard_exact([[x1, x2], [n1 - x1, n2 - x2]], pooled=True)
+        assert barnard(*table).p == pytest.approx(oracle.pvalue, abs=1e-7)
+        assert barnard(*table).statistic == pytest.approx(oracle.statistic)
+
+
+@given(st.integers(1, 25), st.integers(1, 25), st.data())
+def test_barnard_is_the_largest_probability_of_all_tables_as_extreme(n1, n2, data):
+    x1, x2 = data.draw(st.integers(0, n1)), data.draw(st.integers(0, n2))
+    found = barnard(x1, n1, x2, n2)
+    if x1 + x2 in (0, n1 + n2):
+        assert found.p == 1.0
+        return
+
+    def z(a, b):
+        m = Fraction(a + b, n1 + n2)
+        return (Fraction(a, n1) - Fraction(b, n2)) ** 2 / (m * (1 - m)) if 0 < m < 1 else Fraction(0)
+
+    extreme = [
+        (a, b) for a in range(n1 + 1) for b in range(n2 + 1) if z(a, b) >= z(x1, x2)
+    ]  # without rounding
+
+    def total(p):
+        return sum(
+            comb(n1, a) * comb(n2, b) * p ** (a + b) * (1 - p) ** (n1 + n2 - a - b) for a, b in extreme
+        )
+
+    highest = max(total(i / 300) for i in range(1, 300))
+    assert highest <= found.p + 1e-12
+    assert found.p <= highest + 0.01
+
+
+@pytest.mark.parametrize("counts", [(0, 5, 0, 7), (5, 5, 7, 7)])
+def test_where_all_or_none_succeeded_barnard_finds_nothing(counts):
+    assert barnard(*counts).p == 1.0
+
+
+def test_barnard_refuses_counts_that_cannot_be():
+    with pytest.raises(StatisticsError, match="6 successes in 5 trials"):
+        barnard(6, 5, 0, 5)
+
+
+@settings(deadline=None, max_examples=30)
+@given(COUNTS, COUNTS)
+def test_the_probability_to_be_better_is_that_of_the_posteriors(one, other):
+    from scipy.integrate import quad
+    from scipy.stats import beta
+
+    a, b = posterior(*one), posterior(*other)
+    expected, _ = quad(lambda t: beta.pdf(t, a.a, a.b) * beta.cdf(t, b.a, b.b), 0, 1, limit=200)
+    assert probability_better(*one, *other) == pytest.approx(expected, abs=1e-6)
+
+
+@given(COUNTS)
+def test_an_arm_is_better_than_its_like_with_probability_one_half(one):
+    assert probability_better(*one, *one) == pytest.approx(0.5, abs=1e-9)
+
+
+def test_mcnemar_looks_at_discordant_pairs_alone():
+    pairs = [(True, False)] * 8 + [(False, True)] * 2 + [(True, True)] * 30
+    found = mcnemar(pairs)
+    assert (found.first_only, found.second_only, found.pairs) == (8, 2, 40)
+    assert found.p == pytest.approx(0.109375)
+    assert mcnemar([(True, True)] * 5).p == 1.0
+
+
+def test_the_bootstrap_draws_initial_conditions_not_trials():
+    first = {f"position {i}": [1.0] * 10 for i in range(4)} | {"position 4": [0.0] * 10}
+    second = {f"position {i}": [0.0] * 10 for i in range(5)}
+    found = cluster_bootstrap(first, second, seed=1)
+    assert found.value == pytest.approx(0.8)
+    # Five clusters, however many trials: the interval is that of five.
+    assert found.interval.low == pytest.approx(0.4)
+    assert found.interval.high == pytest.approx(1.0)
+    assert cluster_bootstrap(first, second, seed=1) == found
+
+
+def test_the_bootstrap_says_where_it_would_claim_too_much():
+    with pytest.raises(StatisticsError, match="nothing to resample"):
+        cluster_bootstrap({"a": [1], "b": [1]}, {"a": [0], "b": [0]}, seed=0)
+    with pytest.raises(StatisticsError, match="at least 2 are needed"):
+        cluster_bootstrap({"a": [1]}, {"a": [0]}, seed=0)
+    with pytest.raises(StatisticsError, match="second arm has no trial at 'b'"):
+        cluster_bootstrap({"a": [1], "b": [1]}, {"a": [0], "b": []}, seed=0)
+
+
+def test_simpsons_paradox_is_seen():
+    # Kidney stones (Charig et al. 1986): better in both strata, worse when pooled.
+    found = mantel_haenszel([Table(81, 87, 234, 270), Table(192, 263, 55, 80)])
+    assert found.crude == pytest.approx(273 / 350 - 289 / 350)
+    assert found.stratified > 0
+    assert found.reversed
+    assert found.odds_ratio == pytest.approx(1.446847, abs=1e-5)
+
+
+def test_one_stratum_is_a_plain_table():
+    found = mantel_haenszel([Table(9, 10, 3, 10)])
+    assert found.odds_ratio == pytest.approx((9 * 7) / (1 * 3))
+    assert found.crude == pytest.approx(found.stratified) == pytest.approx(0.6)
+    assert not found.reversed
+    # (n - 1) (ad - bc)^2 / (rows and columns): Mantel-Haenszel's statistic of one table.
+    chi2 = 19 * (9 * 7 - 1 * 3) ** 2 / (10 * 10 * 12 * 8)
+    assert found.p == pytest.approx(math.erfc(math.sqrt(chi2 / 2)), rel=1e-9)
+
+
+def test_no_difference_anywhere_is_no_evidence():
+    found = mantel_haenszel([Table(5, 5, 7, 7)])
+    assert (found.p, found.odds_ratio, found.reversed) == (1.0, None, False)
+
+
+def test_scenes_are_equally_heavy_whatever_their_trials():
+    found = macro_average({"easy": [1.0] * 30 + [0.0] * 10, "hard": [0.0, 0.0, 1.0, 0.0]}, seed=2)
+    assert found.value == pytest.approx(0.5)
+    assert found.interval is not None
+    assert found.interval.low < 0.5 < found.interval.high
+    assert macro_average({"easy": [1, 1], "hard": [0, 0]}, seed=2).interval is None
+    with pytest.raises(StatisticsError, match="'hard' has no trial"):
+        macro_average({"easy": [1], "hard": []}, seed=2)

@@ -1,0 +1,137 @@
+"""Nothing that an operator can reach tells which checkpoint a blind trial is of, before the reveal.
+
+Every named address is asked in every stage of a trial, with the first of the things there are that it answers for, and
+everything that the live socket sends is read. An address with a parameter that is not known here fails the test.
+"""
+
+from __future__ import annotations
+
+import pytest
+from django.core.management import call_command
+from django.test import Client
+from django.urls import reverse
+
+from evaweb.api.tokens import token_create
+from evaweb.plans.guarded import GUARDS as of_plans
+from evaweb.plans.services import plan_reveal
+from evaweb.plans.sight import look
+from evaweb.sight import sight_of
+from evaweb.trials.guarded import GUARDS as of_trials
+from tests.evaweb.blind_lab import LATENCY, NAMES, SECRETS, Lab
+from tests.evaweb.crawling import QUERIES, crawled, leaks, told_apart, whispers
+from tests.evaweb.episodes.conftest import recorded  # noqa: F401  a fixture
+from tests.evaweb.unguarded import unguarded
+
+pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow, pytest.mark.timeout(300)]
+
+
+@pytest.fixture(autouse=True)
+def _data(settings, tmp_path, monkeypatch):
+    settings.DATA_DIR = tmp_path
+    monkeypatch.setattr("evaweb.jobs.doorbell.ring", lambda queue: True)
+
+
+@pytest.fixture
+def lab(live, runtime, ann, recorded, settings):  # noqa: F811
+    """A frozen plan of olga's, a runtime that says secrets, a scene, and an operator."""
+    yield Lab(live, runtime, ann, recorded["finished"], settings.DATA_DIR)
+    with unguarded(
+        (*of_plans, *of_trials)
+    ):  # what the database refuses to remove is in the way of the next test
+        call_command("flush", verbosity=0, interactive=False, inhibit_post_migrate=True)
+
+
+STAGES = ("before", "handed", "running", "failed", "scored", "closed")
+
+
+def test_nothing_that_an_operator_can_reach_tells_before_the_reveal(lab):
+    client = Client()
+    client.force_login(lab.operator)
+    bearer = Client(headers={"Authorization": f"Bearer {token_create(user=lab.operator, name='crawler')}"})
+    for stage in STAGES:
+        getattr(lab, stage, lambda: None)()
+        asked = {"queries": QUERIES if stage == "scored" else (), "posts": stage == "closed"}
+        assert list(leaks(lab, client, **asked)) == [], stage
+        if stage != "before":
+            assert whispers(lab, lab.operator) == [], stage
+        if stage == "failed":
+            assert list(leaks(lab, bearer)) == []
+        if stage == "closed":
+            assert list(told_apart(lab, client)) == []
+    by_name = [client.get(reverse("api:checkpoint", args=[name])).status_code for name in NAMES]
+    assert by_name == [404, 404]
+    assert client.get(reverse("api:trials"), {"checkpoint": NAMES[0]}).status_code == 404
+    lab.plan = plan_reveal(user=lab.owner, plan=lab.plan)
+    told = "".join(text for _, _, text in crawled(lab, client))
+    assert all(name in told for name in NAMES)
+    assert NAMES.index(lab.trial.checkpoint.name) >= 0
+    shown = client.get(reverse("api:trial", args=[lab.trial.pk])).json()
+    assert shown["checkpoint"] == lab.trial.checkpoint.name
+    assert shown["code"]
+    assert LATENCY in whispers(lab, lab.operator)
+
+
+def test_who_has_looked_is_told_everything(lab):
+    lab.handed()
+    lab.running()
+    client = Client()
+    client.force_login(lab.owner)
+    assert list(leaks(lab, client)) == []
+    look(lab.plan, lab.owner)
+    assert {secret for _, secret in leaks(lab, client)} >= {"secret-alder", "secret-birch", LATENCY}
+    assert set(whispers(lab, lab.owner)) >= {"secret-alder", LATENCY, "something_new"}
+
+
+def test_an_administrator_who_has_run_a_trial_reads_it_in_no_page_of_administration(lab, alma):
+    client = Client()
+    client.force_login(alma)
+    lab.operator = alma
+    lab.handed()
+    assert not sight_of(alma).clear
+    for model in ("trials_trial", "trials_score", "stations_command", "episodes_episode", "jobs_job"):
+        answer = client.get(reverse(f"admin:{model}_changelist"), headers={"Accept": "text/html"})
+        assert answer.status_code == 403, model
+        assert not any(secret in answer.content.decode() for secret in SECRETS), model
+    assert client.get(reverse("admin:stations_station_changelist")).status_code == 200
+
+
+SEAMS = {
+    "evaweb.sight.Sight.label": lambda self, trial: trial.checkpoint.name,
+    "evaweb.sight.Sight.told": lambda self, text: text,
+    "evaweb.sight.Sight.policy_of": lambda self, episode: episode.checkpoint,
+    "evaweb.sight.Sight.hides_episode": lambda self, episode: False,
+    "evaweb.sight.Sight.require_episode": lambda self, episode: None,
+    "evaweb.sight.Sight.open": lambda self, rows, checkpoint="checkpoint": rows,
+    "evaweb.sight.Sight.veils": lambda self, station, snapshot: False,
+    "evaweb.stations.veil.answer": lambda data: dict(data),
+}
+
+
+def test_without_one_seam_something_tells(lab, monkeypatch):
+    client = Client()
+    client.force_login(lab.operator)
+    for stage in ("handed", "running", "failed", "scored"):
+        getattr(lab, stage)()
+    for seam, instead in SEAMS.items():
+        with monkeypatch.context() as without:
+            without.setattr(seam, instead)
+            assert any(leaks(lab, client)), seam
+
+
+def test_without_its_seam_a_filter_tells(lab, monkeypatch):
+    client = Client()
+    client.force_login(lab.operator)
+    for stage in ("handed", "running", "failed", "scored"):
+        getattr(lab, stage)()
+    monkeypatch.setattr("evaweb.sight.Sight.open", SEAMS["evaweb.sight.Sight.open"])
+    assert any(told_apart(lab, client))
+
+
+def test_without_one_seam_the_live_socket_tells(lab, monkeypatch):
+    lab.handed()
+    lab.running()
+    assert whispers(lab, lab.operator) == []
+    for seam in ("veils", "veils_events"):
+        with monkeypatch.context() as without:
+            without.setattr(f"evaweb.sight.Sight.{seam}", lambda self, *given: False)
+            assert whispers(lab, lab.operator) != [], seam
