@@ -40,16 +40,9 @@ demo: setup ## a small lab on this machine, no robot needed; ARGS="--once --json
 lab: setup ## web, worker and stations of this machine; ARGS="deployments/MINE.toml"
 	$(PY) manage.py lab $(ARGS)
 
-# A third of the tests' time is waiting: one more of them at a time than there are cores.
-WORKERS := $(shell expr $$(nproc) + 1)
-
-# Tests in real time of whole labs and stations have the machine for themselves; all others run beside each other.
 test: setup-dev ## every test; ARGS="-m 'not slow'" for the quick ones
 ifeq ($(strip $(ARGS)),)
-	@failed=0; \
-	$(PY) -m pytest -n $(WORKERS) --dist loadfile -m 'not alone' || failed=1; \
-	$(PY) -m pytest -m alone tests/e2e tests/crash tests/runtime/sim || failed=1; \
-	exit $$failed
+	$(PY) -m tests.whole
 else
 	$(PY) -m pytest $(ARGS)
 endif
