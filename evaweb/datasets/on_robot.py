@@ -21,6 +21,7 @@ from evaweb.errors import Conflict, EvaError, NotFound, StationGone
 from evaweb.stations.looks import facts_of
 from evaweb.stations.models import Station
 from evaweb.stations.wire import wire_to
+from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError
 from runtime.recording.reader import open_episode
 
@@ -57,7 +58,8 @@ class Recorded:
             return reverse("replay", args=[self.source])
         name, _, index = self.source.rpartition(":")
         path = reverse("dataset-replay", args=[name, int(index)])
-        return path if self.ours else f"{path}?{urlencode({'robot': self.robot})}"
+        said = not self.ours and self.robot in robots.names()
+        return f"{path}?{urlencode({'robot': self.robot})}" if said else path
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +154,7 @@ def _recording(uuid: UUID) -> Recorded:
         joints=[str(name) for name in robot.get("joint_names") or ()],
         poses=[str(name) for name in robot.get("eef_names") or ()] if has_poses else (),
         columns={},
-        ours=True,
+        ours=row.kind != IMPORTED,
     )
 
 
@@ -176,7 +178,7 @@ def _of_dataset(shown: Played) -> Recorded:
         joints=joints,
         poses=shown.names(poses) if poses else (),
         columns={"joint": action, "eef": poses},
-        ours=bool(shown.uuid) and not shown.assumed,
+        ours=bool(shown.uuid) and shown.told.get("kind") != IMPORTED and not shown.assumed,
     )
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 import robots
 from runtime.datasets import layout
+from runtime.datasets.carried import Carried, carried, names_of
 from runtime.datasets.identities import uuids_of
 from runtime.datasets.mapping import ColumnMapping, video_key
 from runtime.datasets.pictures import PictureSequence
@@ -43,7 +44,7 @@ class Whose:
     def names(self, dataset: Dataset) -> list[str]:
         """Of the numbers of the state; RecordingError where the robot has not as many."""
         feature = dataset.features[self.state]
-        width, names = int(feature["shape"][0]), feature.get("names")
+        width = int(feature["shape"][0])
         if self.robot:
             joints = list(robots.load(self.robot).joint_names)
             if len(joints) != width:
@@ -51,9 +52,7 @@ class Whose:
                     f"{dataset.root}: {self.state} has {width} numbers, {self.robot} has {len(joints)} joints"
                 )
             return joints
-        if isinstance(names, Mapping) and len(names) == 1:  # {"motors": [...]}, as some have it
-            names = next(iter(names.values()))
-        told = [str(name) for name in names] if isinstance(names, list) else []
+        told = names_of(feature)
         return told if len(told) == width else [f"{self.state}[{k}]" for k in range(width)]
 
 
@@ -98,27 +97,36 @@ def _recorded(dataset: Dataset, index: int, uuid: str, root: Path, told: Whose, 
     cameras = {key.removeprefix(video_key("")).replace("/", "."): key for key in keys}
     action = ACTION if _is_vector(dataset.features.get(ACTION, {})) else None
     episode = dataset.episode(index, ColumnMapping(state=told.state, action=action, videos=cameras))
+    beside = carried(dataset, index, told.state)
     settings = RecordingSettings(min_free_bytes=0)
     with ExitStack() as stack:
         pictures = {camera: stack.enter_context(episode.pictures(camera)) for camera in cameras}
-        manifest = _manifest(dataset, episode, uuid, told, name, _sizes(pictures, settings))
+        manifest = _manifest(dataset, episode, uuid, told, name, _sizes(pictures, settings), beside)
         journal = EpisodeJournal(root, settings, patient=True)
         journal.begin(manifest)
         try:
             for row in range(episode.length):
-                journal.append(_row(episode, row, {camera: each[row] for camera, each in pictures.items()}))
+                shown = {camera: each[row] for camera, each in pictures.items()}
+                journal.append(_row(episode, row, shown, beside))
                 journal.append(_tick(episode, row))
         except BaseException as error:
             journal.end(Outcome("failed", f"the import of row {row} failed: {error}", time.time()))
             raise
-        journal.end(Outcome("finished", f"imported: episode {index} of {name}", time.time()))
+        reason = "; ".join([f"imported: episode {index} of {name}", *beside.left_out])
+        journal.end(Outcome("finished", reason, time.time()))
     if losses := journal.losses():
         raise RecordingError(f"{dataset.root}, episode {index}: {'; '.join(loss.text for loss in losses)}")
     return root / uuid
 
 
 def _manifest(
-    dataset: Dataset, episode: RecordedEpisode, uuid: str, told: Whose, name: str, sizes: Mapping[str, Any]
+    dataset: Dataset,
+    episode: RecordedEpisode,
+    uuid: str,
+    told: Whose,
+    name: str,
+    sizes: Mapping[str, Any],
+    beside: Carried,
 ) -> dict[str, Any]:
     joints = told.names(dataset)
     own = str(dataset.info.get("robot_type") or "")
@@ -132,19 +140,25 @@ def _manifest(
         "robot": {
             "name": told.robot or own,
             "joint_names": joints,
-            "eef_names": [],
+            "eef_names": list(beside.eef_names),
             "dim": len(joints),
-            "eef_dim": 0,
+            "eef_dim": len(beside.eef_names),
         },
         "fps": dataset.fps,
         "control_rate": dataset.fps,
         "cameras": sizes,
-        "streams": {},
+        "streams": dict.fromkeys(beside.vectors, True),
         "capture_streams": [],
         "started_wall": time.time(),
         "started_monotonic": 0.0,
         "configuration": {},
-        "imported": {"dataset": name, "index": episode.index, "state": told.state, "robot": told.robot},
+        "imported": {
+            "dataset": name,
+            "index": episode.index,
+            "state": told.state,
+            "robot": told.robot,
+            "columns": dict(beside.columns),
+        },
     }
 
 
@@ -154,7 +168,7 @@ def _sizes(pictures: Mapping[str, PictureSequence], settings: RecordingSettings)
     return {camera: {"width": width, "height": height} for camera, (height, width) in sizes.items()}
 
 
-def _row(episode: RecordedEpisode, row: int, pictures: Mapping[str, Any]) -> Row:
+def _row(episode: RecordedEpisode, row: int, pictures: Mapping[str, Any], beside: Carried) -> Row:
     return Row(
         index=row,
         step=row,
@@ -165,6 +179,7 @@ def _row(episode: RecordedEpisode, row: int, pictures: Mapping[str, Any]) -> Row
         captured={},
         pictures=pictures,
         control_source="unknown",
+        **beside.row(row),
     )
 
 

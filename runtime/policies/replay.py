@@ -17,6 +17,7 @@ from runtime.errors import PolicyError, RecordingError
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.request import poses_of
 from runtime.pose_format import PoseFormat
+from runtime.recording.base import IMPORTED
 from runtime.section import Section
 from runtime.types import ActionChunk, Conditioning, Float32, Observation, Space
 
@@ -127,6 +128,11 @@ class ReplayPolicy(Policy):
         if poses and not journal.has_stream(column):
             raise PolicyError(
                 f'{self._config.path} has no poses of its actions; allowed: policy.space = "joint"'
+            )
+        if poses and journal.manifest.get("kind") == IMPORTED:
+            raise PolicyError(
+                f"{self._config.path} was imported: nobody knows in which frames its poses are; allowed: "
+                'policy.space = "joint"'
             )
         names = journal.manifest["robot"][key]
         return _Recorded(journal.finite_vectors(column), journal.fps, journal.task, journal.robot, names)

@@ -16,8 +16,10 @@ from django.core.management import CommandError, call_command
 from django.test import Client
 from django.urls import reverse
 
+import robots
 from evaweb.datasets.importing import imported
 from evaweb.datasets.job_kinds import dataset as run_order
+from evaweb.datasets.on_robot import recorded_at
 from evaweb.episodes.job_kinds import preview, publish_episode
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import reconcile
@@ -29,13 +31,17 @@ from evaweb.reviews.models import Standing
 from evaweb.reviews.selectors import report_get
 from evaweb.reviews.services import review_add, segment_put
 from evaweb.stations.models import Station
+from runtime.clock import VirtualClock
 from runtime.datasets.consistency import check
+from runtime.datasets.journal import read_journal
 from runtime.datasets.operations import convert
 from runtime.datasets.reader import open_dataset
-from runtime.errors import RecordingError
+from runtime.errors import PolicyError, RecordingError
+from runtime.policies import replay
+from runtime.recording.layout import VECTOR_STREAMS
 from tests.evaweb.conftest import person
 from tests.runtime.datasets.foreign import Plan, column, write
-from tests.runtime.datasets.small import JOINTS
+from tests.runtime.datasets.small import JOINTS, POSES
 
 pytestmark = pytest.mark.django_db
 Foreign = Callable[..., Path]
@@ -92,6 +98,62 @@ def test_it_is_replayed_with_its_own_numbers(browser: Client, tmp_path: Path) ->
     assert curves.header["held"] == []
     video = browser.get(told["videos"][0]["address"])
     assert video.status_code == 200
+
+
+BESIDE = {
+    "observation.qvel": ("qvel", len(JOINTS)),
+    "observation.effort": ("effort", len(JOINTS)),
+    "observation.eef": ("eef", len(POSES)),
+    "action_eef": ("eef_action", len(POSES)),
+}
+
+
+def wide(**widths: int) -> dict[str, int]:
+    given = {name: width for name, (_, width) in BESIDE.items()}
+    return {"observation.state": len(JOINTS), "action": len(JOINTS), **given, **widths}
+
+
+def test_velocities_efforts_and_poses_come_along(data: Path, tmp_path: Path) -> None:
+    names = {"observation.eef": POSES, "action_eef": POSES}
+    source = theirs(tmp_path, widths=wide(), names=names)
+    journal = read_journal(data / "episodes" / str(imported(source).episodes[1]))
+    for name, (stream, width) in BESIDE.items():
+        stored = column(1, name, 8, Plan(smooth=True, widths=wide()))
+        assert np.array_equal(journal.vectors(stream), stored)
+        assert stored.shape == (8, width)
+    assert journal.manifest["imported"]["columns"] == {stream: name for name, (stream, _) in BESIDE.items()}
+    assert journal.manifest["robot"]["eef_names"] == list(POSES)
+    assert not journal.flags("eef_measured").any()  # nobody knows
+    assert journal.outcome["reason"] == "imported: episode 1 of datasets/cups"
+
+
+def test_what_cannot_be_told_apart_or_has_another_width_is_left_out_and_named(
+    data: Path, tmp_path: Path
+) -> None:
+    wrong = [*POSES[:3], POSES[6], *POSES[3:6], *POSES[7:]]  # x, y, z, w last
+    widths = wide(**{"observation.effort": 2})
+    source = theirs(tmp_path, widths=widths, names={"observation.eef": wrong})
+    journal = read_journal(data / "episodes" / str(imported(source).episodes[0]))
+    assert [stream for stream in VECTOR_STREAMS if journal.has_stream(stream)] == ["qvel"]
+    reason = journal.outcome["reason"]
+    assert "observation.effort is left out: its rows have 2 numbers, expected 6" in reason
+    assert "observation.eef is left out: its numbers are called left_arm.x, left_arm.y" in reason
+    assert "action_eef is left out: its numbers are called nothing; allowed: ARM.x, ARM.y" in reason
+
+
+def test_poses_of_others_are_sent_to_no_robot(data: Path, tmp_path: Path) -> None:
+    source = theirs(tmp_path, widths=wide(), names=dict.fromkeys(("observation.eef", "action_eef"), POSES))
+    done = imported(source)
+    for name in (str(done.episodes[0]), f"{done.dataset}:0"):
+        recorded = recorded_at(name)
+        assert list(recorded.poses) == list(POSES)
+        assert not recorded.ours
+    path = str(data / "episodes" / str(done.episodes[0]))
+    policy = replay.build(
+        replay.Config(path=path, space="eef"), robots.load("agilex_piper"), VirtualClock(), 30.0
+    )
+    with pytest.raises(PolicyError, match="was imported: nobody knows in which frames its poses are"):
+        policy.connect()
 
 
 def test_pictures_in_columns_are_played_too(data: Path, tmp_path: Path) -> None:
@@ -239,6 +301,10 @@ def test_the_real_episode_is_imported_reviewed_and_converted_there_and_back(
     assert not report["unchecked"]
     told = browser.get(reverse("replay", args=[uuid])).context["config"]
     assert browser.get(told["geometry"]).status_code == 200
+    journal, source = read_journal(data / "episodes" / str(uuid)), open_dataset(Path(SAMPLE)).table(0)
+    for stream, name in journal.manifest["imported"]["columns"].items():
+        assert np.array_equal(journal.vectors(stream), np.array(source[name].to_pylist(), np.float32))
+    assert [name for name in VECTOR_STREAMS if journal.has_stream(name)] == list(VECTOR_STREAMS)
     episode, ann = Episode.objects.get(uuid=uuid), person("ann", "operator")
     review_add(user=ann, episode=episode, verdict="pass")
     segment_put(user=ann, episode=episode, first=0, last=100, label="reach")

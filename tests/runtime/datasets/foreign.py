@@ -45,6 +45,7 @@ class Plan:
     b_frames: int = 3
     key_frames: bool = True  # whether each episode begins with a key frame
     widths: Mapping[str, int] = field(default_factory=lambda: WIDTHS)
+    names: Mapping[str, Sequence[str]] = field(default_factory=dict)  # of the numbers of some columns
     smooth: bool = False  # motion that a robot could make; else noise
 
     @property
@@ -152,7 +153,8 @@ def _video(path: Path, plan: Plan, episodes: Sequence[int]) -> None:
 
 def _info(plan: Plan) -> dict[str, Any]:
     features: dict[str, Any] = {
-        name: {"dtype": "float32", "shape": [width], "names": None} for name, width in plan.widths.items()
+        name: {"dtype": "float32", "shape": [width], "names": plan.names.get(name)}
+        for name, width in plan.widths.items()
     }
     for keys, dtype in ((plan.videos, "video"), (plan.images, "image")):
         for key in keys:

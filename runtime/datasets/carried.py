@@ -1,0 +1,103 @@
+"""What an imported episode has beside its joints and pictures: velocities, efforts, poses of its end effectors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robots import EEF_FIELDS
+from runtime.datasets.mapping import ColumnMapping
+from runtime.datasets.reader import Dataset
+from runtime.errors import RecordingError
+from runtime.types import Float32
+
+
+class _Kind(NamedTuple):
+    """Where a stream of a recording comes from: keys of a mapping and of an episode, and what columns are called."""
+
+    mapped: str
+    read: str
+    columns: tuple[str, ...]  # the first that there is
+
+
+_KINDS: Mapping[str, _Kind] = {
+    "qvel": _Kind("velocity", "qvel", ("joint_velocity", "observation.velocity", "observation.qvel")),
+    "effort": _Kind("effort", "effort", ("joint_effort", "observation.effort")),
+    "eef": _Kind("eef", "eef", ("eef_state", "observation.eef")),
+    "eef_action": _Kind("action_eef", "action_eef", ("eef_action", "action_eef")),
+}
+_POSES = ("eef", "eef_action")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Carried:
+    """`vectors` [N, W] by stream, the `columns` they are from, the names of poses; what is left out, and why."""
+
+    vectors: Mapping[str, Float32]
+    columns: Mapping[str, str]
+    eef_names: Sequence[str]
+    left_out: Sequence[str]
+
+    def row(self, index: int) -> dict[str, Any]:
+        """The vectors of one row, for a Row; None where nothing of one is known."""
+        given = {stream: vectors[index] for stream, vectors in self.vectors.items()}
+        return {stream: None if np.isnan(vector).all() else vector for stream, vector in given.items()}
+
+
+def carried(dataset: Dataset, index: int, state: str) -> Carried:
+    """What episode `index` has beside the joints in `state`: as many numbers as these, or poses written as ours."""
+    vectors: dict[str, Float32] = {}
+    columns: dict[str, str] = {}
+    names: Sequence[str] = ()
+    left_out: list[str] = []
+    for stream, kind in _KINDS.items():
+        column = next((name for name in kind.columns if name in dataset.features and name != state), None)
+        if column is None:
+            continue
+        try:
+            told = _pose_names(dataset, column, names) if stream in _POSES else ()
+            vectors[stream] = _read(dataset, index, state, kind, column, len(told))
+        except RecordingError as error:
+            left_out.append(f"{column} is left out: {error}")
+            continue
+        columns[stream] = column
+        names = told or names
+    return Carried(vectors, columns, names, left_out)
+
+
+def names_of(feature: Mapping[str, Any]) -> list[str]:
+    """What a feature calls its numbers, [] where it does not say."""
+    names = feature.get("names")
+    if isinstance(names, Mapping) and len(names) == 1:  # {"motors": [...]}, as some have it
+        names = next(iter(names.values()))
+    return [str(name) for name in names] if isinstance(names, list) else []
+
+
+def _pose_names(dataset: Dataset, column: str, others: Sequence[str]) -> list[str]:
+    told = names_of(dataset.features[column])
+    fields = [name.rpartition(".")[2] for name in told]
+    if not told or fields != list(EEF_FIELDS) * (len(told) // len(EEF_FIELDS)):
+        raise RecordingError(
+            f"its numbers are called {', '.join(told) or 'nothing'}; allowed: ARM.{', ARM.'.join(EEF_FIELDS)}"
+        )
+    if others and told != list(others):
+        raise RecordingError(
+            f"its numbers are {', '.join(told)}, those of the measured poses {', '.join(others)}"
+        )
+    return told
+
+
+def _read(dataset: Dataset, index: int, state: str, kind: _Kind, column: str, width: int) -> Float32:
+    """The column's rows, as wide as the poses' names or, without any (0), as the state."""
+    episode = dataset.episode(
+        index,
+        ColumnMapping.model_validate({"state": state, "action": None, "videos": {}, kind.mapped: column}),
+    )
+    values: Float32 = getattr(episode, kind.read)
+    expected = width or episode.qpos.shape[1]
+    if values.shape[1] != expected:
+        raise RecordingError(f"its rows have {values.shape[1]} numbers, expected {expected}")
+    return values
