@@ -31,7 +31,7 @@ Run = Callable[[Sequence[str]], int]
 
 
 def whole(run: Run, failed: Callable[[], list[str]], tell: Callable[[str], None]) -> int:
-    """The exit code of the suite; `run` runs pytest with these arguments, `failed` are the test ids that failed since."""
+    """The exit code of the suite; `run` runs pytest so, `failed` are the ids of what failed since."""
     codes = [run(_SIDE_BY_SIDE), run(_ALONE)]
     worst = max(codes)
     if worst != _TESTS_FAILED:
