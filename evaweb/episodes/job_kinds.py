@@ -1,4 +1,4 @@
-"""The jobs of episodes: preview, export, publish, reconcile; and what every worker looks after."""
+"""The jobs of episodes: preview, export, smoothness, publish, reconcile; and what every worker looks after."""
 
 from __future__ import annotations
 
@@ -18,11 +18,15 @@ from evaweb.episodes.preview import make_preview
 from evaweb.episodes.publishing import dataset_name, success_of
 from evaweb.episodes.reconcile import reconcile
 from evaweb.episodes.recorded import recorded_in
+from evaweb.episodes.smoothness import Smoothness, smoothness_in
 from evaweb.jobs.kinds import Work, at_start, chore, job_kind
 from evaweb.jobs.services import enqueue
 from runtime.datasets.published import never_published, publish
 from runtime.recording.export import export
+from runtime.recording.files import RecordingError
 from runtime.recording.labels import newest
+
+_AT_ONCE = 20  # asked for in one look
 
 
 @job_kind("preview")
@@ -39,6 +43,22 @@ def export_episode(work: Work) -> Mapping[str, Any]:
     """Write its three streams as one parquet table, unless the station has done so; args: uuid."""
     path = export(journal_folder(UUID(work.args["uuid"])), data_dir())
     return {"file": str(path.relative_to(data_dir())), "bytes": path.stat().st_size}
+
+
+@job_kind("smoothness")
+def measure_smoothness(work: Work) -> Mapping[str, Any]:
+    """Measure how smoothly the robot moved, or keep why that is not known; args: uuid."""
+    uuid = UUID(work.args["uuid"])
+    try:
+        found = smoothness_in(journal_folder(uuid))
+    except RecordingError as error:
+        found = Smoothness(None, None, {}, str(error))
+    Episode.objects.filter(uuid=uuid).update(
+        smoothness=found.measured,
+        smoothness_commanded=found.commanded,
+        smoothness_detail={"arms": {name: dict(arm) for name, arm in found.arms.items()}, "why": found.why},
+    )
+    return {"smoothness": found.measured, "why": found.why}
 
 
 @job_kind("publish")
@@ -111,3 +131,9 @@ def reconcile_at_start() -> None:
 def look_for_closed() -> int:
     """Episodes that a station has repaired, or closed while the web was away."""
     return services.catch_up()
+
+
+@chore("runs to be measured")
+def look_for_unmeasured() -> int:
+    """Runs that were closed, here or elsewhere, since the last look."""
+    return services.smoothness_asked(most=_AT_ONCE)

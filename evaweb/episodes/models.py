@@ -53,6 +53,13 @@ class Episode(models.Model):
     configuration_hash = models.CharField(max_length=64, blank=True)
     control = models.JSONField(default=dict, blank=True, help_text="The control loop's figures at the end.")
     policy = models.JSONField(default=dict, blank=True, help_text="Latencies and delays of the policy.")
+    smoothness = models.FloatField(
+        null=True, blank=True, help_text="SPARC of the measured speed of its end effectors; none: not known."
+    )
+    smoothness_commanded = models.FloatField(null=True, blank=True, help_text="The same of what was sent.")
+    smoothness_detail = models.JSONField(
+        null=True, blank=True, help_text="Arm by arm, or why there is none; null: nobody was asked yet."
+    )
     previewed_at = models.DateTimeField(null=True, blank=True, help_text="Since when videos can be played.")
     dataset = models.CharField(max_length=240, blank=True, help_text="Relative to the data folder.")
     dataset_index = models.PositiveIntegerField(null=True, blank=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import robots
 from evaweb.errors import NotFound
 from evaweb.stations.looks import Looks, groups_of, looks_of
 
@@ -23,11 +24,27 @@ def groups_in(manifest: Mapping[str, Any]) -> tuple[str, ...] | None:
 
 def looks_in(manifest: Mapping[str, Any]) -> Looks:
     """The robot as it is described today; NotFound where it is not, or has other joints than were recorded."""
-    recorded = robot_in(manifest)
-    name, groups, dim = str(recorded.get("name", "")), groups_in(manifest), recorded.get("dim")
-    looks = looks_of(name, groups)
-    if looks.robot.dim != dim:
-        raise NotFound(f"the episode has {dim} joints, {name} has {looks.robot.dim} today")
-    if groups is not None and list(looks.robot.joint_names) != recorded["joint_names"]:
-        raise NotFound(f"the joints of {name} have other names, or another order, today")
+    looks = looks_of(str(robot_in(manifest).get("name", "")), groups_in(manifest))
+    _require_same(looks.robot, manifest)
     return looks
+
+
+def described_in(manifest: Mapping[str, Any]) -> robots.Robot:
+    """The same without its looks, for who draws nothing."""
+    name, groups = str(robot_in(manifest).get("name", "")), groups_in(manifest)
+    if name not in robots.names():
+        raise NotFound(f"robot {name!r:.80} does not exist; there are: {', '.join(robots.names())}")
+    try:
+        robot = robots.load(name, groups)
+    except robots.RobotError as error:
+        raise NotFound(str(error)) from error
+    _require_same(robot, manifest)
+    return robot
+
+
+def _require_same(robot: robots.Robot, manifest: Mapping[str, Any]) -> None:
+    recorded = robot_in(manifest)
+    if robot.dim != recorded.get("dim"):
+        raise NotFound(f"the episode has {recorded.get('dim')} joints, {robot.name} has {robot.dim} today")
+    if groups_in(manifest) is not None and list(robot.joint_names) != recorded["joint_names"]:
+        raise NotFound(f"the joints of {robot.name} have other names, or another order, today")

@@ -103,6 +103,9 @@ def episode_read(*, uuid: UUID, station: Station | None = None) -> Episode:
     )
     if episode.status in CLOSED and episode.frames and episode.cameras and episode.previewed_at is None:
         preview_asked(episode=episode)
+    if episode.smoothness is None and episode.smoothness_detail is not None:
+        episode.smoothness_detail = None  # what the folder lacked may be there now
+        episode.save(update_fields=["smoothness_detail"])
     return episode
 
 
@@ -114,6 +117,20 @@ def preview_asked(*, episode: Episode) -> Job:
 def export_asked(*, episode: Episode) -> Job:
     """Have the worker write its three streams as one table; it leaves one alone that is there."""
     return enqueue(kind="export", key=job_key(episode.uuid), args={"uuid": str(episode.uuid)})
+
+
+def smoothness_asked(*, most: int) -> int:
+    """Have the worker measure closed runs that nobody asked for yet, at most so many; how many."""
+    rows = Episode.objects.filter(
+        status__in=CLOSED, kind="rollout", frames__gt=0, smoothness_detail__isnull=True
+    )
+    found = list(rows.order_by("created_at")[:most])
+    for episode in found:
+        with transaction.atomic():
+            # Asked for once, however it ends: a job that failed is there to be seen and to be tried again.
+            Episode.objects.filter(pk=episode.pk).update(smoothness_detail={})
+            enqueue(kind="smoothness", key=f"smoothness:{episode.uuid}", args={"uuid": str(episode.uuid)})
+    return len(found)
 
 
 def publish_asked(*, episode: Episode, version: str = "") -> Job | None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from evaweb.statistics.base import StatisticsError
 
-_CUT_OFF = 10.0  # [Hz] beyond it is no movement
+CUT_OFF = 10.0  # [Hz] beyond it is no movement
 _AMPLITUDE = 0.05  # of the largest: what is below, at the end, is noise
 _PADDING = 4  # the spectrum is taken at 2^4 times the next power of two samples
 
@@ -34,7 +34,7 @@ def sparc(speed: Sequence[float], rate: float) -> float:
         raise StatisticsError("nothing moved: smoothness is not defined")
     spectrum /= spectrum.max()
     frequency = np.arange(size) * rate / size
-    within = frequency <= _CUT_OFF
+    within = frequency <= CUT_OFF
     frequency, spectrum = frequency[within], spectrum[within]
     loud = np.flatnonzero(spectrum >= _AMPLITUDE)
     frequency, spectrum = frequency[loud[0] : loud[-1] + 1], spectrum[loud[0] : loud[-1] + 1]
