@@ -70,11 +70,14 @@ class EpisodeOut(Schema):
 
 
 class EpisodeDetail(EpisodeOut):
-    """With the figures of the control loop at its end."""
+    """With the figures of the control loop at its end, and how smoothly the robot moved (SPARC; null: not known)."""
 
     configuration_hash: str
     control: dict[str, Any]
     policy: dict[str, Any]
+    smoothness: float | None
+    smoothness_commanded: float | None
+    smoothness_detail: dict[str, Any] | None
 
     @staticmethod
     def of(episode: Episode, sight: Sight) -> dict[str, Any]:
@@ -85,6 +88,9 @@ class EpisodeDetail(EpisodeOut):
             "configuration_hash": "" if hidden else episode.configuration_hash,
             "control": {} if hidden else episode.control,
             "policy": {} if hidden else episode.policy,
+            "smoothness": None if hidden else episode.smoothness,
+            "smoothness_commanded": None if hidden else episode.smoothness_commanded,
+            "smoothness_detail": None if hidden else episode.smoothness_detail,
         }
 
 

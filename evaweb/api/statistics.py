@@ -31,6 +31,10 @@ class StatisticsOut(Schema):
     level: float | None
     mean_score: float | None
     median_duration_s: float | None
+    smoothness: float | None
+    smoothness_low: float | None
+    smoothness_high: float | None
+    smoothness_n: int
     to_score: int
     interrupted: int
     voided: int
@@ -39,6 +43,8 @@ class StatisticsOut(Schema):
     def of(row: StatisticsRow) -> dict[str, Any]:
         """Flat, the same for JSON and CSV."""
         success, interval = row.summary.success, row.summary.success.interval
+        smooth = row.summary.smoothness
+        spread = smooth.interval if smooth else None
         return {
             "scene": row.scene.name,
             "scene_title": row.scene.title,
@@ -51,6 +57,10 @@ class StatisticsOut(Schema):
             "level": interval and interval.level,
             "mean_score": row.summary.mean_score,
             "median_duration_s": row.summary.median_duration_s,
+            "smoothness": smooth and smooth.value,
+            "smoothness_low": spread and spread.low,
+            "smoothness_high": spread and spread.high,
+            "smoothness_n": smooth.n if smooth else 0,
             "to_score": row.to_score,
             "interrupted": row.interrupted,
             "voided": row.voided,
@@ -65,7 +75,8 @@ class Statistics(Schema):
 
 
 METHOD = (
-    "success rate with Wilson 95 % interval over scored trials; voided and interrupted trials do not count"
+    "success rate with Wilson 95 % interval over scored trials; voided and interrupted trials do not count; "
+    "smoothness: mean SPARC of those that were recorded, with Student's 95 % interval"
 )
 
 
@@ -76,7 +87,7 @@ METHOD = (
     url_name="statistics",
 )
 def statistics(request: HttpRequest, filters: Query[Filters], format: Format = "json") -> Any:
-    """Counts, success rate with its Wilson 95 % interval, mean score, median duration; also CSV and Parquet."""
+    """Counts, success rate with its Wilson 95 % interval, mean score, median duration, smoothness; CSV, Parquet."""
     rows = [StatisticsOut.of(row) for row in selectors.statistics(filters.chosen(), sight_for(request))]
     if format != "json":
         columns = {name: field.annotation for name, field in StatisticsOut.model_fields.items()}

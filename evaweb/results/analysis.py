@@ -16,6 +16,7 @@ from evaweb.statistics import strata
 from evaweb.statistics.base import LEVEL, Interval, StatisticsError
 from evaweb.statistics.difference import Difference, ExactTest, barnard, newcombe, probability_better
 from evaweb.statistics.many import holm, letters
+from evaweb.statistics.means import Average, average
 from evaweb.statistics.paired import McNemar, cluster_bootstrap, mcnemar
 from evaweb.statistics.progress import Step, funnel
 from evaweb.statistics.proportions import Posterior, Proportion, clopper_pearson, posterior, proportion
@@ -42,7 +43,8 @@ class Arm:
 
     `macro` is the mean of the scenes' success rates, each equally heavy; `cells` success by initial condition;
     `speed` successes per hour of running, `interventions` how often a run was broken off. `curve` and `mean_time` are
-    of time to success [s], with trials that failed counted as cut off at their end.
+    of time to success [s], with trials that failed counted as cut off at their end. `smoothness` is SPARC of what was
+    measured, `commanded` of what was sent, over those trials of which there is a recording.
     """
 
     checkpoint: str
@@ -59,6 +61,8 @@ class Arm:
     speed: Rate | None
     interventions: Rate | None
     failures: tuple[tuple[str, int], ...]
+    smoothness: Average | None
+    commanded: Average | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +175,8 @@ def _arm(name: str, trials: list[Outcome], interruptions: list[Interruption]) ->
         rate(sum(succeeded), sum(durations)) if timed and sum(durations) > 0 else None,
         _interventions(durations, interruptions),
         tuple(Counter(o.failure for o in trials if not o.success and o.failure).most_common()),
+        average([o.smoothness for o in trials if o.smoothness is not None]),
+        average([o.commanded for o in trials if o.commanded is not None]),
     )
 
 

@@ -44,6 +44,7 @@ def fingerprint(plan: Plan) -> Hashable:
         verdicts=Sum("verdict_id", filter=Q(status=TrialStatus.SCORED)),
         newest=Max("verdict_id"),
         seconds=Sum("duration_s"),
+        measured=Count("episode__smoothness"),
         changed=Max("changed_at"),
     )
     names = plan.checkpoints.order_by("pk").values_list("pk", "name")

@@ -11,6 +11,7 @@ from typing import Any
 from evaweb.results.analysis import Analysis, Arm, Comparison
 from evaweb.statistics.base import Interval
 from evaweb.statistics.difference import Difference
+from evaweb.statistics.means import Average
 from evaweb.statistics.proportions import Proportion
 from evaweb.statistics.rates import Rate
 from evaweb.statistics.sequential import Evidence
@@ -57,6 +58,8 @@ def arm_document(arm: Arm) -> dict[str, Any]:
         "successes_per_hour": _rate(arm.speed),
         "interruptions_per_hour": _rate(arm.interventions),
         "failures": dict(arm.failures),
+        "smoothness": _average(arm.smoothness),
+        "smoothness_commanded": _average(arm.commanded),
     }
 
 
@@ -107,6 +110,10 @@ def _ends(interval: Interval | None) -> list[float] | None:
 
 def _mean(found: Mean | None) -> dict[str, Any] | None:
     return None if found is None else {"value": found.value, "bootstrap": _ends(found.interval)}
+
+
+def _average(found: Average | None) -> dict[str, Any] | None:
+    return None if found is None else {"n": found.n, "mean": found.value, "student": _ends(found.interval)}
 
 
 def _clustered(found: Difference | None) -> dict[str, Any] | None:

@@ -24,6 +24,8 @@ _FIELDS = (
     "verdict__success",
     "verdict__score",
     "verdict__failure",
+    "episode__smoothness",
+    "episode__smoothness_commanded",
 )
 
 
@@ -69,6 +71,8 @@ def _outcomes(trials: QuerySet[Trial], blocks: dict[int, str], order: dict[int, 
             success,
             score,
             why,
+            smoothness,
+            commanded,
         ) = row
         reached = milestones.get(verdict, [])
         found.append(
@@ -87,6 +91,8 @@ def _outcomes(trials: QuerySet[Trial], blocks: dict[int, str], order: dict[int, 
                 station=station,
                 operator=operator,
                 labels=tuple(text for text, _ in reached),
+                smoothness=smoothness,
+                commanded=commanded,
             )
         )
     return sorted(found, key=lambda outcome: outcome.order)

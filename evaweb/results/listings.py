@@ -16,6 +16,7 @@ from evaweb.results.filters import Chosen, choices
 from evaweb.results.outcomes import Outcome, paired
 from evaweb.results.wording import ends
 from evaweb.statistics.proportions import Proportion
+from evaweb.trials.figures import average_words
 from evaweb.trials.models import Trial
 
 MOST_PAIRS = 200
@@ -45,6 +46,8 @@ def arm_rows(plan: Plan, analysis: Analysis, only: Chosen) -> list[dict[str, Any
             "speed": arm.speed
             and f"{arm.speed.per_hour:.1f} [{arm.speed.interval.low:.1f}, {arm.speed.interval.high:.1f}]",
             "between": _between(arm),
+            "smoothness": average_words(arm.smoothness, arm.success.n),
+            "commanded": average_words(arm.commanded, arm.success.n),
         }
         for arm in analysis.arms
     ]

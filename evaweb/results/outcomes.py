@@ -29,6 +29,8 @@ class Outcome:
     station: str = ""
     operator: str = ""
     labels: tuple[str, ...] = field(default=())  # of the milestones
+    smoothness: float | None = None  # SPARC of the measured motion; None where there is no recording of it
+    commanded: float | None = None  # the same of what was sent
 
     @property
     def condition(self) -> str:

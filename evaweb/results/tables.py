@@ -45,6 +45,8 @@ class OutcomeRow:
     started_at: datetime | None
     ended_at: datetime | None
     duration_s: float | None
+    smoothness: float | None
+    smoothness_commanded: float | None
     episode: str | None
 
 
@@ -77,6 +79,8 @@ _FIELDS = (
     ("started_at", "started_at"),
     ("ended_at", "ended_at"),
     ("duration_s", "duration_s"),
+    ("smoothness", "episode__smoothness"),
+    ("smoothness_commanded", "episode__smoothness_commanded"),
     ("episode", "episode_id"),
 )
 PAGE = 1000

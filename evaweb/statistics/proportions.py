@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from statistics import median
 
 from evaweb.statistics.base import LEVEL, Interval, StatisticsError, check_counts, check_level, z_of
+from evaweb.statistics.means import Average, average
 
 __all__ = ["LEVEL", "Interval", "Posterior", "Proportion", "StatisticsError", "Summary"]
 
@@ -62,6 +63,7 @@ class Summary:
     success: Proportion
     mean_score: float | None
     median_duration_s: float | None
+    smoothness: Average | None = None
 
 
 def proportion(successes: int, n: int, level: float = LEVEL) -> Proportion:
@@ -107,10 +109,16 @@ def posterior(successes: int, n: int) -> Posterior:
     return Posterior(1.0 + successes, 1.0 + n - successes)
 
 
-def summary(outcomes: Sequence[bool], scores: Sequence[float], durations: Sequence[float]) -> Summary:
-    """Of the scored trials of one cell: success, score (0 to 1) and duration [s] of each, where it is known."""
+def summary(
+    outcomes: Sequence[bool],
+    scores: Sequence[float],
+    durations: Sequence[float],
+    smoothness: Sequence[float] = (),
+) -> Summary:
+    """Of the scored trials of one cell: success, score (0 to 1), duration [s] and SPARC of each, as far as known."""
     return Summary(
         proportion(sum(map(bool, outcomes)), len(outcomes)),
         math.fsum(scores) / len(scores) if scores else None,
         float(median(durations)) if durations else None,
+        average(smoothness),
     )

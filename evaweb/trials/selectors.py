@@ -224,6 +224,7 @@ def statistics(filters: TrialFilters | None = None, sight: Sight = EVERYTHING) -
 
 
 _Cell = tuple[int, int]  # scene, checkpoint
+_Outcome = tuple[bool, float, float | None, float | None]  # success, score, seconds, smoothness
 _summaries: Kept[dict[_Cell, Summary]] = Kept()
 
 
@@ -235,6 +236,7 @@ def _fingerprint(trials: QuerySet[Trial]) -> Hashable:
         verdicts=Sum("verdict_id", filter=scored),
         newest=Max("verdict_id", filter=scored),
         seconds=Sum("duration_s", filter=scored),
+        measured=Count("episode__smoothness", filter=scored),
         changed=Max("changed_at"),
     )
     return tuple(counted.values())
@@ -244,13 +246,12 @@ def _summarised(trials: QuerySet[Trial]) -> dict[_Cell, Summary]:
     return {cell: _summary(outcomes) for cell, outcomes in _scored_cells(trials).items()}
 
 
-def _scored_cells(trials: QuerySet[Trial]) -> dict[_Cell, list[tuple[bool, float, float | None]]]:
-    cells: dict[_Cell, list[tuple[bool, float, float | None]]] = defaultdict(list)
+def _scored_cells(trials: QuerySet[Trial]) -> dict[_Cell, list[_Outcome]]:
+    cells: dict[_Cell, list[_Outcome]] = defaultdict(list)
     scored = trials.filter(status=TrialStatus.SCORED)
-    for scene, checkpoint, *outcome in scored.values_list(
-        "scene_id", "checkpoint_id", "verdict__success", "verdict__score", "duration_s"
-    ):
-        cells[scene, checkpoint].append((outcome[0], outcome[1], outcome[2]))
+    named = ("verdict__success", "verdict__score", "duration_s", "episode__smoothness")
+    for scene, checkpoint, *outcome in scored.values_list("scene_id", "checkpoint_id", *named):
+        cells[scene, checkpoint].append((outcome[0], outcome[1], outcome[2], outcome[3]))
     return cells
 
 
@@ -263,11 +264,12 @@ def _other_counts(trials: QuerySet[Trial]) -> dict[_Cell, dict[str, int]]:
     return found
 
 
-def _summary(outcomes: Sequence[tuple[bool, float, float | None]]) -> Summary:
+def _summary(outcomes: Sequence[_Outcome]) -> Summary:
     return summary(
-        [success for success, _, _ in outcomes],
-        [score for _, score, _ in outcomes],
-        [seconds for _, _, seconds in outcomes if seconds is not None],
+        [success for success, *_ in outcomes],
+        [score for _, score, *_ in outcomes],
+        [seconds for _, _, seconds, _ in outcomes if seconds is not None],
+        [smooth for *_, smooth in outcomes if smooth is not None],
     )
 
 

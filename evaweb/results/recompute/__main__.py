@@ -91,10 +91,16 @@ def _trial(row: dict[str, str]) -> Trial:
         status=row["status"],
         success=row["success"] == "true",
         score=float(row["score"] or 0),
-        duration=float(row["duration_s"]) if row["duration_s"] else None,
+        duration=_float(row["duration_s"]),
         failure=row["failure"],
         milestones=tuple((text, reached) for text, reached in json.loads(row["milestones"] or "[]")),
+        smoothness=_float(row["smoothness"]),
+        commanded=_float(row["smoothness_commanded"]),
     )
+
+
+def _float(cell: str) -> float | None:
+    return float(cell) if cell else None
 
 
 def differences(shown: Any, found: Any, where: str) -> Iterator[tuple[str, str]]:

@@ -11,6 +11,7 @@ from itertools import combinations
 from typing import Any
 
 from . import methods
+from .means import student
 
 DRAWS = 4000
 
@@ -30,6 +31,8 @@ class Trial:
     duration: float | None
     failure: str
     milestones: tuple[tuple[str, bool], ...]
+    smoothness: float | None = None
+    commanded: float | None = None
 
     @property
     def condition(self) -> str:
@@ -120,6 +123,8 @@ def _arm(trials: Trials, broken: Trials) -> dict[str, Any]:
         "successes_per_hour": _per_hour(sum(ok for _, ok in timed), exposure),
         "interruptions_per_hour": _per_hour(len(broken), whole),
         "failures": dict(Counter(t.failure for t in trials if not t.success and t.failure)),
+        "smoothness": student([t.smoothness for t in trials if t.smoothness is not None]),
+        "smoothness_commanded": student([t.commanded for t in trials if t.commanded is not None]),
     }
 
 

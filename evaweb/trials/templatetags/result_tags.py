@@ -7,6 +7,7 @@ from typing import Any
 
 from django import template
 
+from evaweb.statistics.means import Average
 from evaweb.statistics.proportions import Proportion
 from evaweb.trials import figures
 from evaweb.trials.lifecycle import advice
@@ -31,6 +32,12 @@ def seconds(value: float | str | None) -> str:
 def interval(found: Proportion) -> str:
     """The ends of the interval in whole percent."""
     return figures.interval(found)
+
+
+@register.filter
+def averaged(found: Average | None, of: int) -> str:
+    """A mean with its interval and of how many; a dash where there is none."""
+    return figures.average_words(found, of) or "–"
 
 
 @register.filter

@@ -27,6 +27,8 @@ def test_every_statistic(asked):
     assert arm["n"] == 8
     assert arm["wilson"][0] < arm["rate"] < arm["wilson"][1]
     assert asked("results/pi0-new").json() == arm
+    assert (arm["smoothness"]["n"], arm["smoothness"]["mean"]) == (6, pytest.approx(-5.3))
+    assert arm["smoothness_commanded"]["mean"] == pytest.approx(-4.8)
     assert asked("results?position=1").json()["n"] == 8
     assert asked("comparison?first=pi0-block&second=pi0-new").json() == found["comparisons"][0]
 
@@ -51,6 +53,8 @@ def test_attempts_in_pages_as_csv_and_as_parquet(asked):
     assert {row["failure"] for row in table} == {"", "=dropped"}
     assert table[0]["duration_s"] == pytest.approx(float(rows[0]["duration_s"]))
     assert body(asked("outcomes?format=csv&position=1")).count(b"\r\n") == 9
+    assert sorted(row["smoothness"] for row in rows)[:4] == [""] * 4  # absent, and not 0
+    assert [row["smoothness"] for row in table].count(None) == 4
 
 
 @pytest.mark.parametrize("what", ["scores", "ratings", "preferences"])

@@ -54,7 +54,12 @@ def carry_out(bench):
             trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
             new = trial.checkpoint.name == "pi0-new"
             ok = (trial.number + trial.position.number) % 4 != 0 if new else trial.number == 1
-            episode = Episode.objects.create(station=bench.station, status="finished") if recorded else None
+            smooth = (
+                -5.0 - 0.1 * trial.number if trial.number > 1 else None
+            )  # the first of each was not measured
+            facts = {"smoothness": smooth, "smoothness_commanded": smooth and smooth + 0.5 * new}
+            row = {"station": bench.station, "status": "finished", **facts}
+            episode = Episode.objects.create(**row) if recorded else None
             Trial.objects.filter(pk=trial.pk).update(
                 status="ended", duration_s=8.0 + trial.number + 0.25 * new, episode=episode
             )

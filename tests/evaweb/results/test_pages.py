@@ -9,11 +9,12 @@ from django.test import Client
 from django.test.utils import CaptureQueriesContext
 from django.utils import timezone
 
+from evaweb.episodes.models import Episode
 from evaweb.plans.services import plan_close
 from evaweb.results import caching, judging
 from evaweb.results.selectors import PlanRow
 from evaweb.trials import services
-from evaweb.trials.models import Checkpoint
+from evaweb.trials.models import Checkpoint, Trial
 from tests.evaweb.trials import builders
 
 PLAN = "/result/plans/blocks/1/"
@@ -315,3 +316,22 @@ def test_a_pace_that_runs_backwards_is_none(plan):
     assert row.hours_left == pytest.approx(6.0)
     assert replace(row, until=begun - timedelta(hours=2)).hours_left is None
     assert replace(row, counted=16).hours_left is None
+
+
+def test_smoothness_stands_with_its_interval_and_how_many_trials_it_is_of(revealed, as_, viewer):
+    text = as_(viewer).get(PLAN).content.decode()
+    assert "Smoothness, SPARC" in text
+    assert text.count("−5.30 [−5.39, −5.21], 6 of 8 trials") == 3  # one of them as what was sent
+    assert "Of what was sent: −4.80 [−4.89, −4.71], 6 of 8 trials" in text
+    Trial.objects.filter(handout__plan=revealed).update(episode=None)
+    again = as_(viewer).get(PLAN).content.decode()
+    assert "6 of 8 trials" not in again
+    assert "Of what was sent: not recorded" in again
+
+
+def test_a_smoothness_that_is_measured_later_is_shown(revealed, as_, viewer):
+    before = caching.analysis_of(revealed).arm("pi0-new").smoothness
+    missing = Episode.objects.filter(trial__handout__plan=revealed, smoothness=None).first()
+    Episode.objects.filter(pk=missing.pk).update(smoothness=-9.0)
+    after = [arm.smoothness for arm in caching.analysis_of(revealed).arms]
+    assert (before.n, sorted(found.n for found in after)) == (6, [6, 7])

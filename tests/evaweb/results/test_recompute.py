@@ -37,6 +37,8 @@ def outcomes(checkpoints, n, scenes, seed):
                     reached,
                     "" if ok else chance.choice("ab"),
                     labels=("one", "two", "three"),
+                    smoothness=-chance.uniform(2, 9) if chance.random() < 0.8 else None,
+                    commanded=-3.0 if name == 0 else -chance.uniform(2, 9),
                 )
             )
     return found
@@ -56,6 +58,8 @@ def as_rows(runs):
             r.duration,
             r.failure,
             tuple(zip(r.labels, r.milestones, strict=True)),
+            r.smoothness,
+            r.commanded,
         )
         for r in runs
     ]

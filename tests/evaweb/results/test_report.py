@@ -51,6 +51,8 @@ def test_a_program_without_us_computes_every_number_again(report):
     [
         ("arms", "pi0-new", "wilson", 0),
         ("arms", "pi0-new", "time_to_success", "restricted_mean", "value_s"),
+        ("arms", "pi0-new", "smoothness", "student", 1),
+        ("arms", "pi0-block", "smoothness_commanded", "mean"),
         ("comparisons", 0, "barnard", "p"),
         ("comparisons", 0, "evidence", "log_e_first", 3),
         ("agreement", "success", "ac1"),

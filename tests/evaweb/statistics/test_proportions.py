@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evaweb.statistics.means import average
 from evaweb.statistics.proportions import (
     StatisticsError,
     clopper_pearson,
@@ -97,6 +98,8 @@ def test_a_summary_counts_averages_and_takes_the_middle():
     assert (found.success.successes, found.success.n, found.success.rate) == (3, 4, 0.75)
     assert found.mean_score == pytest.approx(0.7)
     assert found.median_duration_s == 6.0
+    assert found.smoothness is None
+    assert summary([True, True], [1.0, 1.0], [], [-4.0, -5.0]).smoothness == average([-4.0, -5.0])
 
 
 @pytest.mark.parametrize(("x", "n"), [(0, 0), (3, 2), (-1, 5), (0, -1)])
