@@ -86,30 +86,31 @@ def _about(args: Mapping[str, Any]) -> str:
     if args.get("to"):
         return f"{about} to {args['to'].removeprefix('datasets/')}"
     if args["what"] == "delete":
-        return f"{len(args['episodes'])} episodes of {about}"
+        return f"{_counted(len(args['episodes']), 'episode')} of {about}"
     return f"{about} to {args['repository']}" if args["what"] == "push" else about
 
 
 def _sentence(what: str, result: Mapping[str, Any]) -> str:
     problems = result.get("problems") or []
     if what in ("check", "repair"):
-        return (
-            "whole"
-            if not problems
-            else f"{len(problems)} problem{'s' if len(problems) > 1 else ''}: {problems[0]}"
-        )
+        return "whole" if not problems else f"{_counted(len(problems), 'problem')}: {problems[0]}"
     if what == "push":
         return str(result.get("address", ""))
     if what == "import":
-        said = f"{result['episodes']} episodes can be reviewed, {result['made']} of them new"
+        said = f"{_counted(result['episodes'], 'episode')} can be reviewed, {result['made']} new"
         return said + (f"; {problems[0]}" if problems else "")
     parts = result.get("parts") or [result]
-    said = f"{sum(part['episodes'] for part in parts)} episodes, {sum(part['frames'] for part in parts)} rows"
+    episodes, rows = (sum(part[name] for part in parts) for name in ("episodes", "frames"))
+    said = f"{_counted(episodes, 'episode')}, {_counted(rows, 'row')}"
     again = sum(len(part["encoded"]) for part in parts)
     left = [thing for part in parts for thing in part["left_out"]]
-    said += f"; {again} videos coded again" if again else ""
+    said += f"; {_counted(again, 'video')} coded again" if again else ""
     said += f"; left out: {'; '.join(left)}" if left else ""
     return said + (f"; {problems[0]}" if problems else "")
+
+
+def _counted(count: int, thing: str) -> str:
+    return f"{count} {thing}{'' if count == 1 else 's'}"
 
 
 def checked(name: str) -> Checked | None:

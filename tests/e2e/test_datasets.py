@@ -1,14 +1,21 @@
-"""Datasets in a real browser: an episode played from its place in a shared file, several beside each other."""
+"""Datasets in a real browser: played from a shared file, beside each other; those of others imported and reviewed."""
+
+import json
+import os
+import shutil
 
 import pytest
 
 from tests.e2e.by_hand import SOON_S, ByHand
 from tests.e2e.lab import WIDE
+from tests.e2e.pixels import share, white
 from tests.processes import eventually
 from tests.runtime.datasets.foreign import Plan, shown, write
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 FPS, LENGTHS = 10.0, (40, 50, 60)
+SAMPLE = os.environ.get("EVA_SAMPLE_EPISODE")
+PREPARED_S = 150  # three videos are coded again by a worker that everything else comes before
 # The number that the test's pictures show: the brightness in the middle of the video.
 NUMBER = """(video) => {
   const canvas = new OffscreenCanvas(4, 4).getContext("2d");
@@ -80,3 +87,50 @@ def test_two_episodes_are_seen_beside_each_other_on_one_clock(viewer, cups):
     page.keyboard.press("End")
     eventually(lambda: other.inner_text() == "row 49 of 50", SOON_S, "the longer one is at its end")
     assert one.inner_text() == "is over"
+
+
+@pytest.mark.skipif(not SAMPLE, reason="EVA_SAMPLE_EPISODE does not name the real episode")
+def test_a_dataset_of_somebody_else_is_imported_replayed_and_reviewed(viewer, patient):
+    folder = patient.data / "datasets" / "theirs"
+    shutil.copytree(SAMPLE, folder)
+    page, keys = viewer.open("/replay/datasets/theirs/").page, viewer.page.keyboard
+    page.locator("summary", has_text="Import").click()
+    page.locator("details[open] select[name=robot]").select_option("agilex_piper")
+    page.locator("details[open] button[value=import]").click()
+    done = page.locator("[data-job][data-state=done]", has_text="Import theirs")
+    done.wait_for(timeout=1000 * PREPARED_S)
+    assert "1 episode can be reviewed, 1 new" in done.inner_text()
+    page.reload()
+    page.locator("[data-index='0'] a[href^='/replay/']:not([href*=datasets])").click()
+    page.wait_for_url(lambda url: "/datasets/" not in url)
+    uuid = page.url.rstrip("/").rpartition("/")[2]
+    page.locator("#scrub").wait_for(timeout=1000 * PREPARED_S)  # its preview is made
+    eventually(
+        lambda: viewer.api(f"episodes/{uuid}/reviews")["quality"],
+        PREPARED_S,
+        "it is looked through by itself",
+    )
+
+    viewer.open(f"/replay/{uuid}/")
+    keys.press("End")
+    eventually(lambda: row(page) == 397, SOON_S, "the last row is shown")
+    keys.press("Home")
+    videos = page.locator("video[data-camera]")
+    eventually(
+        lambda: videos.evaluate_all("(all) => all.every((one) => one.readyState >= 2 && !one.seeking)"),
+        SOON_S,
+        "all cameras show the first row",
+    )
+    assert videos.count() == 3
+    assert share(viewer.scene(), white) > 0.003  # the arms are drawn
+    page.locator("#curves .u-over").wait_for()
+    keys.press("Space")
+    eventually(lambda: row(page) > 10, SOON_S, "it plays")
+    keys.press("Space")
+    keys.press("f")
+    eventually(lambda: page.locator("#review-state").inner_text() == "fail by ann", SOON_S, "it is reviewed")
+    beside = folder / "eva" / "reviews" / f"{uuid}.jsonl"
+    eventually(beside.exists, SOON_S, "what was said lies beside it in its dataset")
+    assert [json.loads(line)["verdict"] for line in beside.read_text().splitlines()] == ["fail"]
+    manifest = json.loads((patient.data / "episodes" / uuid / "manifest.json").read_text())
+    assert sorted(manifest["streams"]) == ["eef", "eef_action", "effort", "qvel"]
