@@ -11,6 +11,7 @@ class ResultsConfig(AppConfig):
 
     def ready(self) -> None:
         from evaweb.guards import keep
+        from evaweb.results import restoring  # noqa: F401  it declares itself to those that reconcile
         from evaweb.results.guarded import GUARDS
 
         keep(self, GUARDS)

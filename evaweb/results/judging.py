@@ -4,26 +4,45 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from django.contrib.auth.models import User
 from django.db import IntegrityError, transaction
 from django.db.models import Exists, OuterRef, QuerySet
 
+from evaweb.episodes.lines import text
 from evaweb.episodes.models import EpisodeStatus
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.plans.chance import Chance
 from evaweb.plans.models import Handout, Plan, PlanState
 from evaweb.plans.sight import has_looked
+from evaweb.results import journal
 from evaweb.results.models import Preference, Rating
+from evaweb.results.seeing import coming, require_seen_on_video, seen
 from evaweb.roles import Role, require
-from evaweb.trials.models import Score, TrialStatus
+from evaweb.trials.journal import append
+from evaweb.trials.models import Score, Trial, TrialStatus
 from evaweb.trials.verdicts import LONGEST_FAILURE, LONGEST_NOTE, verdict
 
 _STATES = (PlanState.FROZEN, PlanState.CLOSED, PlanState.REVEALED)
+
+
+T = TypeVar("T")
+_NAMED = 500  # ids in one question to the database
+
+
+class Offer(NamedTuple, Generic[T]):
+    """What somebody is asked about next, None for nothing; `left` for them in all.
+
+    `passed`: codes of trials that come before it, of which there are no pictures on this machine.
+    """
+
+    found: T | None
+    left: int
+    passed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,18 +61,27 @@ def sample_of(plan: Plan) -> list[int]:
     return drawn[: math.ceil(plan.second_rater_share * n)]
 
 
-def to_rate(user: User) -> tuple[Handout | None, int]:
-    """The next trial that this user may rate again, and how many there are."""
-    found: Handout | None = None
-    left = 0
+def to_rate(user: User) -> Offer[Handout]:
+    """The next trial that this user may rate again, of those of which there are pictures."""
+    mine: list[Handout] = []
     for plan in Plan.objects.filter(state__in=_STATES, second_rater_share__gt=0).order_by("pk"):
         if has_looked(plan, user):
             continue
         open_ones = {handout.slot.index: handout for handout in _unrated(plan, user)}
-        mine = [open_ones[index] for index in sample_of(plan) if index in open_ones]
-        left += len(mine)
-        found = found or next(iter(mine), None)
-    return found, left
+        mine += [open_ones[index] for index in sample_of(plan) if index in open_ones]
+    return _offered(mine, lambda handout: (handout,))
+
+
+def _offered(waiting: Sequence[T], of: Callable[[T], tuple[Handout, ...]]) -> Offer[T]:
+    """The first of which all pictures are there, else the first of which they may come; what lies before is passed."""
+    for there in (seen, coming):
+        passed: list[str] = []
+        for one in waiting:
+            lacking = [handout.code for handout in of(one) if not there(handout.trial.episode)]
+            if not lacking:
+                return Offer(one, len(waiting), tuple(dict.fromkeys(passed)))
+            passed += lacking
+    return Offer(None, len(waiting), tuple(dict.fromkeys(passed)))
 
 
 def _unrated(plan: Plan, user: User) -> QuerySet[Handout]:
@@ -76,7 +104,7 @@ def rate(
     failure: str = "",
     note: str = "",
 ) -> Rating:
-    """Keep what somebody who did not run the trial of that code saw on its video."""
+    """Keep what somebody who did not run the trial of that code saw on its video: on the disk, then as a row."""
     require(user, Role.OPERATOR)
     handout = _handout(plan, code)
     trial = handout.trial
@@ -86,39 +114,32 @@ def rate(
         raise NotAllowed(f"you ran or scored trial {code}: somebody else rates it again")
     if has_looked(plan, user):
         raise NotAllowed(f"you have seen results of {plan}: a second rater must not know them")
+    if Rating.objects.filter(trial=trial, rater=user).exists():
+        raise Conflict(f"you have rated trial {code} already")
+    require_seen_on_video(handout)
     found = verdict(list(trial.scene.milestones.order_by("order")), milestones, success)
-    if len(note) > LONGEST_NOTE or len(failure) > LONGEST_FAILURE:
-        raise EvaError(
-            f"note or failure is too long; allowed: {LONGEST_NOTE} and {LONGEST_FAILURE} characters"
-        )
-    return _once(
-        Rating(
-            trial=trial,
-            rater=user,
-            success=found.success,
-            score=found.score,
-            milestones=[[row[0].text, row[1]] for row in found.reached],
-            failure=failure.strip(),
-            note=note.strip(),
-            blind=plan.sealed,
-        ),
-        f"you have rated trial {code} already",
+    rating = Rating(
+        trial=trial,
+        rater=user,
+        success=found.success,
+        score=found.score,
+        milestones=[[row[0].text, row[1]] for row in found.reached],
+        failure=text("failure", failure, LONGEST_FAILURE),
+        note=text("note", note, LONGEST_NOTE),
+        blind=plan.sealed,
     )
+    append(journal.of_trial(trial), journal.rating_line(rating))
+    return _once(rating, f"you have rated trial {code} already")
 
 
-def to_prefer(user: User, plans: Iterable[Plan] | None = None) -> tuple[Pair | None, int]:
-    """The next two trials that this user has not compared, and how many pairs there are."""
-    found: Pair | None = None
-    left = 0
+def to_prefer(user: User, plans: Iterable[Plan] | None = None) -> Offer[Pair]:
+    """The next two trials that this user has not compared, of those of which there are pictures."""
+    fresh: list[Pair] = []
     for plan in plans if plans is not None else Plan.objects.filter(state__in=_STATES).order_by("pk"):
-        if has_looked(plan, user):
-            continue
-        judged = set(Preference.objects.filter(plan=plan, rater=user).values_list("first", "second"))
-        fresh = [pair for pair in _pairs(plan) if pair not in judged]
-        left += len(fresh)
-        if found is None and fresh:
-            found = _pair(plan, *fresh[0])
-    return found, left
+        if not has_looked(plan, user):
+            judged = set(Preference.objects.filter(plan=plan, rater=user).values_list("first", "second"))
+            fresh += _named(plan, [pair for pair in _pairs(plan) if pair not in judged])
+    return _offered(fresh, lambda pair: (pair.first, pair.second))
 
 
 def _pairs(plan: Plan) -> list[tuple[int, int]]:
@@ -133,48 +154,57 @@ def _pairs(plan: Plan) -> list[tuple[int, int]]:
     return [(one, other) for (one, at), (other, there) in neighbours if gone not in (at, there)]
 
 
-def _pair(plan: Plan, first: int, second: int) -> Pair:
+def _named(plan: Plan, pairs: Sequence[tuple[int, int]]) -> list[Pair]:
+    trials = {trial for pair in pairs for trial in pair}
+    of_plan = plan.handouts.filter(trial__in=trials) if len(trials) < _NAMED else plan.handouts.all()
     rows = {
         row.trial_id: row
-        for row in plan.handouts.filter(trial__in=(first, second)).select_related(
-            "trial__episode", "trial__scene", "trial__position"
-        )
+        for row in of_plan.select_related("trial__episode", "trial__scene", "trial__position")
     }
-    return Pair(plan, rows[first], rows[second])
+    return [Pair(plan, rows[first], rows[second]) for first, second in pairs]
 
 
 @transaction.atomic
 def prefer(*, user: User, plan: Plan, first: str, second: str, outcome: str, why: str) -> Preference:
-    """Keep which of the trials of these codes was the better one; the first is the one that was run first."""
+    """Keep which of the trials of these codes was the better one; the first is the one that was run first.
+
+    On the disk, then as a row.
+    """
     require(user, Role.OPERATOR)
     if outcome not in Preference.Outcome.values:
         raise EvaError(f"outcome = {outcome!r:.80}; allowed: {', '.join(Preference.Outcome.values)}")
-    reason = why.strip()
-    if not reason or len(reason) > LONGEST_NOTE:
-        raise EvaError(f"why is {'too long' if reason else 'empty'}: say it in a sentence, others read it")
+    reason = text("why", why, LONGEST_NOTE)
+    if not reason:
+        raise EvaError("why is empty: say it in a sentence, others read it")
     if has_looked(plan, user):
         raise NotAllowed(f"you have seen results of {plan}: who prefers must not know them")
     one, other = _handout(plan, first), _handout(plan, second)
     if (one.trial_id, other.trial_id) not in _pairs(plan):
         raise Conflict(f"{first} and {second} were not run one after the other at the same initial condition")
-    return _once(
-        Preference(
-            plan=plan,
-            first=one.trial,
-            second=other.trial,
-            rater=user,
-            outcome=outcome,
-            why=reason,
-            blind=plan.sealed,
-        ),
-        f"you have compared {first} and {second} already",
+    twice = f"you have compared {first} and {second} already"
+    if Preference.objects.filter(first=one.trial, second=other.trial, rater=user).exists():
+        raise Conflict(twice)
+    require_seen_on_video(one, other)
+    row = Preference(
+        plan=plan,
+        first=one.trial,
+        second=other.trial,
+        rater=user,
+        outcome=outcome,
+        why=reason,
+        blind=plan.sealed,
     )
+    append(journal.of_trial(other.trial), journal.preference_line(row))
+    return _once(row, twice)
 
 
 def _handout(plan: Plan, code: str) -> Handout:
-    found = plan.handouts.select_related("slot", "trial__scene").filter(code=code).first()
+    """That of a code, its trial's row kept from others until the transaction ends: one at a time writes its file."""
+    rows = plan.handouts.select_related("slot", "trial__scene", "trial__episode")
+    found = rows.filter(code=code).first()
     if found is None:
         raise NotFound(f"{plan} has no trial {code!r:.20}")
+    found.trial.status = Trial.objects.select_for_update().get(pk=found.trial_id).status
     return found
 
 

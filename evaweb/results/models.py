@@ -7,6 +7,7 @@ import uuid
 from django.conf import settings
 from django.db import models
 from django.db.models import F, Q
+from django.utils import timezone
 
 from evaweb.plans.models import Plan
 from evaweb.trials.models import Trial
@@ -24,7 +25,7 @@ class Rating(models.Model):
     failure = models.CharField(max_length=60, blank=True)
     note = models.TextField(blank=True)
     blind = models.BooleanField(help_text="Whether the rater could not know which checkpoint it was.")
-    at = models.DateTimeField(auto_now_add=True)
+    at = models.DateTimeField(default=timezone.now)
 
     class Meta:
         ordering = ("trial", "pk")
@@ -43,14 +44,20 @@ class Preference(models.Model):
         TIE = "tie", "neither"
 
     uuid = models.UUIDField(unique=True, default=uuid.uuid4, editable=False)
-    plan = models.ForeignKey(Plan, on_delete=models.PROTECT, related_name="preferences")
+    plan = models.ForeignKey(
+        Plan,
+        null=True,
+        on_delete=models.PROTECT,
+        related_name="preferences",
+        help_text="None: restored from the disk, and the plan is lost.",
+    )
     first = models.ForeignKey(Trial, on_delete=models.PROTECT, related_name="+")
     second = models.ForeignKey(Trial, on_delete=models.PROTECT, related_name="+")
     rater = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
     outcome = models.CharField(max_length=6, choices=Outcome)
     why = models.TextField(help_text="In a sentence.")
     blind = models.BooleanField(help_text="Whether the rater could not know which checkpoints they were.")
-    at = models.DateTimeField(auto_now_add=True)
+    at = models.DateTimeField(default=timezone.now)
 
     class Meta:
         ordering = ("plan", "pk")

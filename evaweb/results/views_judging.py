@@ -15,6 +15,7 @@ from evaweb.errors import EvaError
 from evaweb.plans.models import Handout
 from evaweb.results import judging
 from evaweb.results.models import Preference
+from evaweb.results.seeing import seen
 from evaweb.results.selectors import plan_get
 from evaweb.roles import Role, role_of
 
@@ -33,14 +34,16 @@ def rate(request: HttpRequest) -> HttpResponse:
         else:
             return redirect("rate")
     user: Any = request.user
-    handout, left = judging.to_rate(user)
+    offer = judging.to_rate(user)
+    handout = offer.found
     milestones = list(handout.trial.scene.milestones.order_by("order")) if handout else []
     typed = request.POST if handout and request.POST.get("code") == handout.code else QueryDict()
     ticked = typed.getlist("milestone")
     view = _view(handout)
     context = {
         "handout": handout,
-        "left": left,
+        "left": offer.left,
+        "passed": offer.passed,
         "view": view,
         "milestones": [(milestone, str(milestone.pk) in ticked) for milestone in milestones],
         "implied": any(milestone.required for milestone in milestones),
@@ -64,12 +67,14 @@ def prefer(request: HttpRequest) -> HttpResponse:
         else:
             return redirect("prefer")
     user: Any = request.user
-    pair, left = judging.to_prefer(user)
+    offer = judging.to_prefer(user)
+    pair = offer.found
     codes = (pair.first.code, pair.second.code) if pair else ()
     views = [_view(pair.first), _view(pair.second)] if pair else []
     context = {
         "pair": pair,
-        "left": left,
+        "left": offer.left,
+        "passed": offer.passed,
         "views": views,
         "outcomes": Preference.Outcome.choices,
         "unable": _unable(user, views),
@@ -120,8 +125,7 @@ def _view(handout: Handout | None) -> dict[str, Any] | None:
     if handout is None or episode is None:
         return None
     stage = stage_of(episode=episode)
-    seen = stage.name == "ready" and bool(episode.cameras)
-    return {"code": handout.code, "episode": episode, "stage": stage, "seen": seen}
+    return {"code": handout.code, "episode": episode, "stage": stage, "seen": seen(episode)}
 
 
 def _unable(user: Any, views: Sequence[dict[str, Any] | None]) -> str:

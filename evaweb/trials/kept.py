@@ -11,28 +11,28 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, StrictBool, Va
 from evaweb.errors import EvaError
 from evaweb.trials.models import Evaluation, Score
 
-_Name = Annotated[str, Field(min_length=1, max_length=120)]
-_User = Annotated[str, Field(min_length=1, max_length=150)]
+Name = Annotated[str, Field(min_length=1, max_length=120)]
+Person = Annotated[str, Field(min_length=1, max_length=150)]
 _Count = Annotated[int, Field(ge=0, lt=2**31)]
 _Small = Annotated[int, Field(ge=0, lt=2**15)]
 _Seconds = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class _Read(BaseModel):
+class Kept(BaseModel):
     """Plain JSON that was written by this program; fields that it does not know are left alone."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-class KeptTrial(_Read):
+class KeptTrial(Kept):
     """A trial as evaweb.trials.facts writes it; what its run adds is absent from a manifest."""
 
     uuid: UUID
     id: Annotated[int, Field(gt=0, lt=2**63)] | None = None
-    evaluation: _Name
+    evaluation: Name
     evaluation_kind: Evaluation.Kind = Evaluation.Kind.OPEN_BENCH
     version: _Count
-    checkpoint: _Name
+    checkpoint: Name
     scene: Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[-\w]+$")]
     position: _Small
     number: _Count
@@ -52,7 +52,7 @@ class KeptTrial(_Read):
     truth: dict[str, Any] | None = None
 
 
-class KeptOutcome(_Read):
+class KeptOutcome(Kept):
     """A milestone as it was when it was scored."""
 
     order: _Small
@@ -63,12 +63,12 @@ class KeptOutcome(_Read):
     at_s: _Seconds | None = None
 
 
-class KeptScore(_Read):
+class KeptScore(Kept):
     """A line of kind "score"."""
 
     uuid: UUID
     trial: KeptTrial
-    rater: _User
+    rater: Person
     at: AwareDatetime
     success: StrictBool
     score: Annotated[float, Field(ge=0, le=1)]
@@ -79,31 +79,32 @@ class KeptScore(_Read):
     milestones: tuple[KeptOutcome, ...] = ()
 
 
-class KeptVoid(_Read):
+class KeptVoid(Kept):
     """A line of kind "void"."""
 
     trial: KeptTrial
-    by: _User
+    by: Person
     reason: str
     at: AwareDatetime
 
 
-_Model = TypeVar("_Model", bound=_Read)
+_Model = TypeVar("_Model", bound=Kept)
 
 
 def kept_trial(asked: Mapping[str, Any]) -> KeptTrial | None:
     """The trial that a manifest names; None where its run was none of ours."""
-    return _read(KeptTrial, asked, "the manifest's trial") if "uuid" in asked else None
+    return read(KeptTrial, asked, "the manifest's trial") if "uuid" in asked else None
 
 
 def kept_line(line: Mapping[str, Any], number: int) -> KeptScore | KeptVoid | None:
     """The line, the `number`th whole one; None where it is neither score nor void. EvaError says what is wrong."""
     models: dict[object, type[KeptScore] | type[KeptVoid]] = {"score": KeptScore, "void": KeptVoid}
     model = models.get(line.get("kind"))
-    return _read(model, line, f"line {number} of its scores") if model else None
+    return read(model, line, f"line {number} of its scores") if model else None
 
 
-def _read(model: type[_Model], content: Mapping[str, Any], what: str) -> _Model:
+def read(model: type[_Model], content: Mapping[str, Any], what: str) -> _Model:
+    """`content` as that model; EvaError names `what` and the first thing that is wrong with it."""
     try:
         return model.model_validate(content)
     except ValidationError as error:

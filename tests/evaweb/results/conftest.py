@@ -1,5 +1,6 @@
 import pytest
 
+from evaweb.episodes.folders import preview_folder
 from evaweb.episodes.models import Episode
 from evaweb.plans.handing import hand_out
 from evaweb.plans.models import Plan
@@ -58,8 +59,10 @@ def carry_out(bench):
                 -5.0 - 0.1 * trial.number if trial.number > 1 else None
             )  # the first of each was not measured
             facts = {"smoothness": smooth, "smoothness_commanded": smooth and smooth + 0.5 * new}
-            row = {"station": bench.station, "status": "finished", **facts}
+            row = {"station": bench.station, "status": "finished", "cameras": ["top"], **facts}
             episode = Episode.objects.create(**row) if recorded else None
+            if episode:
+                preview_folder(episode.uuid).mkdir(parents=True)  # it can be watched
             Trial.objects.filter(pk=trial.pk).update(
                 status="ended", duration_s=8.0 + trial.number + 0.25 * new, episode=episode
             )

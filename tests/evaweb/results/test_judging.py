@@ -1,5 +1,7 @@
 import pytest
 
+from evaweb.episodes import lines
+from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.models import Plan
@@ -20,22 +22,22 @@ def rater(db):
 def test_half_of_the_trials_are_rated_again_by_somebody_else(plan, carry_out, rater, bench):
     carry_out(plan, 16)
     assert len(judging.sample_of(plan)) == 8
-    assert judging.to_rate(bench.operator) == (None, 0)  # ran them all
+    assert judging.to_rate(bench.operator)[:2] == (None, 0)  # ran them all
     seen = []
     for left in range(8, 0, -1):
-        handout, there = judging.to_rate(rater)
+        handout, there = judging.to_rate(rater)[:2]
         assert there == left
         seen.append(handout.slot.index)
         judging.rate(user=rater, plan=plan, code=handout.code, milestones=bench.ticks(True, True, True))
     assert seen == judging.sample_of(plan)
-    assert judging.to_rate(rater) == (None, 0)
+    assert judging.to_rate(rater)[:2] == (None, 0)
     found = agreement_of(plan)
     assert (found["trials"], found["blind"], found["success"]["n"]) == (8, 8, 8)
 
 
 def test_a_second_rating_changes_no_score(plan, carry_out, rater, bench):
     carry_out(plan, 16)
-    handout, _ = judging.to_rate(rater)
+    handout, _ = judging.to_rate(rater)[:2]
     before = handout.trial.verdict_id
     judging.rate(user=rater, plan=plan, code=handout.code, milestones=bench.ticks(False, False, False))
     handout.trial.refresh_from_db()
@@ -46,12 +48,12 @@ def test_a_second_rating_changes_no_score(plan, carry_out, rater, bench):
 
 def test_who_must_not_rate_is_told_why(plan, owner, carry_out, bench, rater):
     carry_out(plan, 16)
-    handout, _ = judging.to_rate(rater)
+    handout, _ = judging.to_rate(rater)[:2]
     ticks = bench.ticks(True, True, True)
     with pytest.raises(NotAllowed, match="you ran or scored"):
         judging.rate(user=bench.operator, plan=plan, code=handout.code, milestones=ticks)
     look(plan, owner)
-    assert judging.to_rate(owner) == (None, 0)
+    assert judging.to_rate(owner)[:2] == (None, 0)
     with pytest.raises(NotAllowed, match="must not know"):
         judging.rate(user=owner, plan=plan, code=handout.code, milestones=ticks)
     with pytest.raises(NotAllowed):
@@ -63,7 +65,7 @@ def test_who_must_not_rate_is_told_why(plan, owner, carry_out, bench, rater):
 
 def test_two_trials_in_a_row_are_preferred_one_over_the_other(plan, carry_out, rater):
     carry_out(plan, 16)
-    pair, left = judging.to_prefer(rater)
+    pair, left = judging.to_prefer(rater)[:2]
     assert left == 8
     assert pair.first.slot.block == pair.second.slot.block
     assert pair.first.number < pair.second.number
@@ -79,7 +81,7 @@ def test_two_trials_in_a_row_are_preferred_one_over_the_other(plan, carry_out, r
         judging.prefer(
             user=rater, plan=plan, outcome="tie", why="x", first=codes["second"], second=codes["first"]
         )
-    assert judging.to_prefer(rater)[1] == 7
+    assert judging.to_prefer(rater).left == 7
     found = preferences_of(plan)
     assert (found["n"], found["ranking"]) == (1, None)
     assert found["reason"]
@@ -87,7 +89,7 @@ def test_two_trials_in_a_row_are_preferred_one_over_the_other(plan, carry_out, r
 
 def test_the_database_keeps_what_was_said(plan, carry_out, rater, bench):
     carry_out(plan, 16)
-    handout, _ = judging.to_rate(rater)
+    handout, _ = judging.to_rate(rater)[:2]
     rating = judging.rate(user=rater, plan=plan, code=handout.code, milestones=bench.ticks(True, True, True))
     with pytest.raises(Exception, match="never changed"):
         Rating.objects.filter(pk=rating.pk).update(success=False)
@@ -95,7 +97,7 @@ def test_the_database_keeps_what_was_said(plan, carry_out, rater, bench):
 
 def test_and_what_was_preferred(plan, carry_out, rater):
     carry_out(plan, 4)
-    pair, _ = judging.to_prefer(rater)
+    pair, _ = judging.to_prefer(rater)[:2]
     made = judging.prefer(
         user=rater, plan=plan, outcome="tie", why="alike", first=pair.first.code, second=pair.second.code
     )
@@ -105,12 +107,12 @@ def test_and_what_was_preferred(plan, carry_out, rater):
 
 def test_nobody_is_asked_about_what_cannot_be_watched(plan, carry_out, rater):
     carry_out(plan, 16)
-    handout, left = judging.to_rate(rater)
-    pair, pairs = judging.to_prefer(rater)
+    handout, left = judging.to_rate(rater)[:2]
+    pair, pairs = judging.to_prefer(rater)[:2]
     lost = {handout.trial.episode_id, pair.first.trial.episode_id}
     Episode.objects.filter(pk__in=lost).update(status="missing")
-    again, fewer = judging.to_rate(rater)
-    other, fewer_pairs = judging.to_prefer(rater)
+    again, fewer = judging.to_rate(rater)[:2]
+    other, fewer_pairs = judging.to_prefer(rater)[:2]
     assert fewer < left
     assert fewer_pairs < pairs
     assert again.trial.episode_id not in lost
@@ -129,4 +131,65 @@ def test_what_was_not_run_one_after_the_other_is_no_pair_because_one_between_is_
     assert before[1] == after[0]
     Episode.objects.filter(trial=before[1]).update(status="missing")
     assert judging._pairs(wide) == []
-    assert judging.to_prefer(rater) == (None, 0)
+    assert judging.to_prefer(rater)[:2] == (None, 0)
+
+
+def test_what_has_no_pictures_is_passed_over_and_named(plan, carry_out, rater, bench):
+    carry_out(plan, 16)
+    first, left, _ = judging.to_rate(rater)
+    preview_folder(first.trial.episode_id).rmdir()  # absent, and nobody has marked it missing
+    second, still, passed = judging.to_rate(rater)
+    assert (second != first, still, passed) == (True, left, (first.code,))
+    for handout in plan.handouts.exclude(pk=second.pk).exclude(pk=first.pk):
+        preview_folder(handout.trial.episode_id).rmdir()
+    assert judging.to_rate(rater).found == second
+    preview_folder(second.trial.episode_id).rmdir()
+    none = judging.to_rate(rater)
+    assert (none.found, none.left, len(none.passed)) == (None, left, left)
+    journal_folder(first.trial.episode_id).mkdir(parents=True)
+    assert judging.to_rate(rater).found is None  # it is empty
+    Episode.objects.filter(pk=first.trial.episode_id).update(frames=100)  # its preview may come yet
+    assert judging.to_rate(rater)[::2] == (first, ())
+    with pytest.raises(Conflict, match=f"nobody can judge {first.code}: There is no preview of it yet"):
+        judging.rate(user=rater, plan=plan, code=first.code, milestones=bench.ticks(True, True, True))
+    assert Rating.objects.count() == 0
+
+
+def test_a_pair_without_pictures_is_passed_over_and_refused(plan, carry_out, rater):
+    carry_out(plan, 16)
+    pair, left, _ = judging.to_prefer(rater)
+    preview_folder(pair.second.trial.episode_id).rmdir()
+    other, still, passed = judging.to_prefer(rater)
+    assert (other != pair, still, passed) == (True, left, (pair.second.code,))
+    codes = {"first": pair.first.code, "second": pair.second.code}
+    with pytest.raises(Conflict, match=f"{pair.second.code}: Its folder is not on this machine"):
+        judging.prefer(user=rater, plan=plan, outcome="tie", why="x", **codes)
+    Episode.objects.filter(pk=pair.second.trial.episode_id).update(cameras=[])
+    with pytest.raises(Conflict, match="recorded without a camera"):
+        judging.prefer(user=rater, plan=plan, outcome="tie", why="x", **codes)
+
+
+def test_nothing_is_kept_that_the_disk_does_not_take(plan, carry_out, rater, bench, monkeypatch):
+    carry_out(plan, 16)
+    handout, pair = judging.to_rate(rater).found, judging.to_prefer(rater).found
+
+    def full(path, payload):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(lines, "_written", full)
+    with pytest.raises(lines.NotKept):
+        judging.rate(user=rater, plan=plan, code=handout.code, milestones=bench.ticks(True, True, True))
+    codes = {"first": pair.first.code, "second": pair.second.code}
+    with pytest.raises(lines.NotKept):
+        judging.prefer(user=rater, plan=plan, outcome="tie", why="alike", **codes)
+    assert (Rating.objects.count(), Preference.objects.count()) == (0, 0)
+
+
+def test_a_name_or_a_note_that_cannot_be_kept_is_refused(plan, carry_out, rater, bench):
+    carry_out(plan, 16)
+    handout = judging.to_rate(rater).found
+    said = {"user": rater, "plan": plan, "code": handout.code, "milestones": bench.ticks(True, True, True)}
+    with pytest.raises(EvaError, match="note has 8001 characters; allowed: at most 8000"):
+        judging.rate(**said, note="x" * 8001)
+    with pytest.raises(EvaError, match="U\\+0000"):
+        judging.rate(**said, failure="a\x00b")

@@ -9,6 +9,7 @@ from django.test import Client
 from django.test.utils import CaptureQueriesContext
 from django.utils import timezone
 
+from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode
 from evaweb.plans.services import plan_close
 from evaweb.results import caching, judging
@@ -234,7 +235,7 @@ def test_rating_again_shows_the_code_and_nothing_that_was_said(plan, carry_out, 
     carry_out(plan, 16)
     rater = builders.user("rita")
     client = as_(rater)
-    handout, _ = judging.to_rate(rater)
+    handout, _ = judging.to_rate(rater)[:2]
     text = client.get("/result/rate/").content.decode()
     assert handout.code in text
     for secret in ("pi0-new", "pi0-block", "dropped", f"/result/trials/{handout.trial_id}"):
@@ -252,7 +253,7 @@ def test_a_rating_that_is_refused_keeps_its_ticks_and_another_trial_gets_none_of
     carry_out(plan, 16)
     rater = builders.user("rita")
     client = as_(rater)
-    handout, _ = judging.to_rate(rater)
+    handout, _ = judging.to_rate(rater)[:2]
     first = bench.scene.milestones.order_by("order").first()
     given = {
         "plan": "blocks",
@@ -274,6 +275,15 @@ def test_a_rating_that_is_refused_keeps_its_ticks_and_another_trial_gets_none_of
 def test_without_pictures_nothing_is_judged(plan, carry_out, as_):
     carry_out(plan, 16)
     client = as_(builders.user("rita"))
+    for episode in Episode.objects.all():
+        preview_folder(episode.uuid).rmdir()
+    for page in ("rate", "prefer"):
+        text = client.get(f"/result/{page}/").content.decode()
+        assert "Of what is left for you there are no pictures on this machine" in text
+        assert "Passed over, without pictures on this machine" in text
+    Episode.objects.update(frames=9)
+    for episode in Episode.objects.all():
+        journal_folder(episode.uuid).mkdir(parents=True)
     for page in ("rate", "prefer"):
         text = client.get(f"/result/{page}/").content.decode()
         assert "without pictures nobody can judge" in text
@@ -284,7 +294,7 @@ def test_preferring_asks_why(plan, carry_out, as_):
     carry_out(plan, 16)
     rater = builders.user("rita")
     client = as_(rater)
-    pair, _ = judging.to_prefer(rater)
+    pair, _ = judging.to_prefer(rater)[:2]
     text = client.get("/result/prefer/").content.decode()
     assert pair.first.code in text
     assert "pi0" not in text

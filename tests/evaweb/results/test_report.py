@@ -25,7 +25,7 @@ def report(revealed, tmp_path, bench):
         milestones = bench.ticks(True, True, index % 2 == 0)
         judging.rate(user=rater, plan=revealed, code=handout.code, milestones=milestones)
     for index in range(8):
-        pair, _ = judging.to_prefer(rater, [revealed])
+        pair, _ = judging.to_prefer(rater, [revealed])[:2]
         codes = {"first": pair.first.code, "second": pair.second.code}
         # By checkpoint and not by place, which is drawn: where one wins every time, there is nothing to fit.
         won_by_new = index % 4 in (0, 3)

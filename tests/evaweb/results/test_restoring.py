@@ -1,0 +1,97 @@
+"""What second raters and those who prefer have said comes back from the disk."""
+
+import json
+
+import pytest
+
+from evaweb.episodes.folders import scores_file
+from evaweb.episodes.publishing import read_scores, success_of
+from evaweb.episodes.reconcile import reconcile
+from evaweb.plans.models import Plan
+from evaweb.results import judging
+from evaweb.results.agreement import agreement_of, preferences_of
+from evaweb.results.guarded import GUARDS
+from evaweb.results.models import Preference, Rating
+from tests.evaweb.trials import builders
+from tests.evaweb.unguarded import unguarded
+
+
+@pytest.fixture
+def rater(db):
+    return builders.user("rita")
+
+
+@pytest.fixture
+def judged(plan, carry_out, rater, bench):
+    """Two trials rated again, one pair compared."""
+    carry_out(plan, 16)
+    for reached in (True, False):
+        handout = judging.to_rate(rater).found
+        ticks = bench.ticks(True, reached, reached)
+        failure = "" if reached else "wölbt sich"
+        judging.rate(user=rater, plan=plan, code=handout.code, milestones=ticks, failure=failure, note="n")
+    pair = judging.to_prefer(rater).found
+    codes = {"first": pair.first.code, "second": pair.second.code}
+    judging.prefer(user=rater, plan=plan, outcome="second", why="sanfter ⟂", **codes)
+    return plan
+
+
+def rows():
+    return [list(model.objects.order_by("at").values()) for model in (Rating, Preference)]
+
+
+def lose():
+    with unguarded(GUARDS):
+        Rating.objects.all().delete()
+        Preference.objects.all().delete()
+
+
+def without_ids(found):
+    return [[{**row, "id": None} for row in of_one] for of_one in found]
+
+
+def test_they_come_back_as_they_were_once(judged):
+    before, said = rows(), (agreement_of(judged), preferences_of(judged))
+    lose()
+    assert reconcile().restored == 3
+    assert without_ids(rows()) == without_ids(before)
+    assert (agreement_of(judged), preferences_of(judged)) == said
+    assert reconcile().restored == 0
+
+
+def test_what_the_database_has_is_left_alone(judged):
+    before = rows()
+    assert reconcile().restored == 0
+    assert rows() == before
+
+
+def test_a_line_whose_row_was_never_made_is_taken_unless_the_same_was_said_again(judged):
+    rating = Rating.objects.order_by("pk").first()
+    file = scores_file(rating.trial.episode_id)
+    line = next(row for row in read_scores(file).lines if row["kind"] == "rating")
+    again = {**line, "uuid": "9d0f5b41-3d2c-4a27-8a4e-8ed4e7d3b0aa"}
+    with file.open("a") as lines:
+        lines.write(json.dumps(again) + "\n")
+    assert reconcile().restored == 0
+    assert Rating.objects.filter(trial=rating.trial).count() == 1
+
+
+def test_a_preference_whose_plan_is_lost_stays_with_its_trials(judged, monkeypatch):
+    lose()
+    monkeypatch.setattr("evaweb.results.restoring.Plan.objects.filter", lambda **key: Plan.objects.none())
+    assert reconcile().restored == 3
+    assert Preference.objects.get().plan is None
+
+
+def test_a_second_rating_is_no_score(judged):
+    """Neither what is published nor what counts takes it for one."""
+    for rating in Rating.objects.select_related("trial__verdict"):
+        assert success_of(scores_file(rating.trial.episode_id)) == rating.trial.verdict.success
+
+
+def test_a_line_that_is_none_is_named(judged):
+    file = scores_file(Rating.objects.order_by("pk").first().trial.episode_id)
+    with file.open("a") as lines:
+        lines.write('{"kind": "rating", "uuid": "no"}\n')
+    problems = reconcile().problems
+    assert any(" of its scores: uuid is 'no'" in problem for problem in problems), problems
