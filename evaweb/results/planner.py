@@ -10,6 +10,7 @@ from evaweb.errors import EvaError
 from evaweb.statistics.planning import approximate_power, detectable, exact_power, trials_needed
 
 EXACT = 100  # trials an arm up to which the exact power is computed while somebody waits
+LEAST = 0.001  # difference of rates: some four million trials an arm
 _GAINS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
 
 
@@ -61,6 +62,10 @@ def question_of(given: Mapping[str, str]) -> Question:
     if question.better == question.rate:
         raise EvaError(
             f"rate and better are both {question.rate:g}: without a difference nothing can be found"
+        )
+    if abs(question.better - question.rate) < LEAST:
+        raise EvaError(
+            f"rate = {question.rate!r} and better = {question.better!r}; allowed: a difference of at least {LEAST:g}"
         )
     return question
 

@@ -53,11 +53,9 @@ def exact_power(n: int, p1: float, p2: float, alpha: float = ALPHA) -> float:
     if not 1 <= n <= MOST:
         raise StatisticsError(f"n = {n} trials of each arm; allowed: 1 to {MOST}")
     import numpy as np
-    from scipy.stats import binom
 
-    counts = np.arange(n + 1)
-    weights = np.outer(binom.pmf(counts, n, p1), binom.pmf(counts, n, p2))
-    return float(weights[_barnard_tables(n) <= alpha].sum())
+    first, second = _masses(n, np.array([p1, p2]))
+    return float(np.outer(first, second)[_barnard_tables(n) <= alpha].sum())
 
 
 def detectable(n: int, p: float, power: float = POWER, alpha: float = ALPHA) -> float | None:
@@ -78,29 +76,37 @@ def detectable(n: int, p: float, power: float = POWER, alpha: float = ALPHA) -> 
     return high - p
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=MOST)
 def _barnard_tables(n: int) -> NDArray[np.float64]:
-    """Two-sided probability of Barnard's pooled test for every table of two arms of `n` trials: float64 [n+1, n+1]."""
+    """Two-sided probability of Barnard's pooled test for every table of two arms of `n` trials: float64 [n+1, n+1].
+
+    Each number of trials is computed once in a process; all of them together take 42 MB.
+    """
     import numpy as np
-    from scipy.stats import binom
 
     x = np.arange(n + 1)
     p1, p2 = x[:, None] / n, x[None, :] / n
     pooled = (p1 + p2) / 2
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.abs(p1 - p2) / np.sqrt(2 * pooled * (1 - pooled) / n)
-    z = np.where(np.isfinite(z), z, 0.0).ravel().round(10)  # tables as extreme as each other stay together
-    order = np.argsort(-z, kind="stable")
-    # Of each common rate: the probability of all tables at least as extreme, at the end of each group of equals.
-    last = np.searchsorted(-z[order], -z[order], side="right") - 1
-    worst = np.zeros(z.size)
-    for rate in np.linspace(0, 1, _RATES + 2)[1:-1]:
-        pmf = binom.pmf(x, n, rate)
-        tail = np.cumsum(np.outer(pmf, pmf).ravel()[order])
-        np.maximum(worst, tail[last], out=worst)
-    found = np.empty(z.size)
-    found[order] = np.minimum(worst, 1.0)
-    return found.reshape(n + 1, n + 1)
+    z = np.where(np.isfinite(z), z, 0.0).round(10)  # tables as extreme as each other stay together
+    levels, level = np.unique(-z.ravel(), return_inverse=True)
+    worst = np.zeros(len(levels))
+    # Success and failure exchanged, every table is as extreme as before: rates above a half tell nothing more.
+    for mass in _masses(n, np.linspace(0, 1, _RATES + 2)[1 : _RATES // 2 + 1]):
+        each = np.bincount(level.ravel(), weights=np.outer(mass, mass).ravel(), minlength=len(levels))
+        np.maximum(worst, np.cumsum(each), out=worst)
+    return np.minimum(worst, 1.0)[level].reshape(n + 1, n + 1)
+
+
+def _masses(n: int, rates: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The binomial distributions of `n` trials: float64 [rates, n+1]. scipy.stats would be seconds to import."""
+    import numpy as np
+    from scipy.special import gammaln, xlog1py, xlogy
+
+    x = np.arange(n + 1)
+    ways = gammaln(n + 1) - gammaln(x + 1) - gammaln(n - x + 1)
+    return np.asarray(np.exp(ways + xlogy(x, rates[:, None]) + xlog1py(n - x, -rates[:, None])))
 
 
 def _check(p1: float, p2: float, alpha: float) -> None:

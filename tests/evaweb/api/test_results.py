@@ -69,3 +69,6 @@ def test_the_planner(asked, client):
     found = client.get("/api/v1/planner?rate=0.6&better=0.9").json()
     assert found["n"] == 32
     assert client.get("/api/v1/planner?rate=3").status_code == 422
+    near = client.get("/api/v1/planner?rate=0&better=1e-170")
+    assert (near.status_code, "at least 0.001" in near.json()["error"]) == (400, True)
+    assert client.get("/api/v1/planner?rate=0.5&better=0.501").json()["exact"] is None

@@ -1,11 +1,18 @@
+import subprocess
+import sys
+
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import binom
 
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.difference import barnard
 from evaweb.statistics.planning import (
+    MOST,
     _barnard_tables,
+    _masses,
     approximate_power,
     detectable,
     exact_power,
@@ -46,6 +53,32 @@ def test_the_exact_test_is_rarely_wrong_and_its_power_is_near_the_approximation(
     assert exact_power(50, 0.5, 0.75) == pytest.approx(approximate_power(50, 0.5, 0.75), abs=0.03)
     with pytest.raises(StatisticsError, match="allowed: 1 to 250"):
         exact_power(251, 0.5, 0.6)
+
+
+@pytest.mark.parametrize("n", [1, 2, 12, 41])
+def test_the_masses_are_those_of_scipy_and_half_of_the_rates_says_all(n):
+    rates = np.linspace(0, 1, 12)
+    expected = binom.pmf(np.arange(n + 1)[None, :], n, rates[:, None])
+    assert _masses(n, rates) == pytest.approx(expected, abs=1e-13)
+    tables = _barnard_tables(n)
+    assert np.array_equal(tables, tables.T)
+    assert np.array_equal(tables, tables[::-1, ::-1])
+
+
+def test_each_number_of_trials_is_computed_once():
+    first = _barnard_tables(17)
+    for n in range(1, 60):
+        exact_power(n, 0.2, 0.6)
+    assert _barnard_tables(17) is first
+    assert _barnard_tables.cache_info().maxsize == MOST
+
+
+def test_the_planner_does_not_wait_for_scipys_statistics():
+    code = (
+        "import sys; from evaweb.statistics.planning import exact_power; exact_power(30, .2, .6);"
+        "sys.exit('scipy.stats' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_what_can_be_detected_has_just_the_power():
