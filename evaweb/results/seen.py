@@ -7,17 +7,30 @@ from typing import Any
 from evaweb.errors import NotAllowed
 from evaweb.plans.models import Plan, PlanState
 from evaweb.plans.sight import sealed_for
-from evaweb.sight import Sight, sight_of
+from evaweb.sight import Sight, masked, sight_of
 
 
 def why_sealed(plan: Plan, user: Any, sight: Sight | None = None) -> str:
     """Why this user sees no result of the plan, "" where they do."""
     if sealed_for(plan, user):
         return f"{plan} is blind until it is revealed"
-    hidden = (sight or sight_of(user)).checkpoints
-    if hidden and plan.checkpoints.filter(pk__in=hidden).exists():
-        return f"checkpoints of {plan} are compared blind in another plan: what it found is shown after that reveal"
-    return ""
+    others = sealing(plan, user, sight)
+    if not others:
+        return ""
+    names = masked(others)
+    which = names if len(others) == 1 else f"one or more of {names}"
+    return f"checkpoints of {plan} are compared blind in {which}: what it found is shown after that reveal"
+
+
+def sealing(plan: Plan, user: Any, sight: Sight | None = None) -> list[Plan]:
+    """Other plans, blind for this user, because of which they see no result of this one; none where that is shown.
+
+    All that are blind for them, not only those that share a checkpoint: which do would tell what those compare.
+    """
+    seen = sight or sight_of(user)
+    if sealed_for(plan, user) or not plan.checkpoints.filter(pk__in=seen.checkpoints).exists():
+        return []
+    return list(Plan.objects.filter(pk__in=seen.keys).select_related("owner").order_by("title", "-version"))
 
 
 def require_seen(plan: Plan, user: Any) -> None:

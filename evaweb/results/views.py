@@ -23,7 +23,7 @@ from evaweb.results import caching, listings, pages, selectors
 from evaweb.results.agreement import agreement_of, preferences_of
 from evaweb.results.filters import chosen
 from evaweb.results.reporting import write_report
-from evaweb.results.seen import has_results, require_seen, why_sealed
+from evaweb.results.seen import has_results, require_seen, sealing, why_sealed
 from evaweb.results.selectors import Question
 from evaweb.roles import Role, role_of
 from evaweb.sight import sight_for
@@ -189,6 +189,9 @@ def _sealed_page(
     context = {
         **_common(request, found),
         "why": why,
+        "others": [
+            (plan, may_look(plan, request.user)) for plan in sealing(found, request.user, sight_for(request))
+        ],
         "may_look": found.sealed and may_look(found, request.user),
         "fault": fault,
         "typed": typed,

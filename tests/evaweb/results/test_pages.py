@@ -185,8 +185,24 @@ def test_another_blind_plan_of_the_same_checkpoint_hides_the_results(revealed, o
     again.positions.set(bench.scene.positions.all())
     plan_freeze(user=owner, plan=again)
     text = as_(viewer).get(PLAN).content.decode()
-    assert "compared blind in another plan" in text
+    assert "compared blind in Again v1" in text
+    assert "ask its owner, olga, or an administrator to close and reveal it" in text
     assert "pi0-new" not in text
+    assert (
+        "close and reveal it there, or look behind its blind there" in as_(owner).get(PLAN).content.decode()
+    )
+    assert (
+        "compared blind in Again v1"
+        in as_(viewer).get(f"/api/v1{PLAN.removeprefix('/result')}results").json()["error"]
+    )
+    third = Checkpoint.objects.create(name="pi0-third", policy={})
+    apart = Plan.objects.create(name="apart", title="Apart", owner=owner)
+    apart.checkpoints.set([third])
+    apart.positions.set(bench.scene.positions.all())
+    plan_freeze(user=owner, plan=apart)
+    both = as_(viewer).get(PLAN).content.decode()
+    assert "compared blind in one or more of Again v1, Apart v1" in both  # which of them is not said
+    assert "pi0-third" not in both
     plan_close(user=owner, plan=again, reason="not now")
 
 
