@@ -375,6 +375,9 @@ def test_what_is_no_master_is_named(answer: bytes, said: str) -> None:
                 with contextlib.suppress(OSError), server.accept()[0] as caller:
                     caller.recv(4096)
                     caller.sendall(answer)
+                    caller.shutdown(socket.SHUT_WR)
+                    while caller.recv(4096):  # closed over what was not read, it would be a reset
+                        pass
 
         thread = threading.Thread(target=serve, daemon=True)
         thread.start()
