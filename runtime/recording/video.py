@@ -10,12 +10,13 @@ from typing import Any
 import av
 import numpy as np
 from av.video.frame import PictureType
-from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
+from av.video.reformatter import ColorRange, Colorspace
 
 from runtime.recording import codecs
 from runtime.recording.backlog import RUN
 from runtime.recording.files import AppendFile
 from runtime.recording.ordinary import ordinary_threads
+from runtime.recording.planes import planes
 from runtime.recording.settings import RecordingSettings
 from runtime.types import UInt8
 
@@ -41,8 +42,7 @@ class FragmentedVideo:
         self._rate = Fraction(fps).limit_denominator(1001)
         self._size = size
         self._key_next = False
-        self._reformatter = VideoReformatter()
-        self._picture = self._planes(np.zeros((*size, 3), dtype=np.uint8))
+        self._picture = planes(np.zeros((*size, 3), dtype=np.uint8), size)
         options = {
             "movflags": _FRAGMENTS,
             "frag_duration": str(int(FRAGMENT_SECONDS * 1e6)),
@@ -57,7 +57,7 @@ class FragmentedVideo:
     def encode(self, picture: UInt8 | None) -> None:
         """Append one frame: `picture` [H, W, 3], or the previous one (black at first) for None."""
         if picture is not None:
-            self._picture = self._planes(picture)
+            self._picture = planes(picture, self._size)
         self._mux(self._code(key=self._key_next))
         self._key_next = False
         self._store()
@@ -124,18 +124,6 @@ class FragmentedVideo:
         codecs.set_up(context, settings.codec, self._size, self._rate, told, gop)
         context.colorspace, context.color_range = Colorspace.ITU601, ColorRange.MPEG
         return stream
-
-    def _planes(self, picture: UInt8) -> av.VideoFrame:
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-        return self._reformatter.reformat(
-            frame,
-            width=self._size[1],
-            height=self._size[0],
-            format=codecs.PIXELS,
-            dst_colorspace=Colorspace.ITU601,
-            dst_color_range=ColorRange.MPEG,
-            interpolation="AREA" if picture.shape[:2] != self._size else None,
-        )
 
     def _store(self) -> None:
         if self._muxed.bytes:

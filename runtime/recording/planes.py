@@ -1,0 +1,43 @@
+"""Pictures as an encoder takes them: brightness at full size, colour at half of it, limited range of ITU-R BT.601.
+
+OpenCV does in 0.3 ms what takes swscale 1 ms (640x480): the picture is not copied first. Its own colours are those of
+every second pixel, so they are made here of the mean of the four pixels that each stands for.
+"""
+
+from __future__ import annotations
+
+import av
+import cv2
+import numpy as np
+from av.video.reformatter import ColorRange, Colorspace
+
+from runtime.recording.codecs import PIXELS
+from runtime.types import UInt8
+
+# What cv2.transform adds up of red, green, blue and 1. It has a fast way for three rows; the first is not needed.
+_COLOURS = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0],
+        [-37.797 / 255, -74.203 / 255, 112.0 / 255, 128.0],
+        [112.0 / 255, -93.786 / 255, -18.214 / 255, 128.0],
+    ],
+    np.float32,
+)
+
+
+def planes(picture: UInt8, size: tuple[int, int]) -> av.VideoFrame:
+    """The picture, RGB uint8 [H, W, 3], scaled to `size` (height and width, both even) where it is of another one."""
+    height, width = size
+    rgb = np.ascontiguousarray(picture)
+    if rgb.shape[:2] != size:
+        rgb = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    coded = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV_I420), np.uint8)
+    half = cv2.resize(rgb, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+    colours = cv2.transform(half, _COLOURS)
+    for number, plane in enumerate(coded[height:].reshape(2, height // 2, width // 2), start=1):
+        cv2.extractChannel(colours, number, plane)
+    # PyAV 18 takes a buffer of any other height for a lower picture; those are copied.
+    taken = av.VideoFrame.from_numpy_buffer if height % 4 == 0 else av.VideoFrame.from_ndarray
+    frame = taken(coded, format=PIXELS)
+    frame.colorspace, frame.color_range = Colorspace.ITU601, ColorRange.MPEG
+    return frame
