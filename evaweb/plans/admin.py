@@ -13,8 +13,9 @@ from django.shortcuts import redirect, render
 from django.urls import URLPattern, path
 
 from evaweb.errors import EvaError
-from evaweb.plans.exchange import exported, imported
+from evaweb.plans.exchange import exported, exported_with_pictures, imported
 from evaweb.plans.models import Plan, PlanEvent, PlanState
+from evaweb.plans.references import LARGEST, unpacked
 from evaweb.trials.admin import ReadOnly, Table
 from evaweb.trials.models import Checkpoint, Position, Scene
 
@@ -36,7 +37,6 @@ _FROZEN = (
     "second_rater_share",
     "match_gate",
 )
-_LARGEST = 2_000_000  # bytes of a file that is imported
 
 
 class PlanForm(forms.ModelForm):
@@ -73,17 +73,20 @@ class EventInline(ReadOnly, admin.TabularInline):
 class FileForm(forms.Form):
     """A file to import."""
 
-    file = forms.FileField(help_text="TOML with scenes, checkpoints and plans, as the export writes it.")
+    file = forms.FileField(
+        help_text="TOML with scenes, checkpoints and plans, as the export writes it; or an archive (zip) of it with "
+        "reference pictures."
+    )
 
-    def clean_file(self) -> str:
-        """Its text."""
+    def clean_file(self) -> tuple[str, dict[str, bytes]]:
+        """Its text and its pictures."""
         given = self.cleaned_data["file"]
-        if given.size > _LARGEST:
-            raise forms.ValidationError(f"{given.size} bytes; allowed: {_LARGEST}")
+        if given.size > LARGEST:
+            raise forms.ValidationError(f"{given.size} bytes; allowed: {LARGEST}")
         try:
-            return str(given.read().decode())
-        except UnicodeDecodeError as error:
-            raise forms.ValidationError(f"This is not a text: {error}") from None
+            return unpacked(given.read())
+        except EvaError as error:
+            raise forms.ValidationError(str(error)) from None
 
 
 @admin.register(Plan)
@@ -98,7 +101,7 @@ class PlanAdmin(admin.ModelAdmin):
     filter_horizontal = ("positions", "checkpoints", "stations")
     prepopulated_fields = {"name": ("title",)}
     inlines = (EventInline,)
-    actions = ("export",)
+    actions = ("export", "export_archive")
     formfield_overrides = {models.TextField: {"widget": forms.Textarea(attrs={"rows": 3, "cols": 80})}}
     change_list_template = "plans/admin_list.html"
     fieldsets = (
@@ -157,8 +160,9 @@ class PlanAdmin(admin.ModelAdmin):
         """Take a file, or say what is wrong with it."""
         form = FileForm(request.POST or None, request.FILES or None)
         if request.method == "POST" and form.is_valid():
+            text, pictures = form.cleaned_data["file"]
             try:
-                lines = imported(user=request.user, text=form.cleaned_data["file"])
+                lines = imported(user=request.user, text=text, pictures=pictures)
             except EvaError as error:
                 form.add_error("file", str(error))
             else:
@@ -174,20 +178,28 @@ class PlanAdmin(admin.ModelAdmin):
         return render(request, "plans/admin_import.html", context)
 
     def export_all(self, request: HttpRequest) -> HttpResponse:
-        """Every scene, checkpoint and plan, each plan as it is newest."""
+        """Every scene, checkpoint and plan, each plan as it is newest; with ?pictures as an archive."""
         newest = {plan.name: plan for plan in Plan.objects.order_by("version")}
-        text = exported(
-            scenes=list(Scene.objects.all()),
-            checkpoints=list(Checkpoint.objects.all()),
-            plans=list(newest.values()),
-        )
-        return _download(text, "lab.toml")
+        everything: dict[str, Any] = {
+            "scenes": list(Scene.objects.all()),
+            "checkpoints": list(Checkpoint.objects.all()),
+            "plans": list(newest.values()),
+        }
+        if "pictures" in request.GET:
+            return _download(exported_with_pictures(**everything), "lab.zip", "application/zip")
+        return _download(exported(**everything), "lab.toml")
 
     @admin.action(description="Export as TOML")
     def export(self, request: HttpRequest, rows: QuerySet[Plan]) -> HttpResponse:
         """Those chosen, with the scenes and checkpoints that they are made of."""
-        plans = list({plan.name: plan for plan in rows.order_by("version")}.values())
-        return _download(exported(plans=plans), f"{plans[0].name}.toml" if len(plans) == 1 else "plans.toml")
+        plans = _newest(rows)
+        return _download(exported(plans=plans), f"{_title(plans)}.toml")
+
+    @admin.action(description="Export with reference pictures (zip)")
+    def export_archive(self, request: HttpRequest, rows: QuerySet[Plan]) -> HttpResponse:
+        """The same with the reference pictures of their positions."""
+        plans = _newest(rows)
+        return _download(exported_with_pictures(plans=plans), f"{_title(plans)}.zip", "application/zip")
 
     @admin.display(description="trials")
     def trials(self, plan: Plan) -> str:
@@ -196,6 +208,14 @@ class PlanAdmin(admin.ModelAdmin):
         return str(n)
 
 
-def _download(text: str, name: str) -> HttpResponse:
+def _newest(rows: QuerySet[Plan]) -> list[Plan]:
+    return list({plan.name: plan for plan in rows.order_by("version")}.values())
+
+
+def _title(plans: list[Plan]) -> str:
+    return plans[0].name if len(plans) == 1 else "plans"
+
+
+def _download(content: str | bytes, name: str, kind: str = "application/toml; charset=utf-8") -> HttpResponse:
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-    return HttpResponse(text, content_type="application/toml; charset=utf-8", headers=headers)
+    return HttpResponse(content, content_type=kind, headers=headers)

@@ -5,6 +5,7 @@
     [[scene.milestone]]  order, text, points, required, time_limit_s, truth
     [[checkpoint]]  name, description, policy, digest, parent (a name), tags
     [[plan]]        name, title, question, positions (scene and number each), checkpoints, repetitions, ...
+    [[reference]]   which picture a camera's reference at a position is; see .references
 
 What is there already under the same name is left where it is the same, changed where no trial was made with it, and
 refused, with the differences, where one was. All of a file is taken, or nothing.
@@ -14,93 +15,25 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
 import tomli_w
 from django.contrib.auth.models import User
 from django.core.exceptions import ValidationError as Invalid
 from django.db import models, transaction
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
 
 from evaweb.errors import Conflict, EvaError
 from evaweb.plans.canonical import difference
 from evaweb.plans.documents import checkpoint_of, scene_of
+from evaweb.plans.file import CheckpointTable, File, PlaceTable, PlanTable, SceneTable
 from evaweb.plans.models import Plan, PlanState, Reference
+from evaweb.plans.references import packed, reference_tables, take_references
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
 
 _Row = TypeVar("_Row", bound=models.Model)
-_Name = Annotated[str, Field(min_length=1, max_length=120)]
-
-
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-class _Position(_Table):
-    number: int = Field(ge=0, lt=2**15)
-    label: str = ""
-    description: str = ""
-    bench: dict[str, list[float]] | None = None
-
-
-class _Milestone(_Table):
-    order: int = Field(ge=0, lt=2**15)
-    text: str = Field(min_length=1, max_length=200)
-    points: int = Field(default=1, ge=1, le=100)
-    required: bool = False
-    time_limit_s: float | None = None
-    truth: str = ""
-
-
-class _Scene(_Table):
-    name: _Name
-    title: _Name
-    instruction: str
-    criterion: str = ""
-    layout: str = ""
-    time_limit_s: float | None = None
-    ordered: bool = False
-    position: list[_Position] = Field(min_length=1)
-    milestone: list[_Milestone] = []
-
-
-class _Checkpoint(_Table):
-    name: _Name
-    description: str = ""
-    policy: dict[str, Any] = {}
-    digest: str = ""
-    parent: str | None = None
-    tags: list[str] = []
-
-
-class _Place(_Table):
-    scene: str
-    number: int
-
-
-class _Plan(_Table):
-    name: _Name
-    title: _Name
-    question: str = ""
-    positions: list[_Place] = Field(min_length=1)
-    checkpoints: list[str] = Field(min_length=1)
-    repetitions: int = Field(default=1, ge=1)
-    stations: list[str] = []
-    strategy: dict[str, Any] | None = None
-    blind: bool = True
-    stopping: str = "none"
-    alpha: float = 0.05
-    comparison: list[str] = Field(default=[], max_length=2)
-    second_rater_share: float = 0.0
-    match_gate: float | None = None
-
-
-class _File(_Table):
-    scene: list[_Scene] = []
-    checkpoint: list[_Checkpoint] = []
-    plan: list[_Plan] = []
 
 
 # --- out ---------------------------------------------------------------------------------------------------
@@ -113,6 +46,23 @@ def exported(
     plans: list[Plan] | None = None,
 ) -> str:
     """A file with these, and with the scenes and checkpoints that the plans are made of."""
+    return _written(scenes, checkpoints, plans)[0]
+
+
+def exported_with_pictures(
+    *,
+    scenes: list[Scene] | None = None,
+    checkpoints: list[Checkpoint] | None = None,
+    plans: list[Plan] | None = None,
+) -> bytes:
+    """The same as an archive, with the reference pictures of the positions."""
+    text, references = _written(scenes, checkpoints, plans)
+    return packed(text, "lab.toml", references)
+
+
+def _written(
+    scenes: list[Scene] | None, checkpoints: list[Checkpoint] | None, plans: list[Plan] | None
+) -> tuple[str, list[dict[str, Any]]]:
     shown_scenes = {scene.pk: scene for scene in scenes or ()}
     shown_checkpoints = {row.pk: row for row in checkpoints or ()}
     for plan in plans or ():
@@ -121,12 +71,14 @@ def exported(
     shown_checkpoints |= {
         above.pk: above for row in list(shown_checkpoints.values()) for above in row.lineage
     }
+    references = reference_tables(shown_scenes.values())
     written = {
         "scene": [_scene_table(row) for row in sorted(shown_scenes.values(), key=lambda row: row.name)],
         "checkpoint": [_checkpoint_table(row) for row in sorted(shown_checkpoints.values(), key=_generation)],
         "plan": [_plan_table(plan) for plan in plans or ()],
+        "reference": references,
     }
-    return tomli_w.dumps({key: _without_none(rows) for key, rows in written.items() if rows})
+    return tomli_w.dumps({key: _without_none(rows) for key, rows in written.items() if rows}), references
 
 
 def _scene_table(scene: Scene) -> dict[str, Any]:
@@ -184,8 +136,11 @@ def _without_none(value: Any) -> Any:
 # --- in ----------------------------------------------------------------------------------------------------
 
 
-def imported(*, user: User, text: str) -> list[str]:
-    """Take a file; what was done, a line each. EvaError or Conflict names what cannot be, and nothing is taken then."""
+def imported(*, user: User, text: str, pictures: Mapping[str, bytes] | None = None) -> list[str]:
+    """Take a file; what was done, a line each. EvaError or Conflict names what cannot be, and nothing is taken then.
+
+    `pictures`: those of an archive, by the names that references have in the text.
+    """
     require(user, Role.ADMIN)
     given = _read(text)
     with transaction.atomic():
@@ -193,12 +148,13 @@ def imported(*, user: User, text: str) -> list[str]:
             *(_take_scene(table) for table in given.scene),
             *(_take_checkpoint(table) for table in given.checkpoint),
             *(_take_plan(table, user) for table in given.plan),
+            *take_references([row.model_dump() for row in given.reference], pictures or {}, user),
         ]
 
 
-def _read(text: str) -> _File:
+def _read(text: str) -> File:
     try:
-        return _File.model_validate(tomllib.loads(text))
+        return File.model_validate(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
         raise EvaError(f"this is not TOML: {error}") from None
     except ValidationError as error:
@@ -207,7 +163,7 @@ def _read(text: str) -> _File:
         raise EvaError(f"{where}: {first['msg']} (given: {first['input']!r:.80})") from None
 
 
-def _take_scene(table: _Scene) -> str:
+def _take_scene(table: SceneTable) -> str:
     made = Scene.objects.select_for_update().filter(name=table.name).first()
     wanted = table.model_dump()
     positions, milestones = wanted.pop("position"), wanted.pop("milestone")
@@ -231,7 +187,7 @@ def _take_scene(table: _Scene) -> str:
     return f"scene {scene.name}: {'changed' if made else 'new'}"
 
 
-def _take_checkpoint(table: _Checkpoint) -> str:
+def _take_checkpoint(table: CheckpointTable) -> str:
     made = Checkpoint.objects.select_for_update().filter(name=table.name).first()
     wanted = table.model_dump()
     if made is not None:
@@ -253,7 +209,7 @@ def _take_checkpoint(table: _Checkpoint) -> str:
     return f"checkpoint {checkpoint.name}: {'changed' if made else 'new'}"
 
 
-def _take_plan(table: _Plan, user: User) -> str:
+def _take_plan(table: PlanTable, user: User) -> str:
     newest = Plan.objects.select_for_update().filter(name=table.name).order_by("-version").first()
     if newest is not None and newest.state != PlanState.DRAFT:
         raise Conflict(f"plan {table.name} is {newest.get_state_display()}: amend it, then change the draft")
@@ -276,14 +232,14 @@ def _take_plan(table: _Plan, user: User) -> str:
     return f"plan {plan.name}: {'draft changed' if newest else 'new draft'}"
 
 
-def _position(place: _Place, table: _Plan) -> Position:
+def _position(place: PlaceTable, table: PlanTable) -> Position:
     found = Position.objects.filter(scene__name=place.scene, number=place.number).first()
     if found is None:
         raise EvaError(f"plan {table.name}: position {place.number} of scene {place.scene!r} does not exist")
     return found
 
 
-def _named(model: type[_Row], kind: str, name: str, table: _Plan) -> _Row:
+def _named(model: type[_Row], kind: str, name: str, table: PlanTable) -> _Row:
     found = model._default_manager.filter(name=name).first()
     if found is None:
         raise EvaError(f"plan {table.name}: {kind} {name!r} does not exist")

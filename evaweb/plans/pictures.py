@@ -83,6 +83,11 @@ def kept(name: str) -> bytes:
         raise NotFound(f"picture {name:.16} is not on this disk") from None
 
 
+def is_kept(name: str) -> bool:
+    """Whether the picture of that name is on this disk."""
+    return _path(name).is_file()
+
+
 def _path(name: str) -> Path:
     return Path(settings.DATA_DIR) / "pictures" / f"{name}.jpg"
 

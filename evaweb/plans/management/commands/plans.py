@@ -10,15 +10,18 @@ from django.contrib.auth.models import User
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
 from evaweb.errors import EvaError
-from evaweb.plans.exchange import exported, imported
+from evaweb.plans.exchange import exported, exported_with_pictures, imported
 from evaweb.plans.models import Plan
+from evaweb.plans.references import unpacked
 from evaweb.trials.models import Checkpoint, Scene
 
 
 class Command(BaseCommand):
-    """`import FILE --user NAME` takes a file, `export [NAME ...]` writes one."""
+    """`import FILE --user NAME` takes a file, `export [NAME ...] [--archive FILE.zip]` writes one."""
 
-    help = "Imports and exports scenes, checkpoints and plans as TOML."
+    help = (
+        "Imports and exports scenes, checkpoints and plans as TOML, or with reference pictures as an archive."
+    )
 
     def add_arguments(self, parser: CommandParser) -> None:
         parts = parser.add_subparsers(dest="what", required=True)
@@ -27,13 +30,16 @@ class Command(BaseCommand):
         take.add_argument("--user", required=True, help="the administrator who takes it, and owns its plans")
         give = parts.add_parser("export", help="write plans with all that they are made of")
         give.add_argument("names", nargs="*", help="of plans; none: every scene, checkpoint and plan")
+        give.add_argument(
+            "--archive", type=Path, help="a zip to write, with the reference pictures of positions"
+        )
 
     def handle(self, *args: Any, **options: Any) -> None:
         try:
             if options["what"] == "import":
                 self._import(options["file"], options["user"])
             else:
-                self._export(options["names"])
+                self._export(options["names"], options["archive"])
         except EvaError as error:
             raise CommandError(str(error)) from error
 
@@ -42,21 +48,27 @@ class Command(BaseCommand):
         if user is None:
             raise CommandError(f"--user {name}: there is no such user")
         try:
-            text = sys.stdin.read() if str(file) == "-" else file.read_text()
-        except (OSError, UnicodeDecodeError) as error:
+            content = sys.stdin.buffer.read() if str(file) == "-" else file.read_bytes()
+        except OSError as error:
             raise CommandError(f"{file}: {error}") from error
-        for line in imported(user=user, text=text):
+        text, pictures = unpacked(content)
+        for line in imported(user=user, text=text, pictures=pictures):
             self.stdout.write(line)
 
-    def _export(self, names: list[str]) -> None:
+    def _export(self, names: list[str], archive: Path | None) -> None:
         newest = {plan.name: plan for plan in Plan.objects.order_by("version")}
         unknown = [name for name in names if name not in newest]
         if unknown:
             raise CommandError(
                 f"plan {unknown[0]} does not exist; there are: {', '.join(newest) or 'none yet'}"
             )
-        if names:
-            self.stdout.write(exported(plans=[newest[name] for name in names]))
-        else:
-            everything = {"scenes": list(Scene.objects.all()), "checkpoints": list(Checkpoint.objects.all())}
-            self.stdout.write(exported(**everything, plans=list(newest.values())))
+        chosen: dict[str, Any] = {"plans": [newest[name] for name in names or newest]}
+        if not names:
+            chosen |= {"scenes": list(Scene.objects.all()), "checkpoints": list(Checkpoint.objects.all())}
+        if archive is None:
+            self.stdout.write(exported(**chosen))
+            return
+        try:
+            archive.write_bytes(exported_with_pictures(**chosen))
+        except OSError as error:
+            raise CommandError(f"{archive}: {error}") from error

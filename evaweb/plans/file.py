@@ -1,0 +1,105 @@
+"""What a file of scenes, checkpoints, plans and references may have; see .exchange for what is done with it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+_Name = Annotated[str, Field(min_length=1, max_length=120)]
+
+
+class Table(BaseModel):
+    """A table of the file; keys that it does not know are refused."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class PositionTable(Table):
+    """A position of a scene."""
+
+    number: int = Field(ge=0, lt=2**15)
+    label: str = ""
+    description: str = ""
+    bench: dict[str, list[float]] | None = None
+
+
+class MilestoneTable(Table):
+    """A milestone of a scene."""
+
+    order: int = Field(ge=0, lt=2**15)
+    text: str = Field(min_length=1, max_length=200)
+    points: int = Field(default=1, ge=1, le=100)
+    required: bool = False
+    time_limit_s: float | None = None
+    truth: str = ""
+
+
+class SceneTable(Table):
+    """A scene with its positions and milestones."""
+
+    name: _Name
+    title: _Name
+    instruction: str
+    criterion: str = ""
+    layout: str = ""
+    time_limit_s: float | None = None
+    ordered: bool = False
+    position: list[PositionTable] = Field(min_length=1)
+    milestone: list[MilestoneTable] = []
+
+
+class CheckpointTable(Table):
+    """A checkpoint, and which it was trained on from."""
+
+    name: _Name
+    description: str = ""
+    policy: dict[str, Any] = {}
+    digest: str = ""
+    parent: str | None = None
+    tags: list[str] = []
+
+
+class PlaceTable(Table):
+    """A position by its scene."""
+
+    scene: str
+    number: int
+
+
+class PlanTable(Table):
+    """A plan: what its draft becomes."""
+
+    name: _Name
+    title: _Name
+    question: str = ""
+    positions: list[PlaceTable] = Field(min_length=1)
+    checkpoints: list[str] = Field(min_length=1)
+    repetitions: int = Field(default=1, ge=1)
+    stations: list[str] = []
+    strategy: dict[str, Any] | None = None
+    blind: bool = True
+    stopping: str = "none"
+    alpha: float = 0.05
+    comparison: list[str] = Field(default=[], max_length=2)
+    second_rater_share: float = 0.0
+    match_gate: float | None = None
+
+
+class ReferenceTable(Table):
+    """Which picture a camera's reference at a position is."""
+
+    scene: str = Field(max_length=60)
+    position: int = Field(ge=0, lt=2**15)
+    station: str = Field(max_length=63)
+    camera: str = Field(min_length=1, max_length=63)
+    picture: str = Field(pattern=r"^[0-9a-f]{64}$")
+
+
+class File(Table):
+    """All of a file."""
+
+    scene: list[SceneTable] = []
+    checkpoint: list[CheckpointTable] = []
+    plan: list[PlanTable] = []
+    reference: list[ReferenceTable] = []
