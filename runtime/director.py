@@ -55,8 +55,11 @@ _HOLDS = ("refusals", "unmeasured", "family", "orphaned", "too_far", "moved_away
 class Director:
     """One `pump` does everything that is due; lockstep calls it tick by tick."""
 
-    def __init__(self, plan: Plan, page: Page, clock: Clock, runner: Runner) -> None:
+    def __init__(
+        self, plan: Plan, page: Page, clock: Clock, runner: Runner, people: Clock | None = None
+    ) -> None:
         self.page, self.clock = page, clock
+        self.people = people or clock  # of leases, and of how long commands are valid: lockstep has another
         self._facts = facts(plan)
         self.boot = str(uuid.uuid4())
         settings = plan.deployment
@@ -74,7 +77,7 @@ class Director:
             asking, strategy_of(plan), page, self._orders, clock, patience, Commitment(plan.rate)
         )
         self.setup = SetUp(plan, self.inference, self._orders, page, clock, lambda: self.media_report)
-        self._watch = Watch(plan, page, self.lease, clock, lambda: self.media_report)
+        self._watch = Watch(plan, page, self.lease, clock, self.people, lambda: self.media_report)
         control = settings.control
         self._punctuality = Punctuality(
             page, plan.rate, control.realtime_priority, control.realtime == "auto"
@@ -99,7 +102,7 @@ class Director:
         )
         self.operations = Operations(plan, parts, self._state, self._watch.absent, self.say)
         self.preflights = PreflightDesk(lambda: self.plan, plan, self._state, self.say, clock)
-        self.session = Session(self.operations, self.lease, self.boot, clock.now)
+        self.session = Session(self.operations, self.lease, self.boot, self.people.now)
         for ring in ("control_events", "media_events"):
             for _ in page.rings[ring].drain():
                 pass  # told to a predecessor that died
@@ -152,10 +155,15 @@ class Director:
                 estop=self._watch.estop,
                 boot=self.boot,
                 now=self.clock.now(),
+                people=self.people.now(),
                 newest_event=self.events.newest,
                 facts=self._facts,
             )
         )
+
+    def finish(self, reason: str) -> None:
+        """The run is over, says who simulates what it is about."""
+        self._observe(Happening.RUN_ENDED, reason)
 
     # --- what the family says ------------------------------------------------------------------------------
 
@@ -174,6 +182,7 @@ class Director:
             self.collecting.closed(message)
         elif isinstance(message, MediaReport):
             self.media_report = message
+            self.runs.saw(message.truth, self.session.state is State.RUNNING)
 
     def _unlock(self) -> None:
         """A control that was restarted, or obeys the e-stop, knows of no locks, another may: none, in any case."""

@@ -6,10 +6,13 @@ import logging
 import mmap
 import uuid
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from runtime.clock import VirtualClock
+from runtime.clock import Clock, VirtualClock
+from runtime.closing import Close, at_once
 from runtime.control import make_tick
 from runtime.director import Director
 from runtime.errors import SetupError
@@ -20,8 +23,10 @@ from runtime.media import Media, make_recorder
 from runtime.messages import Ack, Command
 from runtime.page import Page
 from runtime.plugins import variants
-from runtime.runner import LockstepRunner
+from runtime.recorder import Closed
+from runtime.runner import LockstepRunner, Runner
 from runtime.transitions import State
+from runtime.types import Observation
 
 log = logging.getLogger(__name__)
 _HOLDER = "lockstep"
@@ -38,21 +43,39 @@ class LockstepRun:
     events: list[dict[str, Any]] = field(default_factory=list)
 
 
-class Lockstep:
-    """One station without processes; each `tick` is media, main, control in that order."""
+@dataclass(frozen=True, slots=True)
+class Around:
+    """What a lockstep station is in the middle of; by default it is alone."""
 
-    def __init__(self, plan: Plan) -> None:
+    runner: Runner | None = None
+    people: Clock | None = None  # the clock of leases and commands
+    waits: Clock | None = None  # what the guard waits by
+    preview: Callable[[Observation], None] = lambda observation: None
+    closer: Callable[[Close], Future[Closed]] = at_once
+    on_disk: Callable[[Path], None] = lambda folder: None
+
+
+class Lockstep:
+    """One station without processes; each `tick` is media, main, control in that order.
+
+    `clock` and `around` are given where somebody else has a part in it.
+    """
+
+    def __init__(self, plan: Plan, clock: VirtualClock | None = None, around: Around | None = None) -> None:
         self.plan = plan
-        self.clock = VirtualClock()
+        self.clock = clock = clock or VirtualClock()
         self.page = Page(plan.layout, mmap.mmap(-1, Page.size(plan.layout)))
-        settings = plan.deployment
-        self.guard = Guard(self.page, Latch(settings.station_dir), self.clock, 1.0 / plan.rate)
-        self._source = plan.source(self.clock)
-        self._sink = plan.transport.sink(settings.transport, plan.robot, self.clock)
-        recorder = make_recorder(plan, self.clock.now, patient=True)
-        self.media = Media(self.page, self._source, recorder, self.clock)
-        self._runner = LockstepRunner(settings.lockstep.delay_ticks)
-        self.main = Director(plan, self.page, self.clock, self._runner)
+        settings, around = plan.deployment, around or Around()
+        waits = around.waits or clock
+        self.guard = Guard(self.page, Latch(settings.station_dir), waits, 1.0 / plan.rate, settings.station)
+        self._source = plan.source(clock)
+        self._sink = plan.transport.sink(settings.transport, plan.robot, clock)
+        recorder = make_recorder(plan, clock.now, patient=True)
+        self.media = Media(
+            self.page, self._source, recorder, clock, around.preview, around.closer, around.on_disk
+        )
+        self._runner = around.runner or LockstepRunner(settings.lockstep.delay_ticks)
+        self.main = Director(plan, self.page, clock, self._runner, around.people)
         self._tick = make_tick(plan, self.page, self._sink, self.clock.now)
         self.step = 0
 
@@ -72,7 +95,10 @@ class Lockstep:
         self._tick(self.step, now)
         self._runner.tick()
         self.step += 1
-        # From the start and not by adding up, so that tick k is at k / rate exactly.
+        self._pass()
+
+    def _pass(self) -> None:
+        """Let time come to the next tick: from the start and not by adding up, so that tick k is at k / rate."""
         self.clock.sleep_until(self.step / self.plan.rate)
 
     def command(self, kind: str, **arguments: Any) -> Ack:

@@ -78,7 +78,7 @@ class Service:
         self._unjournalled = failure
 
     def _publish(self) -> None:
-        main, now = self._main, self._main.clock.now()
+        main, now = self._main, self._main.people.now()
         self._every("state", 0.1, now, main.snapshot)
         self._every("joints", 1 / 30, now, self._joints)
         self._every("poses", 1 / 30, now, self._poses)

@@ -77,6 +77,11 @@ class Media:
     def recording(self) -> bool:
         return bool(self._recorder.recording)
 
+    @property
+    def closing(self) -> bool:
+        """Whether the last episode is still being closed."""
+        return self._closing is not None
+
     def pump(self, timeout: float) -> None:
         """Take one observation if there is one within `timeout` seconds, then all that the family says."""
         self._intake.pump(timeout)
@@ -84,16 +89,14 @@ class Media:
 
     def digest(self) -> None:
         """Write down what control and main have posted."""
-        self._collect()
+        self.collect()
         self._drain("minutes")
         self._drain("ticks")
         for event in self._recorder.news():
             log.warning("%s", event.text)
             self._tell(event)
-        now = self._clock.now()
-        if now >= self._next_report:
-            self._next_report = now + _REPORT_PERIOD
-            self._report(now)
+        if self._clock.now() >= self._next_report:
+            self.report()
 
     def _drain(self, ring: str) -> None:
         if ring == "minutes" and not self._ready_to_begin():
@@ -136,7 +139,7 @@ class Media:
             self._begin(message)
         elif isinstance(message, EndEpisode):
             self._drain("ticks")  # those that control did before main decided to end
-            self._say_truth()
+            self._say_truth(message.details.get("reached") or {})
             self.end(message.status, message.reason, message.details)
             self._intake.end_run()
 
@@ -158,17 +161,18 @@ class Media:
         if self._recorder.recording:
             self._closing_uuid = self._recorder.recording
             self._closing = self._closer(self._recorder.end(status, reason, details or {}))  # type: ignore[arg-type]
-            self._collect()
+            self.collect()
 
     def finish(self, seconds: float) -> None:
         """Wait for an episode that is being closed, at most so long; what is missing then, repair completes."""
         if self._closing is not None:
             wait([self._closing], seconds)
-            self._collect()
+            self.collect()
         if self._closing is not None:
             log.error("episode %s was not closed within %g s", self._closing_uuid, seconds)
 
-    def _collect(self) -> None:
+    def collect(self) -> None:
+        """Tell main of an episode that has been closed."""
         if self._closing is None or not self._closing.done():
             return
         closed, self._closing, self._closing_uuid = self._closing.result(), None, ""
@@ -184,20 +188,22 @@ class Media:
         self._tell(Event("recording_failed", str(error), self._clock.now()))
         self.end("failed", str(error))
 
-    def _report(self, now: float) -> None:
-        intake, recorder = self._intake, self._recorder
+    def report(self) -> None:
+        """Tell main how it goes; done by itself five times a second."""
+        intake, recorder, now = self._intake, self._recorder, self._clock.now()
+        self._next_report = now + _REPORT_PERIOD
         faults, rates = intake.faults(), intake.rates()
         recording = recorder.recording or self._closing_uuid  # until it is on disk
         rows, repeated = recorder.rows, recorder.repeated
         told = (intake.truth, intake.drives, intake.cameras)
         self._tell(MediaReport(now, rates, faults, rows, recording, repeated, *told))
 
-    def _say_truth(self) -> None:
-        """How a simulated bench is left: what the episode is scored by."""
+    def _say_truth(self, reached: Mapping[str, float]) -> None:
+        """How a simulated bench is left, and when its milestones were reached: what the episode is scored by."""
         truth = self._intake.truth
         if truth:
             how = "success" if truth["success"] else "no success"
-            data = {**truth, "episode": self._recorder.recording}
+            data = {**truth, "reached": dict(reached), "episode": self._recorder.recording}
             self._say(Event("truth", f"the simulated bench says: {how}", self._clock.now(), data=data))
 
     def _say(self, event: Event) -> None:

@@ -126,6 +126,11 @@ class Ring:
         """Bytes that a ring for `capacity` bytes of messages takes in the shared file."""
         return 2 * _ALIGN + aligned(capacity)
 
+    @property
+    def waiting(self) -> bool:
+        """Whether there is a message that nobody has taken yet."""
+        return int(self._head[0]) != int(self._tail[0])
+
     def push(self, payload: bytes) -> bool:
         """Append one message; False (and counted in `refused`) where there is no room."""
         head, tail = int(self._head[0]), int(self._tail[0])

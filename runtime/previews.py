@@ -27,6 +27,7 @@ class Previews:
         self._height = settings.preview_height
         self._due: dict[str, float] = {}
         self._shown: dict[str, float] = {}  # when each camera's last one was captured
+        self._newest: dict[str, bytes] = {}
         cv2.setNumThreads(1)  # the other cores belong to the rest of the family
         Endpoints(plan.deployment.station_dir).write("media", {"cameras": self._publisher.endpoint})
 
@@ -38,9 +39,17 @@ class Previews:
             self._shown[camera] = captured
             # A little early counts, so that 15 of 30 pictures a second are shown and not 10.
             self._due[camera] = observation.arrived + 0.9 * self._period
-            self._publisher.publish(
-                f"camera/{camera}", simplejpeg.encode_jpeg(self._small(picture), quality=80)
-            )
+            self._newest[camera] = simplejpeg.encode_jpeg(self._small(picture), quality=80)
+            self._publisher.publish(f"camera/{camera}", self._newest[camera])
+
+    def again(self) -> None:
+        """Show the newest of each camera once more: time stands still, and who begins to look now sees them too."""
+        for camera, jpeg in self._newest.items():
+            self._publisher.publish(f"camera/{camera}", jpeg)
+
+    def close(self) -> None:
+        """Release the socket."""
+        self._publisher.close()
 
     def _small(self, picture: UInt8) -> UInt8:
         """By a whole factor, each pixel the mean of those that it stands for."""

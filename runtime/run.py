@@ -44,6 +44,7 @@ class Run:
     waiting: bool = False  # begins when what it needs is loaded
     unrecorded: str = ""  # why its recording ended before it did
     counted: Mapping[str, Any] = field(default_factory=dict)  # control's figures when it was asked for
+    reached: dict[str, float] = field(default_factory=dict)  # milestones of a simulated bench [s of the run]
 
     def figures(self, now: Mapping[str, Any]) -> dict[str, Any]:
         """Control's figures `now`, with what it counts counted from the beginning of this run.

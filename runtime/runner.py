@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import threading
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
@@ -91,6 +93,60 @@ class ThreadRunner(Runner):
 
     def close(self) -> None:
         self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+class DeclaredRunner(Runner):
+    """Makes calls between two ticks, and hands each result over as many ticks later as `declared` says of it.
+
+    Calls wait for `begin`. They are made on a thread, so that who ticks can answer commands meanwhile; as long as one
+    is being made, no time may pass. So what is handed over when does not depend on how long a call really took.
+    """
+
+    def __init__(self, declared: Callable[[Any], tuple[Any, int]]) -> None:
+        self._declared = declared  # from a result to what is handed over, and its delay [ticks]
+        self._thread = ThreadRunner()
+        self._now = 0
+        self._waiting: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
+        self._asked: WeakKeyDictionary[Future[Any], int] = WeakKeyDictionary()
+        self._late: WeakKeyDictionary[Future[Any], int] = WeakKeyDictionary()
+
+    def submit(self, call: Callable[[], Result]) -> Future[Result]:
+        future: Future[Result] = Future()
+        self._asked[future] = self._now
+        self._waiting.append((future, call))
+        return future
+
+    def aside(self, call: Callable[[], Result]) -> Future[Result]:
+        future: Future[Result] = Future()
+        _settle(future, call)
+        return future
+
+    def begin(self) -> bool:
+        """Begin all calls that wait; whether one is being made now."""
+        while self._waiting:
+            self._thread.submit(partial(self._make, *self._waiting.popleft()))
+        return self._thread.busy
+
+    def ready(self, future: Future[Result]) -> bool:
+        # Never within the tick of the question: how often main looks in that time is chance.
+        return future.done() and self._now >= self._asked[future] + max(1, self._late.get(future, 1))
+
+    @property
+    def busy(self) -> bool:
+        return bool(self._waiting) or self._thread.busy
+
+    def tick(self) -> None:
+        self._now += 1
+
+    def close(self) -> None:
+        self._thread.close()
+
+    def _make(self, future: Future[Any], call: Callable[[], Any]) -> None:
+        def handed_over() -> Any:
+            result, self._late[future] = self._declared(_told(call)())
+            return result
+
+        _settle(future, handed_over)
 
 
 class LockstepRunner(Runner):

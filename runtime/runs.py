@@ -151,10 +151,20 @@ class Runs:
             self.last = {"number": run.number, "uuid": run.uuid, "status": status, "reason": reason}
             policy = self._inference.tally.figures()
             details = {"run_seconds": seconds, "control": run.figures(self._figures()), "policy": policy}
+            details |= {"reached": run.reached} if run.reached else {}
             self.note(EndEpisode(status, reason, details))  # a stop is not refused because media hangs
         if self._alone and status != "finished":
             self.note(self._end_alone(status, reason))
             self._alone = ""
+
+    def saw(self, truth: Mapping[str, Any], running: bool) -> None:
+        """Note when a simulated bench first says of a milestone that it is reached, in a run that is not held."""
+        run, milestones = self.open, truth.get("milestones")
+        if not running or run is None or run.begun is None or not isinstance(milestones, Mapping):
+            return
+        for name, reached in milestones.items():
+            if reached:
+                run.reached.setdefault(str(name), round(run.elapsed(self._clock.now()), 2))
 
     def pump(self) -> None:
         """Begin a run as soon as what it waited for is there."""

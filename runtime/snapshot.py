@@ -43,17 +43,21 @@ class View:
     estop: str
     boot: str
     now: float
+    people: float  # the same moment on the clock of leases and commands
     newest_event: int
     facts: Mapping[str, Any]  # as by `facts`, which never change
 
 
 def snapshot(view: View) -> dict[str, Any]:
-    """The station's state; times in seconds on the runtime's clock, ages in seconds."""
+    """The station's state; times in seconds on the runtime's clock, ages in seconds.
+
+    "clock" is the one that commands are valid by; in lockstep it goes on while the runtime's stands.
+    """
     settings, session = view.plan.deployment, view.session
     return {
         "boot": view.boot,
         "sequence": session.sequence,
-        "clock": view.now,
+        "clock": view.people,
         "station": settings.station,
         "robot": view.plan.robot.name,
         "state": str(session.state),
@@ -128,10 +132,10 @@ def facts(plan: Plan) -> dict[str, Any]:
 
 
 def _lease(view: View) -> dict[str, Any]:
-    held = view.lease.current(view.now)
+    held = view.lease.current(view.people)
     if held is None:
         return {"holder": "", "epoch": view.lease.epoch, "expires_in": 0.0}
-    return {"holder": held.holder, "epoch": held.epoch, "expires_in": held.until - view.now}
+    return {"holder": held.holder, "epoch": held.epoch, "expires_in": held.until - view.people}
 
 
 def _run(view: View) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from typing import IO
 
 from runtime.bus import Endpoints
 from runtime.companion import Companion
+from runtime.config import Deployment
 from runtime.errors import SetupError
 from runtime.family import Lifeline, Plan
 from runtime.page import PROCESSES, Page
@@ -28,6 +29,37 @@ MOST_RESTARTS, RESTART_WINDOW_S = 5, 60.0
 _PATIENCE_S = 9.0  # after the lifeline is cut; then what is left is killed
 _DRIVER_PATIENCE_S = 2.0  # for what drives a headless run, after it was told to end
 _POLL_S = 0.05
+
+
+def hold(settings: Deployment) -> IO[str]:
+    """The lock of a station, for as long as it runs; SetupError names the process that has it, or why it cannot be."""
+    try:
+        return _locked(settings)
+    except OSError as error:
+        raise _unwritable(settings, error) from None
+
+
+def _unwritable(settings: Deployment, error: OSError) -> SetupError:
+    return SetupError(
+        f"{settings.station_dir} cannot be written ({error.strerror}): make room there, or name another folder with "
+        "data_dir"
+    )
+
+
+def _locked(settings: Deployment) -> IO[str]:
+    settings.station_dir.mkdir(parents=True, exist_ok=True)
+    lock = (settings.station_dir / "lock").open("a+", encoding="utf-8")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.seek(0)
+        raise SetupError(
+            f"station {settings.station!r} is already running (process {lock.read().strip() or '?'}); "
+            "end it first, or give this one another name with --set station=NAME"
+        ) from None
+    lock.truncate(0)
+    os.write(lock.fileno(), str(os.getpid()).encode())
+    return lock
 
 
 class Supervisor:
@@ -48,14 +80,11 @@ class Supervisor:
 
     def run(self, headless: bool) -> int:
         """Start, watch until a signal or the end of a headless run, end; returns the exit code."""
+        lock = hold(self._plan.deployment)
         try:
-            lock = self._lock()
             self._resolved = self._write_resolved()
         except OSError as error:
-            raise SetupError(
-                f"{self._station_dir} cannot be written ({error.strerror}): make room there, or name another "
-                "folder with data_dir"
-            ) from None
+            raise _unwritable(self._plan.deployment, error) from None
         self._endpoints.clear()
         self._page, self._page_fd = Page.create(self._plan.layout)
         # Children hold the reading end as their standard input: it ends when this process does, however it does.
@@ -75,21 +104,6 @@ class Supervisor:
         finally:
             self._end()
             lock.close()
-
-    def _lock(self) -> IO[str]:
-        self._station_dir.mkdir(parents=True, exist_ok=True)
-        lock = (self._station_dir / "lock").open("a+", encoding="utf-8")
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            lock.seek(0)
-            raise SetupError(
-                f"station {self._plan.deployment.station!r} is already running (process {lock.read().strip() or '?'}); "
-                "end it first, or give this one another name with --set station=NAME"
-            ) from None
-        lock.truncate(0)
-        os.write(lock.fileno(), str(os.getpid()).encode())
-        return lock
 
     def _write_resolved(self) -> Path:
         path = self._station_dir / "resolved.json"

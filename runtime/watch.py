@@ -34,12 +34,19 @@ class Watch:
     """Looks at page, lease and run once per pump; the session decides what follows."""
 
     def __init__(
-        self, plan: Plan, page: Page, lease: Lease, clock: Clock, media: Callable[[], MediaReport]
+        self,
+        plan: Plan,
+        page: Page,
+        lease: Lease,
+        clock: Clock,
+        people: Clock,
+        media: Callable[[], MediaReport],
     ) -> None:
         self._plan = plan
         self._page = page
         self._lease = lease
         self._clock = clock
+        self._people = people  # the clock of leases
         self._media = media  # what it last reported
         self._latch = Latch(plan.deployment.station_dir)
         self._generations = {name: page.generation(name) for name in SIBLINGS}
@@ -99,7 +106,7 @@ class Watch:
         return now - self._pressed < _LATCH_S
 
     def _leases(self) -> Iterator[Noticed]:
-        held = self._lease.current(self._clock.now()) is not None
+        held = self._lease.current(self._people.now()) is not None
         if self._lease_held and not held:
             yield Noticed(Happening.LEASE_ENDED, "the lease was not renewed: claim it, then resume or stop")
         self._lease_held = held

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
 from runtime import codecs
@@ -13,7 +14,7 @@ from runtime.clock import Clock
 from runtime.sim.node import Node
 from runtime.transports.base import Sink, Source
 from runtime.transports.node_messages import MESSAGE_LIMIT, NodeMessages
-from runtime.types import Observation, RobotCommand
+from runtime.types import Observation, RobotCommand, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -57,7 +58,7 @@ class Link(Source, Sink):
             arrived=now,
             captured=MappingProxyType(dict.fromkeys(streams, frame.stamp)),
             qpos=frame.qpos,
-            pictures={key: np.ascontiguousarray(bgr[..., ::-1]) for key, bgr in frame.pictures.items()},
+            pictures={key: _rgb(bgr) for key, bgr in frame.pictures.items()},
             eef=frame.eef,
             truth=frame.truth,
         )
@@ -76,3 +77,8 @@ class Link(Source, Sink):
 
     def _say(self, message: dict[str, Any]) -> None:
         self._commands.append(codecs.pack(message | {"master": _NAME}))
+
+
+def _rgb(bgr: UInt8) -> UInt8:
+    """A picture of a node as one of ours."""
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

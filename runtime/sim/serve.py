@@ -15,6 +15,7 @@ from runtime.sim.script import Script, Waving
 
 if TYPE_CHECKING:
     from robots import Robot
+    from runtime.clock import Clock
     from runtime.sim.rtc_wires import Name
 
 
@@ -92,6 +93,7 @@ def parser() -> argparse.ArgumentParser:
     groot.add_argument("--token-env", metavar="NAME", help="environment variable with the API token it wants")
     line.add_argument("--fault", type=faults.parse, default=faults.NONE, metavar="NAME[:ARG]")
     standin.add_arguments(line)
+    line.set_defaults(declared=False)  # by `made`
     return line
 
 
@@ -102,11 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     told = standin.ending(options.lifeline)
     try:
-        robot = robots.load(options.robot, options.groups)
-        rate = options.rate or robot.control_rate
-        played = _spoken(_script(robot, rate, options), robot, rate, options)
-        made = _PROTOCOLS[options.protocol](robot, rate, played, options)
-        with contextlib.closing(made) as server:
+        with contextlib.closing(made(options)) as server:
             standin.announce(server.start(), options.ready_file)
             told.wait()
     except (RuntimeFault, robots.RobotError) as error:
@@ -115,11 +113,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+def made(options: argparse.Namespace, clock: Clock | None = None) -> StandInServer:
+    """The server that a command line asks for, not yet started; RuntimeFault, RobotError where it cannot be.
+
+    With a virtual `clock` it lives by that, and its answers say how long they took without anybody waiting for it;
+    openpi with pick_place alone can do so.
+    """
+    import robots
+
+    if clock is not None and (options.protocol, options.behaviour) != ("openpi", "pick_place"):
+        raise SetupError(
+            f"{options.protocol} with --behaviour {options.behaviour} in lockstep; allowed: openpi with pick_place"
+        )
+    robot = robots.load(options.robot, options.groups)
+    rate = options.rate or robot.control_rate
+    played = _spoken(_script(robot, rate, options, clock), robot, rate, options)
+    options.declared = clock is not None
+    return _PROTOCOLS[options.protocol](robot, rate, played, options)
+
+
 def _openpi(robot: Robot, rate: float, script: Script, options: argparse.Namespace) -> StandInServer:
     from runtime.sim.openpi_server import Behaviour, OpenpiServer
 
     latency = options.latency_ms / 1e3
-    behaviour = Behaviour(options.horizon, rate, latency, options.fault, options.seed, _rtc(options))
+    behaviour = Behaviour(
+        options.horizon, rate, latency, options.fault, options.seed, _rtc(options), options.declared
+    )
     return OpenpiServer(robot, behaviour, options.port, script)
 
 
@@ -213,7 +232,7 @@ def _spoken(script: Script, robot: Robot, rate: float, options: argparse.Namespa
     return InPoses(script, robot, rate, pose_format(options.pose))
 
 
-def _script(robot: Robot, rate: float, options: argparse.Namespace) -> Script:
+def _script(robot: Robot, rate: float, options: argparse.Namespace, clock: Clock | None) -> Script:
     from runtime.sim.chase import Chase
     from runtime.sim.pick_place import PickPlace, Skill, poses_apart
 
@@ -227,7 +246,7 @@ def _script(robot: Robot, rate: float, options: argparse.Namespace) -> Script:
         return Waving(robot, options.horizon, rate, options.seed, options.name)
     skill = Skill(options.noise / 1e3, options.failure_rate, options.seed)
     apart = poses_apart if options.space == "eef" else None
-    return PickPlace(robot, options.horizon, rate, skill, options.name, apart=apart)
+    return PickPlace(robot, options.horizon, rate, skill, options.name, clock, apart)
 
 
 def _length(text: str) -> float:

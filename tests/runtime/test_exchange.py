@@ -369,6 +369,29 @@ def test_what_the_bench_says_at_the_end_of_a_run_is_in_the_episode_and_among_the
     station.close()
 
 
+def test_when_milestones_were_first_reached_is_told_in_seconds_of_the_run(tmp_path: Path) -> None:
+    def says(**milestones: bool) -> None:
+        station.robot.truth = {"reset": "reset-1", "milestones": milestones, "success": False}
+
+    station = simulated(tmp_path).ready(bench=BENCH)
+    says(grasped=True, placed=False)  # by whatever was before the run
+    station.command("run")
+    station.go(30)
+    says(grasped=False, placed=True)
+    station.go(15)
+    station.command("halt")
+    station.go(60)  # held time is none of the run
+    says(grasped=True, placed=True, lifted=True)
+    station.go(15)
+    station.command("resume")
+    station.go(15)
+    told = next(event for event in station.stop().events if event["kind"] == "truth")["data"]["reached"]
+    assert told["grasped"] < 0.3
+    assert 1.0 <= told["placed"] < 1.3
+    assert 1.5 <= told["lifted"] < 1.8  # as soon as it goes on
+    station.close()
+
+
 def test_the_snapshot_says_what_is_set_up(tmp_path: Path) -> None:
     station = simulated(tmp_path)
     station.reach(State.IDLE)

@@ -513,10 +513,10 @@ def test_an_episode_ends_with_the_newest_truth(desk: Desk) -> None:
     desk.begin()
     desk.source.waiting.append(desk.observation(2, truth=TRUTH))
     desk.media.pump(0.0)
-    desk.post(EndEpisode("finished", "stopped"))
+    desk.post(EndEpisode("finished", "stopped", {"reached": {"grasped": 1.5}}))
     desk.media.pump(0.0)
     said = [event for event in desk.told(Event) if event.kind == "truth"]
-    assert [event.data for event in said] == [TRUTH | {"episode": "one"}]
+    assert [event.data for event in said] == [TRUTH | {"reached": {"grasped": 1.5}, "episode": "one"}]
     assert [event["data"] for event in desk.journal.events if event["kind"] == "truth"] == [said[0].data]
     assert desk.journal.outcome is not None
 

@@ -6,7 +6,7 @@ import weakref
 import pytest
 
 from runtime.errors import PolicyError
-from runtime.runner import LockstepRunner, ThreadRunner
+from runtime.runner import DeclaredRunner, LockstepRunner, ThreadRunner
 
 
 def test_lockstep_hands_every_result_over_the_same_number_of_ticks_later() -> None:
@@ -77,3 +77,64 @@ def test_an_error_aside_is_its_own() -> None:
         with pytest.raises(ZeroDivisionError):
             runner.aside(lambda: 1 // 0).result(10)
         runner.close()
+
+
+def declaring(ticks: int) -> DeclaredRunner:
+    """Hands over what was answered as a sentence, `ticks` late."""
+    return DeclaredRunner(lambda answer: (f"{answer}", ticks))
+
+
+def test_a_declared_delay_counts_from_the_question_whatever_the_call_took() -> None:
+    runner = declaring(3)
+    gate = threading.Event()
+    future = runner.submit(lambda: gate.wait(10))
+    assert runner.busy
+    assert runner.begin()  # being made: no time may pass now
+    gate.set()
+    assert future.result(10) == "True"
+    ready = []
+    for _ in range(5):
+        ready.append(runner.ready(future))
+        runner.tick()
+    assert ready == [False, False, False, True, True]
+    runner.close()
+
+
+def test_what_is_declared_to_take_no_time_is_there_with_the_next_tick() -> None:
+    runner = declaring(0)
+    future = runner.submit(lambda: 1)
+    runner.begin()
+    assert future.result(10) == "1"
+    assert not runner.ready(future)
+    runner.tick()
+    assert runner.ready(future)
+    runner.close()
+
+
+def test_no_call_is_made_before_time_stands_still() -> None:
+    runner, made = declaring(1), []
+    futures = [runner.submit(lambda number=number: made.append(number)) for number in range(3)]
+    runner.tick()
+    assert made == []
+    runner.begin()
+    assert futures[-1].result(10) == "None"
+    assert made == [0, 1, 2]
+    runner.close()
+
+
+def test_an_error_of_a_call_or_of_what_it_declares_is_handed_over_with_the_next_tick() -> None:
+    def declared(answer: object) -> tuple[object, int]:
+        raise PolicyError("it says -1 ms")
+
+    runner = DeclaredRunner(declared)
+    failing, odd = runner.submit(lambda: 1 // 0), runner.submit(lambda: 1)
+    runner.begin()
+    with pytest.raises(PolicyError, match="ZeroDivisionError"):
+        failing.result(10)
+    with pytest.raises(PolicyError, match="it says -1 ms"):
+        odd.result(10)
+    runner.tick()
+    assert runner.ready(failing)
+    assert runner.ready(odd)
+    assert runner.aside(lambda: 7).result() == 7
+    runner.close()

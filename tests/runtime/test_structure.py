@@ -23,7 +23,7 @@ DOORS = {
     "quality",
 }
 FAMILY = {"control", "main", "media", "guard", "headless"}
-ROOF = FAMILY | {"lockstep", "supervisor", "ctl", "terminal", "channel", "__main__"}
+ROOF = FAMILY | {"lockstep", "served_lockstep", "supervisor", "ctl", "terminal", "channel", "__main__"}
 
 
 SOURCES = Sources("runtime", "robots")

@@ -1,0 +1,193 @@
+"""A lockstep station that people and programs find as they find any other: commands, streams, pictures, e-stop.
+
+Its time passes as fast as the machine can while it sets up or the policy drives, and stands still while it is ready,
+while the policy is asked and while an episode is being closed: nothing that is recorded depends on how long those
+took. Leases, and for how long a command is valid, are of the people's own time, which goes on.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import zmq
+
+from runtime.asking import Answered
+from runtime.bus import CommandServer, Endpoints
+from runtime.clock import Clock, MonotonicClock, VirtualClock
+from runtime.closing import in_background
+from runtime.control import Lateness
+from runtime.errors import PolicyError, SetupError
+from runtime.exports import Exports
+from runtime.family import Plan
+from runtime.leftovers import start_repair
+from runtime.lockstep import Around, Lockstep
+from runtime.main import Service
+from runtime.previews import Previews
+from runtime.runner import DeclaredRunner
+from runtime.supervisor import hold
+from runtime.transitions import State
+
+log = logging.getLogger(__name__)
+_POLL_S = 0.002  # for a command, while time stands still
+_AGAIN_S = 0.2  # between two showings of the same pictures
+_LAST_S, _EXPORT_S = 8.0, 3.0  # at the end: for the last episode, for exports
+_FIGURES_EVERY = 30  # ticks
+_ON_DEMAND = ("step", "preview", "manual")  # modes in which a person is waited for: no faster than they live
+Over = Callable[[bool], str]
+"""Asked before each tick with whether a run goes on: why it is over, "" while it is not."""
+
+
+def declared(rate: float) -> Callable[[Any], tuple[Any, int]]:
+    """What a policy's answer is handed over as, and how many ticks late: as late as it says that it took.
+
+    What is no answer, connecting for one, is there with the next tick.
+    """
+
+    def told(result: Any) -> tuple[Any, int]:
+        if not isinstance(result, Answered):
+            return result, 1
+        ms = result.chunk.timing.get("policy.infer_ms", 0.0)
+        if not 0.0 <= ms < math.inf:
+            raise PolicyError(
+                f"the answer's policy_timing.infer_ms is {ms}: lockstep goes by it; allowed: 0 or more"
+            )
+        return replace(result, seconds=ms / 1e3), math.ceil(ms / 1e3 * rate - 1e-6)
+
+    return told
+
+
+class _Waiting(Clock):
+    """The station's clock for its guard, which waits for control: to wait is to tick."""
+
+    def __init__(self, clock: Clock, tick: Callable[[], None]) -> None:
+        self._clock, self._tick = clock, tick
+
+    def now(self) -> float:
+        return self._clock.now()
+
+    def sleep_until(self, deadline: float) -> None:
+        while self._clock.now() < deadline:
+            self._tick()
+
+
+class ServedLockstep(Lockstep):
+    """One lockstep station with the sockets of a family; `serve` until told to end, then `close`.
+
+    Raises SetupError where another process has the station, or what it needs is no part of lockstep.
+    """
+
+    def __init__(
+        self, plan: Plan, clock: VirtualClock, over: Over = lambda running: "", people: Clock | None = None
+    ) -> None:
+        settings = plan.deployment
+        if settings.control_channel.enabled:
+            raise SetupError("control_channel.enabled = true in lockstep, which has none; allowed: false")
+        self._people = people or MonotonicClock()
+        self._over = over
+        self._lock = hold(settings)
+        Endpoints(settings.station_dir).clear()
+        self._exports = Exports(settings.data, settings.recording.export)
+        start_repair(settings.episodes_dir, settings.station, self._exports.start)
+        self._previews = Previews(plan)
+        self._asking = DeclaredRunner(declared(plan.rate))
+        around = Around(
+            runner=self._asking,
+            people=self._people,
+            waits=_Waiting(clock, self.tick),
+            preview=self._previews,
+            closer=in_background,
+            on_disk=self._exports.start,
+        )
+        super().__init__(plan, clock, around)
+        self._figures = Lateness(self._tick.status, "lockstep")
+        context: zmq.Context[Any] = zmq.Context.instance()
+        self._estops = CommandServer(context, settings.bus.host, settings.bus.estop_port)
+        Endpoints(settings.station_dir).write("guard", {"estop": self._estops.endpoint})
+        self._service = Service(self.main, context)
+        self._told_at = -1  # the step that main was last told of how it goes, time standing still
+        self._again_at = self._next_at = 0.0  # on the people's clock
+
+    def serve(self, ended: Callable[[], bool]) -> None:
+        """Tick where time passes, answer commands, publish, until `ended`."""
+        self.connect()
+        while not ended():
+            self.turn()
+
+    def turn(self) -> None:
+        """One tick if time passes, then every command there is."""
+        wait = _POLL_S
+        if not self._stands():
+            now = self._people.now()
+            if self._fast():
+                wait = 0.0
+                self.tick()
+            elif now >= self._next_at:
+                self._next_at = now + 1.0 / self.plan.rate
+                self.tick()
+        else:
+            self._stand()
+        self._service.serve(wait)
+        while (received := self._estops.receive()) is not None:
+            address, command = received
+            self._estops.answer(address, self.guard.answer(command))
+
+    def tick(self) -> None:
+        """One control period; a run that is over ends within it."""
+        super()._pass()
+        if why := self._over(self.main.session.state is State.RUNNING):
+            self.main.finish(why)
+        super().tick()
+        self._figures.add(0.0, 0)
+        if self.step % _FIGURES_EVERY == 0:
+            self._figures.write()
+
+    def _pass(self) -> None:
+        """Time comes to a tick when that begins: the policy is asked between two, and it is now until it answers."""
+
+    def _stands(self) -> bool:
+        """Whether time stands still: nothing goes on that needs it, or somebody is waited for."""
+        if self._asking.begin() or self.media.closing:
+            return True
+        if self.main.session.state not in (State.IDLE, State.READY):
+            return False
+        moving = bytes(self.page.control.read()["behaviour"]) == b"motion"
+        return not (moving or self.media.recording or self.page.rings["orders"].waiting)
+
+    def _fast(self) -> bool:
+        """Whether nobody is waited for, who would want to see it as it happens."""
+        state, run = self.main.session.state, self.main.run
+        if state is State.RUNNING:
+            return run is None or run.mode not in _ON_DEMAND
+        return state is State.SETTING_UP
+
+    def _stand(self) -> None:
+        """Hear and tell, while it is still now; what begins, begins with a tick."""
+        self.guard.watch()
+        if self.media.closing:
+            self.media.collect()
+        elif self.main.session.state in (State.IDLE, State.READY):
+            self.media.digest()
+            if self._told_at != self.step:
+                self._told_at = self.step
+                self.media.report()
+        self.main.pump()
+        if (now := self._people.now()) >= self._again_at:
+            self._again_at = now + _AGAIN_S
+            self._previews.again()
+
+    def close(self) -> None:
+        """Close the episode, what is asked, all sockets; then the station is free for another process."""
+        self.media.digest()
+        self.media.end("interrupted", "the station's supervisor ended")
+        self.media.finish(_LAST_S)
+        self._exports.finish(_EXPORT_S)
+        super().close()
+        self._service.close()
+        self._estops.close()
+        self._previews.close()
+        Endpoints(self.plan.deployment.station_dir).clear()
+        self._lock.close()

@@ -1,0 +1,133 @@
+"""A station at its simulated bench on a virtual clock: `python -m runtime.sim.lockstep DEPLOYMENT`.
+
+Node, bench, policy servers and station are one process and have one time; people, pages and programs find the station
+as they find any other. With the same seeds the same commands in the same order give the same course, to the tick, on
+any machine however busy it is. A run ends by itself once the bench's own truth has said success for a second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import robots
+from robots import Robot
+from runtime import deployment, family, log
+from runtime.clock import Clock, VirtualClock
+from runtime.errors import RuntimeFault, SetupError
+from runtime.family import Plan
+from runtime.served_lockstep import ServedLockstep
+from runtime.sim import serve, standin, surroundings
+from runtime.sim.link import Link
+from runtime.sim.node import Node
+from runtime.sim.node import parser as node_parser
+from runtime.sim.surroundings import Surroundings
+from runtime.transports import zmq
+
+REST_S = 1.0  # of success, after which nothing more is to be seen
+
+
+@dataclass(frozen=True, slots=True)
+class BenchPlan(Plan):
+    """A plan whose transport is a simulated node in this process."""
+
+    link: Link
+
+    @property
+    def transport(self) -> Any:
+        return SimpleNamespace(source=self._linked, sink=self._linked, capabilities=zmq.capabilities)
+
+    def _linked(self, config: object, robot: Robot, clock: Clock) -> Link:
+        return self.link
+
+
+class Rested:
+    """Says when a run is over: the bench's truth has said success for a while."""
+
+    def __init__(self, truth: Callable[[], Mapping[str, Any] | None], clock: Clock) -> None:
+        self._truth, self._clock = truth, clock
+        self._since: float | None = None
+
+    def __call__(self, running: bool) -> str:
+        truth = self._truth() if running else None
+        if not (truth and truth["success"]):
+            self._since = None
+            return ""
+        self._since = self._clock.now() if self._since is None else self._since
+        rested = self._clock.now() - self._since >= REST_S - 1e-6
+        return f"the simulated bench has said success for {REST_S:g} s" if rested else ""
+
+
+def planned(made: Plan, clock: Clock, around: Surroundings, options: argparse.Namespace) -> BenchPlan:
+    """The plan of a deployment, with a node in this process; SetupError where it declares none."""
+    transport = made.deployment.transport
+    if not made.capabilities.resets_bench or transport.kind != "zmq":
+        raise SetupError(
+            f"transport.kind = {transport.kind!r} with a bench in lockstep; allowed: zmq with simulated = true"
+        )
+    link = Link(Node(made.robot, options, clock, around), made.robot, clock)
+    return BenchPlan(made.resolved, made.robot, link)
+
+
+def station(
+    path: Path, assignments: Sequence[str], seed: int, clock: VirtualClock, bench: str = "tabletop"
+) -> ServedLockstep:
+    """The station of a deployment at its bench, laid out by `seed`; RuntimeFault where it cannot be."""
+    made = family.plan(deployment.load(path, assignments))
+    options = node_parser().parse_args(["--robot", made.robot.name, "--bench", bench, "--seed", str(seed)])
+    around = surroundings.surroundings(made.robot, options)
+    return ServedLockstep(planned(made, clock, around, options), clock, Rested(around.truth, clock))
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    line = argparse.ArgumentParser(
+        prog="python -m runtime.sim.lockstep", description="A station at a simulated bench, in lockstep."
+    )
+    line.add_argument("deployment", type=Path, help="one whose transport is zmq and simulated")
+    line.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
+    line.add_argument("--seed", type=int, default=0, help="the first layout of the bench")
+    line.add_argument(
+        "--serve",
+        action="append",
+        default=[],
+        metavar="LINE",
+        help="a policy server of this process, as a command line of runtime.sim.serve; the first is the deployment's",
+    )
+    standin.add_arguments(line)
+    return line
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Serve until SIGTERM, SIGINT or the end of the lifeline."""
+    options = parser().parse_args(arguments)
+    log.start("lockstep")
+    told = standin.ending(options.lifeline)
+    clock = VirtualClock()
+    try:
+        with ExitStack() as stack:
+            urls: dict[str, str] = {}
+            for line in options.serve:
+                given = serve.parser().parse_args(shlex.split(line))
+                server = stack.enter_context(closing(serve.made(given, clock)))
+                urls[str(given.name or len(urls))] = str(server.start()["url"])
+            own = [f'policy.url="{url}"' for url in [*urls.values()][:1]]
+            served = station(options.deployment, [*own, *options.assignments], options.seed, clock)
+            stack.enter_context(closing(served))
+            standin.announce({"policies": urls}, options.ready_file)
+            served.serve(told.is_set)
+    except (RuntimeFault, robots.RobotError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,180 @@
+"""The demo's bench in lockstep: the same course to the tick, however long anything took."""
+
+from __future__ import annotations
+
+import shlex
+import time
+import uuid
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime import deployment, family
+from runtime.clock import VirtualClock
+from runtime.errors import SetupError
+from runtime.messages import Command
+from runtime.recording.reader import open_episode
+from runtime.served_lockstep import ServedLockstep
+from runtime.sim import lockstep, serve
+from runtime.sim.lockstep import Rested, planned
+from runtime.sim.node import parser
+from runtime.sim.tabletop import Tabletop
+from runtime.transitions import State
+from tests.runtime.sim.tabletop_station import DEPLOYMENTS, SlowEye
+from tests.runtime.station import column
+
+LINE = "openpi --robot agilex_piper --behaviour pick_place --port 0 --seed 3 --noise {} --latency-ms {}"
+TURNS = 200_000
+
+
+@dataclass(frozen=True)
+class Course:
+    """What there is of a trial: what was sent at which time, how it ended, what the bench says."""
+
+    sent: np.ndarray[Any, Any]
+    times: np.ndarray[Any, Any]
+    rows: int
+    reason: str
+    truth: dict[str, Any]
+    delays: set[int]
+
+
+class Operator:
+    """Who sets up and runs trial after trial, and dawdles so many turns before each command."""
+
+    def __init__(self, station: ServedLockstep, dawdles: int) -> None:
+        self.station, self._dawdles = station, dawdles
+        station.connect()
+        self._until(State.IDLE)
+        self._give("lease_claim")
+
+    def trial(self, policy: str, seed: int, seconds: float) -> Course:
+        bench = {"id": str(uuid.uuid4()), "seed": seed}
+        self._give("setup", policy={"url": policy}, bench=bench)
+        self._until(State.READY, State.IDLE)
+        session, runs = self.station.main.session, self.station.main.runs
+        assert session.state is State.READY, session.reason
+        before = runs.last_episode
+        self._give("run", duration_s=seconds)
+        self._until(State.READY)
+        while runs.last_episode is before:
+            self.station.turn()
+        episode = open_episode(Path(runs.last_episode["path"]))
+        truth = next(event["data"] for event in episode.events if event["kind"] == "truth")
+        return Course(
+            column(episode.rows, "action"),
+            column(episode.rows, "time"),
+            episode.frames,
+            session.reason,
+            {key: value for key, value in truth.items() if key not in ("episode", "reset")},
+            set(self.station.main.inference.tally.delays),
+        )
+
+    def _give(self, kind: str, **arguments: Any) -> None:
+        for _ in range(self._dawdles):
+            self.station.turn()
+        main = self.station.main
+        epoch = 0 if kind == "lease_claim" else main.lease.epoch
+        ack = main.handle(
+            Command(
+                str(uuid.uuid4()),
+                kind,
+                arguments,
+                holder="script",
+                epoch=epoch,
+                boot=main.boot,
+                sequence=main.session.sequence,
+            )
+        )
+        assert ack.status == "accepted", ack.reason
+
+    def _until(self, *states: State) -> None:
+        for _ in range(TURNS):
+            if self.station.main.session.state in states:
+                return
+            self.station.turn()
+        raise AssertionError(f"never {states}")
+
+
+def courses(
+    data: Path, trials: Sequence[tuple[int, int, float]], dawdles: int = 0, slow_s: float = 0.0
+) -> list[Course]:
+    """Trials of (policy, seed, seconds), at a bench whose policies may take longer than they say."""
+    clock = VirtualClock()
+    lines = [LINE.format(1, 80), LINE.format(14, 250) + " --failure-rate 0.4"]
+    servers: list[Any] = [serve.made(serve.parser().parse_args(shlex.split(line)), clock) for line in lines]
+    for server in servers:
+        reply = server.reply
+
+        def replying(*given: Any, reply: Any = reply) -> Any:
+            time.sleep(slow_s)
+            return reply(*given)
+
+        server.reply = replying
+    urls = [str(server.start()["url"]) for server in servers]
+    given = [f'data_dir="{data}"', f'policy.url="{urls[0]}"', "recording.export=false", "lease.ttl_s=600"]
+    made = family.plan(deployment.load(DEPLOYMENTS / "tabletop.toml", given))
+    around = SlowEye(made.robot, Tabletop(made.robot, 1))
+    options = parser().parse_args(["--robot", made.robot.name, "--bench", "tabletop", "--seed", "1"])
+    over = Rested(around.truth, clock)
+    with closing(ServedLockstep(planned(made, clock, around, options), clock, over)) as station:
+        operator = Operator(station, dawdles)
+        found = [operator.trial(urls[policy], seed, seconds) for policy, seed, seconds in trials]
+    for server in servers:
+        server.close()
+    return found
+
+
+@pytest.mark.timeout(240)
+def test_the_same_plan_gives_the_same_course_however_busy_the_machine(tmp_path: Path) -> None:
+    trials = [(1, 4, 3.0), (0, 5, 3.0)]
+    *first, skilled = courses(tmp_path / "first", [*trials, (0, 4, 20.0)])
+    second = courses(tmp_path / "second", trials, dawdles=7, slow_s=0.01)
+    for one, other in zip(first, second, strict=True):
+        assert np.array_equal(one.sent, other.sent)
+        assert np.array_equal(one.times, other.times)
+        assert (one.rows, one.reason, one.truth) == (other.rows, other.reason, other.truth)
+    assert skilled.truth["success"] is True
+    assert skilled.reason == "the simulated bench has said success for 1 s"
+    reached = skilled.truth["reached"]
+    assert list(reached) == ["grasped", "lifted", "over_plate", "placed"]
+    assert sorted(reached.values()) == list(reached.values())
+    assert skilled.rows / 30 == pytest.approx(reached["placed"] + 1.0, abs=0.5)
+    assert [course.delays for course in first] == [{8}, {3}]  # 250 and 80 ms, as declared
+
+
+def test_a_run_is_over_once_success_has_lasted(tmp_path: Path) -> None:
+    clock, truth = VirtualClock(), {"success": False}
+    over = Rested(lambda: truth, clock)
+
+    def after(seconds: float, running: bool = True) -> str:
+        clock.advance(seconds)
+        return over(running)
+
+    assert [after(1.0), after(1.0)] == ["", ""]
+    truth["success"] = True
+    assert [after(0.1), after(0.9)] == ["", ""]
+    truth["success"] = False
+    assert after(0.2) == ""
+    truth["success"] = True
+    assert [after(0.1), after(5.0, running=False), after(0.1), after(0.9)] == ["", "", "", ""]
+    assert after(0.1) == "the simulated bench has said success for 1 s"
+
+
+def test_a_station_without_a_declared_bench_is_refused(tmp_path: Path) -> None:
+    given = [f'data_dir="{tmp_path}"', "transport.simulated=false"]
+    with pytest.raises(
+        SetupError, match=r"transport.kind = 'zmq' with a bench in lockstep; allowed: zmq with"
+    ):
+        lockstep.station(DEPLOYMENTS / "tabletop.toml", given, 1, VirtualClock())
+
+
+def test_only_a_server_that_can_declare_its_times_is_served() -> None:
+    given = serve.parser().parse_args(["gr00t", "--robot", "agilex_piper"])
+    with pytest.raises(SetupError, match="gr00t with --behaviour gesture in lockstep; allowed: openpi with"):
+        serve.made(given, VirtualClock())

@@ -1,0 +1,345 @@
+"""A lockstep station behind its sockets: when its time passes, and that who stops it is not kept waiting."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+
+from runtime.bus import Endpoints, Subscriber, TransportError
+from runtime.clock import VirtualClock
+from runtime.errors import SetupError
+from runtime.latch import Latch
+from runtime.messages import Ack, Command, decode, encode
+from runtime.recording.reader import Episode, open_episode
+from runtime.served_lockstep import ServedLockstep
+from runtime.transitions import State
+from runtime.types import ActionChunk
+from tests.runtime.station import STANDS, StubPlan, StubPolicy, StubRobot, column, plan
+
+TURNS = 5000
+
+
+class Client:
+    """A station and who commands it, turn by turn in one thread; `people` is the time that they have."""
+
+    def __init__(self, made: StubPlan, over: Callable[[bool], str] = lambda running: "") -> None:
+        made.built.clear()
+        self.people = VirtualClock(100.0)
+        self.station = ServedLockstep(made, VirtualClock(), over, self.people)
+        self.station.connect()
+        self.robot: StubRobot = made.built["robot"]
+        self.policy: StubPolicy = made.built["policy"]
+        self._context: zmq.Context[Any] = zmq.Context()
+        self._endpoints = Endpoints(made.deployment.station_dir)
+        self._main = self._connected("main", "commands")
+        self._guard = self._connected("guard", "estop")
+        self.until(State.IDLE)
+        assert self.ask("lease_claim", epoch=0).status == "accepted"
+
+    def _connected(self, process: str, key: str) -> zmq.Socket[Any]:
+        socket = self._context.socket(zmq.DEALER)
+        socket.connect(self._endpoints.read(process)[key])
+        return socket
+
+    @property
+    def state(self) -> State:
+        return self.station.main.session.state
+
+    @property
+    def reason(self) -> str:
+        return self.station.main.session.reason
+
+    def ask(self, kind: str, epoch: int | None = None, guard: bool = False, **arguments: Any) -> Ack:
+        """The answer over the socket, the station turning meanwhile."""
+        main, socket = self.station.main, self._guard if guard else self._main
+        command = Command(
+            str(uuid.uuid4()),
+            kind,
+            arguments,
+            user="ada",
+            holder="ada",
+            epoch=main.lease.epoch if epoch is None else epoch,
+            boot=main.boot,
+            sequence=main.session.sequence,
+            valid_until=self.people.now() + 2.0,
+        )
+        socket.send(encode(command))
+        for _ in range(TURNS):
+            self.station.turn()
+            if socket.poll(1):
+                answer = decode(socket.recv())
+                assert isinstance(answer, Ack)
+                return answer
+        raise AssertionError(f"no answer to {kind}")
+
+    def turn(self, count: int = 1, seconds: float = 0.0) -> int:
+        """Turns that take `seconds` each of the people's time; how many ticks were in them."""
+        before = self.station.step
+        for _ in range(count):
+            self.people.advance(seconds)
+            self.station.turn()
+        return self.station.step - before
+
+    def until(self, *states: State) -> None:
+        for _ in range(TURNS):
+            if self.state in states:
+                return
+            self.station.turn()
+        raise AssertionError(f"never {states}; {self.state}: {self.reason}")
+
+    def ready(self) -> Client:
+        self.accepted("setup")
+        self.until(State.READY)
+        return self
+
+    def running(self, ticks: int = 20) -> Client:
+        self.accepted("run")
+        begun = self.station.step
+        while self.station.step < begun + ticks:
+            self.station.turn()
+        return self
+
+    def episode(self) -> Episode:
+        """The last episode, once it is closed."""
+        for _ in range(TURNS):
+            if found := self.station.main.runs.last_episode:
+                return open_episode(Path(found["path"]))
+            self.station.turn()
+        raise AssertionError("no episode is closed")
+
+    def hangs(self) -> threading.Event:
+        """From now on the policy answers when the event is set; returns when it is asked."""
+        infer, asked, gate = self.policy.infer, threading.Event(), threading.Event()
+
+        def hanging(*given: Any) -> ActionChunk:
+            asked.set()
+            gate.wait(60)
+            return infer(*given)
+
+        self.policy.infer = hanging  # type: ignore[method-assign]
+        while not asked.is_set():
+            self.station.turn()
+        return gate
+
+    def accepted(self, kind: str, **arguments: Any) -> None:
+        answer = self.ask(kind, **arguments)
+        assert answer.status == "accepted", answer.reason
+
+    def close(self) -> None:
+        self.station.close()
+        self._context.destroy(linger=0)
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> StubPlan:
+    return plan(tmp_path, recording={"min_free_bytes": 0, "export": False})
+
+
+@pytest.fixture
+def client(made: StubPlan) -> Iterator[Client]:
+    client = Client(made)
+    yield client
+    client.close()
+
+
+# --- when time passes --------------------------------------------------------------------------------------
+
+
+def test_time_stands_still_before_and_after_a_set_up_and_its_station_is_seen_all_the_while(
+    client: Client,
+) -> None:
+    assert client.turn(50, 0.1) == 0
+    client.ready()
+    endpoints = Endpoints(client.station.plan.deployment.station_dir)
+    context: zmq.Context[Any] = zmq.Context()
+    states = Subscriber(context, endpoints.read("main")["state"], "state")
+    pictures = Subscriber(context, endpoints.read("media")["cameras"], "camera/")
+    seen: set[str] = set()
+    for _ in range(200):
+        assert client.turn(1, 0.1) == 0
+        seen |= {*states.receive(0.01), *pictures.receive(0.01)}
+        client.ask("lease_renew")
+        if len(seen) == 4:
+            break
+    assert seen == {"state", *(f"camera/{camera}" for camera in client.robot.cameras)}
+    for reader in (states, pictures):
+        reader.close()
+    context.destroy(linger=0)
+
+
+def test_a_run_goes_on_without_waiting_for_anybodys_time(client: Client) -> None:
+    client.ready().running(100)  # not a moment of theirs
+    assert client.state is State.RUNNING
+
+
+def test_what_waits_for_a_person_goes_no_faster_than_they_live(client: Client) -> None:
+    client.ready().accepted("run", mode="manual")
+    client.turn(5, 1.0)
+    assert client.turn(100) == 0
+    assert client.turn(60, 1 / 60) == pytest.approx(30, abs=2)
+
+
+def test_what_a_person_moves_in_between_takes_its_time_and_then_it_stands_still(client: Client) -> None:
+    client.ready()
+    before = client.robot.position.copy()
+    client.accepted("gripper", arm="left_arm", action="close")
+    for _ in range(10):
+        client.turn(10, 1 / 30)
+        client.ask("lease_renew")
+    assert not np.allclose(client.robot.position, before)
+    assert client.turn(50, 0.01) == 0
+
+
+def test_a_policy_that_takes_long_changes_nothing_of_what_is_recorded(tmp_path: Path) -> None:
+    said = []
+    for name, waits in (("quick", 0.0), ("slow", 0.02)):
+        made = plan(tmp_path / name, recording={"min_free_bytes": 0, "export": False})
+        client = Client(made)
+        infer = client.policy.infer
+
+        def slowly(*given: Any, infer: Any = infer, waits: float = waits) -> ActionChunk:
+            threading.Event().wait(waits)
+            chunk = infer(*given)
+            return ActionChunk(chunk.actions, timing={"policy.infer_ms": 100.0})
+
+        client.policy.infer = slowly  # type: ignore[method-assign]
+        client.turn(int(1000 * waits), 0.01)  # an operator who is slower too
+        client.ready()
+        client.turn(int(1000 * waits), 0.01)
+        client.running(60)
+        client.accepted("halt")
+        client.turn(2, 1.0)
+        client.accepted("stop")
+        episode = client.episode()
+        asked = [row["observation_step"] for row in episode.raw.to_pylist()]
+        said.append((client.robot.sent[:60], asked[:12], column(episode.rows, "time")[:55]))
+        delays = list(client.station.main.inference.tally.delays)
+        assert delays[2:]
+        assert set(delays[2:]) == {3}  # 100 ms, whatever they really took
+        client.close()
+    for quick, slow in zip(*said, strict=True):
+        assert np.array_equal(quick, slow)
+
+
+def test_a_time_that_cannot_be_is_refused(client: Client) -> None:
+    infer = client.policy.infer
+    client.policy.infer = lambda *given: ActionChunk(  # type: ignore[method-assign]
+        infer(*given).actions, timing={"policy.infer_ms": -1.0}
+    )
+    client.accepted("setup")
+    client.until(State.IDLE)
+    assert "policy_timing.infer_ms is -1.0: lockstep goes by it; allowed: 0 or more" in client.reason
+
+
+def test_a_run_ends_where_its_bench_says_so_and_its_episode_is_whole(made: StubPlan) -> None:
+    asked = []
+
+    def over(running: bool) -> str:
+        asked.append(running)
+        return "the block lies there" if asked.count(True) == 40 else ""
+
+    client = Client(made, over)
+    client.ready().accepted("run")
+    client.until(State.READY)
+    assert client.reason == "the block lies there"
+    outcome = client.episode().outcome
+    assert outcome is not None
+    assert outcome["status"] == "finished"
+    client.turn(3)
+    assert outcome["control"]["scheduling"] == "lockstep"
+    assert client.station.main.snapshot()["recording"]["uuid"] == ""
+    again = client.station.step
+    client.running(20)  # at once, and as whole
+    assert client.state is State.RUNNING
+    assert client.station.step >= again + 20
+    client.close()
+
+
+# --- who stops it ------------------------------------------------------------------------------------------
+
+
+def test_a_lease_that_is_not_renewed_in_the_peoples_time_holds_the_robot(client: Client) -> None:
+    client.ready().running(200)  # more than a lease lasts, of its own time
+    assert client.state is State.RUNNING
+    client.turn(1, 6.0)
+    client.turn(5)
+    assert client.state is State.HOLDING
+    assert "the lease was not renewed" in client.reason
+    assert client.ask("resume").reason == "nobody holds the lease: claim it first"
+
+
+def test_a_lease_ends_while_time_stands_still_too(client: Client) -> None:
+    client.ready()
+    client.turn(3, 3.0)
+    assert client.station.main.snapshot()["lease"]["holder"] == ""
+
+
+def test_a_command_is_void_after_its_time_whatever_the_stations_own_is(client: Client) -> None:
+    client.ready().running(100)
+    client.people.advance(2.0)
+    client.accepted("halt")
+    assert client.state is State.HOLDING
+
+
+@pytest.mark.parametrize("during", ["idle", "run", "call"])
+def test_the_e_stop_is_obeyed_at_once(client: Client, during: str) -> None:
+    gate = threading.Event()
+    if during != "idle":
+        client.ready().running()
+    if during == "call":
+        gate = client.hangs()
+        assert client.turn(20) == 0
+    answer = client.ask("estop", guard=True, why="smoke")
+    assert (answer.status, answer.data) == ("done", {"station": "bench"})
+    gate.set()
+    client.turn(20, 1 / 30)
+    assert client.state is State.FAULTED
+    assert "ada: smoke" in client.reason
+    assert Latch(client.station.plan.deployment.station_dir).read() is not None
+    client.accepted("release")
+    client.turn(20, 1 / 30)
+    assert client.state is State.IDLE
+    assert Latch(client.station.plan.deployment.station_dir).read() is None
+
+
+def test_a_policy_that_hangs_keeps_nobody_from_stopping(client: Client) -> None:
+    gate = client.ready().running().hangs()
+    assert client.turn(20) == 0
+    client.accepted("stop")
+    assert client.state is State.READY
+    gate.set()
+
+
+# --- a station like any other ------------------------------------------------------------------------------
+
+
+def test_a_station_is_of_one_process(made: StubPlan, client: Client) -> None:
+    with pytest.raises(SetupError, match="station 'bench' is already running"):
+        ServedLockstep(made, VirtualClock())
+
+
+def test_there_is_no_control_channel(tmp_path: Path) -> None:
+    made = plan(tmp_path, control_channel={"enabled": True})
+    with pytest.raises(SetupError, match=r"control_channel\.enabled = true in lockstep, which has none"):
+        ServedLockstep(made, VirtualClock())
+
+
+def test_when_it_ends_its_episode_is_closed_and_nothing_is_found_of_it(made: StubPlan) -> None:
+    client = Client(made)
+    client.ready().running()
+    client.close()
+    (folder,) = made.deployment.episodes_dir.iterdir()
+    outcome = open_episode(folder).outcome
+    assert outcome is not None
+    assert outcome["status"] == "interrupted"
+    with pytest.raises(TransportError, match="is not running here"):
+        Endpoints(made.deployment.station_dir).read("main")
+    assert client.robot.sent[-1] == pytest.approx(STANDS, abs=0.2)
+    Client(made).close()
