@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from django.utils import timezone
 from evaweb.cells import csv_lines
 from evaweb.errors import EvaError
 from evaweb.plans.models import Plan, PlanState
-from evaweb.results import caching, facts, listings
+from evaweb.results import caching, facts, laid_out, listings
 from evaweb.results.agreement import agreement_of, preferences_of
 from evaweb.results.analysis import Analysis
 from evaweb.results.checklist import checklist
@@ -43,8 +44,11 @@ _PREFERENCES = (
 _SCORES = ("trial", "rater", "source", "success", "score", "failure", "note", "reason", "scored_at")
 
 
-def write_report(plan: Plan, out: Path) -> Path:
-    """Everything into the new folder `out`; its first page. EvaError where it exists and is not empty."""
+def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> Path:
+    """Everything into the new folder `out`; its first page. EvaError where it exists and is not empty.
+
+    `most_pictures`: bytes of pictures of benches, None for all that there are.
+    """
     if out.exists() and any(out.iterdir()):
         raise EvaError(f"{out} is not empty: name a new folder, so that reports are not mixed")
     if plan.state == PlanState.DRAFT:
@@ -59,9 +63,12 @@ def write_report(plan: Plan, out: Path) -> Path:
     _csv(data / "scores.csv", _SCORES, _scores(plan))
     _csv(data / "ratings.csv", _RATINGS, _ratings(plan))
     _csv(data / "preferences.csv", _PREFERENCES, _preferences(plan))
+    _csv(data / "laid_out.csv", laid_out.COLUMNS, laid_out.laid_out(plan))
+    left = laid_out.write_pictures(plan, data / "pictures", most_pictures)
     shutil.copytree(_PROGRAM, out / "recompute", ignore=shutil.ignore_patterns("__pycache__"))
     page = out / "index.html"
-    page.write_text(render_to_string("results/report.html", report_context(plan, analysis)), "utf-8")
+    context = {**report_context(plan, analysis), "benches": _benches(plan, data / "pictures"), "left": left}
+    page.write_text(render_to_string("results/report.html", context), "utf-8")
     return page
 
 
@@ -129,6 +136,17 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
         "checklist": checklist(plan, analysis),
         "runs": runs.outcomes,
     }
+
+
+def _benches(plan: Plan, folder: Path) -> dict[int, list[dict[str, Any]]]:
+    """Of each trial what its cameras showed, as far as the pictures are in the report."""
+    there = {path.stem for path in folder.glob("*.jpg")}
+    found: dict[int, list[dict[str, Any]]] = defaultdict(list)
+    for row in (row for page in laid_out.laid_out(plan) for row in page):
+        if row["picture"] in there:
+            known = row["reference"] if row["reference"] in there else ""
+            found[row["trial"]].append({**row, "reference": known})
+    return dict(found)
 
 
 def _style(name: str) -> str:

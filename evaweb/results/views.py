@@ -31,6 +31,7 @@ from evaweb.trials.models import TrialStatus
 
 PER_PAGE = 50
 PLANS_PER_PAGE = 25
+MOST_PICTURES = 32_000_000  # bytes of a report that is packed in memory; the command has no such limit
 
 
 @require_GET
@@ -123,7 +124,7 @@ def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
     require_seen(found, request.user)
     title = f"{found.name}-v{found.version}"
     with TemporaryDirectory() as folder:
-        write_report(found, Path(folder) / title)
+        write_report(found, Path(folder) / title, most_pictures=MOST_PICTURES)
         packed = shutil.make_archive(f"{folder}/packed", "zip", folder, title)
         content = Path(packed).read_bytes()
     return HttpResponse(

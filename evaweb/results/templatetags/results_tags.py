@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -60,6 +61,12 @@ def twice_over(alpha: float) -> str:
 def chosen_items(only: Chosen) -> list[tuple[str, str]]:
     """What is chosen, name and value."""
     return [(name, value) for name, value in asdict(only).items() if value]
+
+
+@register.filter
+def of_trial(rows: Mapping[int, list[Any]], trial: int) -> list[Any]:
+    """Those of one trial."""
+    return rows.get(trial, [])
 
 
 @register.filter

@@ -1,3 +1,4 @@
+import csv
 import json
 import os
 import subprocess
@@ -6,9 +7,13 @@ import sys
 import pytest
 from django.core.management import CommandError, call_command
 
+from evaweb.plans import pictures
+from evaweb.plans.models import Achieved, Reference
 from evaweb.results import judging
 from evaweb.results.caching import analysis_of
 from evaweb.results.checklist import checklist
+from evaweb.results.reporting import write_report
+from tests.evaweb.plans.lab import jpeg
 from tests.evaweb.trials import builders
 
 
@@ -132,3 +137,40 @@ def test_the_checklist_says_what_the_record_says(revealed):
     assert kept["Every trial on record"].record == "16 of 16 trials that count have a recording"
     assert kept["A second, blind rater"].kept == "no"
     assert kept["Question and comparison before the first trial"].kept == "yes"
+
+
+@pytest.fixture
+def laid_out(revealed, bench, owner):
+    """The first trial's bench, with its reference, and another's whose picture was lost."""
+    first, second = (handout.trial for handout in revealed.handouts.order_by("number")[:2])
+    before, now, lost = (pictures.keep(jpeg(seed)) for seed in (1, 2, 3))
+    row = {"station": bench.station, "position": first.position, "camera": "top", "by": owner}
+    reference = Reference.objects.create(picture=before, **row)
+    seen = {"camera": "top", "by": bench.operator}
+    Achieved.objects.create(trial=first, picture=now, reference=reference, match=0.93, **seen)
+    Achieved.objects.create(trial=second, picture=lost, override="the lamp", **seen)
+    pictures._path(lost).unlink()
+    return first, before, now, lost
+
+
+def test_it_has_the_pictures_of_how_benches_were_laid_out(revealed, laid_out, tmp_path):
+    first, before, now, lost = laid_out
+    page = write_report(revealed, tmp_path / "with").read_text("utf-8")
+    data = tmp_path / "with" / "data"
+    assert {path.stem for path in (data / "pictures").iterdir()} == {before, now}
+    assert (data / "pictures" / f"{now}.jpg").read_bytes() == jpeg(2)
+    assert f'href="data/pictures/{now}.jpg">top</a>' in page
+    assert f'match 0.93 of <a href="data/pictures/{before}.jpg">' in page
+    assert lost not in page
+    assert "1 picture of benches is not in this report" in page
+    rows = list(csv.DictReader((data / "laid_out.csv").open(encoding="utf-8", newline="")))
+    assert [(row["trial"], row["picture"], row["override"]) for row in rows] == [
+        (str(first.pk), now, ""),
+        (str(first.pk + 1), lost, "the lamp"),
+    ]
+
+
+def test_a_download_has_so_many_pictures_and_says_so(revealed, laid_out, tmp_path):
+    page = write_report(revealed, tmp_path / "few", most_pictures=len(jpeg(2))).read_text("utf-8")
+    assert len(list((tmp_path / "few" / "data" / "pictures").iterdir())) == 1
+    assert "2 pictures of benches are not in this report" in page

@@ -1,0 +1,49 @@
+"""How the benches of a plan's trials were laid out, for its report: what each camera showed, and the reference then."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from evaweb.errors import NotFound
+from evaweb.plans import pictures
+from evaweb.plans.models import Achieved, Plan
+
+COLUMNS = ("trial", "camera", "picture", "reference", "match", "override", "by", "at")
+_FIELDS = (
+    "trial_id",
+    "camera",
+    "picture",
+    "reference__picture",
+    "match",
+    "override",
+    "by__username",
+    "at",
+)
+
+
+def laid_out(plan: Plan) -> Iterator[list[dict[str, Any]]]:
+    """A row for each camera of each attempt that was asked to run."""
+    rows = Achieved.objects.filter(trial__evaluation=plan.evaluation_id).order_by("trial_id", "pk")
+    yield [dict(zip(COLUMNS, row, strict=True)) for row in rows.values_list(*_FIELDS)]
+
+
+def write_pictures(plan: Plan, folder: Path, most: int | None) -> int:
+    """Each picture once, by its SHA-256, at most so many bytes of them; how many were left out or are lost."""
+    rows = [row for page in laid_out(plan) for row in page]
+    names = dict.fromkeys(row[which] for row in rows for which in ("picture", "reference") if row[which])
+    left, written = 0, 0
+    for name in names:
+        try:
+            jpeg = pictures.kept(name)
+        except NotFound:
+            left += 1
+            continue
+        if most is not None and written + len(jpeg) > most:
+            left += 1
+            continue
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{name}.jpg").write_bytes(jpeg)
+        written += len(jpeg)
+    return left
