@@ -4,7 +4,7 @@ from robots.body import Body
 from robots.chain import Chain
 from robots.errors import RobotError
 from robots.gripping import GripperChoice
-from robots.loading import load, names
+from robots.loading import load, load_whole, names
 from robots.robot import EEF_FIELDS, Camera, Gripper, Group, Robot
 from robots.visuals import RobotScene, Visual, scene_of
 
@@ -21,6 +21,7 @@ __all__ = [
     "RobotScene",
     "Visual",
     "load",
+    "load_whole",
     "names",
     "scene_of",
 ]

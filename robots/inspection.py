@@ -14,7 +14,7 @@ from robots.body import Body
 from robots.clearance import problems
 from robots.copies import copies
 from robots.description import GroupTable, OverrideTable, RobotTable, RosGroupTable
-from robots.loading import load
+from robots.loading import load, load_whole
 from robots.robot import Group, Robot
 from robots.rotations import Float64
 from robots.urdf import Urdf
@@ -38,7 +38,7 @@ def inspect(name: str | Path) -> Inspection:
     usual = load(name)
     file = usual.folder / "robot.toml"
     table = description.read(file)
-    whole = load(name, [group.name for group in table.groups])
+    whole = load_whole(name)
     tree = urdf.read(whole.urdf)
     scene_of(whole)  # meshes that are missing
     lines = [

@@ -95,6 +95,11 @@ def load(
     )
 
 
+def load_whole(robot: str | Path) -> Robot:
+    """The same robot with the optional groups too."""
+    return load(robot, [group.name for group in description.read(_folder(robot) / _FILE).groups])
+
+
 def _chosen(file: Path, table: RobotTable, groups: Sequence[str] | None) -> list[GroupTable]:
     """The groups that are part of the robot, in the file's order."""
     known = [group.name for group in table.groups]
