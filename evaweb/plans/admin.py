@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import groupby
 from typing import Any
 
 from django import forms
@@ -11,6 +12,8 @@ from django.db.models import QuerySet
 from django.http import HttpRequest, HttpResponse
 from django.shortcuts import redirect, render
 from django.urls import URLPattern, path
+from django.utils.html import format_html_join
+from django.utils.safestring import SafeString, mark_safe
 
 from evaweb.errors import EvaError
 from evaweb.plans.exchange import exported, exported_with_pictures, imported
@@ -133,7 +136,28 @@ class PlanAdmin(admin.ModelAdmin):
         """What was frozen is only read; the name is that of all versions."""
         if obj is None:
             return ()
-        return _FROZEN if obj.state != PlanState.DRAFT else (("name",) if obj.version > 1 else ())
+        frozen = tuple("conditions" if name == "positions" else name for name in _FROZEN)
+        return frozen if obj.state != PlanState.DRAFT else (("name",) if obj.version > 1 else ())
+
+    def get_fieldsets(self, request: HttpRequest, obj: Plan | None = None) -> Any:
+        """Of what was frozen the positions with their scenes; a draft has its list to choose them from."""
+        if obj is None or obj.state == PlanState.DRAFT:
+            return self.fieldsets
+        return [
+            (
+                title,
+                {**options, "fields": ["conditions" if f == "positions" else f for f in options["fields"]]},
+            )
+            for title, options in self.fieldsets
+        ]
+
+    @admin.display(description="positions")
+    def conditions(self, plan: Plan) -> SafeString:
+        """Scene by scene, a line each."""
+        found = plan.positions.select_related("scene").order_by("scene__title", "number")
+        scenes = groupby(found, key=lambda position: position.scene.title)
+        lines = [(scene, ", ".join(map(str, positions))) for scene, positions in scenes]
+        return format_html_join(mark_safe("<br>"), "{}: {}", lines) or mark_safe("–")
 
     def get_prepopulated_fields(self, request: HttpRequest, obj: Plan | None = None) -> dict[str, Any]:
         """Only as long as the name can be chosen."""

@@ -107,3 +107,11 @@ def test_the_command_reads_and_writes_files(admin, draft, tmp_path, capsys):
         call_command("plans", "import", str(file), "--user", "nobody")
     with pytest.raises(CommandError, match=r"none\.toml"):
         call_command("plans", "import", str(tmp_path / "none.toml"), "--user", "adam")
+
+
+def test_a_frozen_plan_lists_its_positions_scene_by_scene(client, admin, draft):
+    other = builders.scene("fold-towel")
+    draft.positions.add(other.positions.get(number=1))
+    plan_freeze(user=admin, plan=draft)
+    shown = client.get(reverse("admin:plans_plan_change", args=[draft.pk])).content.decode()
+    assert "block on plate: 1, 2<br>fold towel: 1" in shown
