@@ -1,4 +1,4 @@
-"""A blind plan carried out without a human: trial by trial as an operator does it, judged by the bench's own truth.
+"""A blind plan carried out without a human, in lockstep: trial by trial as an operator does it, judged by the bench.
 
 The operator's session takes the station, confirms its cameras, asks for the next trial, sets up, runs, scores, all over
 REST and the live socket; it is never told which checkpoint it runs. Then the plan's owner closes and reveals the plan.
@@ -9,10 +9,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from evaweb.lab.once import TruthTimes, run_to_its_end, score_by_truth, set_up_and_run
+from evaweb.lab.once import recorded, run_to_its_end, score_by_truth, set_up_and_run
 from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
 
 _STATION_UP_S = 60.0
@@ -49,7 +49,7 @@ def carry_out(operator: Visitor, station: str, plan: str, count: int, tell: Tell
             made.append(one)
             verdict = "success" if one.success else "no success"
             tell(f"{number:>3} of {count}  {one.code}  position {one.position}  {verdict}, {one.score:.0%}")
-    return made
+    return [replace(one, duration_s=recorded(operator, one.trial)["duration_s"]) for one in made]
 
 
 def revealed(owner: Visitor, plan: str, made: list[Made]) -> dict[str, Any]:
@@ -74,16 +74,16 @@ def _made(operator: Visitor, page: LivePage, station: str, plan: str) -> Made:
         code, trial = handed["code"], handed["trial"]
         _require_blind(code, trial)
         try:
-            set_up_and_run(page, trial["id"])
-            times = TruthTimes()
-            run_to_its_end(page, trial["id"], float(trial["time_limit_s"]), times)
-            scored = score_by_truth(operator, trial["id"], times)
+            set_up_and_run(page, trial["id"], lockstep=True)
+            run_to_its_end(page, trial["id"], float(trial["time_limit_s"]), lockstep=True)
+            scored = score_by_truth(operator, trial["id"])
         except VisitFailed as failed:
             fault = str(failed)
             _give_up(operator, page, trial["id"], fault)
             continue
         facts = {name: scored[name] for name in ("scene", "position", "success", "score", "duration_s")}
-        return Made(code=code, trial=trial["id"], attempt=handed["attempt"], times=times.reached, **facts)
+        times = operator.get(f"trials/{trial['id']}")["truth"].get("reached", {})
+        return Made(code=code, trial=trial["id"], attempt=handed["attempt"], times=times, **facts)
     raise VisitFailed(f"a trial of {plan} was not made in {_TRIES} attempts: {fault}")
 
 

@@ -22,10 +22,11 @@ _WATCH_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """One station of this lab: its deployment file and what is set on top of it."""
+    """One station of this lab: its deployment file and what is set on top of it; one that `runs` is started already."""
 
     deployment: Path
     assignments: Sequence[str] = ()
+    runs: bool = False
 
 
 class Lab:
@@ -41,6 +42,8 @@ class Lab:
         names = [self._register(bench) for bench in benches]
         self.processes.start(programs.worker(["lab", *names]))
         for bench in benches:
+            if bench.runs:
+                continue
             assignments = [f'data_dir="{settings.DATA_DIR}"', *bench.assignments]
             self.processes.start(programs.station(str(bench.deployment), assignments))
         return str(self.processes.start(programs.web(self._host, self._port))["url"])

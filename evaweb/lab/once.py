@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
@@ -16,6 +16,7 @@ _STOPPED_S = 10.0
 _PUBLISHED_S = 60.0
 _RESUMES = 3
 _REST_S = 1.0  # how long success has to last before the operator presses Stop
+_SLOWEST = 30.0  # how many times as long as its own time a run in lockstep may take
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,10 +53,9 @@ def perform(visitor: Visitor, choice: Choice) -> Done:
     begun = time.monotonic()
     with closing(LivePage(visitor, choice.station)) as page:
         trial = start(visitor, page, choice)
-        times = TruthTimes()
-        resumed = run_to_its_end(page, trial, float(visitor.get(f"trials/{trial}")["time_limit_s"]), times)
-        episode = _published(visitor, score_by_truth(visitor, trial, times)["episode"])
-        scored = _whole(visitor, trial, episode)
+        resumed = run_to_its_end(page, trial, float(visitor.get(f"trials/{trial}")["time_limit_s"]))
+        episode = _published(visitor, score_by_truth(visitor, trial)["episode"])
+        scored = whole(visitor, trial, episode)
     return Done(
         trial=trial,
         success=scored["success"],
@@ -83,29 +83,17 @@ def start(visitor: Visitor, page: LivePage, choice: Choice) -> int:
     return trial
 
 
-def set_up_and_run(page: LivePage, trial: int) -> None:
+def set_up_and_run(page: LivePage, trial: int, lockstep: bool = False) -> None:
     """Set the station up for a prepared trial, and begin its run."""
     page.command("setup", trial)
     set_up = page.wait(lambda state: state["state"] != "setting_up", _READY_S, "setting up")
     if set_up["state"] != "ready":
         raise VisitFailed(f"set-up ended {set_up['state']}: {set_up['reason']}")
     page.command("run", trial)
-    # One that holds at once, because an observation was late, has begun too: it is resumed.
-    page.wait(lambda state: state["state"] in ("running", "holding"), _STOPPED_S, "starting the run")
-
-
-@dataclass(slots=True)
-class TruthTimes:
-    """When the bench first said of each milestone that it is reached [s after the start of the run]."""
-
-    reached: dict[str, float] = field(default_factory=dict)
-
-    def note(self, state: Mapping[str, Any]) -> None:
-        """Take what a state of the run says."""
-        elapsed = float((state.get("run") or {}).get("elapsed") or 0.0)
-        for name, done in (state["truth"].get("milestones") or {}).items():
-            if done and state["state"] == "running":
-                self.reached.setdefault(name, round(elapsed, 2))
+    # One that holds at once, because an observation was late, has begun too: it is resumed. In lockstep, as fast as the
+    # machine, one may have begun and ended between two looks.
+    begun = ("running", "holding", "ready") if lockstep else ("running", "holding")
+    page.wait(lambda state: state["state"] in begun, _STOPPED_S, "starting the run")
 
 
 def report(done: Done) -> dict[str, Any]:
@@ -113,25 +101,24 @@ def report(done: Done) -> dict[str, Any]:
     return asdict(done)
 
 
-def run_to_its_end(page: LivePage, trial: int, limit: float, times: TruthTimes) -> int:
+def run_to_its_end(page: LivePage, trial: int, limit: float, lockstep: bool = False) -> int:
     """Watch until the bench says it is done or the run ends by itself; press Stop.
 
-    Where it holds for a reason that passes (an observation that was late), resume a few times as an operator
-    would; returns how often.
+    In lockstep it always ends by itself: a Stop of ours would come when the machine has time for it. Where it holds for
+    a reason that passes (an observation that was late), resume a few times as an operator would; returns how often.
     """
     succeeded = 0.0
 
     def over(state: Mapping[str, Any]) -> bool:
         nonlocal succeeded
-        times.note(state)
-        if not state["truth"].get("success"):
+        if lockstep or not state["truth"].get("success"):
             succeeded = 0.0
         elif not succeeded:
             succeeded = state["clock"]
         return state["state"] != "running" or bool(succeeded and state["clock"] - succeeded >= _REST_S)
 
     for resumed in range(_RESUMES + 1):
-        state = page.wait(over, limit + 30.0, "running")
+        state = page.wait(over, limit * _SLOWEST if lockstep else limit + 30.0, "running")
         if state["state"] != "holding" or resumed == _RESUMES:
             break
         page.command("resume", trial)
@@ -142,8 +129,8 @@ def run_to_its_end(page: LivePage, trial: int, limit: float, times: TruthTimes) 
     return resumed
 
 
-def score_by_truth(visitor: Visitor, trial: int, times: TruthTimes) -> Mapping[str, Any]:
-    """Tick what the bench says was reached, once the trial waits to be scored and its truth is there."""
+def score_by_truth(visitor: Visitor, trial: int) -> Mapping[str, Any]:
+    """Tick what the bench says was reached, and when, once the trial waits to be scored and its truth is there."""
     facts = _poll(
         lambda: visitor.get(f"trials/{trial}"),
         lambda found: found["status"] in ("ended", "interrupted") and found["truth"] is not None,
@@ -154,7 +141,7 @@ def score_by_truth(visitor: Visitor, trial: int, times: TruthTimes) -> Mapping[s
     said = facts["truth"]["milestones"]
     reached = {str(milestone["id"]): bool(said.get(milestone["truth"])) for milestone in milestones}
     when = {
-        str(milestone["id"]): times.reached.get(milestone["truth"])
+        str(milestone["id"]): facts["truth"].get("reached", {}).get(milestone["truth"])
         for milestone in milestones
         if reached[str(milestone["id"])]
     }
@@ -163,6 +150,18 @@ def score_by_truth(visitor: Visitor, trial: int, times: TruthTimes) -> Mapping[s
     visitor.post(f"trials/{trial}/score", content)
     scored: Mapping[str, Any] = visitor.get(f"trials/{trial}")
     return scored
+
+
+def recorded(visitor: Visitor, trial: int) -> Mapping[str, Any]:
+    """The trial once it is as long as its recording, whatever becomes of that later."""
+    uuid = visitor.get(f"trials/{trial}")["episode"]
+    episode = _poll(
+        lambda: visitor.get(f"episodes/{uuid}"),
+        lambda facts: facts["duration_s"] is not None,
+        _PUBLISHED_S,
+        "waiting for the recording",
+    )
+    return whole(visitor, trial, episode)
 
 
 def _published(visitor: Visitor, episode: str) -> Mapping[str, Any]:
@@ -175,7 +174,7 @@ def _published(visitor: Visitor, episode: str) -> Mapping[str, Any]:
     return found
 
 
-def _whole(visitor: Visitor, trial: int, episode: Mapping[str, Any]) -> Mapping[str, Any]:
+def whole(visitor: Visitor, trial: int, episode: Mapping[str, Any]) -> Mapping[str, Any]:
     """The trial once it is as long as its recording: until then its duration is that of the commands."""
     found: Mapping[str, Any] = _poll(
         lambda: visitor.get(f"trials/{trial}"),

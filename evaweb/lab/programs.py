@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -65,16 +66,42 @@ def leader(robot: str, observations: str, seed: int) -> Program:
     )
 
 
+def _serving(name: str, robot: str, options: Sequence[str], port: object) -> tuple[str, ...]:
+    """A scripted policy that looks at the pictures, as runtime.sim.serve is asked for it."""
+    what = ("openpi", "--robot", robot, "--behaviour", "pick_place")
+    return (*what, "--name", name, "--port", str(port), *options)
+
+
 def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> Program:
-    """A scripted policy that looks at the pictures, on that port, or on a free one that it keeps."""
+    """A scripted policy on that port, or on a free one that it keeps."""
 
     def arguments(port: object) -> tuple[str, ...]:
-        serving = ("-m", "runtime.sim.serve", "openpi", "--robot", robot, "--behaviour", "pick_place")
-        return (*serving, "--name", name, "--port", str(port), *options)
+        return ("-m", "runtime.sim.serve", *_serving(name, robot, options, port))
 
     return Program(
         f"policy-{name}", arguments(port), announces=True, again=lambda found: arguments(_port(found))
     )
+
+
+def lockstep(
+    deployment: str,
+    assignments: Sequence[str],
+    robot: str,
+    policies: Mapping[str, tuple[Sequence[str], int]],
+    seed: int,
+) -> Program:
+    """A station, its simulated bench and its policy servers in one process on a virtual clock.
+
+    `policies`: by name, the options of each and its port, 0 for a free one; it announces their addresses.
+    """
+    sets = [part for assignment in assignments for part in ("--set", assignment)]
+    served = [
+        part
+        for name, (options, port) in policies.items()
+        for part in ("--serve", shlex.join(_serving(name, robot, options, port)))
+    ]
+    arguments = ("-m", "runtime.sim.lockstep", deployment, *sets, *served, "--seed", str(seed))
+    return Program(f"station-{_stem(deployment)}", arguments, announces=True, patience_s=15.0)
 
 
 def _port(found: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""A blind plan carried out by the script, as the README has it."""
+"""A blind plan carried out by the script in lockstep, as the README has it."""
 
 import json
 import subprocess
@@ -34,6 +34,11 @@ def test_two_blind_trials_are_made_revealed_and_compared(tmp_path):
     }
     assert len({trial["code"] for trial in trials}) == 2
     assert len({trial["position"] for trial in trials}) == 1  # one block: the same condition for both
+    assert found["lockstep"] is True
+    for trial in trials:  # its own time: whole ticks of 30 Hz, and nothing was reached after its end
+        assert trial["duration_s"] * 30 == pytest.approx(round(trial["duration_s"] * 30), abs=1e-6)
+        assert all(0 < at <= trial["duration_s"] for at in trial["times"].values())
+        assert trial["success"] == ("placed" in trial["times"])
     assert found["commitment"] in done.stderr
     assert len(bytes.fromhex(found["key"])) == 32
     assert [arm["success"]["n"] for arm in found["analysis"]["arms"]] == [1, 1]

@@ -59,7 +59,7 @@ class Command(BaseCommand):
             "--evaluate",
             type=int,
             metavar="N",
-            help="carry out N trials of a blind plan without a human, reveal it, compare, then end",
+            help="carry out N trials of a blind plan without a human, in lockstep, reveal it, compare, then end",
         )
         parser.add_argument(
             "--json", type=Path, metavar="FILE", help="with --once or --evaluate: write the result there"
@@ -107,16 +107,36 @@ class Command(BaseCommand):
             raise CommandError(str(error)) from None
 
     def _up(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> tuple[str, list[Login]]:
+        seed.demo_scene()
+        bench = (self._lockstep if options["evaluate"] else self._bench)(lab, deployment, options)
+        url = lab.up([bench])
+        roles = {"operator": Role.OPERATOR, "admin": Role.ADMIN}
+        logins = [seed.demo_login(username=name, role=role) for name, role in roles.items()]
+        try:
+            self._plan("block-on-plate-blind", "Block on plate", "evaluated", repetitions=3)
+        except EvaError as error:
+            self.stderr.write(f"The demo's plan is left as it is: {error}")
+        return url, logins
+
+    def _lockstep(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> Bench:
+        """Bench, policies and station in one process on a virtual clock."""
+        robot = options["robot"]
+        policies = {name: (_skill(name, options), _known_port(name)) for name in _POLICIES}
+        assignments = [f'robot="{robot}"', f'data_dir="{settings.DATA_DIR}"', *options["set"]]
+        program = programs.lockstep(str(deployment), assignments, robot, policies, options["seed"])
+        for name, url in lab.processes.start(program)["policies"].items():
+            seed.demo_checkpoint(name=name, description=_POLICIES[name][0], policy={"url": url})
+        return Bench(deployment, assignments, runs=True)
+
+    def _bench(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> Bench:
+        """Bench, policies and station in processes of their own."""
         robot, seed_number = options["robot"], options["seed"]
         node = lab.processes.start(programs.tabletop(robot, seed_number))
         served = {}
-        for name, (description, skill) in _POLICIES.items():
-            known = Checkpoint.objects.filter(name=name).values_list("policy__url", flat=True).first()
-            port = free_port_of(known)  # a plan that is frozen names it
-            serving = programs.policy(name, robot, (*skill, "--seed", str(seed_number)), port)
+        for name, (description, _) in _POLICIES.items():
+            serving = programs.policy(name, robot, _skill(name, options), _known_port(name))
             served[name] = lab.processes.start(serving)["url"]
             seed.demo_checkpoint(name=name, description=description, policy={"url": served[name]})
-        seed.demo_scene()
         assignments = [
             f'robot="{robot}"',
             f'transport.sub_endpoint="{node["obs_endpoint"]}"',
@@ -132,14 +152,7 @@ class Command(BaseCommand):
                 'collection.leader.kind="zmq"',
                 f'collection.leader.endpoint="{leader["endpoint"]}"',
             ]
-        url = lab.up([Bench(deployment, assignments)])
-        roles = {"operator": Role.OPERATOR, "admin": Role.ADMIN}
-        logins = [seed.demo_login(username=name, role=role) for name, role in roles.items()]
-        try:
-            self._plan("block-on-plate-blind", "Block on plate", "evaluated", repetitions=3)
-        except EvaError as error:
-            self.stderr.write(f"The demo's plan is left as it is: {error}")
-        return url, logins
+        return Bench(deployment, assignments)
 
     def _plan(self, name: str, title: str, use: str, repetitions: int) -> Plan:
         # What a blind plan hands out is hidden from operators: single trials keep theirs.
@@ -174,7 +187,7 @@ class Command(BaseCommand):
         result = evaluate.revealed(visitors[1], name, made)
         plan.refresh_from_db()
         found = analyse(outcomes_of_plan(plan), primary=(f"{_SKILLED}-by-script", f"{_CLUMSY}-by-script"))
-        result |= {"analysis": asdict(found), "wall_s": time.monotonic() - begun}
+        result |= {"lockstep": True, "analysis": asdict(found), "wall_s": time.monotonic() - begun}
         if options["json"]:
             options["json"].write_text(json.dumps(plain(result), indent=1), "utf-8")
         for line in told(found):
@@ -229,6 +242,19 @@ def _check(options: Mapping[str, Any]) -> None:
         )
     if count is not None and options["once"]:
         raise CommandError("--evaluate with --once: name one of them")
+    if count is not None and options["collect"]:
+        raise CommandError(
+            "--evaluate with --collect: its bench is in lockstep, a leader is not; leave one out"
+        )
+
+
+def _skill(name: str, options: Mapping[str, Any]) -> tuple[str, ...]:
+    return (*_POLICIES[name][1], "--seed", str(options["seed"]))
+
+
+def _known_port(name: str) -> int:
+    """Where the policy of that checkpoint was served before, if nobody is there: a plan that is frozen names it."""
+    return free_port_of(Checkpoint.objects.filter(name=name).values_list("policy__url", flat=True).first())
 
 
 def free_port_of(url: str | None) -> int:
