@@ -32,6 +32,8 @@ from runtime.sim.surroundings import Surroundings
 from runtime.transports import zmq
 
 REST_S = 1.0  # of success, after which nothing more is to be seen
+# Deadlines are in real seconds; a server of this process is not lost because the machine is busy.
+_PATIENT = ["policy.connect_deadline=60.0", "policy.inference_deadline=60.0"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 given = serve.parser().parse_args(shlex.split(line))
                 server = stack.enter_context(closing(serve.made(given, clock)))
                 urls[str(given.name or len(urls))] = str(server.start()["url"])
-            own = [f'policy.url="{url}"' for url in [*urls.values()][:1]]
+            own = [f'policy.url="{url}"' for url in [*urls.values()][:1]] + (_PATIENT if urls else [])
             served = station(options.deployment, [*own, *options.assignments], options.seed, clock)
             stack.enter_context(closing(served))
             standin.announce({"policies": urls}, options.ready_file)
