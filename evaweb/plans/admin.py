@@ -156,7 +156,7 @@ class PlanAdmin(admin.ModelAdmin):
         """Scene by scene, a line each."""
         found = plan.positions.select_related("scene").order_by("scene__title", "number")
         scenes = groupby(found, key=lambda position: position.scene.title)
-        lines = [(scene, ", ".join(map(str, positions))) for scene, positions in scenes]
+        lines = [(scene, "; ".join(map(str, positions))) for scene, positions in scenes]
         return format_html_join(mark_safe("<br>"), "{}: {}", lines) or mark_safe("–")
 
     def get_prepopulated_fields(self, request: HttpRequest, obj: Plan | None = None) -> dict[str, Any]:

@@ -114,4 +114,4 @@ def test_a_frozen_plan_lists_its_positions_scene_by_scene(client, admin, draft):
     draft.positions.add(other.positions.get(number=1))
     plan_freeze(user=admin, plan=draft)
     shown = client.get(reverse("admin:plans_plan_change", args=[draft.pk])).content.decode()
-    assert "block on plate: 1, 2<br>fold towel: 1" in shown
+    assert "block on plate: 1; 2<br>fold towel: 1" in shown
