@@ -175,6 +175,8 @@ class Report:
         self._outbox.clear()
 
     def _tell_makers(self, makers: Makers, sent: Sent) -> None:
+        if sent.target is not None and sent.target.source == "teleop":
+            makers = ()  # what a leader said: each message is merged like a chunk, and is none to whoever looks
         status = self.status
         status["chunk"] = max(makers, key=lambda made: made[1])[0] if makers else -1
         status["chunks"] = sum(maker != HELD for maker, _ in makers)

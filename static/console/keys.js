@@ -39,9 +39,12 @@ function text(element) {
 }
 
 function show(dialog) {
-  const rows = FIXED.filter(([, , taken]) => !taken || !document.querySelector(taken));
+  const rows = FIXED.filter(([, , other]) => !other || !document.querySelector(other));
+  const taken = new Set(); // a key is that of the first that has it, as when it is pressed
   for (const element of document.querySelectorAll("[data-key]")) {
-    if (usable(element)) rows.push([element.dataset.key, text(element)]);
+    if (!usable(element) || taken.has(element.dataset.key)) continue;
+    taken.add(element.dataset.key);
+    rows.push([element.dataset.key, text(element)]);
   }
   const list = dialog.querySelector("#keys-list");
   list.replaceChildren();

@@ -63,6 +63,21 @@ def test_the_robot_goes_where_the_leader_is_and_every_stream_is_recorded(tmp_pat
     station.close()
 
 
+def test_a_leader_says_no_chunks(tmp_path: Path) -> None:
+    station = collecting(tmp_path).armed()
+    station.command("run")
+    station.turn, seen = 0.002, set()
+    for _ in range(30):
+        station.go(1)
+        status = station.page.control.read()
+        seen.add((int(status["chunk"]), int(status["chunks"])))
+    assert seen <= {(-1, 0), (0, 0)}, "nothing is drawn where nothing is planned in chunks"
+    station.command("stop")
+    station.go(3)
+    assert len(station.episode().raw) > 20, "what the leader said is recorded all the same"
+    station.close()
+
+
 def test_the_task_of_a_run_is_that_of_its_episode_alone(tmp_path: Path) -> None:
     station = collecting(tmp_path).armed()
     assert demonstrated(station, 10, task="fold").manifest["task"] == "fold"

@@ -85,17 +85,23 @@ class Machine(RuleBasedStateMachine):
 
     @initialize(delay=st.integers(0, 4), home=st.booleans(), strategy=st.sampled_from(STRATEGIES))
     def begin(self, delay: int, home: bool, strategy: str) -> None:
-        self.station = station = Station(
-            plan(
-                Path(self.folder.name),
-                self.rows,
-                strategy=strategy,
-                delay=delay,
-                setup={"home": home},
-                recording={"enabled": False},
-                faults={"policy_error": "slow"},
+        self.watch(
+            Station(
+                plan(
+                    Path(self.folder.name),
+                    self.rows,
+                    strategy=strategy,
+                    delay=delay,
+                    setup={"home": home},
+                    recording={"enabled": False},
+                    faults={"policy_error": "slow"},
+                )
             )
         )
+
+    def watch(self, station: Station) -> None:
+        """Be the witness of that station."""
+        self.station = station
         self.limits = station.plan.limits
         self.records: list[Any] = []
         ring = station.page.rings["ticks"]
