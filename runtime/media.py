@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from runtime import heap
+from runtime.aside import Aside
 from runtime.clock import Clock, MonotonicClock
 from runtime.closing import Close, at_once, in_background
 from runtime.errors import RecordingError, RuntimeFault
@@ -243,9 +244,10 @@ def main() -> None:
     exports = Exports(plan.deployment.data, plan.deployment.recording.export)
     start_repair(plan.deployment.episodes_dir, plan.deployment.station, exports.start)
     source = plan.source(clock)
-    media = Media(
-        page, source, make_recorder(plan, clock.now), clock, Previews(plan), in_background, exports.start
-    )
+    previews = Aside(
+        Previews(plan)
+    )  # late on a busy machine, rather than what control sees and what is recorded
+    media = Media(page, source, make_recorder(plan, clock.now), clock, previews, in_background, exports.start)
     connected = False
     try:
         while not member.lifeline.cut:
@@ -265,6 +267,7 @@ def main() -> None:
         ended = clock.now()
         media.finish(_LAST_S)
         exports.finish(min(_EXPORT_S, _LAST_S - (clock.now() - ended)))
+        previews.close()
         source.close()
 
 
