@@ -233,12 +233,15 @@ def plan(resolved: Resolved) -> Plan:
 
 
 def _check_collection(made: Plan) -> None:
-    """A node that drives by itself must be one that can be told to, or says what it applied."""
+    """A node that drives by itself must be one that can be told to, and to leave off, and says what it applied."""
     wanted, capabilities = made.deployment.collection, made.capabilities
     if wanted is not None and wanted.source == "node" and not capabilities.leads:
+        kind = made.deployment.transport.kind
+        leads = kind if kind in variants("runtime.leaders") else "zmq"
         raise SetupError(
-            f'collection.source = "node" with transport {made.deployment.transport.kind!r}, whose robot reads no '
-            'leader of its own; allowed: source = "relay", or the transport zmq'
+            f'collection.source = "node" with transport {kind!r}, over which a robot is neither told to follow a '
+            "leader of its own and to leave off, which every stop of ours has to, nor says what it applied; allowed: "
+            f'the transport zmq, or source = "relay" with collection.leader.kind = {leads!r}'
         )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from runtime import deployment, family
 from runtime.datasets.published import publish
 from runtime.errors import RecordingError, SetupError
 from runtime.recording.labels import labels
@@ -339,6 +340,30 @@ def test_a_station_set_up_to_collect_runs_no_policy_and_one_with_a_policy_collec
     station.go(20)
     assert station.stop().manifest["kind"] == "rollout"
     station.close()
+
+
+@pytest.mark.parametrize(
+    ("transport", "leader"), [({"kind": "ros2", "domain": 77}, "ros2"), ({"kind": "dataset"}, "zmq")]
+)
+def test_a_node_that_cannot_be_told_to_leave_off_is_refused(
+    tmp_path: Path, transport: dict[str, Any], leader: str
+) -> None:
+    if leader == "ros2":
+        pytest.importorskip("cyclonedds", reason="the package cyclonedds (extra ros2) is not installed")
+    else:
+        transport = {**transport, "path": str(tmp_path)}
+    tree = {
+        "station": "bench",
+        "robot": "r1_lite",
+        "data_dir": str(tmp_path),
+        "task": "wave",
+        "transport": transport,
+        "collection": {"source": "node"},
+        "recording": {"min_free_bytes": 0},
+    }
+    with pytest.raises(SetupError, match=r"to leave off.*nor says what it applied") as refused:
+        family.plan(deployment.resolve(tree, {}, "test"))
+    assert f"collection.leader.kind = '{leader}'" in str(refused.value)
 
 
 @pytest.mark.parametrize("given", [{"policy": {"kind": "mock"}}, {"strategy": {"kind": "sync"}}])
