@@ -86,7 +86,7 @@ class Operations(Effects):
         self.inference.tune(strategy_of(plan), plan.deployment.task)
         self._tuned = False
         self.collecting.begin_setup(plan.collecting)
-        self.setup.begin(reset)
+        self.setup.begin(reset, asked.least)
         return {"bench": reset["id"]} if reset else {}
 
     def _changed(self, asked: SetUpRequest) -> Plan:

@@ -55,12 +55,20 @@ class BenchRequest(Section):
     positions: Positions | None = None
 
 
+class LeastTimes(Section):
+    """How long the stages of a set-up that wait for the policy last at least [s], whoever it is."""
+
+    connect_s: float = Field(default=0.0, ge=0, le=3600)
+    warm_up_s: float = Field(default=0.0, ge=0, le=3600)
+
+
 class SetUpRequest(Section):
     """`setup`: what differs from the deployment this time; what is absent is the deployment's own.
 
     `policy` is merged into the deployment's own [policy] as a file over what it extends: a table of another
     `kind` replaces it whole. `checkpoint` is only written down. `collect`: a person is to drive the robot, as the
-    deployment's [collection] says; absent: where the deployment has no policy.
+    deployment's [collection] says; absent: where the deployment has no policy. `least`: so that nobody can tell two
+    policies by how long they take.
     """
 
     policy: Map | None = None
@@ -69,6 +77,7 @@ class SetUpRequest(Section):
     checkpoint: Checkpoint | None = None
     bench: BenchRequest | None = None
     collect: bool | None = None
+    least: LeastTimes = LeastTimes()
 
     @property
     def changes(self) -> dict[str, Any]:

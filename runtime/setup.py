@@ -22,6 +22,7 @@ from runtime.messages import Event, MediaReport
 from runtime.orders import Orders
 from runtime.page import Page
 from runtime.policies.base import PolicyInfo
+from runtime.requests import LeastTimes
 from runtime.timeline import difference
 from runtime.types import Float64
 
@@ -67,7 +68,9 @@ class SetUp:
         self.validated = ""
         self.first_action: Float64 | None = None  # [D] of the newest validated answer
         self.stages: dict[Stage, float] = {}  # those that were entered, and when
+        self.took: dict[str, float] = {}  # how long the policy took for its stages [s], without rests
         self.failed: Stage | None = None
+        self._least = LeastTimes()
         self._motion_only = ""  # what a motion alone amounts to, "" in a whole set-up
         self._reset: dict[str, Any] | None = None  # of the bench, that has been asked for
 
@@ -80,9 +83,11 @@ class SetUp:
         """What came of it, in one sentence."""
         return self._motion_only or self.validated
 
-    def begin(self, reset: dict[str, Any] | None) -> None:
+    def begin(self, reset: dict[str, Any] | None, least: LeastTimes | None = None) -> None:
         """Start from the first stage; `reset` as by `BenchReset.of`."""
         self._reset = reset
+        self._least = least or LeastTimes()
+        self.took = {}
         self.info, self.validated, self.first_action = None, "", None
         self._motion_only = ""
         self._start()
@@ -130,7 +135,8 @@ class SetUp:
     def pump(self) -> bool:
         """Advance; True when done. Raises RuntimeFault where it cannot go on."""
         if self.stage is Stage.CONNECT:
-            if self._inference.runner.ready(self._connection):
+            ready = self._inference.runner.ready(self._connection)
+            if ready and self._rested("connect_s", self._least.connect_s):
                 self.info = self._connection.result()
                 check_info(self.info, self._plan, self._inference.continues)
                 self._enter(Stage.OBSERVE)
@@ -224,6 +230,15 @@ class SetUp:
         return False
 
     def _warm_up(self) -> bool:
+        if self._left and not self._answered():
+            return False
+        if self._left or not self._rested("warm_up_s", self._least.warm_up_s):
+            return False
+        self.stage = Stage.IDLE
+        return True
+
+    def _answered(self) -> bool:
+        """Ask once more, and look at what came; whether something did."""
         if self._asked is None:
             self._asked = self._inference.asking.ask()
             return False
@@ -232,10 +247,13 @@ class SetUp:
         answered, self._asked = self._asked.result(), None
         self._validate(answered)
         self._left -= 1
-        if self._left:
-            return False
-        self.stage = Stage.IDLE
         return True
+
+    def _rested(self, name: str, least: float) -> bool:
+        """The policy is done with this stage: whether that lasted long enough to tell nothing of who it is."""
+        waited = self._waited()
+        self.took.setdefault(name, waited)
+        return waited >= least
 
     def _validate(self, answered: Answered) -> None:
         self._inference.asking.note(answered)

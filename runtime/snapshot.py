@@ -69,6 +69,7 @@ def snapshot(view: View) -> dict[str, Any]:
         "phase": _phase(view),
         "stage": str(view.setup.stage),
         "stages": _stages(view),
+        "setup_took": dict(view.setup.took),
         "first_action": _first_action(view),
         "proposal": _proposal(view),
         "grippers": view.by_hand.grippers.told(view.by_hand.commanded()),

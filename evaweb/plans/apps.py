@@ -13,7 +13,7 @@ class PlansConfig(AppConfig):
         from evaweb.guards import keep
 
         # They declare what is hidden from whom, and what is asked before a trial of a plan runs.
-        from evaweb.plans import bench, sight  # noqa: F401
+        from evaweb.plans import bench, pacing, sight  # noqa: F401
         from evaweb.plans.guarded import GUARDS
 
         keep(self, GUARDS)

@@ -39,6 +39,7 @@ _COVERED: Mapping[str, Any] = {
     "phase": "",
     "stage": "idle",
     "stages": [],
+    "setup_took": {},
     "first_action": {},
     "proposal": {},
     "validated": "",

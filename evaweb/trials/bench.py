@@ -5,7 +5,7 @@ Beside them the set-up for a checkpoint without a trial.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 from uuid import UUID
 
@@ -81,6 +81,15 @@ def _policy_args(checkpoint: Checkpoint) -> dict[str, Any]:
     return {"policy": checkpoint.policy, "checkpoint": {"id": checkpoint.pk, "name": checkpoint.name}}
 
 
+Least = Callable[[Trial], Mapping[str, float] | None]
+_least: list[Least] = []
+
+
+def declare_least(find: Least) -> None:
+    """`find` says how long the policy's stages of a trial's set-up last at least, None: as long as they take."""
+    _least.append(find)
+
+
 def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
     """What the station needs to know for this trial; `reset` names this laying out of a simulated bench.
 
@@ -89,6 +98,8 @@ def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
     args: dict[str, Any] = {"task": trial.instruction, **_policy_args(trial.checkpoint)}
     if trial.strategy is not None:
         args["strategy"] = trial.strategy
+    for least in (found for find in _least if (found := find(trial))):
+        args["least"] = dict(least)
     if trial.station.simulated and trial.seed is not None:
         args["bench"] = {"id": str(reset), "seed": trial.seed, "positions": trial.position.bench}
     return args
@@ -112,7 +123,7 @@ def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
         _require_prepared(trial, "set up", given["user"])
     args = setup_args(trial, given["uuid"])
     if first is not None:
-        _require_same(first, trial, trial.setup == first.pk or first.args == plain(args))
+        _require_same(first, trial, trial.setup == first.pk or _asked(first.args) == _asked(plain(args)))
         args = first.args
     row = issue(**given, args=args)
     if row.status not in NOT_CARRIED_OUT:
@@ -125,12 +136,18 @@ def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
     return row
 
 
+def _asked(args: Mapping[str, Any]) -> dict[str, Any]:
+    """What a set-up is about; how long it lasts at least is drawn anew each time."""
+    return {key: value for key, value in args.items() if key != "least"}
+
+
 def _run(trial: Trial, given: Mapping[str, Any]) -> Command:
     first = Command.objects.filter(pk=given["uuid"]).first()
     if first is None:
         _require_prepared(trial, "run", given["user"])
         _require_set_up(trial)
-        _require_loaded(trial, given["user"])
+        took = _require_loaded(trial, given["user"])
+        Trial.objects.filter(pk=trial.pk).update(setup_took=took)
         checked("run", trial, given["user"])
     else:
         _require_same(first, trial, _is_about(first, trial))
@@ -169,12 +186,13 @@ def _require_set_up(trial: Trial) -> None:
         )
 
 
-def _require_loaded(trial: Trial, user: User) -> None:
+def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
     """Whoever set the station up last, a terminal included: this is the checkpoint that it would run.
 
-    What changes after this look makes the run stale, which the station refuses by itself.
+    What changes after this look makes the run stale, which the station refuses by itself. How long its policy took.
     """
-    told = wire_to(trial.station.name).status().get("checkpoint") or {}
+    status = wire_to(trial.station.name).status()
+    told = status.get("checkpoint") or {}
     if told.get("id") != trial.checkpoint_id:
         seen = sight_of(user)
         other = "another checkpoint" if told.get("id") in seen.checkpoints else told.get("name")
@@ -182,6 +200,8 @@ def _require_loaded(trial: Trial, user: User) -> None:
             f"{trial.station.name} was set up for {other or 'no checkpoint'} by somebody else, "
             f"not for {seen.label(trial)}: press Set up again"
         )
+    took = status.get("setup_took")
+    return {str(name): float(seconds) for name, seconds in took.items()} if took else None
 
 
 def _require_same(first: Command, trial: Trial, same: bool) -> None:

@@ -254,6 +254,12 @@ class Trial(models.Model):
     truth = models.JSONField(
         null=True, blank=True, help_text="How a simulated bench says it was left at the end of the run."
     )
+    setup_took = models.JSONField(
+        null=True,
+        blank=True,
+        editable=False,
+        help_text="How long its policy took to connect and to warm up [s], by the names of the runtime.",
+    )
     # Which commands made it, and from where on the station's events are about it.
     setup = models.UUIDField(null=True, blank=True, editable=False, help_text="Of its newest set-up.")
     run = models.UUIDField(null=True, blank=True, editable=False, help_text="Of the command that ran it.")

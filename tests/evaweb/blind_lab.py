@@ -100,7 +100,8 @@ class Lab:
             data={"latency_ms": FIGURE, "name": NAMES[0]},
             issued_at=timezone.now(),
         )
-        Trial.objects.filter(pk=self.trial.pk).update(setup=self.command.pk)
+        took = {"connect_s": FIGURE, "warm_up_s": FIGURE}
+        Trial.objects.filter(pk=self.trial.pk).update(setup=self.command.pk, setup_took=took)
         self.runtime.say("setup", "connecting to the policy")
         self.runtime.say("setup_note", f"{NAMES[0]} answers {ROWS} rows in {FIGURE} ms")
 
@@ -120,6 +121,7 @@ class Lab:
                 "tuning": {"execution_horizon": ROWS, "digest": DIGEST},
                 "strategy": "rtc",
                 "stages": [{"name": "warming up the policy", "state": "done", "seconds": FIGURE}],
+                "setup_took": {"connect_s": FIGURE, "warm_up_s": FIGURE},
                 "first_action": {"distance": FIGURE, "joint": NAMES[0], "far": False},
                 "episode": {"uuid": "", "reason": ERROR},
                 "last_run": {"reason": ERROR},
@@ -187,6 +189,12 @@ class Lab:
             duration_s=0.8,
             configuration_hash=DIGEST,
             control={"late_ms": FIGURE},
+            smoothness=-FIGURE,
+            smoothness_commanded=-FIGURE,
+            smoothness_detail={
+                "arms": {"left_arm": {"measured": -FIGURE, "commanded": -FIGURE, "measured_m": FIGURE}},
+                "why": "",
+            },
             policy={
                 "latency_ms": {"p50": FIGURE, "p90": FIGURE, "max": FIGURE},
                 "delay_steps": {"p50": 3, "max": 9},

@@ -305,3 +305,41 @@ def test_measured_poses_that_agree_are_nothing_to_speak_of(tmp_path: Path) -> No
     station.policy.sees_poses = True
     assert station.ready().events("eef_disagrees") == []
     station.close()
+
+
+def set_up_in(station: Station, **args: Any) -> float:
+    """How long a set-up with these arguments lasts, on the station's clock [s]."""
+    began = station.clock.now()
+    station.command("setup", **args)
+    station.until(lambda: station.state is State.READY, 60.0, "set-up")
+    return station.clock.now() - began
+
+
+def test_whose_policy_is_quick_takes_as_long_as_it_is_told_to(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path))
+    station.until(lambda: station.state is State.IDLE, 5.0, "observations")
+    quick = set_up_in(station)
+    assert quick < 1.0
+    assert station.main.snapshot()["setup_took"].keys() == {"connect_s", "warm_up_s"}
+    rested = set_up_in(station, least={"connect_s": 3.0, "warm_up_s": 5.0})
+    assert rested == pytest.approx(8.0 + quick, abs=0.5)
+    entered = station.main.setup.stages
+    assert entered[Stage.OBSERVE] - entered[Stage.CONNECT] == pytest.approx(3.0, abs=0.1)
+    took = station.main.snapshot()["setup_took"]
+    assert max(took.values()) < 0.5, "rests are none of the policy's time"
+    assert station.policy.calls.count("infer") == 2 * 2
+    station.close()
+
+
+def test_a_rest_can_be_cancelled_and_times_that_cannot_be_are_refused(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path))
+    station.until(lambda: station.state is State.IDLE, 5.0, "observations")
+    station.command("setup", least={"warm_up_s": 100.0})
+    station.go(90)
+    assert station.state is State.SETTING_UP
+    assert station.main.setup.stage is Stage.WARM_UP
+    station.command("halt")
+    assert station.state is State.IDLE
+    with pytest.raises(SetupError, match=r"least\.warm_up_s = -1: Input should be greater than or equal to 0"):
+        station.command("setup", least={"warm_up_s": -1})
+    station.close()
