@@ -20,7 +20,7 @@ REFUSED = {
         SetUpRequest,
         {"polcy": {}},
         "say: polcy = {}: unknown key (did you mean policy?); "
-        "allowed here: bench, checkpoint, collect, policy, strategy, task",
+        "allowed here: bench, checkpoint, collect, least, policy, strategy, task",
     ),
     "an unknown key of a table": (
         SetUpRequest,

@@ -4,6 +4,7 @@ from uuid import uuid4
 import pytest
 from django.test import Client
 
+from evaweb.episodes.models import Episode
 from evaweb.episodes.services import episode_opened
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Score, Trial
@@ -46,10 +47,19 @@ def test_every_rate_stands_beside_its_n_and_its_interval(bench, browser):
     text = page(browser, "/result/")
     row = re.search(r'<tr data-checkpoint="pi0-block">.*?</tr>', text, re.S).group()
     cells = re.findall(r'<td class="number[^"]*">(?:<a[^>]*>)?([^<]*)', row)
-    assert cells == ["3", "4", "75 %", "30 to 95 %", "81 %", "12.5 s"]
+    assert cells == ["3", "4", "75 %", "30 to 95 %", "81 %", "12.5 s", "–"]
     assert 'aria-label="75 % of 4, 95 % interval 30 to 95"' in row
     assert "1 voided" in row
     assert "no ranking" in text
+
+
+def test_smoothness_is_missing_where_it_was_not_measured_and_says_of_how_many_it_is(bench, browser):
+    for smooth in (-5.0, -6.0, None):
+        trial = bench.scored(True)
+        if smooth is not None:
+            episode = Episode.objects.create(station=bench.station, status="finished", smoothness=smooth)
+            Trial.objects.filter(pk=trial.pk).update(episode=episode)
+    assert "−5.50 [−11.85, 0.85], 2 of 3 trials" in page(browser, "/result/")
 
 
 def test_a_cell_without_a_scored_trial_has_no_rate(bench, browser):
