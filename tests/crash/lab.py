@@ -20,7 +20,7 @@ FREE = "tcp://127.0.0.1:0"
 class Lab:
     """A node, a policy server and a station in a folder of its own."""
 
-    patience = 20.0  # for whatever the station does in its own time [s]
+    patience = 60.0  # for whatever the station does in its own time [s]
     ending = 15.0  # for its end [s]
 
     def __init__(self, folder: Path):
@@ -113,7 +113,9 @@ class Lab:
         """A run that has moved the arm for a while."""
         self.ready()
         self.client.command("run")
-        self.client.wait(lambda s: s["run"]["elapsed"] >= seconds and s["policy"]["answers"] > 3, 20)
+        self.client.wait(
+            lambda s: s["run"]["elapsed"] >= seconds and s["policy"]["answers"] > 3, self.patience
+        )
         return self
 
     def pids(self):

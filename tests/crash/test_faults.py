@@ -29,7 +29,7 @@ def assert_holds(lab, *words, seconds=15):
     status = lab.reach("holding", seconds=seconds)
     for word in words:
         assert word in status["reason"], status["reason"]
-    behaviour = lab.client.wait(lambda s: s["control"]["behaviour"] == "hold", 5)
+    behaviour = lab.client.wait(lambda s: s["control"]["behaviour"] == "hold", 60)
     assert behaviour["control"]["engaged"]
     return status
 
@@ -151,7 +151,7 @@ def test_an_expiring_lease_makes_the_robot_hold_and_its_holder_may_resume(lab):
     assert status["state"] == "holding"
     assert "lease" in status["reason"]
     lab.client.command("resume")
-    lab.client.wait(lambda s: s["state"] == "running" and s["control"]["remaining"] > 0, 5)
+    lab.client.wait(lambda s: s["state"] == "running" and s["control"]["remaining"] > 0, 60)
     lab.client.command("stop")
     episode = open_episode(eventually(lambda: lab.outcome() and lab.episodes()[0], 10, "an episode"))
     sources = episode.rows["control_source"].to_pylist()
@@ -192,7 +192,7 @@ def test_a_stall_of_half_a_second_is_no_burst(lab):
     time.sleep(0.5)
     os.kill(control, signal.SIGCONT)
     before = lab.client.status()["run"]["elapsed"]
-    lab.client.wait(lambda s: s["run"]["elapsed"] > before + 1.0 or s["state"] != "running", 10)
+    lab.client.wait(lambda s: s["run"]["elapsed"] > before + 1.0 or s["state"] != "running", 60)
     assert lab.client.status()["control"]["missed"] >= 10
     lab.client.command("stop")
     lab.outcome()

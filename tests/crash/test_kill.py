@@ -61,7 +61,7 @@ def test_a_killed_process_is_restarted_and_nothing_moves_until_set_up_again(lab,
     if state == "recording":
         readable_to_the_last_second(lab, killed_at)
     if state != "idle":
-        held = lab.client.wait(lambda s: s["control"]["behaviour"] == "hold", 10)
+        held = lab.client.wait(lambda s: s["control"]["behaviour"] == "hold", 60)
         assert held["control"]["engaged"]
     lab.ready()
 

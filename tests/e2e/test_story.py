@@ -113,11 +113,11 @@ def test_the_episode_plays_back_on_one_clock(trial, operator):
         return min(times) > 1 and max(times) - min(times) < 0.5
 
     scene = page.locator(".replay-scene, #scene").first
+    eventually(lambda: share(pixels(scene), white) > 0.003, 30, "the robot is drawn")
     before = pixels(scene)
     page.keyboard.press("Space")
     eventually(together, 30, "the videos play together")
     page.keyboard.press("Space")
-    assert share(before, white) > 0.003
     eventually(lambda: moved(before, pixels(scene)) > 0.002, 10, "the robot is drawn where it is by now")
     assert page.locator("canvas").count() >= 2
 
