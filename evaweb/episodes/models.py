@@ -68,6 +68,14 @@ class Episode(models.Model):
 
     class Meta:
         ordering = ("-started_at", "-created_at")
+        indexes = [
+            # How many were measured is asked for whenever statistics are shown.
+            models.Index(
+                fields=("smoothness",),
+                condition=models.Q(smoothness__isnull=False),
+                name="episode_measured",
+            )
+        ]
 
     def __str__(self) -> str:
         return f"{self.uuid} ({self.get_status_display()})"
