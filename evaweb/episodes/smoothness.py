@@ -1,16 +1,17 @@
 """How smoothly the arms of a run moved: SPARC of the speed of each end effector, as measured and as it was sent.
 
 The speed of the hand is what SPARC was made for (Balasubramanian et al. 2015), and it means the same for robots with
-other joints. Positions follow from the joints by the robot's description, at the control steps in which somebody asked
-for something: a robot that is held for its operator is not jerky. The measured one counts; the sent one, beside it, is
-free of the sensors' noise and of what the robot's own controller smooths.
+other joints. Positions follow from the joints by the robot's description, while somebody asked for something: a robot
+that is held for its operator is not jerky. The measured one counts, at the times at which it was captured; the sent one,
+beside it, is free of the sensors' noise and of what the robot's own controller smooths.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,8 @@ from runtime.recording.summary import HELD
 
 LEAST_M = 0.02  # an arm that stays within it did not move: its speed is the noise of its sensors
 Array = NDArray[np.float64]
-_STREAMS = {"measured": "qpos", "commanded": "executed"}
+_STREAMS = ("measured", "commanded")
+_LEAST_RATE = 0.95 * 2 * CUT_OFF  # of observations [1/s]; a lost one now and then is none of these
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,51 +61,98 @@ def smoothness_of(episode: Episode) -> Smoothness:
             f"control_rate = {rate!r}: SPARC looks at up to {CUT_OFF:g} Hz, which takes twice the rate"
         )
     forward = ChainForward(robot)
+    measured = _tracked(_measured(episode), float(rate), forward)
+    seen = measured.seen
+    if seen is not None and seen < _LEAST_RATE:
+        measured = replace(measured, spans=())
     arms: dict[str, dict[str, float | None]] = {arm.name: {} for arm in robot.arms}
-    for stream, column in _STREAMS.items():
-        spans = _moved(episode, column, forward)
+    for stream, track in (
+        ("measured", measured),
+        ("commanded", _tracked(_commanded(episode, rate), float(rate), forward)),
+    ):
         for index, arm in enumerate(robot.arms):
-            way = _way(spans, index)
+            way = _way(track.spans, index)
             arms[arm.name] |= {stream: _sparc(way, float(rate)), f"{stream}_m": float(way.sum())}
     moved = {
         name: facts for name, facts in arms.items() if any(facts[stream] is not None for stream in _STREAMS)
     }
-    why = "" if moved else f"no arm moved farther than {LEAST_M * 1000:.0f} mm while it was asked to"
-    return Smoothness(_mean(moved, "measured"), _mean(moved, "commanded"), moved, why)
+    found = Smoothness(_mean(moved, "measured"), _mean(moved, "commanded"), moved)
+    if found.measured is not None:
+        return found
+    if seen is not None and seen < _LEAST_RATE:
+        return replace(
+            found,
+            why=f"{seen:.0f} observations a second: SPARC looks at up to {CUT_OFF:g} Hz, which takes twice that",
+        )
+    return replace(found, why=f"no arm moved farther than {LEAST_M * 1000:.0f} mm while it was asked to")
 
 
 def _none(why: str) -> Smoothness:
     return Smoothness(None, None, {}, why)
 
 
-def _moved(episode: Episode, column: str, forward: ChainForward) -> list[Array]:
-    """Positions of all end effectors [steps, arms, 3], at every step from the first to the last, span by span.
+@dataclass(frozen=True, slots=True)
+class _Samples:
+    """Joints [N, D] at `times` [N] in s, and whether somebody asked for something then; NaN where nothing is known."""
 
-    A span is as long as the robot was asked to move without a pause. Steps that were missed, or at which nothing new
-    was measured, lie on the straight line between those beside them.
+    times: Array
+    joints: Array
+    asked: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class _Track:
+    """Positions of all end effectors [steps, arms, 3] at the control rate, one span for each stretch without a pause.
+
+    What was not sampled lies on the straight line between what was; `seen`: samples a second, None for none.
     """
+
+    spans: tuple[Array, ...]
+    seen: float | None
+
+
+def _measured(episode: Episode) -> _Samples:
+    """What the robot said of its joints, when they were captured: a tick sees the newest, of whatever age that is."""
+    rows, name = episode.rows, "capture_time.joints"
+    ticked = rows.column("tick_time").to_numpy()
+    told = rows.column(name).to_numpy(zero_copy_only=False) if name in rows.column_names else ticked
+    times = np.asarray(told if np.isfinite(told.astype(float)).any() else ticked, np.float64)
+    joints = vectors(rows, "qpos", episode.layout.dim).T.astype(np.float64)
+    joints[np.diff(rows.column("sequence").to_numpy(), prepend=-1) == 0] = np.nan  # seen before
+    return _Samples(times, joints, _asked(rows))
+
+
+def _commanded(episode: Episode, rate: float) -> _Samples:
+    """What was sent, at the control steps that it was sent for."""
     ticks = episode.ticks
-    steps = ticks.column("step").to_numpy()
-    asked = np.array([source not in HELD for source in ticks.column("control_source").to_pylist()], bool)
-    joints = vectors(ticks, column, episode.layout.dim).T.astype(np.float64)
-    known = np.isfinite(joints).all(axis=1)
-    if column == "qpos":
-        known &= np.diff(ticks.column("sequence").to_numpy(), prepend=-1) != 0
-    spans = []
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], asked.astype(np.int8), [0]])))
+    joints = vectors(ticks, "executed", episode.layout.dim).T.astype(np.float64)
+    return _Samples(ticks.column("step").to_numpy() / rate, joints, _asked(ticks))
+
+
+def _asked(table: Any) -> NDArray[np.bool_]:
+    return np.array([source not in HELD for source in table.column("control_source").to_pylist()], bool)
+
+
+def _tracked(samples: _Samples, rate: float, forward: ChainForward) -> _Track:
+    known = np.isfinite(samples.joints).all(axis=1) & np.isfinite(samples.times)
+    spans, count, duration = [], 0, 0.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], samples.asked.astype(np.int8), [0]])))
     for first, end in zip(edges[::2], edges[1::2], strict=True):
         there = first + np.flatnonzero(known[first:end])
+        at = samples.times[there]
+        later = at > np.concatenate([[-np.inf], np.maximum.accumulate(at)[:-1]])
+        there, at = there[later], at[later]
         if len(there) < 2:
             continue
-        at = steps[there]
-        places = forward.forward(joints[there])[..., :3]
-        grid = np.arange(at[0], at[-1] + 1)
+        count, duration = count + len(there) - 1, duration + float(at[-1] - at[0])
+        places = forward.forward(samples.joints[there])[..., :3]
+        grid = at[0] + np.arange(int((at[-1] - at[0]) * rate + 1e-6) + 1) / rate
         every = [np.interp(grid, at, places[:, a, x]) for a in range(places.shape[1]) for x in range(3)]
         spans.append(np.stack(every, axis=-1).reshape(len(grid), places.shape[1], 3))
-    return spans
+    return _Track(tuple(spans), count / duration if duration > 0 else None)
 
 
-def _way(spans: list[Array], arm: int) -> Array:
+def _way(spans: Sequence[Array], arm: int) -> Array:
     """How far the arm's end effector went in each step [m]; empty where it did not move."""
     if not spans:
         return np.empty(0)

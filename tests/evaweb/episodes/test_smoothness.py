@@ -27,25 +27,29 @@ def real(recorded):
     return open_episode(recorded["finished"])
 
 
-def moving(real, angles, *, commanded=None, sources=None, sequence=None, **manifest):
-    """The episode with these angles of the left arm's first joint, tick by tick; the other arm stands."""
+def moving(real, angles, *, commanded=None, sources=None, seen=None, captured=None, **manifest):
+    """The episode with these angles of the left arm's first joint, tick by tick; the other arm stands.
+
+    `seen`: the number of the observation of each tick; `captured`: when that was taken [s].
+    """
     n = len(angles)
+    number = np.arange(n) if seen is None else seen
 
     def joints(values):
         q = np.tile(STANDS.astype(np.float32), (n, 1))
         q[:, 0] += values
         return pa.FixedSizeListArray.from_arrays(pa.array(q.ravel()), real.layout.dim)
 
-    columns = {
+    plain = {
         "step": pa.array(np.arange(n)),
-        "sequence": pa.array(np.arange(n) if sequence is None else sequence),
+        "sequence": pa.array(number),
         "control_source": pa.array(sources or ["policy"] * n),
         "qpos": joints(np.asarray(angles)),
-        "executed": joints(np.asarray(angles if commanded is None else commanded)),
     }
-    return replace(
-        real, ticks=pa.table(columns), manifest={**real.manifest, "control_rate": RATE, **manifest}
-    )
+    times = pa.array(number / RATE if captured is None else captured)
+    rows = pa.table(plain | {"tick_time": pa.array(np.arange(n) / RATE), "capture_time.joints": times})
+    ticks = pa.table(plain | {"executed": joints(np.asarray(angles if commanded is None else commanded))})
+    return replace(real, rows=rows, ticks=ticks, manifest={**real.manifest, "control_rate": RATE, **manifest})
 
 
 def bell(seconds=4.0):
@@ -84,12 +88,26 @@ def test_a_pause_of_the_operators_is_no_jerk(real):
     assert smoothness_of(moving(real, paused)).measured < whole - 0.2
 
 
-def test_an_observation_that_is_seen_twice_is_no_stop(real):
+def test_an_observation_that_is_old_when_it_is_seen_is_no_jerk(real):
+    """Each tick sees the newest one, now one and now three ticks old, some twice: the motion was as smooth."""
     angles, _ = bell()
-    seen = np.arange(len(angles)) // 2
-    assert smoothness_of(
-        moving(real, angles[2 * seen], commanded=angles, sequence=seen)
-    ).measured == pytest.approx(smoothness_of(moving(real, angles)).measured, abs=0.02)
+    ages = np.random.default_rng(2).integers(0, 3, len(angles))
+    seen = np.maximum.accumulate(np.clip(np.arange(len(angles)) - ages, 0, None))
+    whole = smoothness_of(moving(real, angles)).measured
+    late = smoothness_of(moving(real, angles[seen], commanded=angles, seen=seen))
+    assert late.measured == pytest.approx(whole, abs=0.03)
+    unstamped = np.full(len(angles), np.nan)
+    guessed = smoothness_of(moving(real, angles[seen], commanded=angles, seen=seen, captured=unstamped))
+    assert guessed.measured < whole - 0.2, "without the times of capture it would look rough"
+
+
+def test_too_few_observations_say_nothing_of_how_it_moved(real):
+    angles, _ = bell()
+    seen = np.arange(len(angles)) // 3 * 3
+    found = smoothness_of(moving(real, angles[seen], commanded=angles, seen=seen))
+    assert found.measured is None
+    assert found.commanded == smoothness_of(moving(real, angles)).commanded
+    assert found.why.startswith("10 observations a second")
 
 
 def test_who_did_not_move_has_none(real):

@@ -348,11 +348,11 @@ def test_smoothness_stands_with_its_interval_and_how_many_trials_it_is_of(reveal
     text = as_(viewer).get(PLAN).content.decode()
     assert "Smoothness, SPARC" in text
     assert text.count("−5.30 [−5.39, −5.21], 6 of 8 trials") == 3  # one of them as what was sent
-    assert "Of what was sent: −4.80 [−4.89, −4.71], 6 of 8 trials" in text
+    assert "as sent −4.80 [−4.89, −4.71], 6 of 8 trials" in text
     Trial.objects.filter(handout__plan=revealed).update(episode=None)
     again = as_(viewer).get(PLAN).content.decode()
     assert "6 of 8 trials" not in again
-    assert "Of what was sent: not recorded" in again
+    assert "as sent" not in again
 
 
 def test_a_smoothness_that_is_measured_later_is_shown(revealed, as_, viewer):
