@@ -2,7 +2,7 @@
 
 The speed of the hand is what SPARC was made for (Balasubramanian et al. 2015), and it means the same for robots with
 other joints. Positions follow from the joints by the robot's description, while somebody asked for something: a robot
-that is held for its operator is not jerky. The measured one counts, at the times at which it was captured; the sent one,
+that is held for its operator is not jerky. The measured one counts, at the times of its capture; the sent one,
 beside it, is free of the sensors' noise and of what the robot's own controller smooths.
 """
 
