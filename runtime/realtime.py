@@ -12,6 +12,7 @@ _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _SYS_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 _SLICE_NS = 100_000
+LOCKSTEP = "lockstep"  # the class of ticks that keep no time
 
 
 def enter(priority: int) -> str:
@@ -29,8 +30,8 @@ def enter(priority: int) -> str:
 
 
 def advice(scheduling: str, priority: int) -> str:
-    """How a station whose control got `scheduling` is made punctual, in one sentence; "" where it is."""
-    if scheduling.startswith("FIFO"):
+    """How a station whose control got `scheduling` is made punctual, in one sentence; "" where it need not be."""
+    if scheduling.startswith("FIFO") or scheduling == LOCKSTEP:
         return ""
     return (
         f"control runs in the class {scheduling!r}: SCHED_FIFO is not permitted, so that ticks can be milliseconds "

@@ -27,6 +27,7 @@ from runtime.leftovers import start_repair
 from runtime.lockstep import Around, Lockstep
 from runtime.main import Service
 from runtime.previews import Previews
+from runtime.realtime import LOCKSTEP
 from runtime.runner import DeclaredRunner
 from runtime.supervisor import hold
 from runtime.transitions import State
@@ -103,7 +104,7 @@ class ServedLockstep(Lockstep):
             on_disk=self._exports.start,
         )
         super().__init__(plan, clock, around)
-        self._figures = Lateness(self._tick.status, "lockstep")
+        self._figures = Lateness(self._tick.status, LOCKSTEP)
         context: zmq.Context[Any] = zmq.Context.instance()
         self._estops = CommandServer(context, settings.bus.host, settings.bus.estop_port)
         Endpoints(settings.station_dir).write("guard", {"estop": self._estops.endpoint})
@@ -155,7 +156,7 @@ class ServedLockstep(Lockstep):
         if self.main.session.state not in (State.IDLE, State.READY):
             return False
         moving = bytes(self.page.control.read()["behaviour"]) == b"motion"
-        return not (moving or self.media.recording or self.page.rings["orders"].waiting)
+        return not (moving or self.main.runs.alone or self.page.rings["orders"].waiting)
 
     def _fast(self) -> bool:
         """Whether nobody is waited for, who would want to see it as it happens."""
@@ -167,13 +168,15 @@ class ServedLockstep(Lockstep):
     def _stand(self) -> None:
         """Hear and tell, while it is still now; what begins, begins with a tick."""
         self.guard.watch()
-        if self.media.closing:
+        closing, rests = self.media.closing, self.main.session.state in (State.IDLE, State.READY)
+        if closing:
             self.media.collect()
-        elif self.main.session.state in (State.IDLE, State.READY):
+        elif rests:
             self.media.digest()
-            if self._told_at != self.step:
-                self._told_at = self.step
-                self.media.report()
+        # Once in each rest, and after the episode is closed: whoever commands next, however soon, finds it said.
+        if not self.media.closing and (closing or (rests and self._told_at != self.step)):
+            self._told_at = self.step
+            self.media.report()
         self.main.pump()
         if (now := self._people.now()) >= self._again_at:
             self._again_at = now + _AGAIN_S

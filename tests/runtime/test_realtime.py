@@ -62,6 +62,7 @@ def test_without_a_limit_there_is_no_real_time_class(
 
 def test_advice_is_for_who_lacks_the_class_and_names_both_ways_to_get_it() -> None:
     assert realtime.advice("FIFO 20 unlocked", 20) == ""
+    assert realtime.advice(realtime.LOCKSTEP, 20) == ""
     told = realtime.advice("slice 0.1 ms", 30)
     assert "rtprio limit of 30" in told
     assert "LimitRTPRIO=30" in told

@@ -228,6 +228,25 @@ def test_a_policy_that_takes_long_changes_nothing_of_what_is_recorded(tmp_path: 
         assert np.array_equal(quick, slow)
 
 
+def test_no_tick_more_passes_after_a_run_however_soon_its_recording_is_ended(made: StubPlan) -> None:
+    client = Client(made, lambda running: "over" if running and client.station.step > 60 else "")
+    client.ready().accepted("run")
+    client.until(State.READY)
+    while client.station._asking.begin():  # the policy is told that the rollout is over
+        pass
+    assert client.turn(20, 0.1) == 0
+    client.close()
+
+
+def test_a_recording_of_its_own_takes_its_time(client: Client) -> None:
+    client.ready().accepted("record_start")
+    assert client.turn(60, 1 / 60) == pytest.approx(30, abs=2)
+    client.accepted("record_stop")
+    client.turn(2, 0.1)
+    assert client.episode().frames > 20
+    assert client.turn(20, 0.1) == 0
+
+
 def test_a_time_that_cannot_be_is_refused(client: Client) -> None:
     infer = client.policy.infer
     client.policy.infer = lambda *given: ActionChunk(  # type: ignore[method-assign]

@@ -17,7 +17,7 @@ import pytest
 from runtime import deployment, family
 from runtime.clock import VirtualClock
 from runtime.errors import SetupError
-from runtime.messages import Command
+from runtime.messages import Ack, Command
 from runtime.recording.reader import open_episode
 from runtime.served_lockstep import ServedLockstep
 from runtime.sim import lockstep, serve
@@ -34,49 +34,53 @@ TURNS = 200_000
 
 @dataclass(frozen=True)
 class Course:
-    """What there is of a trial: what was sent at which time, how it ended, what the bench says."""
+    """What there is of a trial: what was sent at which step of the station, how it ended, what the bench says."""
 
     sent: np.ndarray[Any, Any]
-    times: np.ndarray[Any, Any]
-    rows: int
+    steps: np.ndarray[Any, Any]
     reason: str
     truth: dict[str, Any]
     delays: set[int]
 
 
 class Operator:
-    """Who sets up and runs trial after trial, and dawdles so many turns before each command."""
+    """Who sets up and runs trial after trial, at once, or after so many turns and not before a recording is closed."""
 
     def __init__(self, station: ServedLockstep, dawdles: int) -> None:
         self.station, self._dawdles = station, dawdles
+        self._given: list[str] = []
+        self._ended: list[tuple[str, set[int]]] = []
         station.connect()
         self._until(State.IDLE)
         self._give("lease_claim")
 
-    def trial(self, policy: str, seed: int, seconds: float) -> Course:
+    def trial(self, policy: str, seed: int, seconds: float) -> None:
         bench = {"id": str(uuid.uuid4()), "seed": seed}
         self._give("setup", policy={"url": policy}, bench=bench)
         self._until(State.READY, State.IDLE)
         session, runs = self.station.main.session, self.station.main.runs
         assert session.state is State.READY, session.reason
-        before = runs.last_episode
-        self._give("run", duration_s=seconds)
+        self._given.append(self._give("run", duration_s=seconds).data["episode"])
         self._until(State.READY)
-        while runs.last_episode is before:
+        self._ended.append((session.reason, set(self.station.main.inference.tally.delays)))
+        while self._dawdles and runs.last_episode.get("uuid") != self._given[-1]:
             self.station.turn()
-        episode = open_episode(Path(runs.last_episode["path"]))
-        truth = next(event["data"] for event in episode.events if event["kind"] == "truth")
-        return Course(
-            column(episode.rows, "action"),
-            column(episode.rows, "time"),
-            episode.frames,
-            session.reason,
-            {key: value for key, value in truth.items() if key not in ("episode", "reset")},
-            set(self.station.main.inference.tally.delays),
-        )
 
-    def _give(self, kind: str, **arguments: Any) -> None:
-        for _ in range(self._dawdles):
+    def courses(self) -> list[Course]:
+        """Of all trials, once all recordings are closed."""
+        runs, found = self.station.main.runs, []
+        while runs.last_episode["uuid"] != self._given[-1]:
+            self.station.turn()
+        for uuid_, (reason, delays) in zip(self._given, self._ended, strict=True):
+            episode = open_episode(self.station.plan.deployment.episodes_dir / uuid_)
+            truth = next(event["data"] for event in episode.events if event["kind"] == "truth")
+            said = {key: value for key, value in truth.items() if key not in ("episode", "reset")}
+            sent, steps = column(episode.rows, "action"), column(episode.rows, "step")
+            found.append(Course(sent, steps, reason, said, delays))
+        return found
+
+    def _give(self, kind: str, **arguments: Any) -> Ack:
+        for _ in range(1 + self._dawdles):  # nobody decides by what is not published yet
             self.station.turn()
         main = self.station.main
         epoch = 0 if kind == "lease_claim" else main.lease.epoch
@@ -92,6 +96,7 @@ class Operator:
             )
         )
         assert ack.status == "accepted", ack.reason
+        return ack
 
     def _until(self, *states: State) -> None:
         for _ in range(TURNS):
@@ -124,7 +129,9 @@ def courses(
     over = Rested(around.truth, clock)
     with closing(ServedLockstep(planned(made, clock, around, options), clock, over)) as station:
         operator = Operator(station, dawdles)
-        found = [operator.trial(urls[policy], seed, seconds) for policy, seed, seconds in trials]
+        for policy, seed, seconds in trials:
+            operator.trial(urls[policy], seed, seconds)
+        found = operator.courses()
     for server in servers:
         server.close()
     return found
@@ -135,16 +142,17 @@ def test_the_same_plan_gives_the_same_course_however_busy_the_machine(tmp_path: 
     trials = [(1, 4, 3.0), (0, 5, 3.0)]
     *first, skilled = courses(tmp_path / "first", [*trials, (0, 4, 20.0)])
     second = courses(tmp_path / "second", trials, dawdles=7, slow_s=0.01)
+
     for one, other in zip(first, second, strict=True):
         assert np.array_equal(one.sent, other.sent)
-        assert np.array_equal(one.times, other.times)
-        assert (one.rows, one.reason, one.truth) == (other.rows, other.reason, other.truth)
+        assert np.array_equal(one.steps, other.steps)
+        assert (one.reason, one.truth) == (other.reason, other.truth)
     assert skilled.truth["success"] is True
     assert skilled.reason == "the simulated bench has said success for 1 s"
     reached = skilled.truth["reached"]
     assert list(reached) == ["grasped", "lifted", "over_plate", "placed"]
     assert sorted(reached.values()) == list(reached.values())
-    assert skilled.rows / 30 == pytest.approx(reached["placed"] + 1.0, abs=0.5)
+    assert len(skilled.steps) / 30 == pytest.approx(reached["placed"] + 1.0, abs=0.5)
     assert [course.delays for course in first] == [{8}, {3}]  # 250 and 80 ms, as declared
 
 
