@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import uuid
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,14 @@ import numpy as np
 import pytest
 import zmq
 
+from runtime import served_lockstep
 from runtime.bus import Endpoints, Subscriber, TransportError
 from runtime.clock import VirtualClock
+from runtime.closing import Close, in_background
 from runtime.errors import SetupError
 from runtime.latch import Latch
 from runtime.messages import Ack, Command, decode, encode
+from runtime.recorder import Closed
 from runtime.recording.reader import Episode, open_episode
 from runtime.served_lockstep import ServedLockstep
 from runtime.transitions import State
@@ -228,13 +232,39 @@ def test_a_policy_that_takes_long_changes_nothing_of_what_is_recorded(tmp_path: 
         assert np.array_equal(quick, slow)
 
 
-def test_no_tick_more_passes_after_a_run_however_soon_its_recording_is_ended(made: StubPlan) -> None:
-    client = Client(made, lambda running: "over" if running and client.station.step > 60 else "")
-    client.ready().accepted("run")
+def test_no_tick_more_passes_after_a_run(client: Client) -> None:
+    client.ready().accepted("run", duration_s=1.0)
     client.until(State.READY)
     while client.station._asking.begin():  # the policy is told that the rollout is over
         pass
     assert client.turn(20, 0.1) == 0
+
+
+def test_who_sets_up_while_a_recording_is_closed_finds_the_same_as_who_comes_later(
+    made: StubPlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate = threading.Event()
+
+    def slowly(close: Close) -> Future[Closed]:
+        def waiting() -> Closed:
+            gate.wait(60)
+            return close()
+
+        return in_background(waiting)
+
+    monkeypatch.setattr(served_lockstep, "in_background", slowly)
+    client = Client(made, lambda running: "over" if running and client.station.step > 60 else "")
+    client.ready().accepted("run")
+    client.until(State.READY)
+    client.accepted("setup")
+    assert client.turn(20) == 0
+    gate.set()
+    ticks = 0
+    while client.station.media.closing:
+        ticks += client.turn()
+    assert ticks == 0
+    report = client.station.main.media_report
+    assert (report.recording, report.time) == ("", client.station.clock.now())  # before the first tick of it
     client.close()
 
 
