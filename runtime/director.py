@@ -103,9 +103,14 @@ class Director:
         self.operations = Operations(plan, parts, self._state, self._watch.absent, self.say)
         self.preflights = PreflightDesk(lambda: self.plan, plan, self._state, self.say, clock)
         self.session = Session(self.operations, self.lease, self.boot, self.people.now)
+        self._take_over()
+
+    def _take_over(self) -> None:
+        """Keep the events from before there was a main, or since one died; act on nothing that was told to that one."""
         for ring in ("control_events", "media_events"):
-            for _ in page.rings[ring].drain():
-                pass  # told to a predecessor that died
+            for payload in self.page.rings[ring].drain():
+                if isinstance(message := decode(payload), Event):
+                    self._note(message)
 
     @property
     def plan(self) -> Plan:
@@ -192,13 +197,11 @@ class Director:
             log.error("grippers may still be locked: %s", error)
 
     def _hear_event(self, event: Event) -> None:
-        self._log(event)  # control and media write their own events into the episode
+        self._note(event)
         self.setup.heard(event)
         settings = self.plan.deployment
         if event.kind == "motion_done":
             self.runs.arrived()
-        if event.kind in (UNHEARD, HEARD):
-            self.unheard = dict(event.data["unheard"])
         self.inference.tally.starved += event.kind == "starved"
         if event.kind == "starvation":
             trouble = self.inference.trouble
@@ -211,6 +214,11 @@ class Director:
             self._observe(Happening.HELD, event.text)
         elif event.kind == "displaced":
             self._observe(Happening.DISPLACED, event.text)
+
+    def _note(self, event: Event) -> None:
+        self._log(event)  # control and media write their own events into the episode
+        if event.kind in (UNHEARD, HEARD):
+            self.unheard = dict(event.data["unheard"])
 
     def _episode_opened(self, opened: EpisodeOpened) -> None:
         if opened.error:

@@ -5,8 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from runtime.director import Director
 from runtime.errors import SetupError
-from runtime.messages import Command
+from runtime.hearing import UNHEARD
+from runtime.messages import Command, EpisodeOpened, Event, encode
 from runtime.transitions import State
 from tests.runtime.station import STANDS, Station, plan
 
@@ -118,4 +120,25 @@ def test_a_media_that_does_not_read_costs_the_record_and_not_the_station(tmp_pat
     station.go(20)
     assert station.state in (State.RUNNING, State.HOLDING)
     assert np.isfinite(station.robot.sent).all()
+    station.close()
+
+
+def test_events_from_before_main_was_there_are_kept_and_nothing_that_was_told_is_acted_on(
+    tmp_path: Path,
+) -> None:
+    station = Station(plan(tmp_path)).ready()
+    rings, told = station.page.rings, {"unheard": {"left_arm": "nobody listens"}}
+    rings["media_events"].push(encode(Event("source_frozen_cam_high", "the same picture", 0.1)))
+    rings["media_events"].push(encode(EpisodeOpened(1, "one", "", "no room")))
+    rings["control_events"].push(encode(Event(UNHEARD, "nobody listens", 0.1, data=told)))
+    rings["control_events"].push(encode(Event("displaced", "the arm was moved", 0.1)))
+    station.main = Director(station.plan, station.page, station.clock, station._runner)
+    assert [event["kind"] for event in station.main.events.since(0)] == [
+        UNHEARD,
+        "displaced",
+        "source_frozen_cam_high",
+    ]
+    assert station.main.unheard == told["unheard"]
+    assert station.state is State.DISCONNECTED  # as it begins, until it has looked itself
+    assert station.reason == "waiting for the first observation"
     station.close()
