@@ -340,6 +340,8 @@ def test_a_rest_can_be_cancelled_and_times_that_cannot_be_are_refused(tmp_path: 
     assert station.main.setup.stage is Stage.WARM_UP
     station.command("halt")
     assert station.state is State.IDLE
-    with pytest.raises(SetupError, match=r"least\.warm_up_s = -1: Input should be greater than or equal to 0"):
+    with pytest.raises(
+        SetupError, match=r"least\.warm_up_s = -1: Input should be greater than or equal to 0"
+    ):
         station.command("setup", least={"warm_up_s": -1})
     station.close()
