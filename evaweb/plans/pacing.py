@@ -1,14 +1,14 @@
 """How long a blind trial's set-up lasts at least, so that a watch does not tell which checkpoint it is of.
 
 The stages that wait for the policy last as long as they lately did with the slowest of the plan's checkpoints at this
-station, and by chance up to a quarter longer: the slowest is not the one that overruns.
+station, and up to a quarter longer, drawn by the plan's key: the slowest is not the one that overruns.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from secrets import SystemRandom
 
+from evaweb.plans.chance import Chance
 from evaweb.plans.models import Handout
 from evaweb.trials.bench import declare_least
 from evaweb.trials.models import Trial
@@ -17,7 +17,7 @@ NEWEST = 5  # set-ups of a checkpoint that count: the first of a server may have
 LONGER = 1.25
 MOST_S = 300.0
 _STAGES = ("connect_s", "warm_up_s")
-_chance = SystemRandom()
+_FINE = 10_000  # different lengths
 
 
 def least_times(trial: Trial) -> Mapping[str, float] | None:
@@ -37,7 +37,11 @@ def least_times(trial: Trial) -> Mapping[str, float] | None:
     if not took:
         return None
     longest = {stage: max(float(row.get(stage, 0.0)) for row in took) for stage in _STAGES}
-    return {stage: min(MOST_S, seconds * _chance.uniform(1.0, LONGER)) for stage, seconds in longest.items()}
+    chance = Chance(bytes(handout.plan.key or b""), f"set-up/{handout.number}")
+    return {
+        stage: min(MOST_S, seconds * (1 + (LONGER - 1) * chance.below(_FINE) / _FINE))
+        for stage, seconds in longest.items()
+    }
 
 
 declare_least(least_times)

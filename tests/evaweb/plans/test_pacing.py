@@ -43,6 +43,8 @@ def test_every_set_up_lasts_as_long_as_with_the_slowest(bench, plan, handed):
     assert {row.keys() == {"connect_s", "warm_up_s"} for row in found} == {True}
     assert all(8.0 <= row["warm_up_s"] <= 10.0 and 0.2 <= row["connect_s"] <= 0.25 for row in found)
     assert len({row["warm_up_s"] for row in found}) == 6, "by chance"
+    trial = handed()
+    assert pacing.least_times(trial) == pacing.least_times(trial), "but the same for the same trial"
 
 
 def test_what_took_long_once_is_forgotten_after_five_trials(bench, plan, handed):
