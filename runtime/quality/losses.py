@@ -47,5 +47,6 @@ class Losses:
         seconds, bound = run.frames / self._fps, self._settings.picture_age_s
         severity: Severity = "error" if seconds > bound else "warning"
         where = span(run.first, run.last)
-        text = f"{where}: what {self._camera} gave for {seconds:.1f} s is not in its video, the picture before is"
+        long = f"{seconds:.1f}" if seconds >= 0.1 else f"{seconds:.2f}"
+        text = f"{where}: what {self._camera} gave for {long} s is not in its video, the picture before is"
         self._flags.add(Flag("lost", severity, run.first, run.last, self._camera, text, seconds, bound))

@@ -1,10 +1,8 @@
-// The page of one episode: cameras, robot and curves on one clock.
+// The page of one episode: cameras, robot and curves on one clock. Pictures come first, what is drawn after them.
 
-import { cameras } from "./cameras.js";
+import { cameras, firstPictures } from "./cameras.js";
 import { Clock } from "./clock.js";
-import { curvePane } from "./curves.js";
 import { Review } from "./review.js";
-import { robotPane } from "./robot.js";
 import { travelled } from "./segments.js";
 import { Timeline } from "./timeline.js";
 import { transport } from "./transport.js";
@@ -13,9 +11,21 @@ const config = JSON.parse(document.getElementById("config").textContent);
 const clock = new Clock(config);
 const timeline = new Timeline(clock);
 
+/** Say in a pane's note why its scripts are not there. */
+function absent(note, error) {
+  document.getElementById(note).textContent = `The scripts of this pane did not load: ${error.message}. Load the page again.`;
+  console.error(error);
+}
+
 cameras(document, config.videos, clock);
 transport(clock);
 if (document.getElementById("review")) new Review(clock);
 if (config.segments) travelled(clock, config.segments);
-robotPane({ root: document, clock, geometry: config.geometry, poses: config.poses, why: config.why });
-curvePane({ clock, address: config.curves, uplot: config.uplot }).then((found) => timeline.fill(found));
+await firstPictures(document);
+import("./curves.js")
+  .then(({ curvePane }) => curvePane({ clock, address: config.curves, uplot: config.uplot }))
+  .then((found) => timeline.fill(found))
+  .catch((error) => absent("curves-note", error));
+import("./robot.js")
+  .then(({ robotPane }) => robotPane({ root: document, clock, viewer: config.viewer, geometry: config.geometry, poses: config.poses, why: config.why }))
+  .catch((error) => absent("scene-note", error));

@@ -1,6 +1,7 @@
 // The review of an episode: what the checks found, verdicts, annotated parts; everything has a key.
 
 import { get, post } from "../site/api.js";
+import { sayLost } from "./lost.js";
 import { bands, flagFrom, flagsAt, list, stacked } from "./review_lanes.js";
 
 const LOOK_AGAIN_MS = 4000; // while the checks are not done
@@ -133,8 +134,9 @@ export class Review {
     });
     const [flag] = flagsAt(this.#said.flags, row);
     const here = element("flag-here");
-    here.textContent = flag?.text ?? "";
+    here.textContent = here.title = flag?.text ?? "";
     here.dataset.severity = flag?.severity ?? "";
+    sayLost(this.#said.flags, row);
   }
 
   // --- what is done --------------------------------------------------------------------------------------

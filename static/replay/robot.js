@@ -3,6 +3,7 @@
 import { get } from "../site/api.js";
 import { Scene3D } from "../console/scene3d.js";
 import { message } from "./data.js";
+import { viewer as loaded } from "./viewer.js";
 
 const MATRIX = 16;
 
@@ -60,14 +61,14 @@ export class Robot {
 }
 
 /** Fill the pane in `root`, or put a sentence in its place; without an address that is `why`. */
-export async function robotPane({ root, clock, geometry: address, poses, why = "the episode names no robot" }) {
+export async function robotPane({ root, clock, viewer, geometry: address, poses, why = "the episode names no robot" }) {
   const note = root.querySelector("[data-scene-note]");
   if (!address) {
     note.textContent = `No 3D scene: ${why}.`;
     return;
   }
   try {
-    const geometry = await get(address);
+    const [geometry] = await Promise.all([get(address), loaded(viewer)]);
     const scene = new Scene3D(root.querySelector("[data-scene]"));
     scene.show(geometry);
     scene.toggle("path"); // a path that jumps with the clock would be none

@@ -55,7 +55,7 @@ element("with-scenes").addEventListener("click", () => again("scene", scenes ? "
 if (scenes) {
   episodes.forEach((episode, index) => {
     columns[index].querySelector(".beside-scene").hidden = false;
-    robotPane({ root: columns[index], ...episode });
+    robotPane({ root: columns[index], viewer: config.viewer, ...episode });
   });
 }
 

@@ -73,7 +73,8 @@ export class Videos {
   #place({ element, start }) {
     const clock = this.#clock;
     const wanted = start + (clock.playing ? clock.time : (clock.row + 0.5) / clock.fps);
-    if (Math.abs(element.currentTime - wanted) > 1e-4) element.currentTime = wanted;
+    const begins = element.currentTime === 0 && wanted < 1 / clock.fps; // its first picture is there without a seek
+    if (!begins && Math.abs(element.currentTime - wanted) > 1e-4) element.currentTime = wanted;
   }
 
   #follow() {

@@ -153,6 +153,61 @@ def test_an_address_that_says_nothing_of_use_changes_nothing(
     assert run(LINK, "return m.read(given, 10);", search) == expected
 
 
+def test_what_is_drawn_waits_for_pictures_and_for_none_that_never_come() -> None:
+    found = run(
+        "../replay/cameras.js",
+        """
+        globalThis.HTMLMediaElement = { HAVE_CURRENT_DATA: 2 };
+        const video = (more) => ({ tagName: "VIDEO", error: null, readyState: 0, seeking: false, ...more });
+        const waits = async (all, change) => {
+          let over = false;
+          const coming = m.firstPictures({ querySelectorAll: () => all }).then(() => (over = true));
+          await new Promise((go) => setTimeout(go, 50));
+          const before = over;
+          change();
+          await coming;
+          return before;
+        };
+        const late = video({});
+        const seeking = video({ readyState: 4, seeking: true });
+        const image = { tagName: "IMG", complete: true, hasAttribute: () => false };
+        return [
+          await waits([video({ readyState: 2 }), video({ error: {} })], () => {}),
+          await waits([video({ readyState: 2 }), late], () => (late.readyState = 2)),
+          await waits([seeking], () => (seeking.seeking = false)),
+          await waits([image], () => (image.hasAttribute = () => true)),
+          await waits([], () => {}),
+          await waits([video({})], () => {}),
+        ];
+        """,
+    )
+    assert found == [True, False, False, False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("camera", "row", "said"),
+    [
+        ("high", 19, ""),
+        ("high", 20, "lost: the one before"),
+        ("high", 22, "lost: the one before"),
+        ("high", 23, ""),
+        ("wrist", 21, ""),
+        ("wrist", 30, "ended at row 30"),
+        ("wrist", 99, "ended at row 30"),
+        ("side", 0, "no video"),
+        ("black", 5, ""),
+    ],
+)
+def test_a_camera_that_shows_another_picture_than_the_rows_says_so(camera: str, row: int, said: str) -> None:
+    flags = [
+        {"kind": "lost", "stream": "high", "first": 20, "last": 22},
+        {"kind": "video_lost", "stream": "wrist", "first": 30, "last": 99},
+        {"kind": "video_lost", "stream": "side", "first": 0, "last": 99},
+        {"kind": "black", "stream": "black", "first": 0, "last": 99},
+    ]
+    assert run("../replay/lost.js", "return m.lostAt(...given);", [flags, camera, row]) == said
+
+
 def test_episodes_begin_together_or_as_much_later_as_is_said() -> None:
     found = run(
         ALIGNED,

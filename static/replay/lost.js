@@ -1,0 +1,22 @@
+// Which cameras show another picture than the one of the row, said where the picture is: it was given, and is not in the video.
+
+const WORDS = {
+  lost: () => "lost: the one before",
+  video_lost: ({ first }) => (first > 0 ? `ended at row ${first}` : "no video"),
+};
+
+/** What is to be said of a camera at a row by the flags of the checks; "" where its picture is that of the row. */
+export function lostAt(flags, camera, row) {
+  const flag = flags.find(({ kind, stream, first, last }) => kind in WORDS && stream === camera && first <= row && row <= last);
+  return flag ? WORDS[flag.kind](flag) : "";
+}
+
+/** Say it beside the names of the cameras on the page. */
+export function sayLost(flags, row) {
+  for (const picture of document.querySelectorAll("[data-camera]")) {
+    const words = lostAt(flags, picture.dataset.camera, row);
+    const place = picture.parentElement.querySelector("[data-lost]");
+    if (place.textContent !== words) place.textContent = words;
+    picture.toggleAttribute("data-stands", Boolean(words));
+  }
+}
