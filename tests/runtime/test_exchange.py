@@ -74,7 +74,7 @@ REFUSED = {
     ),
     "a key that is no argument": (
         {"plicy": OTHER},
-        r"setup: plicy = .*allowed here: bench, checkpoint, collect, policy",
+        r"setup: plicy = .*allowed here: bench, checkpoint, collect, least, policy",
     ),
     "a bench where there is none": (
         {"policy": OTHER, "bench": {"seed": 1}},
