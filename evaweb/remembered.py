@@ -38,3 +38,11 @@ class Kept(Generic[T]):
         """Forget all of it."""
         with self._lock:
             self._rows.clear()
+
+
+def steady(total: float | None) -> float:
+    """A sum of numbers as part of a fingerprint.
+
+    PostgreSQL adds up on several cores, in another order each time, and the last digits are chance.
+    """
+    return round(total or 0.0, 3)

@@ -13,7 +13,7 @@ from typing import Any
 from django.db.models import Count, Max, Q, Sum
 
 from evaweb.plans.models import Plan
-from evaweb.remembered import Kept
+from evaweb.remembered import Kept, steady
 from evaweb.results.analysis import Analysis, analyse
 from evaweb.results.filters import Chosen
 from evaweb.results.gathering import interruptions_of_plan, outcomes_of_plan
@@ -47,6 +47,7 @@ def fingerprint(plan: Plan) -> Hashable:
         measured=Count("episode__smoothness"),
         changed=Max("changed_at"),
     )
+    counted["seconds"] = steady(counted["seconds"])
     names = plan.checkpoints.order_by("pk").values_list("pk", "name")
     scenes = Scene.objects.filter(positions__plan=plan.pk).order_by("pk").distinct().values_list("pk", "name")
     return (*counted.values(), *names, *scenes)

@@ -16,7 +16,7 @@ from django.utils.dateparse import parse_date, parse_datetime
 
 from evaweb.episodes.models import Episode
 from evaweb.errors import EvaError, NotFound
-from evaweb.remembered import Kept
+from evaweb.remembered import Kept, steady
 from evaweb.sight import EVERYTHING, Sight
 from evaweb.stations.models import Command, Station
 from evaweb.statistics.proportions import Summary, summary
@@ -240,6 +240,7 @@ def _fingerprint(trials: QuerySet[Trial]) -> Hashable:
         changed=Max("changed_at"),
     )
     measured = Episode.objects.filter(smoothness__isnull=False).count()  # of all: no join over every trial
+    counted["seconds"] = steady(counted["seconds"])
     return (*counted.values(), measured)
 
 
