@@ -13,6 +13,7 @@ from runtime.behaviour import Target
 from runtime.collision import Collision
 from runtime.config import Answer
 from runtime.errors import RuntimeFault
+from runtime.limiter import CommandLimiter, Limited
 from runtime.motion import Brake
 from runtime.page import EStop, Page
 from runtime.safety import Limits, RobotState, SafetySettings
@@ -34,9 +35,15 @@ class TickSettings:
     heartbeat_timeout: float
     starvation: Answer
     starvation_hold: float  # until "slow" holds
+    moves_robot: bool = True  # commands reach something that can break
     publication: Callable[[Float64], Float32] | None = (
         None  # poses of a joint command, where they are published too
     )
+
+    @property
+    def guarded(self) -> bool:
+        """Whether measurements are doubted, and commands checked once more where they leave."""
+        return self.moves_robot and not self.safety.report_only
 
     @property
     def starvation_patience(self) -> float:
@@ -55,6 +62,7 @@ class Sent(NamedTuple):
     limited: str = ""  # the joint that safety changed most, "" where it changed nothing
     change: float = 0.0  # by how much [rad, or what a gripper's travel is worth]
     near: Collision | None = None  # links that it brought near each other, where that is only warned of
+    corrected: str = ""  # what the last check changed
 
 
 class Actuator(ABC):
@@ -66,6 +74,7 @@ class Actuator(ABC):
         self._reach = settings.limits.reach
         self._switching = bool(settings.limits.binary.any())
         self._last_planned: float | None = None
+        self._stepped: tuple[str, ...] = ()  # why the next command begins elsewhere than the last one ended
         self.engaged = False
         self.commanded: Float64 = np.zeros(dim)
         self.velocity: Float64 = np.zeros(dim)
@@ -75,10 +84,8 @@ class Actuator(ABC):
         """What an action is judged against; `aim` is the action that was wanted before it."""
 
     @abstractmethod
-    def _deliver(
-        self, step: int, target: Target, action: Float64, notes: tuple[str, ...]
-    ) -> tuple[float, Float64, tuple[str, ...]]:
-        """Tell the robot; when that was, and what it was really told, with the notes."""
+    def _deliver(self, step: int, action: Float64) -> float:
+        """Tell the robot; when that was."""
 
     def engage(self, measured: Float64) -> None:
         """Take the robot over where it stands: from now on something is sent on every tick.
@@ -86,10 +93,31 @@ class Actuator(ABC):
         The grippers of a robot that was engaged before keep their command: closing on an object, they measure
         wider than they were told, and would let go. A base stands.
         """
-        keep = self._settings.limits.grippers & self.engaged
-        self.commanded = self._settings.limits.standing(np.where(keep, self.commanded, measured))
+        limits = self._settings.limits
+        measured = limits.standing(np.where(limits.grippers & self.engaged, self.commanded, measured))
+        if self._settings.guarded:
+            measured = np.clip(measured, limits.lower, limits.upper)
+        self.commanded = measured
         self.velocity = np.zeros(len(measured))
         self.engaged = True
+
+    def step_to(self, measured: Float64, why: str, farthest: Float64 | float = np.inf) -> None:
+        """Count from where the robot is, and not from where it was told to be, at most `farthest` [D] from there.
+
+        The only way in which a command may step: towards the robot, so that nothing pulls it. The record says `why`.
+        """
+        before = self.commanded
+        self.engage(before + np.clip(measured - before, -np.asarray(farthest), farthest))
+        apart = np.where(self._settings.limits.places, np.abs(self.commanded - before), 0.0)
+        if apart.any():
+            worst = int(apart.argmax())
+            self._stepped = (f"{why}: {self._settings.limits.names[worst]} stepped {apart[worst]:.3f} rad",)
+
+    @property
+    def rest(self) -> Float64:
+        """The distance within which each joint can come to rest from the speed of its command [D]."""
+        limits, safety = self._settings.limits, self._settings.safety
+        return np.asarray(self.velocity**2 / (2.0 * safety.brake_acceleration * limits.reach))
 
     def elapsed(self, planned: float) -> float:
         """Time since the last tick as limits may use it: half a period to 1.5 periods."""
@@ -122,14 +150,32 @@ class Actuator(ABC):
         self, step: int, planned: float, target: Target, action: Float64, notes: tuple[str, ...] = ()
     ) -> Sent:
         """Tell the robot `action`, which is what locks and safety made of `target`."""
-        time, action, notes = self._deliver(step, target, action, notes)
-        self.velocity = (action - self.commanded) / self.elapsed(planned)
-        if target.source == "estop":
-            self.velocity[:] = 0.0  # it is told where it is: nothing that a stop could begin from
-        elif self._switching:
+        elapsed = self.elapsed(planned)
+        stop = target.source == "estop"
+        if self._pressed and not stop:
+            # Since this tick looked: the next one takes over, this one repeats the last command.
+            action, notes, stop = (
+                self._settings.limits.standing(self.commanded),
+                ("e-stop pressed within the tick",),
+                True,
+            )
+        action, corrected = self._checked(action, elapsed, stop)
+        time = self._deliver(step, action)
+        self.velocity = (action - self.commanded) / elapsed
+        if self._switching:
             self.velocity[self._settings.limits.binary] = 0.0
         self.commanded = action
-        return Sent(time, target, action, notes)
+        notes, self._stepped = (*self._stepped, *notes, *corrected), ()
+        return Sent(time, target, action, notes, corrected="; ".join(corrected))
+
+    @property
+    def _pressed(self) -> bool:
+        """Whether the e-stop is pressed."""
+        return False
+
+    def _checked(self, action: Float64, elapsed: float, stop: bool) -> Limited:
+        """What of `action` may be sent."""
+        return Limited(action)
 
 
 class RobotActuator(Actuator):
@@ -140,6 +186,7 @@ class RobotActuator(Actuator):
         self._page = page
         self._sink = sink
         self._clock = clock
+        self._limiter = CommandLimiter(settings.limits, settings.safety) if settings.guarded else None
         before = page.control.read()
         self.engaged = bool(before["engaged"])
         self.commanded = np.array(before["commanded"], np.float64)
@@ -155,6 +202,7 @@ class RobotActuator(Actuator):
             measured=self._branch(seen),
             elapsed=self.elapsed(planned),
             joint_age=planned - seen.joints_captured,
+            doubt=seen.doubt,
             picture_ages=seen.picture_ages(planned),
             aim=aim,
         )
@@ -179,17 +227,20 @@ class RobotActuator(Actuator):
             return str(error)
         return ""
 
-    def _deliver(
-        self, step: int, target: Target, action: Float64, notes: tuple[str, ...]
-    ) -> tuple[float, Float64, tuple[str, ...]]:
+    @property
+    def _pressed(self) -> bool:
+        return self._page.estop is EStop.LATCHED
+
+    def _checked(self, action: Float64, elapsed: float, stop: bool) -> Limited:
+        if self._limiter is None:
+            return Limited(action)
+        return self._limiter(action, self.commanded, self.velocity, elapsed, stop)
+
+    def _deliver(self, step: int, action: Float64) -> float:
         now = self._clock()
-        if self._page.estop is EStop.LATCHED and target.source != "estop":
-            # Pressed since this tick looked: the next one takes over, this one repeats the last command.
-            action = self._settings.limits.standing(self.commanded)
-            notes = ("e-stop pressed within the tick",)
         eef = None if self._settings.publication is None else self._settings.publication(action)
         self._sink.send(RobotCommand(action.astype(np.float32), step, now, eef))
-        return now, action, notes
+        return now
 
 
 class SimulatedActuator(Actuator):
@@ -211,7 +262,5 @@ class SimulatedActuator(Actuator):
             aim=aim,
         )
 
-    def _deliver(
-        self, step: int, target: Target, action: Float64, notes: tuple[str, ...]
-    ) -> tuple[float, Float64, tuple[str, ...]]:
-        return self._clock(), action, notes
+    def _deliver(self, step: int, action: Float64) -> float:
+        return self._clock()

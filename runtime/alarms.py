@@ -6,11 +6,11 @@ import numpy as np
 
 from runtime.actuator import RobotActuator, TickSettings
 from runtime.page import Page
+from runtime.plausibility import Plausibility
 from runtime.seen import Seen
 from runtime.types import Float64
 
-_UNSEEN_S = 0.5  # without joints: whatever has happened to the robot meanwhile was not seen
-_RETURNED_AWAY = 0.1  # [rad] that an arm may be off after that, by sagging
+_RETURNED_AWAY = 0.1  # [rad] that an arm may be off after it was not seen, by sagging
 
 
 def silent_sibling(page: Page, now: float, allowed: float) -> str:
@@ -27,26 +27,26 @@ class Displacement:
     """Notices a robot that is far from where it is told to hold.
 
     It was moved by hand, switched off, or its node was restarted: to send the old target would make it move by
-    itself.
+    itself. One sample says nothing: it is there when several agree (`Plausibility.apart`).
     """
 
-    def __init__(self, settings: TickSettings) -> None:
+    def __init__(self, settings: TickSettings, plausibility: Plausibility) -> None:
         self._settings = settings
+        self._plausibility = plausibility
         self._angles = settings.limits.places
-        self._unseen_since: float | None = None
 
     def __call__(self, robot: RobotActuator, seen: Seen, now: float, held: bool) -> Float64 | None:
         """Where the robot is [D], where that is too far from where it is `held`; None where all is well."""
         measured = robot.measured(seen, now)
         if measured is None:
-            self._unseen_since = now if self._unseen_since is None else self._unseen_since
             return None
-        returned = self._unseen_since is not None and now - self._unseen_since > _UNSEEN_S
-        self._unseen_since = None
+        returned = self._plausibility.returned()
         if not held or self._settings.safety.report_only:
             return None
         allowed = _RETURNED_AWAY if returned else self._settings.safety.following_error
-        return measured if self.distance(robot, measured) > allowed else None
+        if self.distance(robot, measured) <= allowed:
+            return None
+        return measured if self._plausibility.apart(robot.commanded, allowed) else None
 
     def distance(self, robot: RobotActuator, measured: Float64) -> float:
         """How far the farthest joint is from its command [rad]."""

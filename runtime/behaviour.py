@@ -5,8 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
-import numpy as np
-
 from runtime.motion import Motion
 from runtime.recording.base import ControlSource
 from runtime.safety import Path
@@ -114,21 +112,26 @@ class EStopped(Behaviour):
 
     It goes along with the measurement for `_FOLLOWS_S`, while the arm comes to rest, and then keeps it: an arm
     that is sent its own measurement for ever sinks under its weight. `position` float64 [D], None before the
-    robot was ever measured: nothing is sent then.
+    robot was ever measured: nothing is sent then. `rest` [D]: the distance within which it could come to rest.
     """
 
     name = "estop"
     _FOLLOWS_S = 0.5
 
-    def __init__(self, position: Float64 | None) -> None:
+    def __init__(self, position: Float64 | None, rest: Float64) -> None:
         self.position = position
+        self.rest = rest
+        self.seen = False  # since it was pressed
         self._time = 0.0
 
-    def see(self, position: Float64, farthest: float) -> None:
-        """Where the robot is now; taken over while it comes to rest, and where it is `farthest` rad away."""
-        late = self._time > self._FOLLOWS_S
-        if self.position is None or not late or np.abs(position - self.position).max() > farthest:
-            self.position = position
+    def see(self, position: Float64) -> None:
+        """Where the robot is."""
+        self.position, self.seen = position, True
+
+    @property
+    def follows(self) -> bool:
+        """Whether the arm may still be coming to rest."""
+        return self._time <= self._FOLLOWS_S
 
     def target(self, step: int, elapsed: float) -> Target | None:
         self._time += elapsed

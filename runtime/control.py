@@ -43,6 +43,7 @@ def make_tick(plan: Plan, page: Page, sink: Sink, now: Callable[[], float]) -> T
             heartbeat_timeout=deployment.control.heartbeat_timeout_s,
             starvation=deployment.faults.starvation,
             starvation_hold=deployment.control.starvation_hold_s,
+            moves_robot=plan.capabilities.moves_robot,
             publication=plan.publication(),
         ),
         now,

@@ -49,7 +49,7 @@ from runtime.watch import Watch
 
 log = logging.getLogger(__name__)
 # Control's own reasons to hold, as events of these kinds.
-_HOLDS = ("refusals", "unmeasured", "family", "orphaned", "too_far", "moved_away")
+_HOLDS = ("refusals", "implausible", "unmeasured", "family", "orphaned", "too_far", "moved_away")
 
 
 class Director:

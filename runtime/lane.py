@@ -166,12 +166,23 @@ class Lane:
         self._aim = None
         action = target.action
         notes: tuple[str, ...] = ()
-        if target.source != "estop":
+        if target.source == "estop":
+            action = self._approach(action, seen, planned)
+        else:
             locked, notes = self._locks.apply(action)
             if notes:
                 state = self.actuator.state(seen, planned, locked)
                 action = np.where(self._locks.on, self._safety.reachable(locked, state, "motion"), action)
         return self.actuator.send(step, planned, target, action, notes)
+
+    def _approach(self, where: Float64, seen: Seen, planned: float) -> Float64:
+        """Towards where the e-stop holds the robot, as fast as it moves; a base stands at once."""
+        if not self._settings.guarded:
+            return where
+        state = self.actuator.state(seen, planned, where)
+        reachable = self._safety.reachable(where, state).copy()
+        reachable[list(self._settings.limits.speeds)] = where[list(self._settings.limits.speeds)]
+        return reachable
 
     def _refuse(self, step: int, planned: float, target: Target, notes: tuple[str, ...], seen: Seen) -> Sent:
         self.refused += 1

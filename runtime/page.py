@@ -26,6 +26,7 @@ RING_BYTES = {
     "control_events": 1 << 19,  # control -> main
     "media_events": 1 << 19,  # media -> main
 }
+DOUBT_BYTES = 200
 PROCESSES = ("control", "main", "media", "guard")
 
 
@@ -95,6 +96,8 @@ class PageLayout:
                 ("waiting", "u1"),  # a run is open, nothing is planned, and that is as it should be
                 ("starved", "u1"),  # a run is open, nothing is planned, and something should be
                 ("simulated", "f4", self.dim),  # the robot of a run in simulation; NaN where there is none
+                ("believed", "u1"),  # the joints are measured, fresh and plausible
+                ("doubt", f"S{DOUBT_BYTES}"),  # why they cannot be true
                 ("locked", "f4", self.dim),  # grippers that are locked, and where; NaN for the rest
                 ("ticks", "i8"),
                 ("missed", "i8"),

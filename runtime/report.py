@@ -13,7 +13,7 @@ from runtime.actuator import Actuator, Sent
 from runtime.behaviour import Behaviour, EStopped
 from runtime.collision import Collision
 from runtime.messages import ChunkMerged, Event, Message, TickDone, encode
-from runtime.page import Page
+from runtime.page import DOUBT_BYTES, Page
 from runtime.recording.base import ControlSource
 from runtime.seen import Seen
 from runtime.timeline import HELD, Makers
@@ -29,6 +29,8 @@ class Standing:
     """Where control stands at the end of a tick."""
 
     robot: Actuator
+    believed: bool  # where the robot is is known
+    doubt: str  # why what is measured cannot be true
     behaviour: Behaviour  # the robot's
     simulating: bool  # the simulated robot follows a run
     simulated: Float64 | None  # [D] the simulated robot's command
@@ -100,8 +102,9 @@ class Report:
         self._page = page
         self._outbox: list[ChunkMerged | Event] = []
         self._records_lost = 0
-        self._step, self._planned = -1, 0.0
+        self._step, self.planned = -1, 0.0
         self._woke: float | None = None
+        self._corrected = float("-inf")  # when the last check last changed something
         self._smoothed: Float32 | None = None  # of this tick: what was wanted before safety
         self.status: StatusRecord = np.zeros((), page.layout.control_dtype())  # written whole by every tick
         self.status[()] = page.control.read()  # counters go on from a predecessor's
@@ -112,11 +115,11 @@ class Report:
 
     def begin(self, step: int, planned: float, woke: float | None = None) -> None:
         """The tick that everything is about from here on; planned for `planned`, begun at `woke`."""
-        self._step, self._planned, self._woke = step, planned, woke
+        self._step, self.planned, self._woke = step, planned, woke
 
     def say(self, kind: str, text: str, data: Mapping[str, object] = MappingProxyType({})) -> None:
         """An event, told at the end of the tick, with the order that control was carrying out."""
-        self._outbox.append(Event(kind, text, self._planned, self._step, {"order": self.order, **data}))
+        self._outbox.append(Event(kind, text, self.planned, self._step, {"order": self.order, **data}))
 
     def merged(self, merged: ChunkMerged) -> None:
         """Where a chunk fell, told at the end of the tick."""
@@ -124,8 +127,9 @@ class Report:
 
     def record(self, seen: Seen, sent: Sent, simulated: bool) -> None:
         """The tick, for the episode; `simulated`: it was the simulated robot that was told."""
-        self.limiting.note(sent, self._planned)
-        self.nearing.note(sent, self._planned)
+        self.limiting.note(sent, self.planned)
+        self._note_corrected(sent)
+        self.nearing.note(sent, self.planned)
         target, executed = sent.target, sent.executed
         wanted = target is not None and target.path is not None
         self._smoothed = target.action.astype(np.float32) if target and wanted else None
@@ -133,7 +137,7 @@ class Report:
         done = TickDone(
             step=self._step,
             run=self.run,
-            planned=self._planned,
+            planned=self.planned,
             sent=sent.time,
             sequence=seen.sequence,
             source=_source(sent, simulated),
@@ -155,7 +159,7 @@ class Report:
         The tick's record comes before either, so that whoever ends an episode by them loses no row.
         """
         status, robot = self.status, standing.robot
-        status["step"], status["planned"] = self._step, self._planned
+        status["step"], status["planned"] = self._step, self.planned
         status["sequence"], status["order"] = seen.sequence, self.order
         name = "simulate" if standing.simulating else standing.behaviour.name
         status["run"], status["behaviour"] = self.run, name.encode()
@@ -167,12 +171,18 @@ class Report:
         status["simulated"] = np.nan if standing.simulated is None else standing.simulated
         status["waiting"], status["starved"] = standing.waiting, standing.starved
         status["locked"] = standing.locked
+        status["believed"], status["doubt"] = standing.believed, standing.doubt.encode()[:DOUBT_BYTES]
         status["records_lost"] = self._records_lost
         self._page.control.write(status)
         for message in self._outbox:
             self._push("control_events", message)
             self._push("ticks", message)
         self._outbox.clear()
+
+    def _note_corrected(self, sent: Sent) -> None:
+        if sent.corrected and self.planned - self._corrected > _QUIET_S:
+            self.say("corrected", sent.corrected)
+        self._corrected = self.planned if sent.corrected else self._corrected
 
     def _tell_makers(self, makers: Makers, sent: Sent) -> None:
         if sent.target is not None and sent.target.source == "teleop":

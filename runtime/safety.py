@@ -36,6 +36,7 @@ class RobotState:
     measured: Float64
     elapsed: float  # since the last command, capped by the caller at 1.5 periods
     joint_age: float = 0.0
+    doubt: str = ""  # why `measured` cannot be true
     picture_ages: dict[str, float] = field(default_factory=dict)
     aim: Float64 | None = (
         None  # the action that was wanted at the last tick; None: none was, `previous` counts
@@ -131,8 +132,8 @@ class SafetyFilter:
 
     def _blind(self, state: RobotState) -> str:
         allowed = self._settings.joint_age_s
-        if state.joint_age <= allowed:
-            return ""
+        if state.doubt or state.joint_age <= allowed:
+            return state.doubt
         return f"joints are {state.joint_age:.2f} s old, allowed {allowed:g}"
 
     def _stale(self, state: RobotState) -> str:

@@ -20,10 +20,11 @@ class Seen:
     joints_captured: float
     pictures_captured: tuple[tuple[str, float], ...]  # by camera; NaN for a picture that never came
     measured: bool  # there is a number for every joint
+    doubt: str = ""  # why these numbers cannot be true
 
     def fresh(self, now: float, allowed: float) -> bool:
-        """Whether the joints are known, and not older than `allowed` seconds."""
-        return self.measured and now - self.joints_captured <= allowed
+        """Whether the joints are known, believed, and not older than `allowed` seconds."""
+        return self.measured and not self.doubt and now - self.joints_captured <= allowed
 
     def picture_ages(self, now: float) -> dict[str, float]:
         """Age of each camera's newest picture [s]."""

@@ -158,6 +158,12 @@ class SetUp:
         self._since = self._clock.now()
         self.stages[stage] = self._since
 
+    def _check_joints(self) -> None:
+        status = self._page.control.read()
+        if self._plan.capabilities.moves_robot and not status["believed"]:
+            doubt = bytes(status["doubt"]).decode(errors="ignore")
+            raise SetupError(doubt or "control has not seen the joints yet")
+
     def _check_drives(self) -> None:
         drives = self._media().drives
         if self._plan.capabilities.moves_robot and drives.get("enabled") is False:
@@ -178,6 +184,7 @@ class SetUp:
             self._require_family()
             self._check_cameras()
             self._inference.asking.observe()
+            self._check_joints()
             self._check_drives()
         except (PolicyError, SetupError) as error:
             if self._waited() <= settings.observation_timeout_s:

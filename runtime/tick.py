@@ -17,6 +17,7 @@ from runtime.lane import Lane
 from runtime.locks import Locks
 from runtime.messages import LockGrippers, Message, NodeRequest, Order, PostedChunk, Tune, decode
 from runtime.page import EStop, Page
+from runtime.plausibility import Plausibility, Unquestioned
 from runtime.report import Report, Standing, StatusRecord
 from runtime.safety import SafetyFilter
 from runtime.seen import Eyes
@@ -25,6 +26,7 @@ from runtime.types import Float64
 from runtime.yielding import Yielding
 
 __all__ = ["Tick", "TickSettings"]
+_QUIET_S = 1.0  # without an implausible measurement: the next one is told again
 
 
 class Tick:
@@ -51,7 +53,9 @@ class Tick:
         self._eyes = Eyes(page)
         self._report = Report(page)
         self._locks = Locks(settings.limits)
-        self._displacement = Displacement(settings)
+        judges = Plausibility if settings.guarded else Unquestioned
+        self._plausibility = judges(settings.limits, settings.dims)
+        self._displacement = Displacement(settings, self._plausibility)
         self._actuator = RobotActuator(page, sink, settings, clock)
         self._hearing = Hearing(page, sink, self._report.say)
         # A restarted control goes on holding where its predecessor stood; a new one keeps silent.
@@ -60,16 +64,19 @@ class Tick:
         self._yielding = Yielding(self._actuator.tell, self._report.say, left)
         self._simulated: Lane | None = None
         self._simulated_run = 0
+        self._left_run = -1  # the run during which the robot was left alone
+        self._doubted = float("-inf")
         self.orphaned = False
 
     def __call__(self, step: int, planned: float, woke: float | None = None) -> None:
         """Do the tick `step`, planned for `planned` on our clock; the loop woke for it at `woke`."""
-        self._seen = self._eyes.look()
         self._report.begin(step, planned, woke)
+        self._seen = self._plausibility.judge(self._eyes.look(), planned, self._moved)
         for payload in self._page.rings["orders"].drain():
             self._read(payload, step, planned)
         self._check_estop(planned)
         self._check_family(planned)
+        self._check_doubt(planned)
         self._check_displaced(planned)
         sent = self._drive(step, planned)
         self._yielding.look(isinstance(self._robot.behaviour, Yielded), planned)
@@ -112,6 +119,8 @@ class Tick:
         empty = run is not None and sent.target is None
         simulated = None if self._simulated is None else self._simulated.actuator.commanded
         return Standing(
+            believed=self._measured(self._report.planned) is not None,
+            doubt=self._seen.doubt,
             robot=self._actuator,
             behaviour=self._robot.behaviour,
             simulating=self._simulated is not None and run is not None,
@@ -202,6 +211,10 @@ class Tick:
             self._begin_motion(order, now)
         elif order.mode == "sim":
             self._begin_simulation(order, now)
+        elif order.run == self._left_run and not self._actuator.engaged:
+            self._report.say(
+                "unmeasured", "nobody knows where the robot is since it was left alone: set up again"
+            )
         elif self._engage(now):
             self._robot.follow(self._run(order))
 
@@ -227,9 +240,8 @@ class Tick:
         if self._simulated is None:
             measured = self._measured(now)
             if measured is None:
-                self._report.say(
-                    "unmeasured", "no fresh joints: nobody knows where the simulation is to begin"
-                )
+                why = self._seen.doubt or "no fresh joints"
+                self._report.say("unmeasured", f"{why}: nobody knows where the simulation is to begin")
                 return
             start = SimulatedActuator(measured, self._settings, self._clock)
             self._simulated, self._simulated_run = self._lane(start), order.run
@@ -246,8 +258,10 @@ class Tick:
         if not self._actuator.engaged:
             measured = self._measured(now)
             if measured is None:
-                self._report.say("unmeasured", "no fresh joints: nothing is sent to a robot unseen")
+                why = self._seen.doubt or "no fresh joints"
+                self._report.say("unmeasured", f"{why}: nothing is sent to a robot unseen")
                 return False
+            self._plausibility.dead = ""
             self._actuator.engage(measured)
         return True
 
@@ -257,7 +271,8 @@ class Tick:
         if latched and stopped is None:
             # Before it was ever engaged nothing is known to send, until the robot has been measured.
             commanded = self._settings.limits.standing(self._actuator.commanded.copy())
-            stopped = EStopped(commanded if self._actuator.engaged else None)
+            stopped = EStopped(commanded if self._actuator.engaged else None, self._actuator.rest)
+            self._actuator.velocity = np.zeros_like(commanded)
             # Or a gripper that is on its way to its lock would go on after the release.
             self._lock(np.full(len(self._locks.on), np.nan))
             self._robot.behaviour, self._simulated = stopped, None
@@ -268,12 +283,21 @@ class Tick:
             return
         measured = None if stopped is None else self._measured(now)
         if stopped is not None and measured is not None:
-            if not self._actuator.engaged:
-                self._actuator.engage(measured)
+            self._stop_at(measured, stopped)
+
+    def _stop_at(self, measured: Float64, stopped: EStopped) -> None:
+        """Send where the robot is: at once as far as it takes to come to rest, farther as fast as it moves."""
+        actuator, limits = self._actuator, self._settings.limits
+        if not actuator.engaged and self._plausibility.dead:
+            return
+        if not actuator.engaged:
+            actuator.engage(measured)
+            stopped.see(actuator.commanded.copy())
+        elif stopped.follows:
+            if not stopped.seen:
+                actuator.step_to(measured, "e-stop, towards where the robot is", stopped.rest)
             # An object in the gripper keeps it open: its command stays, or it would let go.
-            limits = self._settings.limits
-            seen = limits.standing(np.where(limits.grippers, self._actuator.commanded, measured))
-            stopped.see(seen, self._settings.safety.following_error)
+            stopped.see(limits.standing(np.where(limits.grippers, actuator.commanded, measured)))
 
     def _check_family(self, now: float) -> None:
         kind, reason = "orphaned", "the supervisor is gone" if self.orphaned else ""
@@ -282,18 +306,55 @@ class Tick:
         for lane in self._lanes if reason else ():
             lane.hold_because(kind, reason)
 
+    @property
+    def _moved(self) -> Float64 | None:
+        """The command of a robot that we move, None where nothing should change."""
+        return self._actuator.commanded if self._robot.behaviour.moving and self._actuator.engaged else None
+
+    def _check_doubt(self, now: float) -> None:
+        """Hold, and name the joint, while what is measured cannot be true."""
+        doubt = self._seen.doubt
+        if (
+            not doubt or not self._plausibility.known
+        ):  # where the joints were missing there is no contradiction
+            return
+        if self._robot.behaviour.moving:
+            self._robot.hold_because("implausible", doubt)
+        elif now - self._doubted > _QUIET_S:
+            self._report.say("implausible", doubt)
+        self._doubted = now
+
     def _check_displaced(self, now: float) -> None:
         """Hold where the robot is, and not where it was told to hold, once these are far apart."""
-        behaviour, run = self._robot.behaviour, self._robot.run
+        behaviour = self._robot.behaviour
         held = (self._robot.stands or isinstance(behaviour, EStopped)) and self._actuator.engaged
         where = self._displacement(self._actuator, self._seen, now, held)
         if where is None:
             return
-        away = self._displacement.distance(self._actuator, where)
-        self._actuator.engage(where)
-        if isinstance(behaviour, EStopped):
-            behaviour.position = self._actuator.commanded.copy()
+        if self._plausibility.dead:
+            self._leave(
+                f"{self._plausibility.dead}, after joints were missing: nothing is sent; set up again"
+            )
             return
+        away = self._displacement.distance(self._actuator, where)
+        self._actuator.step_to(where, "held where the robot is")
+        if isinstance(behaviour, EStopped):
+            behaviour.see(self._actuator.commanded.copy())
+            return
+        self._tell_displaced(
+            f"the robot is {away:.2f} rad from where it was told to hold: holding where it is"
+        )
         self._robot.hold_here()
-        text = f"the robot is {away:.2f} rad from where it was told to hold: holding where it is"
-        self._report.say("displaced" if run is None else "moved_away", text)
+
+    def _leave(self, why: str) -> None:
+        """Send nothing: a node that was started anew at 0 is pulled by an old target, a dead encoder by a new one."""
+        self._left_run = self._report.run
+        self._tell_displaced(why)
+        if isinstance(self._robot.behaviour, EStopped):
+            self._robot.behaviour.position = None
+            self._actuator.engaged = False
+        else:
+            self._robot.silence()
+
+    def _tell_displaced(self, text: str) -> None:
+        self._report.say("displaced" if self._robot.run is None else "moved_away", text)

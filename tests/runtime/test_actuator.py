@@ -108,9 +108,39 @@ def test_the_e_stop_pressed_within_a_tick_repeats_the_last_command_to_the_robot(
     assert bench.sent.tolist() == pytest.approx([pytest.approx([0.1, 0.1])])
 
 
-def test_a_stop_after_the_e_stop_begins_at_rest():
-    """The e-stop went to where the arm was measured, in one tick: that is no speed to brake from."""
+def test_a_stop_after_a_step_to_where_the_robot_is_begins_at_rest():
+    """That is no speed to brake from, and the record says why the command is elsewhere."""
     actuator = robot(Bench())
     actuator.engage(np.zeros(2))
-    actuator.send(0, 100.0, Target(np.full(2, 0.3), "estop", None), np.full(2, 0.3))
+    actuator.step_to(np.array([0.3, -0.1]), "moved by hand")
     assert actuator.brake().duration == 0.0
+    sent = actuator.send(0, 100.0, HELD, np.array([0.3, -0.1]))
+    assert sent.notes == ("moved by hand: a stepped 0.300 rad",)
+    assert actuator.send(1, 100.0 + PERIOD, HELD, np.array([0.3, -0.1])).notes == ()
+
+
+def test_a_step_ends_within_the_joint_limits_and_goes_no_farther_than_it_may():
+    actuator = robot(Bench())
+    actuator.engage(np.array([1.9, 0.0]))
+    actuator.step_to(np.array([2.05, 1.0]), "e-stop", np.array([1.0, 0.2]))
+    assert actuator.commanded.tolist() == pytest.approx([2.0, 0.2])
+
+
+def test_what_no_limit_allows_does_not_leave_whoever_wants_it_sent():
+    bench = Bench()
+    actuator = robot(bench)
+    actuator.engage(np.zeros(2))
+    sent = actuator.send(0, 100.0, HELD, np.array([1.5, np.nan]))
+    assert bench.sent[-1] == pytest.approx([60 * 1.05 * PERIOD**2, 0.0])
+    assert sent.corrected == (
+        "last check: a 1.5000 was to be sent, 0.0700 is; last check: b nan was to be sent, 0.0000 is"
+    )
+
+
+def test_what_moves_no_robot_and_what_is_only_reported_on_leaves_as_it_is():
+    bench = Bench()
+    for options in ({"moves_robot": False}, {"safety": SafetySettings(report_only=True)}):
+        actuator = robot(bench, **options)
+        actuator.engage(np.array([3.0, 0.0]))
+        actuator.send(0, 100.0, HELD, np.array([-1.5, 5.0]))
+        assert bench.sent[-1] == pytest.approx([-1.5, 5.0])

@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 
 from runtime.alarms import Displacement, silent_sibling
+from runtime.plausibility import Plausibility
+from runtime.timeline import Dims
 from tests.runtime.test_actuator import robot, seen, settings
-from tests.runtime.tick_bench import Bench
+from tests.runtime.tick_bench import PERIOD, Bench
 
 
 def test_a_sibling_that_is_silent_is_named_with_how_long():
@@ -19,23 +21,51 @@ def test_a_sibling_that_never_gave_a_sign_is_named_so():
     assert silent_sibling(Bench().page, 100.0, 1.0) == "no sign of life from main since it was restarted"
 
 
-@pytest.fixture
-def actuator():
-    held = robot(Bench())
-    held.engage(np.zeros(2))
-    return held
+class Held:
+    """A robot that is held at 0, and what displacement says of each sample of it."""
+
+    def __init__(self):
+        self.actuator = robot(Bench())
+        self.actuator.engage(np.zeros(2))
+        self.judge = Plausibility(settings().limits, Dims())
+        self.displacement = Displacement(settings(), self.judge)
+        self.now = 100.0
+
+    def see(self, *joints, held=True):
+        self.now += PERIOD
+        judged = self.judge.judge(seen(*joints, captured=self.now), self.now, None)
+        return self.displacement(self.actuator, judged, self.now, held)
+
+    def miss(self, seconds):
+        old = seen(0.0, 0.0, captured=self.now)
+        until = self.now + seconds
+        while self.now < until:
+            self.now += PERIOD
+            self.displacement(self.actuator, self.judge.judge(old, self.now, None), self.now, True)
 
 
-def test_a_robot_is_displaced_beyond_the_following_error_and_only_while_it_is_held(actuator):
-    displacement = Displacement(settings())
-    assert displacement(actuator, seen(0.4, 0.0), 100.0, True) is None
-    assert displacement(actuator, seen(0.6, 0.0), 100.0, False) is None
-    assert displacement(actuator, seen(0.6, 0.0), 100.0, True) == pytest.approx([0.6, 0.0])
+def moved(robot, joint, ticks=8, held=True):
+    """What is said while the arm is at `joint`, after it came there slowly."""
+    for part in np.linspace(0.0, joint, 12):
+        robot.see(part, 0.0, held=False)
+    return [robot.see(joint, 0.0, held=held) for _ in range(ticks)]
 
 
-def test_who_was_not_seen_for_a_while_is_displaced_by_less(actuator):
-    displacement = Displacement(settings())
-    for tick in range(7):
-        assert displacement(actuator, seen(0.2, 0.0, captured=99.0), 100.0 + 0.1 * tick, True) is None
-    assert displacement(actuator, seen(0.2, 0.0, captured=100.7), 100.7, True) == pytest.approx([0.2, 0.0])
-    assert displacement(actuator, seen(0.2, 0.0, captured=100.8), 100.8, True) is None
+def test_a_robot_is_displaced_beyond_the_following_error_and_only_while_it_is_held():
+    held = Held()
+    assert moved(held, 0.4) == [None] * 8
+    assert moved(held, 0.6, held=False) == [None] * 8
+    assert moved(held, 0.6)[-1] == pytest.approx([0.6, 0.0])
+
+
+def test_a_robot_is_displaced_where_several_samples_agree():
+    held = Held()
+    moved(held, 0.4)
+    assert [held.see(0.6, 0.0) is None for _ in range(4)] == [True, True, True, False]
+
+
+def test_what_was_not_seen_for_a_while_is_displaced_by_less():
+    held = Held()
+    assert moved(held, 0.2) == [None] * 8
+    held.miss(0.7)
+    assert [held.see(0.2, 0.0) is None for _ in range(5)] == [True, True, True, False, True]

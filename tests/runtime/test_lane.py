@@ -65,7 +65,8 @@ def test_a_simulation_starts_where_the_robot_is_measured(bench):
     assert simulated(bench) == pytest.approx([0.7, -0.4])
 
 
-def test_without_joints_nobody_knows_where_a_simulation_is_to_begin(bench):
+def test_without_joints_nobody_knows_where_a_simulation_is_to_begin():
+    bench = Bench(seen=False)
     bench.feed = False
     bench.say("follow", run=1, mode="sim")
     bench.run(2)

@@ -6,7 +6,7 @@ from tests.runtime.tick_bench import Bench
 
 
 def test_before_the_first_observation_nothing_is_measured():
-    seen = Eyes(Bench().page).look()
+    seen = Eyes(Bench(seen=False).page).look()
     assert (seen.sequence, seen.measured) == (0, False)
     assert not seen.fresh(0.0, 1.0)
 

@@ -68,7 +68,8 @@ class RecordingSink(Sink):
 class Bench:
     """The robot goes at once where it is told, unless `moved_by_hand`; `feed` and `alive` let its joints and main be.
 
-    `chosen` is the strategy's section; further keywords are settings of safety.
+    `chosen` is the strategy's section; further keywords are settings of safety. Before the first tick the robot has
+    stood where it is for long enough to be believed, unless nobody has `seen` it.
     """
 
     def __init__(
@@ -77,6 +78,7 @@ class Bench:
         limits: Limits = TWO_JOINTS,
         dims: Dims | None = None,
         starvation: Answer = "slow",
+        seen: bool = True,
         **safety: Any,
     ) -> None:
         self.limits = limits
@@ -86,7 +88,6 @@ class Bench:
         self.page, self.clock, self.sink = Page(layout, shared), VirtualClock(100.0), RecordingSink()
         self.page.set_estop(EStop.CLEAR)
         self.step, self.order, self.sequence = 0, 0, 0
-        self.measured: Float64 = np.zeros(self.dim)
         self.dims = dims or Dims()
         self.chosen: Strategy = strategy(chosen or {"kind": "async"}, self.dims)
         self.safety = SafetySettings(**safety)
@@ -95,6 +96,29 @@ class Bench:
         self.tick = self.new_tick()
         self.feed = self.alive = True
         self.moved_by_hand: Any = None
+        self._begun = not seen
+        self.measured = np.zeros(self.dim)
+
+    @property
+    def measured(self) -> Float64:
+        """Where the robot is."""
+        return self._measured
+
+    @measured.setter
+    def measured(self, measured: Float64) -> None:
+        self._measured = measured
+        if not self._begun:
+            self.tick = self.new_tick()
+            self._stand()
+
+    def _stand(self) -> None:
+        """Let the robot be seen where it is, with nothing else that happens."""
+        for _ in range(5):
+            self.observe()
+            self.tick(self.step, self.clock.now())
+            self.clock.advance(PERIOD)
+        for ring in self.page.rings.values():
+            list(ring.drain())
 
     def new_tick(self) -> Tick:
         settings = TickSettings(
@@ -150,6 +174,7 @@ class Bench:
     # --- time ----------------------------------------------------------------------------------------------
 
     def run(self, ticks: int = 1, stretch: float = 1.0) -> None:
+        self._begun = True
         for _ in range(ticks):
             if self.alive:
                 self.page.beat("main", self.clock.now())

@@ -1,0 +1,75 @@
+"""The last check of a command: whatever wanted it sent, the robot is told nothing that it cannot follow."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from runtime.limits import Limits
+from runtime.safety_settings import SafetySettings
+from runtime.types import Float64
+
+_MARGIN = 1.05  # rounding, and ticks that are not alike, are no excess
+_TOLERANCE = 1e-6  # [rad, or what a gripper's travel is worth]
+
+
+class Limited(NamedTuple):
+    """What may be sent, float64 [D], and what was changed: a sentence each joint."""
+
+    action: Float64
+    notes: tuple[str, ...] = ()
+
+
+class CommandLimiter:
+    """Keeps each number finite, within its limits, its velocity and its acceleration, counted from the last command.
+
+    Safety and all motions of ours keep to less; it is the last one to notice where one of them does not. Where limits
+    contradict each other, position comes before velocity before acceleration. A joint that is outside may stay there,
+    and come back. Grippers that switch have no velocity. A stop may take away any velocity at once.
+    """
+
+    def __init__(self, limits: Limits, settings: SafetySettings) -> None:
+        self._limits = limits
+        self._reach = limits.reach
+        self._top = limits.velocity * _MARGIN
+        hardest = max(settings.acceleration, settings.motion_acceleration, settings.brake_acceleration)
+        self._rate = hardest * limits.reach * _MARGIN
+        self._speeds = np.zeros(len(limits.names), bool)
+        self._speeds[list(limits.speeds)] = True
+
+    def __call__(
+        self, action: Float64, previous: Float64, velocity: Float64, elapsed: float, stop: bool
+    ) -> Limited:
+        """What of `action` [D] may follow the command `previous`, which moved at `velocity`, `elapsed` seconds later.
+
+        `stop`: the e-stop sends it.
+        """
+        wanted = np.where(np.isfinite(action), action, previous)
+        low, high = self._velocities(velocity, elapsed, stop)
+        moved = previous + np.clip((wanted - previous) / elapsed, low, high) * elapsed
+        free = self._limits.binary
+        if stop:
+            free = free | (self._speeds & (np.abs(wanted) <= np.abs(previous)))
+        moved = np.where(free, wanted, moved)
+        lower, upper = self._limits.lower, self._limits.upper
+        sent = np.clip(moved, np.minimum(lower, previous), np.maximum(upper, previous))
+        changed = ~(np.abs(sent - action) <= _TOLERANCE * self._reach)
+        if not changed.any():
+            return Limited(action)
+        return Limited(np.where(changed, sent, action), self._notes(action, sent, changed))
+
+    def _velocities(self, velocity: Float64, elapsed: float, stop: bool) -> tuple[Float64, Float64]:
+        gain = self._rate * elapsed
+        low, high = velocity - gain, velocity + gain
+        if stop:
+            low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
+        high = np.clip(high, -self._top, self._top)
+        return np.minimum(np.maximum(low, -self._top), high), high
+
+    def _notes(self, action: Float64, sent: Float64, changed: np.ndarray) -> tuple[str, ...]:
+        names = self._limits.names
+        return tuple(
+            f"last check: {names[i]} {action[i]:.4f} was to be sent, {sent[i]:.4f} is"
+            for i in np.flatnonzero(changed)
+        )

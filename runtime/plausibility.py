@@ -1,0 +1,246 @@
+"""Whether a measurement of the joints can be true: one bad sample must move nobody."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from runtime.limits import Limits
+from runtime.seen import Seen
+from runtime.timeline import Dims, difference
+from runtime.types import Float64
+
+UNSEEN_S = 0.5  # without joints: whatever has happened to the robot meanwhile was not seen
+CONSISTENT_S = 0.1  # that samples agree for before they are believed against what was known
+_CONSISTENT = 3  # samples, at least, in that time
+_EXCESS = 2.0  # times its velocity that a joint may be pushed at by hand
+_NOISE = 0.02  # [rad] and [s] by which a sample and its stamp may be off
+_LONGEST_S = 0.1  # without a sample, after which no longer way is believed at once
+_BEYOND = 0.1  # [rad] that an arm may rest beyond its limits
+_FROZEN_S, _FROZEN_RAD = 1.0, 0.05
+_SAME = 0.02  # [rad] within which two joints have exchanged their values
+_LONGEST_DOUBT_S = 2.0
+_QUIET_S = 1.0  # without a contradiction, after which the next one is a first one
+_EPSILON = 1e-6  # stamps are sums of floats
+
+
+class _Sample(NamedTuple):
+    joints: Float64  # [D]
+    captured: float
+    seen: float  # when control first saw it
+
+
+class _Chain:
+    """Samples each of which can follow the one before; the newest of them."""
+
+    def __init__(self, first: _Sample) -> None:
+        self.samples = deque([first], maxlen=512)
+
+    @property
+    def newest(self) -> _Sample:
+        return self.samples[-1]
+
+    def lately(self, needed: float) -> list[_Sample]:
+        """The newest samples that span `needed` seconds, [] while there are too few."""
+        enough: list[_Sample] = []
+        for sample in reversed(self.samples):
+            enough.append(sample)
+            spans = self.newest.captured - sample.captured >= needed - _EPSILON
+            if spans and len(enough) >= _CONSISTENT:
+                return enough
+        return []
+
+    def forget(self) -> None:
+        """Keep the newest sample alone."""
+        newest = self.newest
+        self.samples.clear()
+        self.samples.append(newest)
+
+
+class Plausibility:
+    """Judges each new sample of the joints by those before it.
+
+    A sample is believed where no joint is beyond its limits or has moved faster than it can since the last believed
+    one. Samples that contradict that one, and agree with each other for CONSISTENT_S, take its place, later where
+    they contradict each other again and again; a joint that jumped to exactly 0, and joints that exchanged their
+    values, never do. A joint that reads the same number for
+    `_FROZEN_S` while its command moves is frozen. Grippers and speeds are not judged. Nothing can be said of the first
+    samples but that they agree with each other, nor of those after UNSEEN_S without any.
+    """
+
+    def __init__(self, limits: Limits, dims: Dims) -> None:
+        self._limits = limits
+        self._wrapping = dims.wrapping
+        self._places = limits.places
+        self._chain: _Chain | None = None  # what is believed
+        self._other: _Chain | None = None  # what contradicts it
+        self._before: Float64 | None = None  # what was believed before the joints were missing
+        self._missing = 0.0  # how long they were [s]
+        self._needed = CONSISTENT_S  # how long samples have to agree
+        self._contradicted = float("-inf")  # when they last did not
+        self._captured = float("-inf")
+        self._judged: float | None = None
+        self._unseen = 0.0  # how long there has been no sample; a stall of our own counts little [s]
+        self._doubt = ""
+        self._frozen = _Frozen(limits)
+        self.dead = ""  # the joints that have read exactly 0 since they came back from somewhere else
+
+    def judge(self, seen: Seen, now: float, commanded: Float64 | None) -> Seen:
+        """`seen` with why its joints are not believed; `commanded` float64 [D] of a robot that is being moved."""
+        self._unseen += 0.0 if self._judged is None else min(now - self._judged, _LONGEST_S)
+        self._judged = now
+        if not seen.measured:
+            return seen
+        if seen.joints_captured != self._captured:
+            self._captured = seen.joints_captured
+            self._doubt = self._take(_Sample(seen.joints, seen.joints_captured, now), commanded)
+        return replace(seen, doubt=self._doubt) if self._doubt else seen
+
+    @property
+    def known(self) -> bool:
+        """Whether any sample was believed since joints were last missing."""
+        return self._chain is not None
+
+    def apart(self, held: Float64, allowed: float) -> bool:
+        """Whether all samples, for as long as they have to agree, are farther than `allowed` [rad] from `held` [D]."""
+        lately = self._chain.lately(self._needed) if self._chain and not self._doubt else []
+        return bool(lately) and all(self._away(sample.joints, held) > allowed for sample in lately)
+
+    def returned(self) -> float:
+        """For how long the joints were missing before those that are believed now came [s]; 0 the second time."""
+        missing, self._missing = (0.0 if self._chain is None else self._missing), 0.0
+        return missing
+
+    def _take(self, sample: _Sample, commanded: Float64 | None) -> str:
+        unseen, self._unseen = self._unseen, 0.0
+        if self._chain and unseen > UNSEEN_S:
+            self._before, self._missing = self._chain.newest.joints, unseen
+            self._chain = self._other = None
+        if beyond := self._beyond(sample.joints):
+            self._other = None
+            return beyond
+        if self._chain is not None and not self._faster(self._chain.newest, sample).any():
+            self._chain.samples.append(sample)
+            self._other = None
+            return self._frozen(sample.joints, sample.captured, commanded)
+        return self._contradiction(sample)
+
+    def _contradiction(self, sample: _Sample) -> str:
+        other = self._other
+        if other is not None and not self._faster(other.newest, sample).any():
+            other.samples.append(sample)
+        else:
+            if other is not None or self._chain is not None:
+                self._contradict(sample.seen)
+            self._other = other = _Chain(sample)
+        doubt = "" if self._chain is None else self._jump(self._chain.newest, sample)
+        if other.lately(self._needed) and not doubt.endswith("?"):
+            self.dead = "" if self._before is None else self._zeros(self._before, sample.joints)
+            self._chain, self._other, self._before = other, None, None
+            return ""
+        return doubt or f"joints have not been seen for {CONSISTENT_S:g} s yet"
+
+    def _contradict(self, now: float) -> None:
+        """Believe less of what contradicts itself again and again."""
+        again = now - self._contradicted < _QUIET_S
+        self._needed = min(2.0 * self._needed, _LONGEST_DOUBT_S) if again else CONSISTENT_S
+        self._contradicted = now
+        if self._chain is not None:
+            self._chain.forget()
+
+    def _beyond(self, joints: Float64) -> str:
+        limits = self._limits
+        beyond = np.where(self._places, limits.outside(joints), 0.0)
+        worst = int(beyond.argmax())
+        if beyond[worst] <= _BEYOND:
+            return ""
+        return (
+            f"{limits.names[worst]} reads {joints[worst]:.3f} rad, beyond its limits "
+            f"{limits.lower[worst]:.3f}..{limits.upper[worst]:.3f}"
+        )
+
+    def _faster(self, before: _Sample, after: _Sample) -> np.ndarray:
+        """Which joints cannot have come from one sample to the other, bool [D]."""
+        between = max(after.captured - before.captured, after.seen - before.seen, 0.0)
+        allowed = _EXCESS * self._limits.velocity * (min(between, _LONGEST_S) + _NOISE) + _NOISE
+        moved = np.abs(difference(after.joints, before.joints, self._wrapping))
+        return self._places & (moved > allowed)
+
+    def _jump(self, before: _Sample, after: _Sample) -> str:
+        """What is wrong with a sample that contradicts what was known; a question where it never comes right."""
+        jumped = self._faster(before, after)
+        if not jumped.any():
+            return ""
+        if exchanged := self._exchanged(before.joints, after.joints, np.flatnonzero(jumped)):
+            return f"{exchanged} read each other's values: are they swapped?"
+        if dead := self._zeros(before.joints, after.joints):
+            return f"{dead}: is an encoder dead?"
+        worst = int(np.where(jumped, np.abs(after.joints - before.joints), 0.0).argmax())
+        return (
+            f"{self._limits.names[worst]} reads {after.joints[worst]:.3f} rad, {before.joints[worst]:.3f} just "
+            f"before: faster than it moves ({self._limits.velocity[worst]:.2f} rad/s)"
+        )
+
+    def _exchanged(self, before: Float64, after: Float64, jumped: Sequence[int] | np.ndarray) -> str:
+        order = [np.sort(values[jumped]) for values in (before, after)]
+        if len(jumped) < 2 or np.abs(order[0] - order[1]).max() > _SAME:
+            return ""
+        return " and ".join(self._limits.names[i] for i in jumped)
+
+    def _zeros(self, before: Float64, after: Float64) -> str:
+        """The joints that read exactly 0 and were elsewhere before."""
+        dead = np.flatnonzero(self._places & (after == 0.0) & (np.abs(before) > _BEYOND))
+        if not len(dead):
+            return ""
+        was = ", ".join(f"{before[i]:.3f}" for i in dead)
+        return f"{', '.join(self._limits.names[i] for i in dead)} read exactly 0 rad after {was}"
+
+    def _away(self, joints: Float64, held: Float64) -> float:
+        apart = np.abs(difference(joints, held, self._wrapping))
+        return float(apart.max(where=self._places, initial=0.0))
+
+
+class Unquestioned(Plausibility):
+    """Believes each sample: what moves no robot jumps where its recording begins anew."""
+
+    def judge(self, seen: Seen, now: float, commanded: Float64 | None) -> Seen:
+        if seen.measured:
+            self._chain = _Chain(_Sample(seen.joints, seen.joints_captured, now))
+        return seen
+
+    def apart(self, held: Float64, allowed: float) -> bool:
+        return self._chain is not None and self._away(self._chain.newest.joints, held) > allowed
+
+
+class _Frozen:
+    """Notices a joint whose number stays the same, under fresh stamps, while its command moves."""
+
+    def __init__(self, limits: Limits) -> None:
+        dim = len(limits.names)
+        self._limits = limits
+        self._last: Float64 = np.full(dim, np.nan)
+        self._since: Float64 = np.zeros(dim)  # when each number was first read
+        self._range: Float64 = np.zeros((2, dim))  # of the command since then
+
+    def __call__(self, joints: Float64, captured: float, commanded: Float64 | None) -> str:
+        if commanded is None:
+            self._last[:] = np.nan
+            return ""
+        fresh = joints != self._last
+        self._last = joints
+        self._since[fresh] = captured
+        low, high = self._range
+        np.copyto(low, np.where(fresh, commanded, np.minimum(low, commanded)))
+        np.copyto(high, np.where(fresh, commanded, np.maximum(high, commanded)))
+        frozen = self._limits.places & (captured - self._since >= _FROZEN_S) & (high - low > _FROZEN_RAD)
+        if not frozen.any():
+            return ""
+        worst = int(np.where(frozen, high - low, 0.0).argmax())
+        return (
+            f"{self._limits.names[worst]} has read exactly {joints[worst]:.4f} rad for "
+            f"{captured - self._since[worst]:.1f} s while its command moved {high[worst] - low[worst]:.2f} rad"
+        )

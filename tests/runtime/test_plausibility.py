@@ -1,0 +1,237 @@
+"""Of a joint at 0.8 rad that moves at most 3 rad/s, and two more; samples come at 30 Hz."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.limits import Limits
+from runtime.plausibility import Plausibility, Unquestioned
+from runtime.seen import Seen
+from runtime.timeline import Dims
+from tests.runtime.tick_bench import PERIOD
+
+LIMITS = Limits(
+    ("hip", "knee", "gripper"),
+    np.array([-2.0, -2.0, 0.0]),
+    np.array([2.0, 2.0, 0.1]),
+    np.array([3.0, 3.0, 1.0]),
+    np.array([False, False, True]),
+    np.zeros(3, bool),
+)
+STANDS = np.array([0.8, -0.4, 0.05])
+NAN = float("nan")
+
+
+class Watcher:
+    def __init__(self, limits=LIMITS, dims=None):
+        self.judge = Plausibility(limits, dims or Dims())
+        self.now, self.sequence, self.captured = 100.0, 0, 0.0
+
+    def see(self, joints, commanded=None, stamp=True):
+        """The doubt about one more sample."""
+        self.now += PERIOD
+        self.sequence += 1
+        self.captured = self.now - 0.01 if stamp else self.captured
+        joints = np.array(joints, float)
+        seen = Seen(
+            self.sequence,
+            joints.astype(np.float32),
+            joints,
+            self.captured,
+            (),
+            bool(np.isfinite(joints).all()),
+        )
+        return self.judge.judge(
+            seen, self.now, None if commanded is None else np.array(commanded, float)
+        ).doubt
+
+    def stand(self, ticks=5, joints=STANDS):
+        return [self.see(joints) for _ in range(ticks)]
+
+    def miss(self, ticks):
+        seen = Seen(self.sequence, STANDS.astype(np.float32), STANDS, self.captured, (), True)
+        for _ in range(ticks):
+            self.now += PERIOD
+            self.judge.judge(seen, self.now, None)
+
+
+@pytest.fixture
+def watcher():
+    return Watcher()
+
+
+def stood():
+    watcher = Watcher()
+    watcher.stand()
+    return watcher
+
+
+def test_the_first_samples_are_believed_once_they_agree_for_a_while(watcher):
+    doubts = watcher.stand(6)
+    assert doubts[:3] == ["joints have not been seen for 0.1 s yet"] * 3
+    assert doubts[3:] == ["", "", ""]
+
+
+def test_a_first_sample_that_is_wrong_is_not_believed(watcher):
+    watcher.see([0.0, 0.0, 0.0])
+    assert all(watcher.stand(3))
+    assert watcher.stand(3) == ["", "", ""]
+    assert not watcher.judge.apart(STANDS, 0.01)
+
+
+def test_an_isolated_spike_is_named_and_over_with_the_next_sample():
+    watcher = stood()
+    assert watcher.see([0.8, 0.4, 0.05]) == (
+        "knee reads 0.400 rad, -0.400 just before: faster than it moves (3.00 rad/s)"
+    )
+    assert watcher.see(STANDS) == ""
+
+
+def test_a_reading_beyond_the_limits_is_never_believed():
+    watcher = stood()
+    for _ in range(60):
+        assert watcher.see([5.0, -0.4, 0.05]) == "hip reads 5.000 rad, beyond its limits -2.000..2.000"
+    assert watcher.see(STANDS) == ""
+
+
+def test_an_arm_may_rest_a_little_beyond_its_limits(watcher):
+    assert watcher.stand(6, [2.05, -0.4, 0.05])[-1] == ""
+
+
+def test_zeros_of_a_dead_encoder_are_never_believed_however_long_they_last():
+    watcher = stood()
+    for _ in range(300):
+        assert watcher.see([0.0, -0.4, 0.05]) == "hip read exactly 0 rad after 0.800: is an encoder dead?"
+    assert watcher.judge.apart(STANDS, 0.1) is False
+    assert watcher.see(STANDS) == ""
+
+
+def test_swapped_joints_are_never_believed_however_long_they_last():
+    watcher = stood()
+    for _ in range(300):
+        assert watcher.see([-0.4, 0.8, 0.05]) == "hip and knee read each other's values: are they swapped?"
+    assert watcher.see(STANDS) == ""
+
+
+def test_an_arm_that_is_elsewhere_is_believed_once_several_samples_agree():
+    watcher = stood()
+    elsewhere = np.array([-0.5, 0.3, 0.05])
+    doubts = watcher.stand(5, elsewhere)
+    assert all(doubt.startswith("hip reads -0.500 rad") for doubt in doubts[:3])
+    assert doubts[3:] == ["", ""]
+    assert watcher.judge.apart(STANDS, 0.5)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_of_a_broken_encoder_never_agrees_with_itself_for_long_enough(seed):
+    watcher = stood()
+    noise = np.random.default_rng(seed)
+    for _ in range(3000):
+        watcher.see([noise.uniform(-2, 2), -0.4, 0.05])
+        assert not watcher.judge.apart(STANDS, 0.5)
+
+
+def test_what_contradicted_itself_again_and_again_has_to_agree_for_longer():
+    watcher = stood()
+    for value in (-1.9, 1.9, -1.0, 1.9):
+        watcher.see([value, -0.4, 0.05])
+    elsewhere = np.array([-1.5, -0.4, 0.05])
+    doubts = watcher.stand(60, elsewhere)
+    assert 10 < sum(map(bool, doubts)) < 60  # 0.1 s becomes 0.2, 0.4, 0.8, 1.6
+    watcher.stand(31, elsewhere)
+    assert sum(map(bool, watcher.stand(6, STANDS))) == 3
+
+
+def test_an_arm_that_is_moved_as_fast_as_it_can_is_believed_all_the_way():
+    watcher = Watcher()
+    watcher.stand(5, [-1.5, 0.0, 0.05])
+    way = np.arange(-1.5, 1.5, 3.0 * PERIOD)
+    assert [watcher.see([hip, 0.0, 0.05]) for hip in way] == [""] * len(way)
+
+
+@given(
+    st.lists(st.floats(-1, 1), min_size=5, max_size=60),
+    st.lists(st.floats(0.004, 0.09), min_size=5, max_size=60),
+)
+def test_no_motion_within_the_velocity_is_ever_doubted_whatever_the_stamps(speeds, gaps):
+    """Parts of the velocity, and how long until the next sample, which control sees at its ticks."""
+    watcher = stood()
+    hip, captured = 0.8, watcher.captured
+    for speed, gap in zip(speeds, gaps, strict=False):
+        hip = float(np.clip(hip + 3.0 * speed * gap, -2.0, 2.0))
+        captured += gap
+        watcher.now = max(watcher.now + 1e-3, captured)
+        joints = np.array([hip, -0.4, 0.05])
+        seen = Seen(1, joints.astype(np.float32), joints, captured, (), True)
+        assert watcher.judge.judge(seen, watcher.now, None).doubt == ""
+
+
+def test_a_repeated_sample_is_not_judged_again():
+    watcher = stood()
+    assert watcher.see([5.0, 0.0, 0.05]) != ""
+    assert watcher.see(STANDS, stamp=False) != ""  # with the stamp of the sample before
+
+
+def test_after_missing_joints_everything_is_seen_anew_and_zeros_are_named():
+    watcher = stood()
+    watcher.miss(20)
+    assert not watcher.judge.known or watcher.see(np.zeros(3)) != ""
+    watcher.stand(5, np.zeros(3))
+    assert watcher.judge.returned() > 0.5
+    assert watcher.judge.returned() == 0.0
+    assert watcher.judge.dead == "hip, knee read exactly 0 rad after 0.800, -0.400"
+
+
+def test_a_stall_of_our_own_is_no_gap_in_the_joints():
+    watcher = stood()
+    watcher.now += 3.0
+    assert watcher.see(STANDS) == ""
+
+
+def test_a_joint_that_reads_the_same_while_its_command_moves_is_frozen():
+    watcher = stood()
+    doubts = [
+        watcher.see([0.8, -0.4 + 0.002 * tick, 0.05], [0.8 + 0.002 * tick, 0.0, 0.0]) for tick in range(40)
+    ]
+    assert doubts[:30] == [""] * 30
+    assert doubts[-1].startswith("hip has read exactly 0.8000 rad for 1.")
+    assert doubts[-1].endswith("s while its command moved 0.08 rad")
+    assert watcher.see([0.8, -0.4, 0.05]) == ""  # nothing moves it any more
+
+
+def test_a_blocked_joint_that_is_noisy_is_not_frozen_and_neither_is_a_gripper_or_one_that_stands():
+    watcher = stood()
+    for tick in range(90):
+        noisy = 0.8 + 1e-6 * (tick % 2)
+        assert watcher.see([noisy, -0.4, 0.05], [0.8 + 0.01 * tick, -0.4, 0.1 * (tick % 2)]) == ""
+
+
+def test_a_frozen_joint_may_be_tried_again():
+    watcher = stood()
+    for tick in range(40):
+        watcher.see(STANDS, [0.8 + 0.01 * tick, -0.4, 0.05])
+    watcher.see(STANDS)
+    assert watcher.see(STANDS, [1.2, -0.4, 0.05]) == ""
+
+
+def test_an_endless_joint_that_is_counted_in_another_turn_has_not_moved():
+    endless = Limits(
+        ("wheel", "knee", "gripper"),
+        np.array([-np.inf, -2.0, 0.0]),
+        np.array([np.inf, 2.0, 0.1]),
+        LIMITS.velocity,
+        LIMITS.grippers,
+        LIMITS.binary,
+    )
+    watcher = Watcher(endless, Dims((), (0,)))
+    watcher.stand(5, [3.1, 0.0, 0.0])
+    assert watcher.see([-3.1, 0.0, 0.0]) == ""
+
+
+def test_what_moves_no_robot_is_believed_at_once():
+    judge = Unquestioned(LIMITS, Dims())
+    seen = Seen(1, STANDS.astype(np.float32), STANDS, 99.0, (), True)
+    assert judge.judge(seen, 99.0, None) is seen
+    assert judge.apart(np.zeros(3), 0.5)
+    assert not judge.apart(STANDS, 0.5)
