@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,6 +21,7 @@ _NOISE = 0.02  # [rad] and [s] by which a sample and its stamp may be off
 _LONGEST_S = 0.1  # without a sample, after which no longer way is believed at once
 _BEYOND = 0.1  # [rad] that an arm may rest beyond its limits
 _FROZEN_S, _FROZEN_RAD = 1.0, 0.05
+_LIVELY = 5  # samples in a row that differ: an encoder whose last digits are never still
 _SAME = 0.02  # [rad] within which two joints have exchanged their values
 _LONGEST_DOUBT_S = 2.0
 _QUIET_S = 1.0  # without a contradiction, after which the next one is a first one
@@ -37,8 +37,9 @@ class _Sample(NamedTuple):
 class _Chain:
     """Samples each of which can follow the one before; the newest of them."""
 
-    def __init__(self, first: _Sample) -> None:
+    def __init__(self, first: _Sample, never: str = "") -> None:
         self.samples = deque([first], maxlen=512)
+        self.never = never  # why it is not believed, however long it lasts
 
     @property
     def newest(self) -> _Sample:
@@ -86,6 +87,10 @@ class Plausibility:
         self._judged: float | None = None
         self._unseen = 0.0  # how long there has been no sample; a stall of our own counts little [s]
         self._doubt = ""
+        self._alike = np.zeros(
+            len(limits.names), np.int64
+        )  # samples in a row: > 0 that differ, < 0 that do not
+        self._lively = np.zeros(len(limits.names), bool)  # joints whose last digits are never still
         self._frozen = _Frozen(limits)
         self.dead = ""  # the joints that have read exactly 0 since they came back from somewhere else
 
@@ -123,11 +128,24 @@ class Plausibility:
         if beyond := self._beyond(sample.joints):
             self._other = None
             return beyond
-        if self._chain is not None and not self._faster(self._chain.newest, sample).any():
+        if self._chain is not None and self._goes_on(self._chain, sample):
+            self._note_digits(sample.joints != self._chain.newest.joints)
             self._chain.samples.append(sample)
             self._other = None
             return self._frozen(sample.joints, sample.captured, commanded)
         return self._contradiction(sample)
+
+    def _goes_on(self, chain: _Chain, sample: _Sample) -> bool:
+        """Whether the sample follows what is believed, rather than what contradicts it."""
+        if self._faster(chain.newest, sample).any():
+            return False
+        other = self._other
+        return other is None or self._way(chain.newest, sample) <= self._way(other.newest, sample)
+
+    def _way(self, before: _Sample, after: _Sample) -> float:
+        """How long the joint that is farthest would take from one sample to the other [s]."""
+        moved = np.abs(difference(after.joints, before.joints, self._wrapping)) / self._limits.velocity
+        return float(moved.max(where=self._places, initial=0.0))
 
     def _contradiction(self, sample: _Sample) -> str:
         other = self._other
@@ -136,13 +154,16 @@ class Plausibility:
         else:
             if other is not None or self._chain is not None:
                 self._contradict(sample.seen)
-            self._other = other = _Chain(sample)
-        doubt = "" if self._chain is None else self._jump(self._chain.newest, sample)
-        if other.lately(self._needed) and not doubt.endswith("?"):
+            self._other = other = _Chain(sample, self._never(sample))
+        if not other.never and not (stuck := self._stuck(other)) and other.lately(self._needed):
             self.dead = "" if self._before is None else self._zeros(self._before, sample.joints)
             self._chain, self._other, self._before = other, None, None
             return ""
-        return doubt or f"joints have not been seen for {CONSISTENT_S:g} s yet"
+        return other.never or stuck or self._jump(sample)
+
+    def _note_digits(self, differ: np.ndarray) -> None:
+        self._alike = np.where(differ, np.maximum(self._alike, 0) + 1, np.minimum(self._alike, 0) - 1)
+        self._lively = np.where(np.abs(self._alike) >= _LIVELY, self._alike > 0, self._lively)
 
     def _contradict(self, now: float) -> None:
         """Believe less of what contradicts itself again and again."""
@@ -170,26 +191,51 @@ class Plausibility:
         moved = np.abs(difference(after.joints, before.joints, self._wrapping))
         return self._places & (moved > allowed)
 
-    def _jump(self, before: _Sample, after: _Sample) -> str:
-        """What is wrong with a sample that contradicts what was known; a question where it never comes right."""
-        jumped = self._faster(before, after)
-        if not jumped.any():
-            return ""
-        if exchanged := self._exchanged(before.joints, after.joints, np.flatnonzero(jumped)):
-            return f"{exchanged} read each other's values: are they swapped?"
-        if dead := self._zeros(before.joints, after.joints):
-            return f"{dead}: is an encoder dead?"
-        worst = int(np.where(jumped, np.abs(after.joints - before.joints), 0.0).argmax())
+    def _jump(self, sample: _Sample) -> str:
+        """How a sample contradicts what was known."""
+        if self._chain is None:
+            return f"joints have not been seen for {CONSISTENT_S:g} s yet"
+        before = self._chain.newest
+        jumped = self._faster(before, sample)
+        worst = int(np.where(jumped, np.abs(sample.joints - before.joints), 0.0).argmax())
         return (
-            f"{self._limits.names[worst]} reads {after.joints[worst]:.3f} rad, {before.joints[worst]:.3f} just "
+            f"{self._limits.names[worst]} reads {sample.joints[worst]:.3f} rad, {before.joints[worst]:.3f} just "
             f"before: faster than it moves ({self._limits.velocity[worst]:.2f} rad/s)"
         )
 
-    def _exchanged(self, before: Float64, after: Float64, jumped: Sequence[int] | np.ndarray) -> str:
-        order = [np.sort(values[jumped]) for values in (before, after)]
-        if len(jumped) < 2 or np.abs(order[0] - order[1]).max() > _SAME:
+    def _never(self, sample: _Sample) -> str:
+        """Why samples from this one on are never believed: a question, for numbers alone do not answer it."""
+        if self._chain is None:
             return ""
-        return " and ".join(self._limits.names[i] for i in jumped)
+        before = self._chain.newest
+        if exchanged := self._exchanged(before, sample):
+            return f"{exchanged} read each other's values: are they swapped?"
+        if dead := self._zeros(before.joints, sample.joints):
+            return f"{dead}: is an encoder dead?"
+        return ""
+
+    def _exchanged(self, before: _Sample, after: _Sample) -> str:
+        """The joints whose values are those of each other, as far as they can have moved meanwhile."""
+        other = np.flatnonzero(self._places & (np.abs(after.joints - before.joints) > _SAME))
+        apart = np.sort(before.joints[other]) - np.sort(after.joints[other])
+        moved = _SAME + self._limits.velocity[other].max(initial=0.0) * min(
+            after.seen - before.seen, _LONGEST_S
+        )
+        if np.count_nonzero(self._faster(before, after)) < 2 or np.abs(apart).max() > moved:
+            return ""
+        return " and ".join(self._limits.names[i] for i in other)
+
+    def _stuck(self, chain: _Chain) -> str:
+        """The first joint that has read the same number throughout, far from before, although it was never still."""
+        if self._chain is None or len(chain.samples) < _CONSISTENT:
+            return ""
+        joints = np.array([sample.joints for sample in chain.samples])
+        moved = np.abs(difference(joints[-1], self._chain.newest.joints, self._wrapping)) > _SAME
+        still = self._places & self._lively & moved & (np.ptp(joints, axis=0) == 0.0)
+        if not still.any():
+            return ""
+        worst = int(still.argmax())
+        return f"{self._limits.names[worst]} jumped to {joints[-1, worst]:.3f} rad and reads exactly that: is it stuck?"
 
     def _zeros(self, before: Float64, after: Float64) -> str:
         """The joints that read exactly 0 and were elsewhere before."""

@@ -109,8 +109,10 @@ class Tick:
         """Move every lane on by a tick; what became of it on the one that is led, for the record."""
         sent = Sent(planned)
         if self._page.estop is not EStop.UNKNOWN:
-            for lane in self._lanes:
-                sent = lane.drive(step, planned, self._seen)
+            sent = self._robot.drive(step, planned, self._seen)
+            if self._simulated is not None:
+                shown = self._simulated.drive(step, planned, self._seen)
+                sent = shown._replace(notes=(*sent.notes, *shown.notes), corrected=sent.corrected)
         return sent
 
     def _standing(self, step: int, sent: Sent) -> Standing:

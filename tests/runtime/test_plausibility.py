@@ -123,6 +123,16 @@ def test_an_arm_that_is_elsewhere_is_believed_once_several_samples_agree():
     assert watcher.judge.apart(STANDS, 0.5)
 
 
+def test_an_encoder_that_was_noisy_and_is_stuck_elsewhere_is_never_believed():
+    watcher = Watcher()
+    for tick in range(10):
+        watcher.see(STANDS + 1e-5 * (tick % 3))
+    doubts = [watcher.see([-0.7, -0.4 + 1e-5 * (tick % 3), 0.05]) for tick in range(100)]
+    assert doubts[0].startswith("hip reads -0.700 rad, 0.800 just before")
+    assert set(doubts[3:]) == {"hip jumped to -0.700 rad and reads exactly that: is it stuck?"}
+    assert watcher.see(STANDS) == ""
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_of_a_broken_encoder_never_agrees_with_itself_for_long_enough(seed):
     watcher = stood()
