@@ -18,7 +18,8 @@ CONSISTENT_S = 0.1  # that samples agree for before they are believed against wh
 _CONSISTENT = 3  # samples, at least, in that time
 _EXCESS = 2.0  # times its velocity that a joint may be pushed at by hand
 _NOISE = 0.02  # [rad] and [s] by which a sample and its stamp may be off
-_LONGEST_S = 0.1  # without a sample, after which no longer way is believed at once
+_LONGEST_S = 0.05  # without a sample, after which no longer way is believed at once
+_STALL_S = 0.1  # between two looks of ours: it says nothing about the joints
 _BEYOND = 0.1  # [rad] that an arm may rest beyond its limits
 _FROZEN_S, _FROZEN_RAD = 1.0, 0.05
 _LIVELY = 5  # samples in a row that differ: an encoder whose last digits are never still
@@ -96,7 +97,7 @@ class Plausibility:
 
     def judge(self, seen: Seen, now: float, commanded: Float64 | None) -> Seen:
         """`seen` with why its joints are not believed; `commanded` float64 [D] of a robot that is being moved."""
-        self._unseen += 0.0 if self._judged is None else min(now - self._judged, _LONGEST_S)
+        self._unseen += 0.0 if self._judged is None else min(now - self._judged, _STALL_S)
         self._judged = now
         if not seen.measured:
             return seen
@@ -109,6 +110,11 @@ class Plausibility:
     def known(self) -> bool:
         """Whether any sample was believed since joints were last missing."""
         return self._chain is not None
+
+    @property
+    def settled(self) -> bool:
+        """Whether samples have agreed for as long as they have to, up to the newest."""
+        return self._chain is not None and not self._doubt and bool(self._chain.lately(self._needed))
 
     def apart(self, held: Float64, allowed: float) -> bool:
         """Whether all samples, for as long as they have to agree, are farther than `allowed` [rad] from `held` [D]."""
@@ -125,6 +131,7 @@ class Plausibility:
         if self._chain and unseen > UNSEEN_S:
             self._before, self._missing = self._chain.newest.joints, unseen
             self._chain = self._other = None
+            self._needed = CONSISTENT_S
         if beyond := self._beyond(sample.joints):
             self._other = None
             return beyond
@@ -137,7 +144,7 @@ class Plausibility:
 
     def _goes_on(self, chain: _Chain, sample: _Sample) -> bool:
         """Whether the sample follows what is believed, rather than what contradicts it."""
-        if self._faster(chain.newest, sample).any():
+        if self._faster(chain.newest, sample).any() or self._zeros(chain.newest.joints, sample.joints):
             return False
         other = self._other
         return other is None or self._way(chain.newest, sample) <= self._way(other.newest, sample)
@@ -167,7 +174,7 @@ class Plausibility:
 
     def _contradict(self, now: float) -> None:
         """Believe less of what contradicts itself again and again."""
-        again = now - self._contradicted < _QUIET_S
+        again = now - self._contradicted < max(_QUIET_S, 2.0 * self._needed)
         self._needed = min(2.0 * self._needed, _LONGEST_DOUBT_S) if again else CONSISTENT_S
         self._contradicted = now
         if self._chain is not None:
@@ -221,7 +228,7 @@ class Plausibility:
         moved = _SAME + self._limits.velocity[other].max(initial=0.0) * min(
             after.seen - before.seen, _LONGEST_S
         )
-        if np.count_nonzero(self._faster(before, after)) < 2 or np.abs(apart).max() > moved:
+        if len(other) < 2 or np.abs(apart).max() > moved:
             return ""
         return " and ".join(self._limits.names[i] for i in other)
 
@@ -257,6 +264,10 @@ class Unquestioned(Plausibility):
         if seen.measured:
             self._chain = _Chain(_Sample(seen.joints, seen.joints_captured, now))
         return seen
+
+    @property
+    def settled(self) -> bool:
+        return self._chain is not None
 
     def apart(self, held: Float64, allowed: float) -> bool:
         return self._chain is not None and self._away(self._chain.newest.joints, held) > allowed

@@ -121,7 +121,7 @@ class Tick:
         empty = run is not None and sent.target is None
         simulated = None if self._simulated is None else self._simulated.actuator.commanded
         return Standing(
-            believed=self._measured(self._report.planned) is not None,
+            believed=self._measured(self._report.planned) is not None and self._plausibility.settled,
             doubt=self._seen.doubt,
             robot=self._actuator,
             behaviour=self._robot.behaviour,
@@ -259,8 +259,10 @@ class Tick:
         """Take the robot over where it is measured; False, and said so, where nobody knows where it is."""
         if not self._actuator.engaged:
             measured = self._measured(now)
-            if measured is None:
-                why = self._seen.doubt or "no fresh joints"
+            if measured is None or not self._plausibility.settled:
+                why = self._seen.doubt or (
+                    "no fresh joints" if measured is None else "joints contradict each other"
+                )
                 self._report.say("unmeasured", f"{why}: nothing is sent to a robot unseen")
                 return False
             self._plausibility.dead = ""
@@ -290,7 +292,7 @@ class Tick:
     def _stop_at(self, measured: Float64, stopped: EStopped) -> None:
         """Send where the robot is: at once as far as it takes to come to rest, farther as fast as it moves."""
         actuator, limits = self._actuator, self._settings.limits
-        if not actuator.engaged and self._plausibility.dead:
+        if not actuator.engaged and (self._plausibility.dead or not self._plausibility.settled):
             return
         if not actuator.engaged:
             actuator.engage(measured)

@@ -197,7 +197,8 @@ class Scenario(Bench):
     def _compare(self, told: Float64, before: Float64, notes: str, stopped: bool) -> None:
         moved = (told - before) / PERIOD
         if "stepped" in notes:
-            self.velocity = np.zeros(self.dim)
+            hardest = 60.0 * self.limits.reach * _MARGIN * PERIOD
+            self.velocity = np.clip(moved, -hardest, hardest)  # it may have moved on from there
             apart = np.abs(told - before) > 1e-6
             away = np.abs(told - self.body) > np.maximum(np.abs(before - self.body), _NEAR)
             if (apart & away)[self.places].any():

@@ -149,7 +149,7 @@ def test_what_contradicted_itself_again_and_again_has_to_agree_for_longer():
     elsewhere = np.array([-1.5, -0.4, 0.05])
     doubts = watcher.stand(60, elsewhere)
     assert 10 < sum(map(bool, doubts)) < 60  # 0.1 s becomes 0.2, 0.4, 0.8, 1.6
-    watcher.stand(31, elsewhere)
+    watcher.stand(120, elsewhere)
     assert sum(map(bool, watcher.stand(6, STANDS))) == 3
 
 
