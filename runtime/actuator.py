@@ -16,7 +16,7 @@ from runtime.errors import RuntimeFault
 from runtime.limiter import CommandLimiter, Limited
 from runtime.motion import Brake
 from runtime.page import EStop, Page
-from runtime.safety import Limits, RobotState, SafetySettings
+from runtime.safety import Limits, RobotState, SafetySettings, braking
 from runtime.seen import Seen
 from runtime.timeline import Dims, difference
 from runtime.transports.base import Sink
@@ -131,20 +131,7 @@ class Actuator(ABC):
 
     def brake(self) -> Brake:
         """A stop from the last commanded velocity, as hard as needed to stay within the joint limits."""
-        limits, safety, speed = self._settings.limits, self._settings.safety, self.velocity
-        ahead = np.where(speed > 0, limits.upper - self.commanded, self.commanded - limits.lower)
-        needed = speed * speed / (2.0 * np.maximum(ahead, 1e-9))
-        softest = safety.brake_acceleration * self._reach
-        rate = np.clip(needed, softest, np.maximum(softest, safety.acceleration * self._reach))
-        return Brake(
-            self.commanded.copy(),
-            speed.copy(),
-            rate,
-            limits.lower,
-            limits.upper,
-            limits.speeds,
-            limits.velocity,
-        )
+        return braking(self.commanded, self.velocity, self._settings.limits, self._settings.safety)
 
     def send(
         self, step: int, planned: float, target: Target, action: Float64, notes: tuple[str, ...] = ()
@@ -162,6 +149,8 @@ class Actuator(ABC):
         action, corrected = self._checked(action, elapsed, stop)
         time = self._deliver(step, action)
         self.velocity = (action - self.commanded) / elapsed
+        if target.velocity is not None:
+            self.velocity = np.where(action == target.action, target.velocity, self.velocity)
         if self._switching:
             self.velocity[self._settings.limits.binary] = 0.0
         self.commanded = action

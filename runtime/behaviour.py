@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
-from runtime.motion import Motion
+from runtime.motion import Brake, Motion
 from runtime.recording.base import ControlSource
 from runtime.safety import Path
 from runtime.timeline import Makers
@@ -22,6 +22,7 @@ class Target(NamedTuple):
     source: ControlSource
     path: Path | None
     makers: Makers = ()
+    velocity: Float64 | None = None  # at the end of the tick, where it is not that on the way there
 
 
 class Behaviour(ABC):
@@ -62,7 +63,7 @@ class Hold(Behaviour):
 
     name = "hold"
 
-    def __init__(self, brake: Motion) -> None:
+    def __init__(self, brake: Brake) -> None:
         self._brake = brake
         self._time = 0.0
 
@@ -73,7 +74,7 @@ class Hold(Behaviour):
 
     def target(self, step: int, elapsed: float) -> Target:
         self._time += elapsed
-        return Target(self._brake.at(self._time), "hold", None)
+        return Target(self._brake.at(self._time), "hold", None, velocity=self._brake.velocity(self._time))
 
 
 class Move(Behaviour):
@@ -85,7 +86,7 @@ class Move(Behaviour):
     name = "motion"
     moving = True
 
-    def __init__(self, brake: Motion, motion: Motion, goal: Float64, speed: float) -> None:
+    def __init__(self, brake: Brake, motion: Motion, goal: Float64, speed: float) -> None:
         self.goal = goal
         self.speed = speed
         self._brake = brake
@@ -95,7 +96,8 @@ class Move(Behaviour):
     def target(self, step: int, elapsed: float) -> Target | None:
         self._next = self._time + elapsed
         if self._next < self._brake.duration:
-            return Target(self._brake.at(self._next), "motion", None)
+            velocity = self._brake.velocity(self._next)
+            return Target(self._brake.at(self._next), "motion", None, velocity=velocity)
         return Target(self._motion.at(self._next - self._brake.duration), "motion", "motion")
 
     def sent(self) -> None:

@@ -55,6 +55,22 @@ class Brake(Motion):
             position[self._speeds] = self._q[self._speeds] * np.maximum(0.0, 1.0 - elapsed / stop)
         return position
 
+    def velocity(self, elapsed: float) -> Float64:
+        """How fast each number changes then [D]: less than on average since the tick before."""
+        velocity = np.sign(self._velocity) * np.maximum(
+            np.abs(self._velocity) - self._deceleration * elapsed, 0.0
+        )
+        if self._speeds:
+            stop = np.maximum(self._stop[self._speeds], 1e-9)
+            velocity[self._speeds] = np.where(elapsed < stop, -self._q[self._speeds] / stop, 0.0)
+        return np.asarray(velocity)
+
+    def way(self, spacing: float, most: int) -> Float64:
+        """Positions [N, D] on the way to the stand, which ends it, `spacing` apart at most and `most` of them."""
+        farthest = np.abs(0.5 * self._velocity * self._stop).max(initial=0.0)
+        count = int(min(max(np.ceil(farthest / spacing), 1), most))
+        return np.array([self.at(self.duration * (i + 1) / count) for i in range(count)])
+
 
 class Trajectory(Motion):
     """A straight line in joint space from rest to rest, all joints in step, on a trapezoidal speed profile.

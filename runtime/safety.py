@@ -10,6 +10,7 @@ import numpy as np
 
 from runtime.collision import Collision, Collisions
 from runtime.limits import Limits
+from runtime.motion import Brake
 from runtime.safety_settings import SafetySettings, WorkspaceBox
 from runtime.types import Float64
 
@@ -24,6 +25,8 @@ __all__ = [
 ]
 
 _TOLERANCE = 1e-6
+_BOX_STEP, _BOX_POINTS = 0.005, 48  # [rad] of a way that is looked at: between them it bends by micrometres
+_COLLISION_STEP, _COLLISION_POINTS = 0.1, 4
 _MARGIN = 1.05
 
 
@@ -82,14 +85,13 @@ class SafetyFilter:
     ) -> None:
         self._settings = settings
         self._limits = limits
-        self._outside = outside  # names the arms whose end effector is outside its box
+        self._outside = outside  # names the arms whose end effector is outside its box anywhere in q [..., D]
         self._collisions = collisions
         self._angles = limits.places
         self._switching = bool(limits.binary.any())
         self._reach = limits.reach
         self._room = np.zeros((2, len(limits.lower)))  # scratch: to the upper and from the lower limit
         self._stopping = settings.acceleration * self._reach
-        self._braking = settings.brake_acceleration * self._reach
         self._top = {
             "policy": limits.velocity * settings.velocity_scale,
             # A motion is planned at its limits; the margin keeps rounding from counting as excess.
@@ -192,13 +194,22 @@ class SafetyFilter:
         return f"{self._limits.names[worst]} jumps {jump[worst]:.2f} rad, allowed {self._settings.jump:g}"
 
     def _arrival(self, action: Float64, reachable: Float64, state: RobotState, path: Path) -> str:
-        """The same of what is really sent, and of where the robot would come to a stand after it."""
+        """The same of what is really sent, and of the way on which the robot would come to a stand after it."""
         if self._outside is None and self._collisions is None:
             return ""
         velocity = (reachable - state.previous) / state.elapsed
-        stop = reachable + velocity * np.abs(velocity) / (2.0 * self._braking)
+        brake = braking(reachable, velocity, self._limits, self._settings)
         changed = reachable is not action  # an action that was not changed has been looked at already
-        return (self._place(reachable, state, path) if changed else "") or self._place(stop, state, path)
+        return (self._place(reachable, state, path) if changed else "") or self._on_way(brake, state, path)
+
+    def _on_way(self, brake: Brake, state: RobotState, path: Path) -> str:
+        """Why the robot must not be on the way that it brakes on; a box is left between points that are far apart."""
+        if self._outside is not None:
+            left = self._leaves_box(brake.way(_BOX_STEP, _BOX_POINTS), state, path)
+            if left:
+                return left
+        ends = brake.way(_COLLISION_STEP, _COLLISION_POINTS)
+        return next(filter(None, (self._collides(point, state, path) for point in ends)), "")
 
     def reachable(self, action: Float64, state: RobotState, path: Path = "policy") -> Float64:
         """The action next to `action` [D] that velocity, acceleration and joint limits allow; itself where they do."""
@@ -278,6 +289,17 @@ class SafetyFilter:
             f"{limits.names[i]} {action[i]:.4f} is outside {limits.lower[i]:g}..{limits.upper[i]:g}"
             for i in np.flatnonzero(limits.outside(action) > _TOLERANCE)
         )
+
+
+def braking(position: Float64, velocity: Float64, limits: Limits, settings: SafetySettings) -> Brake:
+    """A stop from `position` at `velocity` [D], as hard as needed to stay within the joint limits."""
+    ahead = np.where(velocity > 0, limits.upper - position, position - limits.lower)
+    needed = velocity * velocity / (2.0 * np.maximum(ahead, 1e-9))
+    softest = settings.brake_acceleration * limits.reach
+    rate = np.clip(needed, softest, np.maximum(softest, settings.acceleration * limits.reach))
+    return Brake(
+        position.copy(), velocity.copy(), rate, limits.lower, limits.upper, limits.speeds, limits.velocity
+    )
 
 
 def _usable(action: Float64, state: RobotState) -> bool:

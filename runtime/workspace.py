@@ -25,15 +25,21 @@ class Workspace:
         self._upper = np.array([boxes[name].upper for name in self.arms]).reshape(-1, 3)
 
     def __call__(self, q: Float64) -> tuple[str, ...]:
-        """The names of the arms that are outside with the joints q [D]."""
-        return tuple(name for name, out in zip(self.arms, self.outside(q), strict=True) if out)
+        """The names of the arms that are outside with any of the joints q [..., D]."""
+        outside = self.outside(q)
+        return tuple(name for index, name in enumerate(self.arms) if outside[..., index].any())
 
     def outside(self, q: Float64) -> NDArray[np.bool_]:
         """Whether each of `arms` is outside, bool [..., arms], with the joints q [..., D]."""
+        return np.asarray(self.excess(q) > 0.0)
+
+    def excess(self, q: Float64) -> Float64:
+        """How far each of `arms` is outside [..., arms], in metres along the worst axis, with the joints q [..., D]."""
         if not self._groups:
-            return np.zeros((*q.shape[:-1], 0), dtype=bool)
+            return np.zeros((*q.shape[:-1], 0))
         points = np.stack([arm.transform(q)[..., :3, 3] for arm in self._groups], axis=-2)
-        return np.asarray(((points < self._lower) | (points > self._upper)).any(axis=-1))
+        beyond: Float64 = np.maximum(self._lower - points, points - self._upper).max(axis=-1)
+        return np.maximum(beyond, 0.0)
 
     def left_on(self, way: Float64) -> str:
         """The arm that leaves its box somewhere on a `way` [T, D] in joints; "" where none does.

@@ -68,7 +68,8 @@ _KEPT = ("frozen", "stuck")
 
 
 @cache
-def _robot(name: str) -> tuple[Limits, Dims, Float64]:
+def limits_of(name: str) -> tuple[Limits, Dims, Float64]:
+    """What the robot `name` can do, which of its numbers do not blend, and where it is ready [D]."""
     robot = robots.load(name)
     plan = Plan.__new__(Plan)
     object.__setattr__(plan, "robot", robot)
@@ -81,7 +82,7 @@ class Scenario(Bench):
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
         self.name = str(self.rng.choice(sorted(robots.names())))
-        limits, dims, self.body = _robot(self.name)
+        limits, dims, self.body = limits_of(self.name)
         self.body = self.body.copy()
         super().__init__({"kind": str(self.rng.choice(["async", "naive", "ensemble"]))}, limits, dims)
         self.measured = self.body

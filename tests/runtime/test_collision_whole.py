@@ -118,9 +118,10 @@ def control(tmp_path: Path, start: Float64, **safety: Any) -> tuple[Any, Page, R
 def test_control_itself_stops_a_motion_that_nobody_has_checked(tmp_path: Path) -> None:
     start = turned(0.8)
     tick, page, sink, clock = control(tmp_path, start, collision="off")
-    page.rings["orders"].push(encode(Order(1, "motion", goal=turned(1.6))))
     position, records = start, []
-    for step in range(150):
+    for step in range(155):
+        if step == 5:  # it has been seen for long enough to be taken over
+            page.rings["orders"].push(encode(Order(1, "motion", goal=turned(1.6))))
         for process in ("main", "guard"):
             page.beat(process, clock.now())
         now = clock.now()
@@ -128,7 +129,7 @@ def test_control_itself_stops_a_motion_that_nobody_has_checked(tmp_path: Path) -
             Observation(step + 1, now, {"joints": now}, position.astype(np.float32), {}), {}
         )
         tick(step, now)
-        position = sink.sent[-1].astype(float)
+        position = sink.sent[-1].astype(float) if sink.sent else start
         records += [m for m in map(decode, page.rings["ticks"].drain()) if isinstance(m, TickDone)]
         clock.advance(1 / 30)
     assert any(record.refused for record in records)

@@ -320,7 +320,7 @@ def test_a_motion_of_ours_may_come_from_outside_its_box_and_not_go_there():
     """Where the first joint is beyond 0.05 the arm is outside."""
 
     def outside(action):
-        return ("left_arm",) if action[0] > 0.05 else ()
+        return ("left_arm",) if (action[..., 0] > 0.05).any() else ()
 
     left = judge([0.06, 1, 0.05], state(previous=(0.04, 1, 0.05)), path="motion", outside=outside)
     assert left.notes == ("left_arm would leave the workspace box",)

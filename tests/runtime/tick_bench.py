@@ -29,6 +29,7 @@ from runtime.tick import Tick, TickSettings
 from runtime.timeline import Dims
 from runtime.transports.base import Sink
 from runtime.types import Float64, Observation, RobotCommand
+from runtime.workspace import Workspace
 
 PERIOD = 1 / 30
 NO = np.zeros(2, bool)
@@ -79,9 +80,10 @@ class Bench:
         dims: Dims | None = None,
         starvation: Answer = "slow",
         seen: bool = True,
+        workspace: Workspace | None = None,
         **safety: Any,
     ) -> None:
-        self.limits = limits
+        self.limits, self.workspace = limits, workspace
         self.dim = len(limits.names)
         layout = PageLayout(self.dim, 8, ("cam",), 300)
         shared = mmap.mmap(-1, Page.size(layout))
@@ -136,7 +138,7 @@ class Bench:
     def _judged(self, action: Float64) -> tuple[str, ...]:
         """Safety looks whether a policy's action leaves the workspace: the last moment before it is sent."""
         self.before_send()
-        return ()
+        return self.workspace(action) if self.workspace else ()
 
     def observe(self, **changes: Any) -> None:
         self.sequence += 1

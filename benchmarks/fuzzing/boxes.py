@@ -1,0 +1,56 @@
+"""Policies that run about near the walls of a workspace box: no command ever has the end effector outside."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+import robots
+from benchmarks.fuzzing.encoders import limits_of
+from runtime.safety import WorkspaceBox
+from runtime.types import Float64
+from runtime.workspace import Workspace
+from tests.runtime.tick_bench import Bench
+
+_TICKS = 150
+_HALF = 0.12  # [m] of each box
+
+
+@cache
+def _walled(name: str) -> tuple[Workspace, Float64]:
+    robot = robots.load(name)
+    start = robot.poses["ready"].astype(np.float64)
+    boxes = {}
+    for arm in robot.arms:
+        here = arm.pose(start)[:3]
+        boxes[arm.name] = WorkspaceBox(lower=(here - _HALF).tolist(), upper=(here + _HALF).tolist())
+    return Workspace(robot, boxes), start
+
+
+def once(seed: int) -> list[str]:
+    """What goes wrong in the scenario of `seed`, in words; [] where nothing does."""
+    rng = np.random.default_rng(seed)
+    name = str(rng.choice(sorted(robots.names())))
+    workspace, start = _walled(name)
+    limits, dims, _ = limits_of(name)
+    strategy = str(rng.choice(["async", "naive", "ensemble"]))
+    bench = Bench({"kind": strategy}, limits, dims, workspace=workspace, jump=5.0, following_error=5.0)
+    bench.measured = start
+    bench.say("follow", run=1)
+    for tick in range(_TICKS):
+        if tick % 8 == 0:
+            here = np.array(bench.status["commanded"], np.float64) if tick else start
+            there = np.where(limits.places, here + rng.uniform(-1.0, 1.0, len(here)), here)
+            bench.chunk(tick + 1, np.linspace(here, there, int(rng.integers(8, 25))))
+        if bench.behaviour == "hold":
+            bench.say("follow", run=1)
+        if rng.random() < 0.03:
+            bench.say("hold", run=1)
+        bench.run(stretch=rng.uniform(0.6, 1.4))
+    excess = _excess(workspace, bench.sent)
+    return [f"seed {seed}: {name} {excess * 1e3:.2f} mm outside its box"] if excess > 0.0 else []
+
+
+def _excess(workspace: Workspace, commands: Float64) -> float:
+    return float(workspace.excess(commands).max(initial=0.0))
