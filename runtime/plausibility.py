@@ -22,7 +22,8 @@ _LONGEST_S = 0.05  # without a sample, after which no longer way is believed at 
 _STALL_S = 0.1  # between two looks of ours: it says nothing about the joints
 _BEYOND = 0.1  # [rad] that an arm may rest beyond its limits
 _FROZEN_S, _FROZEN_RAD = 1.0, 0.05
-_LIVELY = 5  # samples in a row that differ: an encoder whose last digits are never still
+_TURNS = 3  # times that the last digits of an encoder which is never still went there and back
+_STILL = 5  # samples that are equal, of one that is
 _SAME = 0.02  # [rad] within which two joints have exchanged their values
 _LONGEST_DOUBT_S = 2.0
 _QUIET_S = 1.0  # without a contradiction, after which the next one is a first one
@@ -88,10 +89,7 @@ class Plausibility:
         self._judged: float | None = None
         self._unseen = 0.0  # how long there has been no sample; a stall of our own counts little [s]
         self._doubt = ""
-        self._alike = np.zeros(
-            len(limits.names), np.int64
-        )  # samples in a row: > 0 that differ, < 0 that do not
-        self._lively = np.zeros(len(limits.names), bool)  # joints whose last digits are never still
+        self._digits = _Digits(len(limits.names))
         self._frozen = _Frozen(limits)
         self.dead = ""  # the joints that have read exactly 0 since they came back from somewhere else
 
@@ -136,7 +134,7 @@ class Plausibility:
             self._other = None
             return beyond
         if self._chain is not None and self._goes_on(self._chain, sample):
-            self._note_digits(sample.joints != self._chain.newest.joints)
+            self._digits.add(sample.joints - self._chain.newest.joints)
             self._chain.samples.append(sample)
             self._other = None
             return self._frozen(sample.joints, sample.captured, commanded)
@@ -167,10 +165,6 @@ class Plausibility:
             self._chain, self._other, self._before = other, None, None
             return ""
         return other.never or stuck or self._jump(sample)
-
-    def _note_digits(self, differ: np.ndarray) -> None:
-        self._alike = np.where(differ, np.maximum(self._alike, 0) + 1, np.minimum(self._alike, 0) - 1)
-        self._lively = np.where(np.abs(self._alike) >= _LIVELY, self._alike > 0, self._lively)
 
     def _contradict(self, now: float) -> None:
         """Believe less of what contradicts itself again and again."""
@@ -238,7 +232,7 @@ class Plausibility:
             return ""
         joints = np.array([sample.joints for sample in chain.samples])
         moved = np.abs(difference(joints[-1], self._chain.newest.joints, self._wrapping)) > _SAME
-        still = self._places & self._lively & moved & (np.ptp(joints, axis=0) == 0.0)
+        still = self._places & self._digits.lively & moved & (np.ptp(joints, axis=0) == 0.0)
         if not still.any():
             return ""
         worst = int(still.argmax())
@@ -271,6 +265,27 @@ class Unquestioned(Plausibility):
 
     def apart(self, held: Float64, allowed: float) -> bool:
         return self._chain is not None and self._away(self._chain.newest.joints, held) > allowed
+
+
+class _Digits:
+    """Which joints are never still, in their last digits: they went there and back, and did not come to rest since."""
+
+    def __init__(self, dim: int) -> None:
+        self._step: Float64 = np.zeros(dim)  # the last one that was any
+        self._turns = np.zeros(dim, np.int64)
+        self._still = np.zeros(dim, np.int64)
+
+    def add(self, step: Float64) -> None:
+        """The difference of two samples [D]."""
+        self._turns += step * self._step < 0.0
+        self._step = np.where(step != 0.0, step, self._step)
+        self._still = np.where(step == 0.0, self._still + 1, 0)
+        self._turns[self._still >= _STILL] = 0
+
+    @property
+    def lively(self) -> np.ndarray:
+        """Bool [D]."""
+        return np.asarray(self._turns >= _TURNS)
 
 
 class _Frozen:

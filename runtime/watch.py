@@ -20,6 +20,7 @@ from runtime.transitions import Happening, State
 SIBLINGS = ("control", "media", "guard")
 _LINK_LOST_S = 2.0
 _CONNECTED_S = 1.0
+_EARLY_S = 1e-6  # moments are sums of floats
 _LATCH_S = 0.2  # how long the e-stop's flag may be ahead of its latch on the disk
 
 
@@ -133,7 +134,7 @@ class Watch:
 
     def _end_of(self, run: Run) -> Iterator[Noticed]:
         limit = run.duration_s
-        if limit is not None and run.elapsed(self._clock.now()) >= limit:
+        if limit is not None and run.elapsed(self._clock.now()) >= limit - _EARLY_S:
             yield Noticed(Happening.RUN_ENDED, f"the run's {limit:g} s are over")
             return
         record: np.void = self._page.observation.read()

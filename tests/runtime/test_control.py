@@ -121,15 +121,17 @@ def test_the_tick_of_a_deployment_keeps_its_arms_in_their_boxes(
     page.set_estop(EStop.CLEAR)
     clock, sink = VirtualClock(10.0), RecordingSink()
     tick = make_tick(plan, page, sink, clock.now)
-    for process in ("main", "guard"):
-        page.beat(process, clock.now())
-    page.publish_observation(
-        plan.transport.source(None, None, clock).receive(0.0), dict.fromkeys(plan.cameras, 1)
-    )
-    page.rings["orders"].push(encode(Order(1, "follow", run=1)))
-    page.rings["orders"].push(encode(PostedChunk(1, 1, 0, np.tile(STANDS, (5, 1)))))
-    tick(0, clock.now())
-    record = next(m for m in map(decode, page.rings["ticks"].drain()) if isinstance(m, TickDone))
+    source = plan.transport.source(None, None, clock)
+    for step in range(5):  # until the joints are believed
+        if step == 4:
+            page.rings["orders"].push(encode(Order(1, "follow", run=1)))
+            page.rings["orders"].push(encode(PostedChunk(1, 1, 4, np.tile(STANDS, (5, 1)))))
+        for process in ("main", "guard"):
+            page.beat(process, clock.now())
+        page.publish_observation(source.receive(0.0), dict.fromkeys(plan.cameras, 1))
+        tick(step, clock.now())
+        clock.advance(1 / 30)
+    *_, record = (m for m in map(decode, page.rings["ticks"].drain()) if isinstance(m, TickDone))
     assert record.refused is refused
     assert [note for note in record.notes if "box" in note] == (
         ["left_arm would leave the workspace box"] if refused else []

@@ -43,7 +43,7 @@ def test_an_arm_that_was_moved_while_ready_makes_the_station_idle_and_stays_wher
     moved = STANDS.copy()
     moved[0] += 0.9
     station.robot.position = moved
-    station.go(5)
+    station.go(10)
     assert station.state is State.IDLE
     assert "0.8" in station.reason
     assert "from where it was told to hold" in station.reason

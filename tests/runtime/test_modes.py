@@ -543,9 +543,10 @@ def test_an_arm_that_was_moved_while_a_person_looks_holds_the_run(tmp_path: Path
     station.go(30)
     station.robot.blocked = True
     station.robot.position = station.robot.position + np.eye(14)[0]
-    station.go(5)
+    station.go(10)
     assert station.state is State.HOLDING
-    assert "from where it was told to hold" in station.reason
+    assert "faster than it moves" in station.reason
+    assert "from where it was told to hold" in station.events("displaced")[0]
     assert station.main.inference.proposal is None
     if station.robot.commands:
         assert np.allclose(station.robot.sent[-1], station.robot.position, atol=1e-6)
