@@ -77,7 +77,8 @@ class Actuator(ABC):
         self._stepped: tuple[str, ...] = ()  # why the next command begins elsewhere than the last one ended
         self.engaged = False
         self.commanded: Float64 = np.zeros(dim)
-        self.velocity: Float64 = np.zeros(dim)
+        self.velocity: Float64 = np.zeros(dim)  # mean, of the last tick
+        self._ends: Float64 | None = None  # at its end, where that is another
 
     @abstractmethod
     def state(self, seen: Seen, planned: float, aim: Float64 | None) -> RobotState:
@@ -98,8 +99,12 @@ class Actuator(ABC):
         if self._settings.guarded:
             measured = np.clip(measured, limits.lower, limits.upper)
         self.commanded = measured
-        self.velocity = np.zeros(len(measured))
+        self.rest_here()
         self.engaged = True
+
+    def rest_here(self) -> None:
+        """Count the last command as one at rest."""
+        self.velocity, self._ends = np.zeros(len(self.commanded)), None
 
     def step_to(self, measured: Float64, why: str, farthest: Float64 | float = np.inf) -> None:
         """Count from where the robot is, and not from where it was told to be, at most `farthest` [D] from there.
@@ -131,7 +136,8 @@ class Actuator(ABC):
 
     def brake(self) -> Brake:
         """A stop from the last commanded velocity, as hard as needed to stay within the joint limits."""
-        return braking(self.commanded, self.velocity, self._settings.limits, self._settings.safety)
+        velocity = self.velocity if self._ends is None else self._ends
+        return braking(self.commanded, velocity, self._settings.limits, self._settings.safety)
 
     def send(
         self, step: int, planned: float, target: Target, action: Float64, notes: tuple[str, ...] = ()
@@ -149,10 +155,11 @@ class Actuator(ABC):
         action, corrected = self._checked(action, elapsed, stop)
         time = self._deliver(step, action)
         self.velocity = (action - self.commanded) / elapsed
-        if target.velocity is not None:
-            self.velocity = np.where(action == target.action, target.velocity, self.velocity)
         if self._switching:
             self.velocity[self._settings.limits.binary] = 0.0
+        self._ends = None
+        if target.velocity is not None:  # to brake anew from the mean would brake farther than was looked at
+            self._ends = np.where(action == target.action, target.velocity, self.velocity)
         self.commanded = action
         notes, self._stepped = (*self._stepped, *notes, *corrected), ()
         return Sent(time, target, action, notes, corrected="; ".join(corrected))

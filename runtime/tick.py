@@ -276,7 +276,7 @@ class Tick:
             # Before it was ever engaged nothing is known to send, until the robot has been measured.
             commanded = self._settings.limits.standing(self._actuator.commanded.copy())
             stopped = EStopped(commanded if self._actuator.engaged else None, self._actuator.rest)
-            self._actuator.velocity = np.zeros_like(commanded)
+            self._actuator.rest_here()
             # Or a gripper that is on its way to its lock would go on after the release.
             self._lock(np.full(len(self._locks.on), np.nan))
             self._robot.behaviour, self._simulated = stopped, None

@@ -270,7 +270,7 @@ class Machine(RuleBasedStateMachine):
         sent = new[-1].action.astype(np.float64)
         before = station.robot.commands[told - 1].action.astype(np.float64) if told else measured
         arms = ~self.limits.grippers
-        if stepped or not told:  # it is held where it is found, and the record says so
+        if stepped:  # it is held where it is found, and the record says so
             inside = np.clip(measured, self.limits.lower, self.limits.upper)
             nearer = np.abs(sent - inside) <= np.abs(before - inside) + 1e-6
             assert nearer[arms].all()
