@@ -17,6 +17,7 @@ _BENCHMARKS = (
     "recording",
     "replay",
     "results",
+    "soak",
     "strategies",
     "wires",
 )
@@ -33,6 +34,7 @@ def main() -> int:
         "--json", nargs="?", const="-", metavar="FILE", help="without FILE: print it in place of the table"
     )
     parser.add_argument("--seconds", type=float, help="of measurement per case")
+    parser.add_argument("--minutes", type=float, help="the same in minutes")
     parser.add_argument(
         "--set",
         action="append",
@@ -49,8 +51,10 @@ def main() -> int:
         parser.error(f"--set is for {' and '.join(_SETTABLE)}")
     if given.long and given.name not in _LONG:
         parser.error(f"--long is for {' and '.join(_LONG)}")
+    if given.seconds and given.minutes:
+        parser.error("--seconds and --minutes say the same: give one of them")
     module = importlib.import_module(f"benchmarks.{given.name}")
-    seconds = given.seconds or getattr(module, "SECONDS", _SECONDS)
+    seconds = given.seconds or 60.0 * (given.minutes or 0.0) or getattr(module, "SECONDS", _SECONDS)
     options = {"long": True} if given.long else {}
     report = module.measure(seconds, *([given.assignments] if given.assignments else []), **options)
     print(report.json() if given.json == "-" else report.table())

@@ -164,6 +164,15 @@ class SetUp:
             doubt = bytes(status["doubt"]).decode(errors="ignore")
             raise SetupError(doubt or "control has not seen the joints yet")
 
+    def _name_zeros(self) -> None:
+        """From the first samples on a dead encoder looks like a joint that stands at 0: the operator knows."""
+        limits = self._plan.limits
+        joints = self._page.observation.read()["qpos"]
+        zero = [limits.names[i] for i in np.flatnonzero(limits.places & (joints == 0.0))]
+        if zero and self._plan.capabilities.moves_robot:
+            text = f"{', '.join(zero)} read exactly 0 rad: look whether the robot stands so, or an encoder is dead"
+            self._inference.notes.append(Event("zero_joints", text, self._clock.now()))
+
     def _check_drives(self) -> None:
         drives = self._media().drives
         if self._plan.capabilities.moves_robot and drives.get("enabled") is False:
@@ -192,6 +201,7 @@ class SetUp:
             waited = f"within {settings.observation_timeout_s:g} s: {error}"
             missing = "ready drives" if isinstance(error, DrivesDisabledError) else "complete observation"
             raise SetupError(f"no {missing} {waited}") from None
+        self._name_zeros()
         if settings.home and self._plan.capabilities.moves_robot:
             self._go_home()
             return False

@@ -2,8 +2,8 @@
 
 import { verb, words } from "./words.js";
 
-const BAD = new Set(["estopped", "family_died", "policy_failed", "policy_lost", "recording_failed", "source_failed", "video_lost", "displaced", "moved_away", "too_far", "node_silent", "leader_lost"]);
-const WARN = new Set(["camera_absent", "camera_ended", "camera_is_a_video", "camera_lost", "commands_unheard", "refused", "word_refused", "tune_refused", "lock_refused", "refusals", "starved", "starvation", "limited", "near", "far_start", "pictures_stopped", "chunk_dropped", "ik_unreached", "not_journalled", "unmeasured", "unreadable", "rtc_warning", "late_ticks", "scheduling", "episode_short"]);
+const BAD = new Set(["estopped", "family_died", "policy_failed", "policy_lost", "recording_failed", "source_failed", "video_lost", "displaced", "moved_away", "implausible", "corrected", "too_far", "node_silent", "leader_lost"]);
+const WARN = new Set(["camera_absent", "camera_ended", "camera_is_a_video", "camera_lost", "commands_unheard", "refused", "word_refused", "tune_refused", "lock_refused", "refusals", "starved", "starvation", "limited", "near", "far_start", "pictures_stopped", "chunk_dropped", "ik_unreached", "not_journalled", "unmeasured", "zero_joints", "unreadable", "rtc_warning", "late_ticks", "scheduling", "episode_short"]);
 const GOOD = new Set(["camera_back", "commands_heard", "pictures_back", "policy_back", "recovered", "punctual", "released"]); // a trouble is over
 const NAMES = {
   camera_absent: "camera absent",
@@ -16,6 +16,7 @@ const NAMES = {
   chunk_dropped: "chunk not used",
   collect_armed: "armed",
   collect_disarmed: "disarmed",
+  corrected: "last check",
   displaced: "arm was moved",
   episode_closed: "recording ended",
   episode_opened: "recording",
@@ -23,6 +24,7 @@ const NAMES = {
   estopped: "e-stop",
   family_died: "process ended",
   far_start: "far from robot",
+  implausible: "encoders",
   ik_unreached: "out of reach",
   leader_lost: "leader lost",
   late_ticks: "control late",
@@ -62,6 +64,7 @@ const NAMES = {
   unreadable: "not understood",
   video_lost: "video lost",
   word_refused: "robot refused",
+  zero_joints: "joints at 0",
 };
 const UUID = /\b([0-9a-f]{8})-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b/g; // its beginning is enough to read
 const HOLDER = /\bweb:([^\s:]+):([A-Za-z0-9_-]{1,4})[A-Za-z0-9_-]*/g; // a page of a person

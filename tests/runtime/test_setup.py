@@ -149,6 +149,31 @@ def test_a_node_that_falls_silent_while_it_homes_stops_the_motion(tmp_path: Path
     station.close()
 
 
+def test_joints_that_read_exactly_0_are_named_before_anything_moves(tmp_path: Path) -> None:
+    standing = STANDS.copy()
+    standing[[3, 12]] = 0.0
+    station = Station(plan(tmp_path, start=standing)).ready()
+    (named,) = station.events("zero_joints")
+    zero = np.flatnonzero(station.plan.limits.places & (standing == 0.0))
+    assert named.startswith(", ".join(station.plan.limits.names[i] for i in zero) + " read exactly 0 rad")
+    station.close()
+
+
+def test_a_set_up_waits_until_the_joints_are_believed(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, setup={"observation_timeout_s": 1.0}))
+    station.reach(State.IDLE)
+    noise = np.random.default_rng(1)
+    station.robot.blocked = True
+    station.command("setup")
+    for _ in range(60):
+        station.robot.position = STANDS + noise.normal(0.0, 0.6, len(STANDS)) * station.plan.limits.places
+        station.go(1)
+    assert station.state is State.IDLE
+    assert "no complete observation within 1 s: " in station.reason
+    assert station.robot.commands == []
+    station.close()
+
+
 def test_a_motion_that_control_never_finishes_ends_it(tmp_path: Path) -> None:
     station = Station(plan(tmp_path, setup={"home": True}))
     station.reach(State.IDLE)
