@@ -14,7 +14,17 @@ from evaweb.jobs.models import Job, JobStatus
 class JobAdmin(admin.ModelAdmin):
     """Rows are written by services alone."""
 
-    list_display = ("key", "status", "attempts", "queue", "created_at", "finished_at", "progress", "error")
+    list_display = (
+        "key",
+        "status",
+        "attempts",
+        "deaths",
+        "queue",
+        "created_at",
+        "finished_at",
+        "progress",
+        "error",
+    )
     list_filter = ("status", "kind", "queue")
     search_fields = ("key", "error")
     actions = ("try_again",)

@@ -16,7 +16,7 @@ class Work:
     """One job as its kind sees it: what is asked for, and how to say how far it is."""
 
     args: Args
-    tell: Callable[[str], None]  # at most 160 characters
+    tell: Callable[[str], None]  # at most 160 characters; raises TakenOver
 
 
 Kind = Callable[[Work], Args]
@@ -25,6 +25,10 @@ Chore = Callable[[], object]
 _kinds: dict[str, Kind] = {}
 _chores: dict[str, Chore] = {}
 _starts: dict[str, Chore] = {}
+
+
+class TakenOver(Exception):
+    """Another worker has the job now: what is under way ends here, and nothing more is written."""
 
 
 class UnknownKind(EvaError):

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from datetime import datetime
 
 from django.db.models import Exists, OuterRef, Q, QuerySet
+from django.db.models.functions import Now
 
 from evaweb.errors import NotFound
 from evaweb.jobs.models import Job, JobStatus
 
 
-def jobs_ready(*, queues: Collection[str], now: datetime) -> QuerySet[Job]:
+def jobs_ready(*, queues: Collection[str]) -> QuerySet[Job]:
     """Those that may be claimed, oldest first; one whose key is being worked on waits for that."""
     same_running = Job.objects.filter(key=OuterRef("key"), status=JobStatus.RUNNING)
     return (
         Job.objects.filter(status=JobStatus.QUEUED, queue__in=queues)
-        .filter(Q(not_before=None) | Q(not_before__lte=now))
+        .filter(Q(not_before=None) | Q(not_before__lte=Now()))
         .exclude(Exists(same_running))
         .order_by("created_at", "pk")
     )

@@ -1,26 +1,30 @@
-"""Jobs: asked for, claimed, done, tried again, swept. The row is the truth; whoever updates it first has it."""
+"""Jobs: asked for, claimed, done, tried again, swept. The row is the truth; whoever updates it first has it.
+
+Who has it is a process, by a uuid of its own. Times are the database's, in the statements that write and compare them:
+no clock of a worker decides about another one.
+"""
 
 from __future__ import annotations
 
 import logging
-import os
-import socket
 import threading
-import uuid
 from collections.abc import Callable
-from datetime import datetime, timedelta
+from contextlib import ExitStack
+from datetime import timedelta
 from functools import partial
 from typing import Any
+from uuid import UUID, uuid4
 
 from django.conf import settings
 from django.db import IntegrityError, transaction
-from django.db.models import F, QuerySet
-from django.utils import timezone
+from django.db.models import QuerySet
+from django.db.models.functions import Now
 
 from evaweb.errors import Conflict
 from evaweb.jobs import doorbell
 from evaweb.jobs.heartbeat import Heartbeat
-from evaweb.jobs.kinds import Args, Work, kind_named
+from evaweb.jobs.kinds import Args, TakenOver, Work, kind_named
+from evaweb.jobs.locks import Worker, alone, worker_of
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.patience import patiently
 from evaweb.jobs.selectors import jobs_ready
@@ -29,6 +33,9 @@ log = logging.getLogger(__name__)
 
 RETRY_AFTER_S = (2.0, 10.0, 60.0)
 MOST_ATTEMPTS = len(RETRY_AFTER_S) + 1
+MOST_DEATHS = 8  # of workers over one job, which is no fault of its own most of the time
+_AGAIN_S = 5.0  # after which a job is looked at again that another process is still at
+OWNER = uuid4()  # this process
 
 _busy = threading.Lock()
 _ending = threading.Event()
@@ -52,7 +59,7 @@ def enqueue(*, kind: str, key: str, args: Args, queue: str = "lab") -> Job:
 def _waiting(kind: str, key: str, args: Args, queue: str) -> Job:
     for _ in range(3):
         asked = Job.objects.filter(key=key, status=JobStatus.QUEUED)
-        if asked.update(kind=kind, args=dict(args), queue=queue, not_before=None, attempts=0):
+        if asked.update(kind=kind, args=dict(args), queue=queue, not_before=None, attempts=0, deaths=0):
             found = asked.first()
             if found is not None:
                 return found
@@ -76,17 +83,15 @@ def try_again(*, job: Job) -> Job:
 # --- working -------------------------------------------------------------------------------------------------
 
 
-def claim(*, queue: str, worker: str) -> Job | None:
+def claim(*, queue: str, owner: UUID) -> Job | None:
     """Take the oldest job that is ready, None where there is none; of two workers one gets it."""
-    while (found := jobs_ready(queues=[queue], now=timezone.now()).first()) is not None:
-        now = timezone.now()
+    while (found := jobs_ready(queues=[queue]).first()) is not None:
         taken = Job.objects.filter(pk=found.pk, status=JobStatus.QUEUED).update(
             status=JobStatus.RUNNING,
-            claimed_by=worker,
-            claimed_at=now,
-            seen_at=now,
+            owner=owner,
+            claimed_at=Now(),
+            seen_at=Now(),
             finished_at=None,
-            attempts=F("attempts") + 1,
             progress="",
         )
         if taken:
@@ -100,7 +105,7 @@ def work(queue: str) -> int:
         return 0
     try:
         done = 0
-        while not _ending.is_set() and (job := patiently(lambda: _claim_one(queue))) is not None:
+        while not _ending.is_set() and (job := patiently(partial(claim, queue=queue, owner=OWNER))):
             _perform(job)
             done += 1
         return done
@@ -108,122 +113,120 @@ def work(queue: str) -> int:
         _busy.release()
 
 
-def _claim_one(queue: str) -> Job | None:
-    return claim(queue=queue, worker=f"{socket.gethostname()}:{os.getpid()}:{uuid.uuid4().hex[:12]}")
-
-
 def _perform(job: Job) -> None:
-    log.info("job %s begins, attempt %d", job.key, job.attempts)
-    try:
-        with Heartbeat(partial(seen, job=job), settings.EVA_JOB_STALE_S / 6):
-            result = kind_named(job.kind)(Work(job.args, _teller(job)))
-    except Exception as error:  # whatever a job raises is its own, never the worker's
-        log.warning("job %s failed, attempt %d: %s", job.key, job.attempts, error, exc_info=True)
-        reason = str(error) or type(error).__name__
-        patiently(lambda: job_failed(job=job, error=reason))
-    else:
-        if patiently(lambda: job_done(job=job, result=result)):
-            log.info("job %s is done: %s", job.key, dict(result))
+    """Do it and write down what came of it, while nobody else on this disk does the same."""
+    log.info("job %s begins after %d errors and %d deaths", job.key, job.attempts, job.deaths)
+    with ExitStack() as stack:
+        ended: Callable[[], object]
+        try:
+            if stack.enter_context(alone(job.key, job.owner)):
+                ended = partial(job_done, job=job, result=_result_of(job))
+            else:
+                ended = partial(job_postponed, job=job)
+        except TakenOver as taken:
+            log.warning("%s", taken)
+            return
+        except Exception as error:  # whatever a job raises is its own, never the worker's
+            log.warning("job %s failed: %s", job.key, error, exc_info=True)
+            ended = partial(job_failed, job=job, error=str(error) or type(error).__name__)
+        patiently(ended)
 
 
-def _teller(job: Job) -> Callable[[str], None]:
-    def tell(progress: str) -> None:
-        patiently(lambda: _ours(job).update(progress=progress[:160], seen_at=timezone.now()))
+def _result_of(job: Job) -> Args:
+    with Heartbeat(partial(seen, job=job), settings.EVA_JOB_STALE_S / 6):
+        return kind_named(job.kind)(Work(job.args, partial(_tell, job)))
 
-    return tell
+
+def _tell(job: Job, progress: str) -> None:
+    if not patiently(lambda: _ours(job).update(progress=progress[:160], seen_at=Now())):
+        raise TakenOver(f"job {job.key} was taken from {job.owner}, which goes no further with it")
 
 
 def seen(*, job: Job) -> bool:
     """A sign of life; False where the job is not this claim's any more."""
-    return bool(_ours(job).update(seen_at=timezone.now()))
+    return bool(_ours(job).update(seen_at=Now()))
 
 
 def job_done(*, job: Job, result: Args) -> bool:
     """Keep the result; False where the job was swept meanwhile, and whoever has it now says how it ends."""
-    return _finish(job, status=JobStatus.DONE, result=dict(result), error="", progress="")
+    done = _finish(job, status=JobStatus.DONE, result=dict(result), error="", progress="")
+    if done:
+        log.info("job %s is done: %s", job.key, dict(result))
+    return done
 
 
-@transaction.atomic
 def job_failed(*, job: Job, error: str) -> bool:
     """Keep the error and let the job wait for its next attempt, or fail for good after the last one."""
-    if job.attempts >= MOST_ATTEMPTS or _asked_anew(job):
-        return _finish(job, status=JobStatus.FAILED, error=error)
-    again = timezone.now() + timedelta(seconds=RETRY_AFTER_S[job.attempts - 1])
-    return bool(_ours(job).update(status=JobStatus.QUEUED, error=error, not_before=again, claimed_by=""))
+    attempts = job.attempts + 1
+    if attempts >= MOST_ATTEMPTS:
+        return _finish(job, status=JobStatus.FAILED, attempts=attempts, error=error)
+    again = Now() + timedelta(seconds=RETRY_AFTER_S[attempts - 1])
+    return _waits(_ours(job), attempts=attempts, error=error, not_before=again)
+
+
+def job_postponed(*, job: Job) -> bool:
+    """Look at it again in a few seconds: the process that it was taken from has not ended yet."""
+    why = "the worker that had it before is still at it: it is waited for; end that one if it hangs"
+    log.warning("job %s: %s", job.key, why)
+    return _waits(_ours(job), progress=why, not_before=Now() + timedelta(seconds=_AGAIN_S))
 
 
 def _finish(job: Job, **facts: Any) -> bool:
-    finished = bool(_ours(job).update(finished_at=timezone.now(), **facts))
+    finished = bool(_ours(job).update(finished_at=Now(), **facts))
     if not finished:
-        log.warning("job %s was taken from %s: what it found is dropped", job.key, job.claimed_by)
+        log.warning("job %s was taken from %s: what it found is dropped", job.key, job.owner)
     return finished
 
 
 def _ours(job: Job) -> QuerySet[Job]:
     """The row as long as it is this claim's."""
-    return Job.objects.filter(pk=job.pk, status=JobStatus.RUNNING, claimed_by=job.claimed_by)
+    return Job.objects.filter(pk=job.pk, status=JobStatus.RUNNING, owner=job.owner)
 
 
-def _asked_anew(job: Job) -> bool:
-    return Job.objects.filter(key=job.key, status=JobStatus.QUEUED).exists()
+def _waits(row: QuerySet[Job], **facts: Any) -> bool:
+    """Let it wait again; where a newer one of its key waits already, that one is done instead."""
+    try:
+        with transaction.atomic():
+            return bool(row.update(status=JobStatus.QUEUED, owner=None, **facts))
+    except IntegrityError:
+        newer = {"error": "given up for a newer one of the same key", **facts, "not_before": None}
+        return bool(row.update(status=JobStatus.FAILED, finished_at=Now(), **newer))
 
 
 # --- what is left behind -------------------------------------------------------------------------------------
 
 
-def sweep(*, now: datetime | None = None) -> int:
-    """Take jobs back from workers that show no sign of life; how many. Any process may do it at any time.
+def sweep() -> int:
+    """Take jobs back from workers that have ended or show no sign of life; how many. Any process may do it at any time.
 
-    A worker of this machine whose process is gone is not waited for.
+    One that is known to be at work keeps its job; one that is known to have ended is not waited for.
     """
-    before = (now or timezone.now()) - timedelta(seconds=settings.EVA_JOB_STALE_S)
-    running = Job.objects.filter(status=JobStatus.RUNNING)
-    taken = sum(
-        _take_back(job, _ours(job).filter(seen_at__lt=before)) for job in running.filter(seen_at__lt=before)
-    )
-    here = running.filter(claimed_by__startswith=f"{socket.gethostname()}:")
-    return taken + sum(_take_back(job, _ours(job)) for job in here if _worker_is_gone(job))
+    return sum(_take_back(job) for job in Job.objects.filter(status=JobStatus.RUNNING))
 
 
-def _worker_is_gone(job: Job) -> bool:
-    """Whether the process on this machine that claimed the job has ended."""
-    process = job.claimed_by.rsplit(":", 2)[1]
-    try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return True
-    except (PermissionError, ValueError):  # somebody else's process, or a claim that names none
+def _take_back(job: Job) -> bool:
+    worker, row = worker_of(job.key, job.owner), _ours(job)
+    if worker is Worker.UNKNOWN:
+        row = row.filter(seen_at__lt=Now() - timedelta(seconds=settings.EVA_JOB_STALE_S))
+    if worker is Worker.ALIVE or not row.exists():
         return False
-    return False
-
-
-@transaction.atomic
-def _take_back(job: Job, row: QuerySet[Job]) -> int:
-    silence = f"its worker {job.claimed_by} went silent in attempt {job.attempts}"
-    if job.attempts >= MOST_ATTEMPTS or _asked_anew(job):
-        return row.update(status=JobStatus.FAILED, error=silence, finished_at=timezone.now())
+    deaths = job.deaths + 1
+    silence = f"its worker {job.owner} ended or went silent, which is number {deaths} of {MOST_DEATHS}"
+    if deaths >= MOST_DEATHS:
+        hint = "the worker's log says what ended them; then try it again"
+        facts = {"status": JobStatus.FAILED, "finished_at": Now(), "error": f"{silence}: {hint}"}
+        return bool(row.update(deaths=deaths, **facts))
     log.warning("job %s is taken back: %s", job.key, silence)
-    return row.update(status=JobStatus.QUEUED, error=silence, not_before=None, claimed_by="")
+    wait = (0.0, *RETRY_AFTER_S)[min(deaths - 1, len(RETRY_AFTER_S))]  # others have their turn meanwhile
+    return _waits(row, deaths=deaths, error=silence, not_before=Now() + timedelta(seconds=wait))
 
 
-def put_back(*, worker_prefix: str) -> int:
-    """Let the jobs of a process that is about to end wait for another one; the attempt does not count."""
-    count = 0
-    for job in Job.objects.filter(status=JobStatus.RUNNING, claimed_by__startswith=worker_prefix):
-        with transaction.atomic():
-            if _asked_anew(job):
-                facts = {"status": JobStatus.FAILED, "error": "given up for a newer one of the same key"}
-            else:
-                facts = {"status": JobStatus.QUEUED, "claimed_by": "", "attempts": job.attempts - 1}
-            count += _ours(job).update(**facts)
-    return count
+def put_back(*, owner: UUID) -> int:
+    """Let the jobs of a process that is about to end wait for another one; that is no death."""
+    mine = Job.objects.filter(status=JobStatus.RUNNING, owner=owner)
+    return sum(_waits(_ours(job)) for job in mine)
 
 
 def end_work() -> None:
     """Claim nothing any more in this process; what is being done goes on."""
     _ending.set()
-
-
-def own_prefix() -> str:
-    """How the claims of this process begin."""
-    return f"{socket.gethostname()}:{os.getpid()}:"

@@ -36,7 +36,7 @@ def run(queues: Sequence[str], *, lifeline: bool) -> None:
         threading.Thread(target=_watch_input, name="lifeline", daemon=True).start()
     looking = threading.Thread(target=_look, args=(queues, ending), name="looking")
     looking.start()
-    log.info("working on %s in %s", ", ".join(queues), settings.DATA_DIR)
+    log.info("worker %s works on %s in %s", services.OWNER, ", ".join(queues), settings.DATA_DIR)
     while not ending.is_set():
         _answer_doorbell(queues)
         if not ending.is_set():
@@ -66,7 +66,7 @@ def _put_back_later() -> None:
     """End the process at the end of its grace; every kind of job can be ended at any moment and done again."""
     threading.Event().wait(settings.EVA_WORKER_GRACE_S)
     try:
-        count = patiently(lambda: services.put_back(worker_prefix=services.own_prefix()))
+        count = patiently(lambda: services.put_back(owner=services.OWNER))
         log.warning("not done within %g s of grace: %d put back", settings.EVA_WORKER_GRACE_S, count)
     finally:
         os._exit(0)  # the row tells the rest: a job that is not put back is swept
@@ -84,7 +84,7 @@ def _answer_doorbell(queues: Sequence[str]) -> None:
         pool="solo",
         concurrency=1,
         queues=list(queues),
-        hostname=f"eva-{os.getpid()}@%h",
+        hostname=f"eva-{services.OWNER}@%h",
         without_gossip=True,
         without_mingle=True,
         without_heartbeat=True,

@@ -244,7 +244,7 @@ def test_a_worker_killed_while_publishing_leaves_a_dataset_that_the_next_one_com
     assert jobs.sweep() == 1
     assert jobs.work("lab") == 1
     job.refresh_from_db()
-    assert (job.status, job.attempts, job.result["index"]) == (JobStatus.DONE, 2, 1)
+    assert (job.status, job.attempts, job.result["index"]) == (JobStatus.DONE, 0, 1)
     assert check(root) == []
     assert successes(data, "rollouts-agilex_piper") == [False, True]
     assert not (root / FOLDER).exists()

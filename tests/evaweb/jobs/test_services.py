@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import socket
-import subprocess
 from datetime import timedelta
+from uuid import uuid4
 
 import pytest
 from django.db import OperationalError
+from django.db.models.functions import Now
 from django.utils import timezone
 
-from evaweb.jobs import patience, services
+from evaweb.jobs import locks, patience, services
 from evaweb.jobs.kinds import UnknownKind, Work
+from evaweb.jobs.locks import alone
 from evaweb.jobs.models import Job, JobStatus
 from tests.evaweb.jobs.conftest import Toy
 
@@ -25,18 +25,29 @@ def enqueue(**args: object) -> Job:
 
 def silent(job: Job, seconds: float = 120.0) -> None:
     """Make the job look as if its worker had last been seen so long ago."""
-    Job.objects.filter(pk=job.pk).update(seen_at=timezone.now() - timedelta(seconds=seconds))
+    Job.objects.filter(pk=job.pk).update(seen_at=Now() - timedelta(seconds=seconds))
 
 
 def due(job: Job) -> None:
     Job.objects.filter(pk=job.pk).update(not_before=None)
 
 
+def claim() -> Job:
+    """The oldest job, as a worker gets it that never says anything again."""
+    claimed = services.claim(queue="lab", owner=uuid4())
+    assert claimed is not None
+    return claimed
+
+
+def break_down(work: Work) -> dict[str, object]:
+    raise ValueError("rows.arrow is damaged")
+
+
 def test_a_job_is_done_and_keeps_its_result(toy: Toy) -> None:
     job = enqueue(a=1)
     assert services.work("lab") == 1
     job.refresh_from_db()
-    assert (job.status, job.result, job.attempts) == (JobStatus.DONE, {"seen": {"a": 1}}, 1)
+    assert (job.status, job.result, job.attempts) == (JobStatus.DONE, {"seen": {"a": 1}}, 0)
     assert job.finished_at is not None
     assert services.work("lab") == 0
 
@@ -59,7 +70,7 @@ def test_what_is_asked_for_while_the_same_is_being_done_is_done_once_more_afterw
     def ask_again(work: Work) -> dict[str, object]:
         if work.args["a"] == 1:
             enqueue(a=2)
-            assert services.claim(queue="lab", worker="other") is None, "two of one key at once"
+            assert services.claim(queue="lab", owner=uuid4()) is None, "two of one key at once"
         return {}
 
     toy.does = ask_again
@@ -69,9 +80,8 @@ def test_what_is_asked_for_while_the_same_is_being_done_is_done_once_more_afterw
 
 def test_of_two_workers_one_gets_the_job(toy: Toy) -> None:
     enqueue()
-    first = services.claim(queue="lab", worker="one")
-    assert first is not None
-    assert services.claim(queue="lab", worker="two") is None
+    claim()
+    assert services.claim(queue="lab", owner=uuid4()) is None
 
 
 def test_another_queue_is_left_alone(toy: Toy) -> None:
@@ -85,9 +95,6 @@ def test_a_kind_that_nobody_knows_is_refused_when_it_is_asked_for(toy: Toy) -> N
 
 
 def test_an_error_is_kept_and_tried_again_later_until_the_last_attempt(toy: Toy) -> None:
-    def break_down(work: Work) -> dict[str, object]:
-        raise ValueError("rows.arrow is damaged")
-
     toy.does = break_down
     job = enqueue()
     for attempt in range(1, services.MOST_ATTEMPTS):
@@ -105,52 +112,131 @@ def test_an_error_is_kept_and_tried_again_later_until_the_last_attempt(toy: Toy)
     assert services.work("lab") == 1
 
 
-def test_a_killed_worker_is_swept_and_its_job_done_once_by_another(toy: Toy) -> None:
+def test_a_silent_worker_is_swept_and_its_job_done_once_by_another(toy: Toy) -> None:
     job = enqueue()
-    dead = services.claim(queue="lab", worker="dead")
+    silenced = claim()
     assert services.sweep() == 0, "it was seen just now"
     silent(job)
     assert services.sweep() == 1
     assert services.sweep() == 0
     assert services.work("lab") == 1
     job.refresh_from_db()
-    assert (job.status, job.attempts) == (JobStatus.DONE, 2)
-    assert dead is not None
-    assert services.job_done(job=dead, result={"late": True}) is False
+    assert (job.status, job.attempts, job.deaths) == (JobStatus.DONE, 0, 1)
+    assert services.job_done(job=silenced, result={"late": True}) is False
     job.refresh_from_db()
     assert job.result == {"seen": {}}, "who was thought dead must not change what the other one found"
 
 
-def test_a_worker_of_this_machine_that_has_ended_is_not_waited_for(toy: Toy) -> None:
+@pytest.mark.parametrize("seconds", [-86400.0, 61.0, 86400.0])
+def test_the_clocks_of_workers_decide_nothing(
+    toy: Toy, monkeypatch: pytest.MonkeyPatch, seconds: float
+) -> None:
+    toy.does = break_down
+    enqueue()
+    services.work("lab")
+    now = timezone.now()
+    off = now + timedelta(seconds=seconds)
+    monkeypatch.setattr(timezone, "now", lambda: off)
+    assert services.claim(queue="lab", owner=uuid4()) is None, "it waits before it is tried again"
+    Job.objects.update(not_before=None)
+    job = claim()
+    assert services.sweep() == 0, "it was seen just now"
+    assert abs(job.seen_at - now) < timedelta(seconds=30)
+    assert services.seen(job=job)
+    assert services.job_done(job=job, result={})
+    job.refresh_from_db()
+    assert job.finished_at - job.created_at < timedelta(seconds=30)
+
+
+def test_a_worker_that_has_ended_is_not_waited_for_where_that_is_certain(toy: Toy) -> None:
     job = enqueue()
-    ended = subprocess.Popen(["true"])
-    ended.wait()
-    here = socket.gethostname()
-    services.claim(queue="lab", worker=f"{here}:{os.getpid()}:alive")
-    assert services.sweep() == 0, "it is at work"
-    Job.objects.filter(pk=job.pk).update(claimed_by=f"elsewhere-than-{here}:{ended.pid}:abc")
-    assert services.sweep() == 0, "of another machine only its silence is known"
-    Job.objects.filter(pk=job.pk).update(claimed_by=f"{here}:{ended.pid}:abc")
+    claimed = claim()
+    with alone(job.key, claimed.owner):
+        silent(job)
+        assert services.sweep() == 0, "it is at work, whatever its signs of life"
+        left = locks._path(job.key).read_bytes()
+    Job.objects.update(seen_at=Now())
+    assert services.sweep() == 0, "it has let go: its signs of life tell"
+    locks._path(job.key).write_bytes(left.replace(str(claimed.owner).encode(), str(uuid4()).encode()))
+    assert services.sweep() == 0, "the lock is one that somebody else has left"
+    locks._path(job.key).write_bytes(left[:36] + b" another kernel")
+    assert services.sweep() == 0, "locks of another machine may not reach here"
+    locks._path(job.key).write_bytes(left)
     assert services.sweep() == 1
     assert services.work("lab") == 1
     job.refresh_from_db()
-    assert (job.status, job.attempts) == (JobStatus.DONE, 2)
+    assert (job.status, job.attempts, job.deaths) == (JobStatus.DONE, 0, 1)
+    assert not locks._path(job.key).exists()
 
 
-def test_a_job_that_silences_every_worker_fails_in_the_end(toy: Toy) -> None:
+def test_two_of_one_key_are_never_at_work_on_one_disk(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(locks, "_AGAIN_S", 0.0)
     job = enqueue()
-    for _ in range(services.MOST_ATTEMPTS):
-        assert services.claim(queue="lab", worker="dead") is not None
+    with alone(job.key, uuid4()):
+        assert services.work("lab") == 1
+    assert toy.asked == []
+    job.refresh_from_db()
+    assert (job.status, job.attempts, job.deaths) == (JobStatus.QUEUED, 0, 0)
+    assert "the worker that had it before is still at it" in job.progress
+    due(job)
+    assert services.work("lab") == 1
+    assert len(toy.asked) == 1
+
+
+def test_a_worker_whose_job_was_taken_goes_no_further_with_it(toy: Toy) -> None:
+    job = enqueue()
+    written = []
+
+    def tell(work: Work) -> dict[str, object]:
+        Job.objects.filter(pk=job.pk).update(owner=other)
+        work.tell("camera 1 of 3")
+        written.append("camera 2")
+        return {}
+
+    other = uuid4()
+    toy.does = tell
+    services.work("lab")
+    job.refresh_from_db()
+    assert (job.status, job.owner, job.attempts, job.progress) == (JobStatus.RUNNING, other, 0, "")
+    assert written == []
+
+
+def test_a_job_that_ends_every_worker_fails_in_the_end_and_lets_others_have_their_turn(toy: Toy) -> None:
+    job = enqueue()
+    for death in range(services.MOST_DEATHS):
+        due(job)
+        dead = claim()
         silent(job)
         assert services.sweep() == 1
+        assert death == 0 or services.claim(queue="lab", owner=uuid4()) is None, "it waits for its next turn"
     job.refresh_from_db()
+    assert (job.status, job.attempts) == (JobStatus.FAILED, 0)
+    assert job.error == (
+        f"its worker {dead.owner} ended or went silent, which is number 8 of 8: "
+        "the worker's log says what ended them; then try it again"
+    )
+    services.try_again(job=job)
+    assert services.work("lab") == 1
+
+
+def test_deaths_of_workers_use_up_no_attempts(toy: Toy) -> None:
+    toy.does = break_down
+    job = enqueue()
+    for errors in range(1, services.MOST_ATTEMPTS + 1):
+        due(job)
+        claim()
+        silent(job)
+        services.sweep()
+        due(job)
+        services.work("lab")
+        job.refresh_from_db()
+        assert (job.attempts, job.deaths) == (errors, errors)
     assert job.status == JobStatus.FAILED
-    assert job.error == f"its worker dead went silent in attempt {services.MOST_ATTEMPTS}"
 
 
 def test_a_stale_job_gives_way_to_one_that_was_asked_for_anew(toy: Toy) -> None:
     old = enqueue(a=1)
-    services.claim(queue="lab", worker="dead")
+    claim()
     silent(old)
     new = enqueue(a=2)
     assert services.sweep() == 1
@@ -163,22 +249,21 @@ def test_a_stale_job_gives_way_to_one_that_was_asked_for_anew(toy: Toy) -> None:
 
 def test_a_sign_of_life_is_one_only_from_who_has_the_job(toy: Toy) -> None:
     job = enqueue()
-    claimed = services.claim(queue="lab", worker="one")
+    claimed = claim()
     silent(job)
-    assert claimed is not None
     assert services.seen(job=claimed) is True
     assert services.sweep() == 0
-    claimed.claimed_by = "two"
+    claimed.owner = uuid4()
     assert services.seen(job=claimed) is False
 
 
-def test_what_an_ending_worker_puts_back_has_all_its_attempts(toy: Toy) -> None:
+def test_what_an_ending_worker_puts_back_is_neither_an_error_nor_a_death(toy: Toy) -> None:
     job = enqueue()
-    services.claim(queue="lab", worker="host:1:abc")
-    assert services.put_back(worker_prefix="host:2:") == 0
-    assert services.put_back(worker_prefix="host:1:") == 1
+    claimed = claim()
+    assert services.put_back(owner=uuid4()) == 0
+    assert services.put_back(owner=claimed.owner) == 1
     job.refresh_from_db()
-    assert (job.status, job.attempts) == (JobStatus.QUEUED, 0)
+    assert (job.status, job.attempts, job.deaths) == (JobStatus.QUEUED, 0, 0)
     assert services.work("lab") == 1
 
 

@@ -1,0 +1,91 @@
+"""A file per job that is being done, locked by the kernel for as long as its process lives.
+
+Two of one key never work on one disk at once, and a worker that was killed is known at once where that is certain:
+the lock is free, and it was this very kernel that kept it. Everything else is told by the database's time.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import Enum
+from pathlib import Path
+from uuid import UUID
+
+from django.conf import settings
+
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # another one with each start of a kernel
+_TRIES, _AGAIN_S = 20, 0.05  # a sweep looks at a lock for a moment
+
+
+class Worker(Enum):
+    """What the lock of a job says of the worker that claimed it."""
+
+    ALIVE = "at work"
+    ENDED = "ended without a word"
+    UNKNOWN = "not known here"
+
+
+@contextmanager
+def alone(key: str, owner: UUID | None) -> Iterator[bool]:
+    """Keep the job of that key to oneself while it is done; False where another process is still at it."""
+    path = _path(key)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor = _locked(path)
+    if descriptor is None:
+        yield False
+        return
+    try:
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, _mark(owner))
+        yield True
+    finally:
+        path.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def worker_of(key: str, owner: UUID | None) -> Worker:
+    """Whether `owner`, which has claimed the job of that key, is at work on it."""
+    try:
+        descriptor = os.open(_path(key), os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return Worker.UNKNOWN
+    try:
+        if not _taken(descriptor):
+            return Worker.ALIVE
+        return Worker.ENDED if os.read(descriptor, 200) == _mark(owner) else Worker.UNKNOWN
+    finally:
+        os.close(descriptor)
+
+
+def _path(key: str) -> Path:
+    return Path(settings.DATA_DIR) / "jobs" / hashlib.sha256(key.encode()).hexdigest()[:32]
+
+
+def _mark(owner: UUID | None) -> bytes:
+    """Who keeps it, on which kernel: locks of another machine may not reach this one."""
+    return f"{owner} {_BOOT_ID.read_text().strip()}".encode()
+
+
+def _locked(path: Path) -> int | None:
+    """The descriptor of the lock of the file that is at `path` now: it may have been removed meanwhile."""
+    for attempt in range(_TRIES):
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        if _taken(descriptor) and path.exists() and os.path.samestat(os.fstat(descriptor), path.stat()):
+            return descriptor
+        os.close(descriptor)
+        if attempt + 1 < _TRIES:
+            time.sleep(_AGAIN_S)
+    return None
+
+
+def _taken(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
