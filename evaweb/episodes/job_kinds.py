@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import UUID
 
+from django.db.models.functions import Now
 from django.utils import timezone
 
 from evaweb.episodes import services
@@ -95,7 +96,7 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
         )
     dataset = str(placed.dataset.relative_to(data_dir()))
     Episode.objects.filter(uuid=episode.uuid).update(
-        dataset=dataset, dataset_index=placed.episode_index, published_at=timezone.now()
+        dataset=dataset, dataset_index=placed.episode_index, published_at=Now()
     )
     return {
         "published": True,

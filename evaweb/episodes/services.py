@@ -9,6 +9,8 @@ from typing import Any
 from uuid import UUID
 
 from django.db import transaction
+from django.db.models import Q
+from django.db.models.functions import Now
 from django.utils import timezone
 
 from evaweb.episodes.exporting import exported, job_key
@@ -156,10 +158,10 @@ def catch_up() -> int:
 
 def missing_marked() -> int:
     """Say of every row whose folder is gone that it is missing; how many there are now."""
-    rows = Episode.objects.values_list("uuid", "status", "created_at")
-    for uuid, status, created_at in rows:
-        fresh = status == EpisodeStatus.RECORDING and timezone.now() - created_at < APPEARS_WITHIN
-        if status != EpisodeStatus.MISSING and not fresh and not journal_folder(uuid).is_dir():
+    fresh = Q(status=EpisodeStatus.RECORDING, created_at__gt=Now() - APPEARS_WITHIN)
+    known = Episode.objects.exclude(fresh).exclude(status=EpisodeStatus.MISSING)
+    for uuid in known.values_list("uuid", flat=True):
+        if not journal_folder(uuid).is_dir():
             Episode.objects.filter(uuid=uuid).update(status=EpisodeStatus.MISSING)
     return Episode.objects.filter(status=EpisodeStatus.MISSING).count()
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
+from uuid import uuid4
 
 import numpy as np
 import simplejpeg
@@ -66,7 +67,7 @@ def keep(jpeg: bytes) -> str:
     path = _path(name)
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        draft = path.with_suffix(f".{os.getpid()}")
+        draft = path.with_suffix(f".{uuid4().hex}")
         with draft.open("wb") as file:
             file.write(jpeg)
             file.flush()

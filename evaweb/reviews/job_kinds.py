@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from uuid import UUID
 
 from django.db import transaction
-from django.utils import timezone
 
 from evaweb.episodes.folders import data_dir, journal_folder
 from evaweb.episodes.models import Episode
@@ -98,7 +97,8 @@ def look_for_outdated() -> int:
     for standing in found:
         with transaction.atomic():
             # Asked for once, however it ends: a job that failed is there to be seen and to be tried again.
-            Standing.objects.filter(pk=standing.pk).update(attached_at=timezone.now())
+            upto = max(standing.changed_at, standing.episode.published_at)
+            Standing.objects.filter(pk=standing.pk).update(attached_at=upto)
             uuid = str(standing.episode_id)
             enqueue(kind="sides", key=f"sides:{uuid}", args={"uuid": uuid})
     return len(found)

@@ -62,7 +62,7 @@ def _reviews(episode: Episode, lines: Sequence[KeptReview]) -> int:
         )
     if absent:
         decided = Review.objects.filter(episode=episode, verdict__in=DECIDES).order_by("-at").first()
-        services.standing_changed(episode=episode, at=max(line.at for line in lines), review=decided)
+        services.standing_changed(episode=episode, review=decided)
     return len(absent)
 
 
@@ -95,5 +95,5 @@ def _segments(episode: Episode, lines: Sequence[Line]) -> int:
     gone = [uuid for uuid in rows if uuid not in wanted]
     Segment.objects.filter(pk__in=gone).delete()
     if changed or gone:
-        services.standing_changed(episode=episode, at=max(line.at for line in lines))
+        services.standing_changed(episode=episode)
     return changed + len(gone)

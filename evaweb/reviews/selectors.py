@@ -88,4 +88,4 @@ def outdated() -> QuerySet[Standing]:
         | Q(attached_at__lt=F("changed_at"))
         | Q(attached_at__lt=F("episode__published_at"))
     )
-    return published.filter(older).exclude(episode__status=EpisodeStatus.MISSING)
+    return published.filter(older).exclude(episode__status=EpisodeStatus.MISSING).select_related("episode")

@@ -8,6 +8,7 @@ from typing import Any
 from uuid import UUID
 
 from django.db import transaction
+from django.db.models.functions import Now
 from django.utils import timezone
 
 from evaweb.episodes.lines import append_line, text
@@ -41,7 +42,7 @@ def review_add(*, user: Any, episode: Episode, verdict: str, note: str = "") -> 
     review = Review(episode=episode, verdict=verdict, note=note, reviewer=user, at=timezone.now())
     append_line(reviews_file(episode.uuid), review_line(review))
     review.save(force_insert=True)
-    standing_changed(episode=episode, at=review.at, review=review if verdict in DECIDES else None)
+    standing_changed(episode=episode, review=review if verdict in DECIDES else None)
     return review
 
 
@@ -73,7 +74,7 @@ def segment_put(
     row.first, row.last, row.label, row.milestone, row.at = first, last, label, milestone, timezone.now()
     append_line(reviews_file(episode.uuid), segment_line(row))
     row.save()
-    standing_changed(episode=episode, at=row.at)
+    standing_changed(episode=episode)
     return row
 
 
@@ -83,10 +84,9 @@ def segment_remove(*, user: Any, episode: Episode, segment: UUID) -> None:
     require(user, Role.OPERATOR)
     _held(episode)
     row = _own(user, episode, segment)
-    at = timezone.now()
-    append_line(reviews_file(episode.uuid), removal_line(row, user, at))
+    append_line(reviews_file(episode.uuid), removal_line(row, user, timezone.now()))
     row.delete()
-    standing_changed(episode=episode, at=at)
+    standing_changed(episode=episode)
 
 
 def _own(user: Any, episode: Episode, uuid: UUID) -> Segment:
@@ -127,9 +127,12 @@ def quality_found(*, episode: Episode, document: Mapping[str, Any], at: datetime
 # --- what both have in common --------------------------------------------------------------------------------
 
 
-def standing_changed(*, episode: Episode, at: datetime, review: Review | None = None) -> None:
-    """Something was said of it at that time; `review` counts from now on, None leaves the one that does."""
-    facts: dict[str, Any] = {"changed_at": at}
+def standing_changed(*, episode: Episode, review: Review | None = None) -> None:
+    """Something was said of it; `review` counts from now on, None leaves the one that does.
+
+    By the database's time, as publications are: they are compared, and workers have clocks of their own.
+    """
+    facts: dict[str, Any] = {"changed_at": Now()}
     if review is not None:
         facts["review"] = review
     Standing.objects.update_or_create(episode=episode, defaults=facts)

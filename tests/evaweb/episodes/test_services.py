@@ -107,10 +107,12 @@ def test_a_recording_closed_with_an_unusable_outcome_fails_with_the_file_named(
 
 
 def test_folders_that_are_gone_are_missing_but_one_just_announced_is_not(
-    data: Path, station: Station
+    data: Path, station: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     old, fresh = opened(station, str(uuid.uuid4())), opened(station, str(uuid.uuid4()))
     Episode.objects.filter(uuid=old.uuid).update(created_at=timezone.now() - timedelta(hours=1))
+    ahead = timezone.now() + timedelta(hours=1)
+    monkeypatch.setattr(timezone, "now", lambda: ahead)  # of the worker, which is another machine
     assert services.missing_marked() == 1
     assert Episode.objects.get(uuid=old.uuid).status == EpisodeStatus.MISSING
     assert Episode.objects.get(uuid=fresh.uuid).status == EpisodeStatus.RECORDING

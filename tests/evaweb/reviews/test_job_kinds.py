@@ -1,8 +1,10 @@
 """Checks after an episode has closed, and what is said of it beside its dataset."""
 
 import json
+from datetime import timedelta
 
 import pytest
+from django.utils import timezone
 
 from evaweb.episodes import services as episodes
 from evaweb.episodes.models import Episode
@@ -86,6 +88,21 @@ def test_what_is_said_goes_beside_the_published_episode(closed, data, ann, bob):
     assert job_kinds.look_for_outdated() == 1
     work("lab")
     assert len((dataset / "eva/reviews" / f"{episode.uuid}.jsonl").read_text().splitlines()) == 2
+
+
+def test_a_review_is_published_however_far_ahead_the_clock_of_the_worker_is(closed, data, ann, monkeypatch):
+    episode = closed()
+    services.review_add(user=ann, episode=episode, verdict="pass")
+    with monkeypatch.context() as ahead:
+        hence = timezone.now() + timedelta(hours=1)
+        ahead.setattr(timezone, "now", lambda: hence)
+        episodes.publish_asked(episode=episode)
+        work("lab")
+        assert job_kinds.look_for_outdated() == 1
+        work("lab")
+    assert job_kinds.look_for_outdated() == 0
+    services.review_add(user=ann, episode=episode, verdict="fail")
+    assert job_kinds.look_for_outdated() == 1
 
 
 def test_what_was_said_before_goes_into_the_dataset_with_the_episode_itself(closed, data, ann):
