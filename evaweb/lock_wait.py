@@ -12,19 +12,17 @@ from django.db import connection
 def lock_wait(seconds: float) -> Iterator[None]:
     """Within it a locked database is an OperationalError after `seconds`.
 
-    SQLite alone locks as a whole; others lock rows, and nobody waits for another's.
+    SQLite locks as a whole. PostgreSQL locks rows, and a new one waits for those that it refers to.
     """
-    if connection.vendor != "sqlite":
-        yield
-        return
-    usual = float(connection.settings_dict["OPTIONS"].get("timeout", 5.0))
-    _wait_at_most(seconds)
+    sqlite = connection.vendor == "sqlite"
+    _wait_at_most(seconds if sqlite else max(seconds, 0.001))
     try:
         yield
     finally:
-        _wait_at_most(usual)
+        _wait_at_most(float(connection.settings_dict["OPTIONS"].get("timeout", 5.0)) if sqlite else 0.0)
 
 
 def _wait_at_most(seconds: float) -> None:
+    name = "PRAGMA busy_timeout" if connection.vendor == "sqlite" else "SET lock_timeout"
     with connection.cursor() as cursor:
-        cursor.execute(f"PRAGMA busy_timeout = {int(seconds * 1000)}")
+        cursor.execute(f"{name} = {int(seconds * 1000)}")

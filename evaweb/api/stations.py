@@ -311,7 +311,10 @@ def _command_out(row: Command, sight: Sight) -> dict[str, Any]:
 def _note_estop(request: HttpRequest, name: str, why: str, uuid: UUID, answer: stops.Answer) -> None:
     """Write the press down where the database has the station; it is done already, whatever comes of this."""
     try:
-        found = Station.objects.filter(name=name).first()
+        try:
+            found = Station.objects.filter(name=name).first()
+        except DatabaseError:
+            found = Station(name=name)
         if found is not None:
             commands.estop_noted(user=request.auth, station=found, why=why, uuid=uuid, answer=answer)
     except (DatabaseError, EvaError) as fault:

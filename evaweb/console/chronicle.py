@@ -199,6 +199,7 @@ class Chronicle:
     def _run(self) -> None:
         failing = False
         while not self._ended.is_set():
+            commands.unwritten.look()
             try:
                 self._look()
                 failing = False

@@ -8,13 +8,13 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from typing import Any
 from uuid import UUID, uuid4
 
 from django.conf import settings
-from django.db import Error, IntegrityError, connection, transaction
+from django.contrib.auth import get_user_model
+from django.db import Error, IntegrityError, transaction
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, StationGone
@@ -23,7 +23,9 @@ from evaweb.lock_wait import lock_wait
 from evaweb.roles import Role, require
 from evaweb.stations.holders import holder_of
 from evaweb.stations.models import Command, CommandStatus, Station
+from evaweb.stations.selectors import station_get
 from evaweb.stations.stops import Answer, answer_of, estop, spoken, stopped
+from evaweb.stations.unwritten import Unwritten
 from evaweb.stations.wire import NoAnswer, wire_to
 from runtime import messages
 from runtime.bus import CodecError
@@ -37,8 +39,8 @@ KINDS = (
     *COLLECTING,
 )
 _UNANSWERED = (CommandStatus.PRESSED, CommandStatus.UNKNOWN)
+_ANSWER = ("status", "reason", "allowed", "data", "answered_at")
 _NOTE_S = 0.5  # for which the answer to a stopping command is kept by its row; then the row is written later
-_later = ThreadPoolExecutor(2, "note")
 _LONG_AGO = 0.0  # on the runtime's clock: a command that must not be carried out any more
 
 
@@ -95,7 +97,7 @@ def issue(
 
 
 def estop_noted(*, user: Any, station: Station, why: str, uuid: UUID | str, answer: Answer) -> Command:
-    """The row of an e-stop that was pressed."""
+    """The row of an e-stop that was pressed; of `station` the name is enough, where the database does not say more."""
     row = Command(uuid=identity_of(uuid), station=station, user=user, kind="estop", args={"why": spoken(why)})
     return _noted(row, answer)
 
@@ -150,6 +152,7 @@ def _give(row: Command) -> Command:
     pressed = time.monotonic()
     try:
         with transaction.atomic(durable=True):
+            row.issued_at = timezone.now()
             row.save(force_insert=True)
     except IntegrityError:  # pressed twice in the same moment
         first = _first(row)
@@ -194,41 +197,45 @@ def _stop(row: Command) -> Command:
 
 
 def _noted(row: Command, answer: Answer) -> Command:
-    """Write down what has been done already, later where the database is locked."""
+    """Write down what has been done already, whenever the database takes it."""
     _put(row, answer)
     try:
         with lock_wait(_NOTE_S):
             return _written(row)
     except Error as error:
         log.warning("%s (%s) is written down later: %s", row, row.uuid, error)
-        _later.submit(_written_later, row)
+        unwritten.keep(row)
         return row
-
-
-def _written_later(row: Command) -> None:
-    """With all patience; where the database refuses, the log has it."""
-    try:
-        _written(row)
-    except (Error, Conflict) as error:
-        log.error("%s (%s) is not in the database: %s", row, row.uuid, error)
-    finally:
-        connection.close()
 
 
 def _written(row: Command) -> Command:
     """The row as it is in the database: this one, or the first of that uuid."""
+    _resolve(row)
     try:
         first = _first(row)
         if first is None:
             with transaction.atomic():
                 row.save(force_insert=True)
         elif first.status in _UNANSWERED:
-            _update(row)
+            row.save(
+                update_fields=_ANSWER, force_update=True
+            )  # not the object that was read: it would be inserted
         else:
             return first
     except IntegrityError:  # pressed twice in the same moment: the other one has written it
         return _first(row) or row
     return row
+
+
+def _resolve(row: Command) -> None:
+    """Station and user as the database has them, where they are known by name alone; NotFound."""
+    if row.station_id is None:
+        row.station = station_get(name=row.station.name)
+    if row.user is not None and row.user_id is None:
+        row.user = get_user_model().objects.filter(username=row.user.get_username()).first()
+
+
+unwritten = Unwritten(_written)
 
 
 def _first(row: Command) -> Command | None:
@@ -248,7 +255,7 @@ def _put(row: Command, answer: Answer) -> None:
 def _update(row: Command) -> None:
     """Where the database refuses, `settle` asks the runtime again later."""
     try:
-        row.save(update_fields=["status", "reason", "allowed", "data", "answered_at"])
+        row.save(update_fields=_ANSWER)
     except Error as error:
         log.error(
             "the answer to %s %s (%s) is not in the database: %s", row.kind, row.uuid, row.status, error

@@ -7,6 +7,7 @@ import uuid
 from django.conf import settings
 from django.core.validators import RegexValidator
 from django.db import models
+from django.utils import timezone
 
 STATION_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$"
 
@@ -137,7 +138,7 @@ class Command(models.Model):
     reason = models.TextField(blank=True)
     allowed = models.JSONField(default=list, blank=True, help_text="What would have been accepted then.")
     data = models.JSONField(default=dict, blank=True)
-    issued_at = models.DateTimeField(auto_now_add=True)
+    issued_at = models.DateTimeField(default=timezone.now, editable=False)
     answered_at = models.DateTimeField(null=True, blank=True)
 
     class Meta:

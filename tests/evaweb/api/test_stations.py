@@ -1,6 +1,4 @@
 import sqlite3
-from concurrent.futures import Future
-from functools import partial
 from uuid import uuid4
 
 import pytest
@@ -11,11 +9,10 @@ from django.test import Client
 from evaweb.api.tokens import token_create
 from evaweb.errors import StationGone
 from evaweb.stations import commands
-from evaweb.stations.models import Command, CommandStatus, Lease, Station
+from evaweb.stations.models import Command, Lease, Station
 from evaweb.stations.wire import NoAnswer
 from evaweb.trials.models import Checkpoint, Trial
 from tests.evaweb.api.conftest import Rest
-from tests.evaweb.trials import builders
 from tests.evaweb.trials.builders import BOOT
 
 
@@ -156,8 +153,7 @@ def locked(transactional_db):
     if connection.vendor != "sqlite":
         pytest.skip("only SQLite is locked as a whole")
     other = sqlite3.connect(connection.settings_dict["NAME"], isolation_level=None)
-    begin = partial(other.execute, "BEGIN IMMEDIATE")
-    yield begin
+    yield lambda what="BEGIN IMMEDIATE": other.execute(what)
     other.close()
 
 
@@ -166,11 +162,9 @@ def test_who_stops_with_a_token_is_not_kept_by_a_locked_database(locked, bench, 
     User.objects.update(is_superuser=True)
     rest = Rest(token_create(user=bench.operator, name="never used"))
     identity = str(uuid4())
-    later = Future()
-    wait = commands._written_later
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(commands, "_NOTE_S", 0)
-        patch.setattr(commands._later, "submit", lambda work, row: later.set_result((work, row)))
+        patch.setattr(commands.unwritten, "look", lambda: None)
         locked()
         if kind == "estop":
             answer = rest.post("stations/bench-1/estop", uuid=identity)
@@ -178,23 +172,27 @@ def test_who_stops_with_a_token_is_not_kept_by_a_locked_database(locked, bench, 
             answer = rest.post("stations/bench-1/commands", uuid=identity, kind="stop", page="p1", epoch=3)
     assert (answer[0], answer[1]["status"]) == (200, "accepted")
     assert [given.kind for given in wire.heard] == [kind]
-    work, row = later.result(0)
-    assert (work, str(row.uuid)) == (wait, identity)
     assert not Command.objects.exists()
+    locked("ROLLBACK")
+    assert commands.unwritten.attempt() is False
+    assert (str(Command.objects.get().uuid), Command.objects.get().status) == (identity, "accepted")
 
 
-def test_what_was_not_written_down_at_once_is_written_later(live_stop):
-    commands._written_later(live_stop)
-    commands._written_later(live_stop)
-    assert Command.objects.get().status == CommandStatus.DONE
+def test_an_e_stop_is_written_down_later_where_the_database_does_not_say_which_station_it_was(
+    rest, bench, wire, monkeypatch
+):
+    def away(*_, **__):
+        raise OperationalError("the server closed the connection unexpectedly")
 
-
-@pytest.fixture
-def live_stop(transactional_db):
-    bench = builders.bench()
-    return Command(
-        uuid=uuid4(), station=bench.station, user=bench.operator, kind="estop", status=CommandStatus.DONE
-    )
+    with monkeypatch.context() as patch:
+        patch.setattr("evaweb.api.stations.Station.objects.filter", away)
+        patch.setattr(commands, "_written", away)
+        patch.setattr(commands.unwritten, "look", lambda: None)
+        status, answer = rest.post("stations/bench-1/estop", why="smoke")
+    assert (status, answer["status"]) == (200, "accepted")
+    commands.unwritten.attempt()
+    row = Command.objects.get()
+    assert (row.station, row.user, row.args) == (bench.station, bench.operator, {"why": "smoke"})
 
 
 @pytest.mark.parametrize("body", ["", "null", "[]", '{"uuid": 5, "why": 7}', '{"why": "%s"}' % ("x" * 999)])

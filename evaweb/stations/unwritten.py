@@ -1,0 +1,132 @@
+"""Commands that were carried out and that the database did not take: they wait for it as files in DATA/unwritten.
+
+A file each, so that a restart loses none, and any process may write any of them. Where the disk does not take them
+either, as when it is full, this process keeps the newest.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+from django.conf import settings
+from django.contrib.auth import get_user_model
+from django.db import DataError, Error, IntegrityError, connection
+
+from evaweb.errors import EvaError
+from evaweb.stations.models import Command, Station
+from runtime.recording.files import RecordingError, write_whole
+
+log = logging.getLogger(__name__)
+
+_MOST = 1000  # that a process keeps
+_AGAIN_S = 1.0
+_TIMES = ("issued_at", "answered_at")
+_PLAIN = ("kind", "args", "holder", "epoch", "boot", "sequence", "status", "reason", "allowed", "data")
+
+
+class Unwritten:
+    """Those that wait, and the thread that goes on trying to have them written by `write`.
+
+    `write` raises a database's Error where it has to be tried again; EvaError, IntegrityError or DataError where
+    that is no use: the log then has the command, and its file stays as UUID.refused.
+    """
+
+    def __init__(self, write: Callable[[Command], object]) -> None:
+        self._write = write
+        self._kept: dict[str, bytes] = {}  # those without a file
+        self._news = threading.Event()
+        self._starting = threading.Lock()
+        self._thread: threading.Thread | None = None
+
+    def keep(self, row: Command) -> None:
+        """Have it written when the database takes it; its station and user may be known by name alone."""
+        name, content = str(row.uuid), json.dumps(_document(row)).encode()
+        try:
+            _folder().mkdir(parents=True, exist_ok=True)
+            write_whole(_path(name), content)
+        except (RecordingError, OSError) as error:
+            log.error("%s is kept in memory alone: %s", name, error)
+            while len(self._kept) >= _MOST:
+                lost = self._kept.pop(next(iter(self._kept)))
+                log.error(
+                    "more than %d commands wait for the database, this one is given up: %r", _MOST, lost
+                )
+            self._kept[name] = content
+        self.look()
+
+    def look(self) -> None:
+        """Have what waits written, by a thread; also what a process left that has ended since."""
+        with self._starting:
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="unwritten", daemon=True)
+                self._thread.start()
+        self._news.set()
+
+    def attempt(self) -> bool:
+        """Write what waits; whether some has to wait on."""
+        try:
+            for name, content in self._waiting():
+                self._attempt(name, content)
+        except Error as error:
+            log.info("the database does not take what was commanded yet: %s", error)
+            return True
+        return False
+
+    def _run(self) -> None:
+        while True:
+            self._news.wait()
+            self._news.clear()
+            while self.attempt():
+                connection.close()
+                time.sleep(_AGAIN_S)
+            connection.close()
+
+    def _waiting(self) -> Iterator[tuple[str, bytes]]:
+        for path in sorted(_folder().glob("*.json")):
+            try:
+                yield path.stem, path.read_bytes()
+            except FileNotFoundError:
+                continue  # another process has written it
+        yield from list(self._kept.items())
+
+    def _attempt(self, name: str, content: bytes) -> None:
+        try:
+            self._write(_row(json.loads(content)))
+        except (IntegrityError, DataError, EvaError, ValueError, KeyError) as refused:
+            log.error("a command is not in the database: %r; it was %r", refused, content)
+            if _path(name).exists():
+                _path(name).replace(_path(name).with_suffix(".refused"))
+        _path(name).unlink(missing_ok=True)
+        self._kept.pop(name, None)
+
+
+def _folder() -> Path:
+    return Path(settings.DATA_DIR) / "unwritten"
+
+
+def _path(name: str) -> Path:
+    return _folder() / f"{name}.json"
+
+
+def _document(row: Command) -> dict[str, Any]:
+    times = {name: at.isoformat() for name in _TIMES if (at := getattr(row, name))}
+    user = row.user.get_username() if row.user else ""
+    said = {"uuid": str(row.uuid), "station": row.station.name, "user": user}
+    return said | {name: getattr(row, name) for name in _PLAIN} | times
+
+
+def _row(document: dict[str, Any]) -> Command:
+    times = {name: datetime.fromisoformat(document[name]) for name in _TIMES if name in document}
+    user = get_user_model()(username=document["user"]) if document["user"] else None
+    plain = {name: document[name] for name in _PLAIN}
+    return Command(
+        uuid=UUID(document["uuid"]), station=Station(name=document["station"]), user=user, **plain, **times
+    )
