@@ -154,7 +154,8 @@ class TrialDetail(TrialOut):
 class ScoreIn(Schema):
     """A score: every milestone of the scene by id; `success` only where none of them is required.
 
-    A trial that has a score takes another one as a correction, with a `reason`.
+    A trial that has a score takes another one as a correction, with a `reason`. Who has lost the answer sends the same
+    again: with its `uuid`, or word by word, it is the first score once more.
     """
 
     milestones: Annotated[dict[str, bool], Field(default_factory=dict)]
@@ -167,6 +168,7 @@ class ScoreIn(Schema):
     failure: str = ""
     source: str = Score.Source.HUMAN.value
     reason: str = ""
+    uuid: Annotated[UUID | None, Field(description="Of your own; another one for each score")] = None
 
 
 class Reason(Schema):

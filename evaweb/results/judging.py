@@ -112,24 +112,24 @@ def rate(
         raise Conflict(f"trial {code} of {plan} is not one of those that are rated again")
     if trial.operator_id == user.pk or trial.scores.filter(rater=user).exists():
         raise NotAllowed(f"you ran or scored trial {code}: somebody else rates it again")
+    twice = f"you have rated trial {code} already"
+    found = verdict(list(trial.scene.milestones.order_by("order")), milestones, success)
+    said = {
+        "success": found.success,
+        "score": found.score,
+        "milestones": [[row[0].text, row[1]] for row in found.reached],
+        "failure": text("failure", failure, LONGEST_FAILURE),
+        "note": text("note", note, LONGEST_NOTE),
+    }
+    before = Rating.objects.filter(trial=trial, rater=user).first()
+    if before is not None:
+        return _once_more(before, said, twice)
     if has_looked(plan, user):
         raise NotAllowed(f"you have seen results of {plan}: a second rater must not know them")
-    if Rating.objects.filter(trial=trial, rater=user).exists():
-        raise Conflict(f"you have rated trial {code} already")
     require_seen_on_video(handout)
-    found = verdict(list(trial.scene.milestones.order_by("order")), milestones, success)
-    rating = Rating(
-        trial=trial,
-        rater=user,
-        success=found.success,
-        score=found.score,
-        milestones=[[row[0].text, row[1]] for row in found.reached],
-        failure=text("failure", failure, LONGEST_FAILURE),
-        note=text("note", note, LONGEST_NOTE),
-        blind=plan.sealed,
-    )
+    rating = Rating(trial=trial, rater=user, blind=plan.sealed, **said)
     append(journal.of_trial(trial), journal.rating_line(rating))
-    return _once(rating, f"you have rated trial {code} already")
+    return _once(rating, twice)
 
 
 def to_prefer(user: User, plans: Iterable[Plan] | None = None) -> Offer[Pair]:
@@ -176,24 +176,18 @@ def prefer(*, user: User, plan: Plan, first: str, second: str, outcome: str, why
     reason = text("why", why, LONGEST_NOTE)
     if not reason:
         raise EvaError("why is empty: say it in a sentence, others read it")
-    if has_looked(plan, user):
-        raise NotAllowed(f"you have seen results of {plan}: who prefers must not know them")
     one, other = _handout(plan, first), _handout(plan, second)
     if (one.trial_id, other.trial_id) not in _pairs(plan):
         raise Conflict(f"{first} and {second} were not run one after the other at the same initial condition")
     twice = f"you have compared {first} and {second} already"
-    if Preference.objects.filter(first=one.trial, second=other.trial, rater=user).exists():
-        raise Conflict(twice)
+    said = {"outcome": outcome, "why": reason}
+    before = Preference.objects.filter(first=one.trial, second=other.trial, rater=user).first()
+    if before is not None:
+        return _once_more(before, said, twice)
+    if has_looked(plan, user):
+        raise NotAllowed(f"you have seen results of {plan}: who prefers must not know them")
     require_seen_on_video(one, other)
-    row = Preference(
-        plan=plan,
-        first=one.trial,
-        second=other.trial,
-        rater=user,
-        outcome=outcome,
-        why=reason,
-        blind=plan.sealed,
-    )
+    row = Preference(plan=plan, first=one.trial, second=other.trial, rater=user, blind=plan.sealed, **said)
     append(journal.of_trial(other.trial), journal.preference_line(row))
     return _once(row, twice)
 
@@ -206,6 +200,13 @@ def _handout(plan: Plan, code: str) -> Handout:
         raise NotFound(f"{plan} has no trial {code!r:.20}")
     found.trial.status = Trial.objects.select_for_update().get(pk=found.trial_id).status
     return found
+
+
+def _once_more(before: T, said: Mapping[str, Any], twice: str) -> T:
+    """What was said before, where it is said again word by word because the answer was lost; else Conflict."""
+    if any(getattr(before, name) != value for name, value in said.items()):
+        raise Conflict(f"{twice}, and otherwise: what was said stands")
+    return before
 
 
 def _once(row: Any, twice: str) -> Any:

@@ -39,6 +39,9 @@ def review_add(*, user: Any, episode: Episode, verdict: str, note: str = "") -> 
     if verdict == Verdict.NOTE and not note:
         raise EvaError("note is empty: a note needs words")
     _held(episode)
+    newest = Review.objects.filter(episode=episode).order_by("-at", "-pk").first()
+    if newest is not None and (newest.reviewer, newest.verdict, newest.note) == (user, verdict, note):
+        return newest  # said once more, because the answer was lost
     review = Review(episode=episode, verdict=verdict, note=note, reviewer=user, at=timezone.now())
     append_line(reviews_file(episode.uuid), review_line(review))
     review.save(force_insert=True)
@@ -70,6 +73,10 @@ def segment_put(
         raise EvaError(
             f"first = {first}, last = {last}; allowed: frames 0 to {episode.frames - 1}, the last not before the first"
         )
+    said = {"first": first, "last": last, "label": label, "milestone": milestone}
+    there = Segment.objects.filter(episode=episode, annotator=user, **said).first()
+    if there is not None and segment in (None, there.pk):
+        return there  # marked once more, because the answer was lost
     row = _own(user, episode, segment) if segment else Segment(episode=episode, annotator=user)
     row.first, row.last, row.label, row.milestone, row.at = first, last, label, milestone, timezone.now()
     append_line(reviews_file(episode.uuid), segment_line(row))

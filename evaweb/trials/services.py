@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
+from uuid import UUID
 
 from django.contrib.auth.models import User
 from django.db import IntegrityError, transaction
@@ -15,6 +17,7 @@ from evaweb.episodes.lines import text
 from evaweb.episodes.services import publish_asked
 from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.roles import Role, require
+from evaweb.stations.commands import identity_of
 from evaweb.stations.models import Station
 from evaweb.trials import journal, lifecycle
 from evaweb.trials.following import run_changed
@@ -219,11 +222,15 @@ def trial_score(
     failure: str = "",
     source: str = Score.Source.HUMAN,
     reason: str = "",
+    uuid: UUID | str | None = None,
 ) -> Score:
     """Add a score; of a trial that has one it is a correction, needs a reason, and counts from then on.
 
     `milestones`: id -> reached, for every milestone of the scene; `times`: id -> when [s after the start of the run],
     as far as known. Disk first, then the row, then publication.
+
+    The same `uuid` again, or without one word by word what this rater said and counts already, is the first score,
+    whose answer was lost: nothing is added. Conflict for a uuid that is another score's.
     """
     require(user, Role.OPERATOR)
     if source not in Score.Source.values:
@@ -235,14 +242,21 @@ def trial_score(
     }
     with transaction.atomic():
         held = _held(trial)
-        _check_scorable(held, words["reason"])
         rows = list(held.scene.milestones.order_by("order"))
-        found = verdict(rows, milestones, success, times=times, ordered=held.scene.ordered)
+        judged = partial(verdict, rows, milestones, success, times=times, ordered=held.scene.ordered)
+        said = {"rater": user, "source": source, **words}
+        first = held.verdict if uuid is None else Score.objects.filter(uuid=identity_of(uuid)).first()
+        if first is not None and first.trial == held and _says(first, said, judged()):
+            return first
+        if first is not None and uuid is not None:
+            raise Conflict(
+                f"uuid {uuid} is that of another score (trial {first.trial_id}): give each its own"
+            )
+        _check_scorable(held, words["reason"])
+        found = judged()
         if found.success and words["failure"]:
             raise EvaError(f"failure = {words['failure']!r} but the trial is a success: leave failure empty")
-        score = Score(
-            trial=held, rater=user, success=found.success, score=found.score, source=source, **words
-        )
+        score = Score(uuid=identity_of(uuid), trial=held, success=found.success, score=found.score, **said)
         _keep(held, score, found)
         _publish(held)
     trial.refresh_from_db()
@@ -256,6 +270,8 @@ def trial_void(*, user: User, trial: Trial, reason: str) -> Trial:
     checked("voided", trial, user)
     with transaction.atomic():
         held = _held(trial)
+        if (held.status, held.reason, held.voided_by) == (TrialStatus.VOIDED, why, user):
+            return held  # asked for once more, because the answer was lost
         lifecycle.apply(held, Move.VOID)
         held.reason, held.voided_by, held.voided_at = why, user, timezone.now()
         journal.append(held.episode_id or held.uuid, journal.void_line(held))
@@ -271,8 +287,11 @@ def trial_abandon(*, user: User, trial: Trial, reason: str = "") -> Trial:
     why = text("reason", reason, LONGEST_NOTE) or "abandoned"
     with transaction.atomic():
         held = _held(trial)
+        why = f"{why} ({user.get_username()})"
+        if (held.status, held.reason) == (TrialStatus.ABANDONED, why):
+            return held  # asked for once more, because the answer was lost
         lifecycle.apply(held, Move.ABANDON)
-        held.reason = f"{why} ({user.get_username()})"
+        held.reason = why
         held.save()
     trial.refresh_from_db()
     return trial
@@ -287,6 +306,14 @@ def _publish(trial: Trial) -> None:
 def _held(trial: Trial) -> Trial:
     """The trial's row as it is now, kept from others until the transaction ends."""
     return Trial.objects.select_for_update().get(pk=trial.pk)
+
+
+def _says(score: Score, said: Mapping[str, Any], found: Verdict) -> bool:
+    """Whether that score is word by word what is said now."""
+    outcomes = {outcome.milestone_id: (outcome.reached, outcome.at_s) for outcome in score.outcomes.all()}
+    same = outcomes == {milestone.pk: (reached, at) for milestone, reached, at in found.reached}
+    words = all(getattr(score, name) == value for name, value in said.items())
+    return same and words and score.success == found.success
 
 
 def _check_scorable(trial: Trial, reason: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any
+from uuid import uuid4
 
 from django.core.paginator import Paginator
 from django.http import HttpRequest, HttpResponse
@@ -66,6 +67,7 @@ def score(request: HttpRequest, id: int) -> HttpResponse:
             trial=found,
             milestones=milestones,
             success={"yes": True, "no": False}.get(request.POST.get("success", "")),
+            uuid=request.POST.get("uuid") or None,
             **given,
         )
     except EvaError as fault:
@@ -113,6 +115,7 @@ def _trial_page(
         "laid_out": laid_out(found),
         "fault": fault,
         "typed": typed or _as_scored(found),
+        "uuid": uuid4(),  # of the score that may be sent from this page, and then be sent again
     }
     return render(request, "trials/trial.html", context, status=fault.status if fault else 200)
 

@@ -1,6 +1,7 @@
 // The Eval page: a trial chosen, prepared and set up with one press, run, and scored.
 
 import { post, RequestFailed } from "../site/api.js";
+import { uuid } from "../site/identity.js";
 import { config } from "./config.js";
 import { PlanControls, times } from "./plan.js";
 import { duration } from "./words.js";
@@ -10,6 +11,7 @@ export class TrialPanel {
   #commands;
   #panel = document.getElementById("panel");
   #busy = ""; // what is on its way
+  #sent = {}; // the newest score: its words and the uuid it was sent with
 
   constructor(store, commands) {
     this.#store = store;
@@ -121,8 +123,15 @@ export class TrialPanel {
     const { note, failure, success } = form.elements;
     const score = { milestones, times: times(form), note: note.value, failure: failure.disabled ? "" : failure.value };
     if (success) score.success = success.value === "yes";
-    await post(`${config.trial}/${form.dataset.score}/score`, score);
+    await post(`${config.trial}/${form.dataset.score}/score`, { ...score, uuid: this.#uuid(form.dataset.score, score) });
     saved(form);
+  }
+
+  /** The same for the same score of a trial: where its answer was lost, Save once more adds none. */
+  #uuid(trial, score) {
+    const words = JSON.stringify([trial, score]);
+    if (this.#sent.words !== words) this.#sent = { words, uuid: uuid() };
+    return this.#sent.uuid;
   }
 
   async #void(button) {

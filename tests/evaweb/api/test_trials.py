@@ -1,5 +1,6 @@
 import csv
 import io
+from uuid import uuid4
 
 import pytest
 
@@ -220,3 +221,14 @@ def test_a_parent_of_a_blind_plan_is_not_named(rest, bench):
     plan.positions.set(bench.scene.positions.all())
     plan_freeze(user=owner, plan=plan)
     assert rest.get("checkpoints/tuned")[1]["parent"] is None
+
+
+def test_a_score_whose_answer_was_lost_is_sent_again_and_there_is_one(rest, bench):
+    trial, uuid = bench.ended(), str(uuid4())
+    said = {"milestones": ticks(bench, True, True, True), "uuid": uuid}
+    for _ in range(2):
+        status, scored = rest.post(f"trials/{trial.pk}/score", **said)
+        assert (status, [one["uuid"] for one in scored["scores"]]) == (200, [uuid])
+    status, refused = rest.post(f"trials/{trial.pk}/score", **said, note="another one")
+    assert (status, f"uuid {uuid} is that of another score" in refused["error"]) == (409, True)
+    assert rest.post(f"trials/{trial.pk}/score", **{**said, "uuid": "seven"})[0] == 422

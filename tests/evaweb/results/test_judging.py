@@ -105,6 +105,24 @@ def test_and_what_was_preferred(plan, carry_out, rater):
         Preference.objects.filter(pk=made.pk).delete()
 
 
+def test_who_judges_once_more_because_the_answer_was_lost_gets_the_first_answer(
+    plan, carry_out, rater, bench
+):
+    carry_out(plan, 16)
+    code = judging.to_rate(rater).found.code
+    rated = {"user": rater, "plan": plan, "code": code, "milestones": bench.ticks(True, True, True)}
+    pair = judging.to_prefer(rater).found
+    preferred = {"user": rater, "plan": plan, "first": pair.first.code, "second": pair.second.code}
+    for _ in range(2):
+        judging.rate(**rated, note="clean")
+        judging.prefer(**preferred, outcome="tie", why="alike")
+    assert (Rating.objects.count(), Preference.objects.count()) == (1, 1)
+    with pytest.raises(Conflict, match=f"you have rated trial {code} already, and otherwise"):
+        judging.rate(**rated, note="not so clean")
+    with pytest.raises(Conflict, match=r"you have compared .* already, and otherwise: what was said stands"):
+        judging.prefer(**preferred, outcome="first", why="alike")
+
+
 def test_nobody_is_asked_about_what_cannot_be_watched(plan, carry_out, rater):
     carry_out(plan, 16)
     handout, left = judging.to_rate(rater)[:2]

@@ -143,3 +143,17 @@ def test_the_next_unreviewed_goes_down_the_list_and_begins_again_at_its_top(clos
     assert selectors.unreviewed_next(after=newer.uuid) == (None, 1)
     services.review_add(user=ann, episode=newer, verdict="fail")
     assert selectors.unreviewed_next(after=None) == (None, 0)
+
+
+def test_who_says_the_same_once_more_because_the_answer_was_lost_has_said_it_once(closed, data, ann, bob):
+    episode = closed()
+    first = services.review_add(user=ann, episode=episode, verdict="pass", note="clean")
+    assert services.review_add(user=ann, episode=episode, verdict="pass", note="clean ") == first
+    part = {"episode": episode, "first": 0, "last": 5, "label": "reach"}
+    marked = services.segment_put(user=ann, **part)
+    assert services.segment_put(user=ann, **part) == marked
+    assert services.segment_put(user=ann, segment=marked.pk, **part) == marked
+    assert services.segment_put(user=bob, **part) != marked, "another annotator sees the same"
+    assert len(said(data, episode)) == 3
+    services.review_add(user=bob, episode=episode, verdict="fail")
+    assert services.review_add(user=ann, episode=episode, verdict="pass", note="clean") != first

@@ -260,6 +260,62 @@ def test_to_score_twice_is_a_correction_that_needs_a_reason_and_counts(bench):
     assert Score.objects.get(pk=first.pk).success is True
 
 
+@pytest.mark.parametrize("uuid", [None, "own"])
+def test_who_scores_once_more_because_the_answer_was_lost_gets_the_first_answer(bench, uuid):
+    trial, uuid = bench.ended(), uuid and uuid4()
+    said = {"note": "clean", "times": {str(next(iter(bench.ticks(True, True, True)))): 3}, "uuid": uuid}
+    first = score(bench, trial, True, True, True, **said)
+    assert uuid in (None, first.uuid)
+    assert score(bench, trial, True, True, True, **said) == first
+    corrected = score(bench, trial, True, True, False, reason="on the rim", uuid=uuid and uuid4())
+    again = score(bench, trial, True, True, False, reason="on the rim", uuid=uuid and corrected.uuid)
+    assert again == corrected
+    assert list(trial.scores.all()) == [first, corrected]
+    assert len(lines(trial.episode_id or trial.uuid)) == 2
+    trial.refresh_from_db()
+    assert trial.verdict == corrected
+    if uuid:
+        assert score(bench, trial, True, True, True, **said) == first, "whatever came after it"
+
+
+def test_the_uuid_of_a_score_says_the_same_for_ever(bench):
+    trial, uuid = bench.ended(), uuid4()
+    score(bench, trial, True, True, True, uuid=uuid)
+    other = builders.user("otto")
+    said = [
+        lambda: score(bench, trial, True, True, False, uuid=uuid, reason="on the rim"),
+        lambda: score(bench, trial, True, True, True, uuid=str(uuid), note="clean"),
+        lambda: score(bench, trial, True, True, True, uuid=uuid, user=other),
+        lambda: score(bench, bench.ended(), True, True, True, uuid=uuid),
+    ]
+    for again in said:
+        with pytest.raises(Conflict, match=f"uuid {uuid} is that of another score .trial {trial.pk}.: give"):
+            again()
+    with pytest.raises(EvaError, match="uuid 'seven': must be a UUID such as"):
+        score(bench, trial, True, True, True, uuid="seven")
+    assert len(lines(trial.episode_id or trial.uuid)) == 1
+
+
+def test_what_somebody_else_says_word_by_word_is_no_repetition(bench):
+    trial = bench.scored()
+    ticks = {outcome.milestone_id: outcome.reached for outcome in trial.verdict.outcomes.all()}
+    with pytest.raises(EvaError, match="has a score already"):
+        services.trial_score(user=builders.user("otto"), trial=trial, milestones=ticks)
+
+
+def test_who_voids_or_gives_up_once_more_gets_the_first_answer(bench):
+    voided = services.trial_void(user=bench.operator, trial=bench.scored(), reason="the camera fell")
+    at = voided.voided_at
+    again = services.trial_void(user=bench.operator, trial=voided, reason="the camera fell")
+    assert (again.status, again.voided_at, len(lines(voided.episode_id or voided.uuid))) == ("voided", at, 2)
+    with pytest.raises(Conflict, match="cannot be voided"):
+        services.trial_void(user=bench.operator, trial=voided, reason="another reason")
+    given_up = services.trial_abandon(user=bench.operator, trial=bench.prepare(), reason="wrong block")
+    assert services.trial_abandon(user=bench.operator, trial=given_up, reason="wrong block") == given_up
+    with pytest.raises(Conflict, match="cannot be abandoned"):
+        services.trial_abandon(user=bench.operator, trial=given_up)
+
+
 def test_a_score_is_never_changed(bench):
     found = bench.scored().verdict
     found.success = False

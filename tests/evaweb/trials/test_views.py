@@ -172,6 +172,20 @@ def test_a_score_is_given_and_corrected_on_the_page(bench, browser):
     assert text.count("<li") >= 2
 
 
+def test_a_form_that_is_sent_twice_is_one_score(bench, browser):
+    trial = bench.ended()
+    where = f"/result/trials/{trial.pk}"
+    uuid = re.search(r'name="uuid" value="([0-9a-f-]{36})"', page(browser, f"{where}/"))[1]
+    form = {**send(bench, trial, True, True, True, note="clean"), "uuid": uuid}
+    for _ in range(2):
+        assert browser.post(f"{where}/score", form).status_code == 302
+    assert str(Score.objects.get().uuid) == uuid
+    answer = browser.post(f"{where}/score", {**form, "note": "typed after going back", "reason": "x"})
+    assert answer.status_code == 409
+    assert f"uuid {uuid} is that of another score" in answer.content.decode()
+    assert uuid not in re.findall(r'name="uuid" value="([0-9a-f-]{36})"', answer.content.decode())
+
+
 def test_success_is_asked_for_where_no_milestone_is_required(bench, browser):
     bench.scene.milestones.update(required=False)
     trial = bench.ended()
