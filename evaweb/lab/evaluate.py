@@ -6,17 +6,15 @@ REST and the live socket; it is never told which checkpoint it runs. Then the pl
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from evaweb.lab.once import recorded, run_to_its_end, score_by_truth, set_up_and_run
-from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
+from evaweb.lab.once import recorded, run_to_its_end, score_by_truth, set_up_and_run, take
+from evaweb.lab.patience import VisitFailed, until
+from evaweb.lab.visitor import LivePage, Visitor
 
-_STATION_UP_S = 60.0
-_LEASE_S = 10.0
 _TRIES = 3  # of one trial, whose set-up or run was interrupted
 Tell = Callable[[str], None]
 
@@ -40,9 +38,7 @@ def carry_out(operator: Visitor, station: str, plan: str, count: int, tell: Tell
     """The next `count` trials of a plan; VisitFailed where one does not come about, or tells what it is of."""
     made = []
     with closing(LivePage(operator, station)) as page:
-        page.wait(lambda state: state["state"] != "disconnected", _STATION_UP_S, "waiting for the station")
-        page.claim()
-        page.wait(lambda state: state["lease"]["epoch"] == page.epoch, _LEASE_S, "waiting for the lease")
+        take(page)
         operator.post(f"stations/{station}/cameras", {"first": True})
         for number in range(1, count + 1):
             one = _made(operator, page, station, plan)
@@ -99,8 +95,12 @@ def _give_up(operator: Visitor, page: LivePage, trial: int, fault: str) -> None:
     status = operator.get(f"trials/{trial}")["status"]
     if status in ("running", "paused"):
         page.command("stop")
-        time.sleep(1.0)
-        status = operator.get(f"trials/{trial}")["status"]
+        over = until(
+            lambda: operator.get(f"trials/{trial}"),
+            lambda found: found["status"] not in ("running", "paused"),
+            "waiting for the end of the trial",
+        )
+        status = over["status"]
     if status == "prepared":
         operator.post(f"trials/{trial}/abandon", {"reason": fault[:200]})
     elif status in ("ended", "scored"):

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from typing import Any
+from uuid import uuid4
 
-from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
+from evaweb.lab.patience import VisitFailed, until
+from evaweb.lab.visitor import LivePage, Visitor
 
-_STATION_UP_S = 60.0
-_READY_S = 60.0
-_STOPPED_S = 10.0
-_PUBLISHED_S = 60.0
 _RESUMES = 3
 _REST_S = 1.0  # how long success has to last before the operator presses Stop
-_SLOWEST = 30.0  # how many times as long as its own time a run in lockstep may take
+_OVER_S = 30.0  # of the station's own time, after which a run should have ended by itself
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,26 +72,43 @@ def perform(visitor: Visitor, choice: Choice) -> Done:
 
 def start(visitor: Visitor, page: LivePage, choice: Choice) -> int:
     """Take the station, prepare a trial, set up and run; its id."""
-    page.wait(lambda state: state["state"] != "disconnected", _STATION_UP_S, "waiting for the station")
-    page.claim()
+    take(page)
     named = {name: value for name, value in asdict(choice).items() if name != "station"}
     trial: int = visitor.post(f"stations/{choice.station}/trials", named)["id"]
-    page.wait(lambda state: state["lease"]["epoch"] == page.epoch, _STOPPED_S, "waiting for the lease")
     set_up_and_run(page, trial)
     return trial
+
+
+def take(page: LivePage) -> None:
+    """Take the station once it is there."""
+    page.follow(lambda state: state["state"] != "disconnected", "waiting for the station", went_on)
+    page.claim()
+    page.follow(lambda state: state["lease"]["epoch"] == page.epoch, "waiting for the lease", went_on)
+
+
+def went_on(state: Mapping[str, Any]) -> object:
+    """What changes of a station whenever something goes on; the clock alone is no progress."""
+    stages = [stage["state"] for stage in state.get("stages", ())]
+    facts = [state.get(name) for name in ("boot", "sequence", "state", "reason", "phase", "stage")]
+    return facts, stages, state.get("lease", {}).get("epoch"), state.get("run", {}).get("number")
+
+
+def _elapsed(state: Mapping[str, Any]) -> float:
+    """How long the run has gone on, on its own clock [s]."""
+    return float(state.get("run", {}).get("elapsed", 0.0))
 
 
 def set_up_and_run(page: LivePage, trial: int, lockstep: bool = False) -> None:
     """Set the station up for a prepared trial, and begin its run."""
     page.command("setup", trial)
-    set_up = page.wait(lambda state: state["state"] != "setting_up", _READY_S, "setting up")
+    set_up = page.follow(lambda state: state["state"] != "setting_up", "setting up", went_on)
     if set_up["state"] != "ready":
         raise VisitFailed(f"set-up ended {set_up['state']}: {set_up['reason']}")
     page.command("run", trial)
     # One that holds at once, because an observation was late, has begun too: it is resumed. In lockstep, as fast as the
     # machine, one may have begun and ended between two looks.
     begun = ("running", "holding", "ready") if lockstep else ("running", "holding")
-    page.wait(lambda state: state["state"] in begun, _STOPPED_S, "starting the run")
+    page.follow(lambda state: state["state"] in begun, "starting the run", went_on)
 
 
 def report(done: Done) -> dict[str, Any]:
@@ -111,6 +126,8 @@ def run_to_its_end(page: LivePage, trial: int, limit: float, lockstep: bool = Fa
 
     def over(state: Mapping[str, Any]) -> bool:
         nonlocal succeeded
+        if _elapsed(state) > limit + _OVER_S:
+            raise VisitFailed(f"the run goes on beyond its {limit:g} s: {_elapsed(state):.0f} s")
         if lockstep or not state["truth"].get("success"):
             succeeded = 0.0
         elif not succeeded:
@@ -118,23 +135,22 @@ def run_to_its_end(page: LivePage, trial: int, limit: float, lockstep: bool = Fa
         return state["state"] != "running" or bool(succeeded and state["clock"] - succeeded >= _REST_S)
 
     for resumed in range(_RESUMES + 1):
-        state = page.wait(over, limit * _SLOWEST if lockstep else limit + 30.0, "running")
+        state = page.follow(over, "running", lambda now: (went_on(now), _elapsed(now)))
         if state["state"] != "holding" or resumed == _RESUMES:
             break
         page.command("resume", trial)
-        page.wait(lambda now: now["state"] != "holding", _STOPPED_S, "resuming")
+        page.follow(lambda now: now["state"] != "holding", "resuming", went_on)
     if state["state"] in ("running", "holding"):
         page.command("stop")
-    page.wait(lambda now: now["state"] not in ("running", "holding"), _STOPPED_S, "stopping")
+    page.follow(lambda now: now["state"] not in ("running", "holding"), "stopping", went_on)
     return resumed
 
 
 def score_by_truth(visitor: Visitor, trial: int) -> Mapping[str, Any]:
     """Tick what the bench says was reached, and when, once the trial waits to be scored and its truth is there."""
-    facts = _poll(
+    facts = until(
         lambda: visitor.get(f"trials/{trial}"),
         lambda found: found["status"] in ("ended", "interrupted") and found["truth"] is not None,
-        _STOPPED_S,
         "waiting for the end of the trial and the bench's truth",
     )
     milestones = visitor.get(f"scenes/{facts['scene']}")["milestones"]
@@ -146,49 +162,44 @@ def score_by_truth(visitor: Visitor, trial: int) -> Mapping[str, Any]:
         if reached[str(milestone["id"])]
     }
     words = {"note": "scored from the bench's truth", "source": "truth"}
-    content = {"milestones": reached, "times": when, **words}
-    visitor.post(f"trials/{trial}/score", content)
-    scored: Mapping[str, Any] = visitor.get(f"trials/{trial}")
+    content = {"milestones": reached, "times": when, "uuid": str(uuid4()), **words}
+    scored: Mapping[str, Any] = until(
+        lambda: visitor.post(f"trials/{trial}/score", content), lambda found: True, "scoring"
+    )
     return scored
 
 
 def recorded(visitor: Visitor, trial: int) -> Mapping[str, Any]:
     """The trial once it is as long as its recording, whatever becomes of that later."""
     uuid = visitor.get(f"trials/{trial}")["episode"]
-    episode = _poll(
-        lambda: visitor.get(f"episodes/{uuid}"),
-        lambda facts: facts["duration_s"] is not None,
-        _PUBLISHED_S,
-        "waiting for the recording",
-    )
+    episode = _worked_on(visitor, uuid, ("duration_s",), "waiting for the recording")
     return whole(visitor, trial, episode)
 
 
 def _published(visitor: Visitor, episode: str) -> Mapping[str, Any]:
-    found: Mapping[str, Any] = _poll(
-        lambda: visitor.get(f"episodes/{episode}"),
-        lambda facts: facts["dataset_index"] is not None and facts["duration_s"] is not None,
-        _PUBLISHED_S,
-        "waiting for the dataset",
-    )
-    return found
+    return _worked_on(visitor, episode, ("dataset_index", "duration_s"), "waiting for the dataset")
+
+
+def _worked_on(visitor: Visitor, uuid: str, facts: Sequence[str], what: str) -> Mapping[str, Any]:
+    """The episode once these facts are known of it; what the worker does meanwhile is progress."""
+
+    def ask() -> tuple[Mapping[str, Any], Sequence[Mapping[str, Any]]]:
+        return visitor.get(f"episodes/{uuid}"), visitor.get("jobs?limit=50")["items"]
+
+    def known(found: tuple[Mapping[str, Any], Sequence[Mapping[str, Any]]]) -> bool:
+        for job in found[1]:
+            if job["key"] == f"publish:{uuid}" and job["status"] == "failed":
+                raise VisitFailed(f"{what}: job {job['key']} has failed: {job['error']}")
+        return all(found[0][name] is not None for name in facts)
+
+    return until(ask, known, what)[0]
 
 
 def whole(visitor: Visitor, trial: int, episode: Mapping[str, Any]) -> Mapping[str, Any]:
     """The trial once it is as long as its recording: until then its duration is that of the commands."""
-    found: Mapping[str, Any] = _poll(
+    found: Mapping[str, Any] = until(
         lambda: visitor.get(f"trials/{trial}"),
         lambda facts: facts["duration_s"] == episode["duration_s"],
-        _STOPPED_S,
         "waiting for the exact duration",
     )
-    return found
-
-
-def _poll(ask: Any, reached: Any, seconds: float, what: str) -> Any:
-    deadline = time.monotonic() + seconds
-    while not reached(found := ask()):
-        if time.monotonic() > deadline:
-            raise VisitFailed(f"{what}: not within {seconds:g} s; it is {found}")
-        time.sleep(0.25)
     return found

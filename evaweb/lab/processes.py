@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import selectors
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from evaweb.errors import EvaError
 log = logging.getLogger(__name__)
 _MOST_RESTARTS, _RESTART_WINDOW_S = 5, 60.0
 _REST_S = 30.0
+_MOST_PROCESSOR_S = 300.0  # of a program that gets ready
 _LONGEST_LOG = 20_000_000  # bytes, beyond which a log starts anew and the old one is kept beside it
 
 
@@ -67,7 +69,10 @@ class Processes:
         logs.mkdir(parents=True, exist_ok=True)
 
     def start(self, program: Program, ready_s: float = 60.0) -> Mapping[str, Any]:
-        """Start it; returns the addresses that it announces, {} where it announces none."""
+        """Start it; returns the addresses that it announces, {} where it announces none.
+
+        It may be slow, as its machine is: LabError where it does nothing for `ready_s`, or far too much.
+        """
         child = _Child(program, *self._spawn(program, program.arguments, program.announces))
         self._children[program.name] = child
         if program.announces:
@@ -125,14 +130,15 @@ class Processes:
     def _announcement(self, child: _Child, ready_s: float) -> Mapping[str, Any]:
         output = child.process.stdout
         assert output is not None
-        deadline = time.monotonic() + ready_s
+        used, since = 0.0, time.monotonic()
         with selectors.DefaultSelector() as selector:
             selector.register(output, selectors.EVENT_READ)
             while not selector.select(0.2):
-                if time.monotonic() > deadline:
-                    raise LabError(
-                        f"{child.program.name} was not ready within {ready_s:g} s: {self._why(child)}"
-                    )
+                now, before, used = time.monotonic(), used, processor_s(child.process.pid)
+                since = since if used == before else now
+                if used > _MOST_PROCESSOR_S or now - since > ready_s:
+                    spent = f"{used:g} s of the processor, nothing for {now - since:.0f} s"
+                    raise LabError(f"{child.program.name} does not get ready ({spent}): {self._why(child)}")
         line = output.readline()
         try:
             found = json.loads(line)
@@ -170,3 +176,12 @@ class Processes:
         child.log.close()
         arguments = program.again(child.addresses) if program.again else program.arguments
         child.process, child.log = self._spawn(program, arguments, heard=False)
+
+
+def processor_s(pid: int) -> float:
+    """How long that process, and what it has waited for, has had a processor [s]; 0 of one that has ended."""
+    try:
+        told = Path(f"/proc/{pid}/stat").read_text("ascii", "replace")
+    except OSError:
+        return 0.0
+    return sum(map(int, told.rpartition(")")[2].split()[11:15])) / os.sysconf("SC_CLK_TCK")

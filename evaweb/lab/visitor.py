@@ -27,15 +27,17 @@ from websockets.sync.client import ClientConnection, connect
 
 from evaweb.errors import EvaError
 from evaweb.frames import decode
+from evaweb.lab.patience import NoReply, Patience, VisitFailed
 
 _RENEW_S = 1.0
+_LOOK_S = 1.0  # between two looks at whether something goes on
 _TIMEOUT_S = 30.0
 _LARGEST_FRAME = 16 * 1024 * 1024
 _TOKEN = re.compile(r'name="csrfmiddlewaretoken" value="([^"]+)"')
 
 
-class VisitFailed(EvaError):
-    """The lab answered something else than was asked for; the message has its words."""
+class NotYet(VisitFailed):
+    """No state came in time that is as it was wanted."""
 
 
 class _NoRedirect(HTTPRedirectHandler):
@@ -102,8 +104,9 @@ class Visitor:
             raise VisitFailed(
                 f"{request.get_method()} {request.selector}: HTTP {refusal.code}: {_sentence(body)}"
             ) from None
-        except URLError as error:
-            raise VisitFailed(f"{self.url} does not answer: {error.reason}") from None
+        except (URLError, TimeoutError, ConnectionError) as error:  # the latter while the body is read
+            reason = error.reason if isinstance(error, URLError) else error
+            raise NoReply(f"{self.url} does not answer: {reason}") from None
 
 
 def _sentence(body: str) -> str:
@@ -115,6 +118,10 @@ def _sentence(body: str) -> str:
     if isinstance(found, dict):
         return str(found.get("error") or found.get("reason") or found.get("detail") or found)
     return str(found)
+
+
+def _words(state: Mapping[str, Any]) -> str:
+    return f"{state.get('state')}: {state.get('reason')}" if state else "no state"
 
 
 class LivePage:
@@ -166,13 +173,23 @@ class LivePage:
                 if self._failure:
                     raise VisitFailed(f"{what}: {self._failure}")
                 if not self._changed.wait(deadline - time.monotonic()) and time.monotonic() >= deadline:
-                    now = (
-                        f"{self._state.get('state')}: {self._state.get('reason')}"
-                        if self._state
-                        else "no state"
-                    )
-                    raise VisitFailed(f"{what}: not within {seconds:g} s; the station is {now}")
+                    raise NotYet(f"{what}: not within {seconds:g} s; the station is {_words(self._state)}")
             return self._state
+
+    def follow(
+        self,
+        reached: Callable[[Mapping[str, Any]], bool],
+        what: str,
+        mark: Callable[[Mapping[str, Any]], object],
+    ) -> Mapping[str, Any]:
+        """As `wait`, while there is progress: `mark` of the state is another one whenever something went on."""
+        patience = Patience(what)
+        while True:
+            try:
+                return self.wait(reached, _LOOK_S, what)
+            except NotYet:
+                state = self._state
+                patience.look(mark(state) if state else None, _words(state))
 
     def claim(self) -> None:
         """Take the station; renewed from then on."""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from evaweb.lab.processes import LabError, Processes, Program
+from evaweb.lab.processes import LabError, Processes, Program, processor_s
 from tests.processes import alive, eventually
 
 WAITS = "import sys\nsys.stdin.read()\n"
@@ -66,8 +66,29 @@ def test_a_program_that_does_not_start_is_named_with_what_it_said(processes):
 
 
 def test_a_program_that_says_nothing_is_given_up(processes):
-    with pytest.raises(LabError, match=r"one was not ready within 0\.5 s"):
+    with pytest.raises(LabError, match=r"one does not get ready \(.* s of the processor, nothing for"):
         processes.start(Program("one", ("-c", WAITS), announces=True), ready_s=0.5)
+
+
+def test_a_slow_one_is_waited_for_as_long_as_it_works(processes, monkeypatch):
+    spent = iter(range(1, 40))
+    monkeypatch.setattr("evaweb.lab.processes.processor_s", lambda pid: float(next(spent)))
+    slow = "import time; time.sleep(1); " + SAYS.replace("import sys\n", "import sys; ", 1)
+    told = processes.start(Program("slow", ("-c", slow), announces=True), ready_s=0.0)
+    assert told["url"].startswith("here")
+
+
+def test_one_that_only_works_is_given_up(processes, monkeypatch):
+    monkeypatch.setattr("evaweb.lab.processes._MOST_PROCESSOR_S", 0.2)
+    with pytest.raises(LabError, match="busy does not get ready"):
+        processes.start(Program("busy", ("-c", "while True: pass"), announces=True))
+
+
+def test_the_time_on_the_processor_is_that_of_the_process():
+    before = processor_s(os.getpid())
+    while processor_s(os.getpid()) == before:
+        sum(range(100_000))
+    assert processor_s(2**22 + 1) == 0.0
 
 
 def test_all_end_with_their_lifelines_and_the_stubborn_are_killed(processes):

@@ -1,0 +1,134 @@
+"""The demo waits as long as something goes on, and says what it waited for where nothing does."""
+
+from __future__ import annotations
+
+import pytest
+
+from evaweb.lab import once, patience
+from evaweb.lab.patience import STILL_S, NoReply, VisitFailed, until
+from evaweb.lab.visitor import LivePage, NotYet
+
+
+class Clock:
+    """Time that passes where one sleeps."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += 60.0
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    made = Clock()
+    monkeypatch.setattr(patience, "time", made)
+    return made
+
+
+def test_what_goes_on_is_waited_for_however_slow_it_is(clock):
+    found = until(lambda: int(clock.now // 120), lambda rows: rows == 50, "waiting for the dataset")
+    assert found == 50
+    assert clock.now > 30 * STILL_S
+
+
+def test_what_stands_still_is_an_error_that_says_what_was_waited_for_and_how_it_stands(clock):
+    with pytest.raises(VisitFailed, match=r"waiting for the dataset: no progress for 180 s; it is .*queued"):
+        until(lambda: {"job": "queued"}, lambda found: False, "waiting for the dataset")
+    assert clock.now < 2 * STILL_S
+
+
+def test_a_lab_that_does_not_reply_is_asked_again_and_not_for_ever(clock):
+    replies = iter([NoReply("timed out"), NoReply("timed out"), "scored"])
+
+    def ask():
+        reply = next(replies)
+        if isinstance(reply, NoReply):
+            raise reply
+        return reply
+
+    assert until(ask, bool, "scoring") == "scored"
+
+    def mute():
+        raise NoReply("http://127.0.0.1:1 does not answer: timed out")
+
+    with pytest.raises(VisitFailed, match=r"scoring: no progress for 180 s; it is http://.* timed out"):
+        until(mute, bool, "scoring")
+
+
+def test_a_refusal_is_told_at_once(clock):
+    def refused():
+        raise VisitFailed("HTTP 409: trial 1 is running")
+
+    with pytest.raises(VisitFailed, match="trial 1 is running"):
+        until(refused, bool, "scoring")
+    assert clock.now == 0.0
+
+
+def station(clock: Clock, **said):
+    state = {"boot": "b", "sequence": 3, "state": "running", "reason": "", "stages": [], "truth": {}}
+    return state | {"clock": clock.now, "lease": {"epoch": 1}, "run": {"number": 1, "elapsed": 0.0}} | said
+
+
+class Page(LivePage):
+    """A page whose states are those of a function of the time."""
+
+    def __init__(self, clock, says):
+        self._clock, self._says = clock, says
+        self.asked = []
+
+    def wait(self, reached, seconds, what):
+        self._clock.sleep(seconds)
+        self._state = self._says()
+        if reached(self._state):
+            return self._state
+        raise NotYet(what)
+
+    def command(self, kind, trial=None):
+        self.asked.append(kind)
+
+
+def test_a_run_on_a_slow_machine_is_watched_to_its_end_by_its_own_clock(clock):
+    def says():
+        elapsed = clock.now / 100
+        state = "running" if elapsed < 40 else "ready"
+        return station(clock, state=state, run={"number": 1, "elapsed": elapsed})
+
+    assert once.run_to_its_end(Page(clock, says), 1, 40.0, lockstep=True) == 0
+    assert clock.now > 4000
+
+
+@pytest.mark.parametrize(
+    ("elapsed", "fault"),
+    [
+        (lambda clock: 7.0, r"running: no progress for 180 s; it is running: "),
+        (lambda clock: clock.now, r"the run goes on beyond its 40 s: "),
+    ],
+)
+def test_a_run_that_stands_still_or_never_ends_is_an_error(clock, elapsed, fault):
+    page = Page(clock, lambda: station(clock, run={"number": 1, "elapsed": elapsed(clock)}))
+    with pytest.raises(VisitFailed, match=fault):
+        once.run_to_its_end(page, 1, 40.0)
+
+
+def test_that_the_clock_of_the_station_goes_on_is_no_progress_of_a_set_up(clock):
+    stages = [{"name": "connect", "state": "active", "seconds": 0.0}]
+    page = Page(clock, lambda: station(clock, state="setting_up", stages=stages))
+    with pytest.raises(VisitFailed, match="setting up: no progress for 180 s; it is setting_up"):
+        once.set_up_and_run(page, 1)
+    assert page.asked == ["setup"]
+
+
+def test_a_publication_that_has_failed_is_told_with_its_error(clock):
+    class Visitor:
+        def get(self, path):
+            failed = {"key": "publish:u", "status": "failed", "error": "disk full"}
+            return (
+                {"items": [failed]} if path.startswith("jobs") else {"dataset_index": None, "duration_s": 1.0}
+            )
+
+    with pytest.raises(VisitFailed, match="waiting for the dataset: job publish:u has failed: disk full"):
+        once._published(Visitor(), "u")
