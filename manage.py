@@ -7,9 +7,19 @@ import sys
 from django.core.exceptions import ImproperlyConfigured
 from django.core.management import execute_from_command_line
 
-if __name__ == "__main__":
+from robots.broken_pipe import unread_ends
+
+
+@unread_ends
+def main() -> int:
+    """Exit code 0, or that of the command."""
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
     try:
         execute_from_command_line(sys.argv)
     except ImproperlyConfigured as error:
         sys.exit(f"cannot start: {error}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

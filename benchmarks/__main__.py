@@ -7,6 +7,8 @@ import importlib
 import sys
 from pathlib import Path
 
+from robots.broken_pipe import unread_ends
+
 _BENCHMARKS = (
     "ik",
     "latency",
@@ -26,6 +28,7 @@ _LONG = ("recording",)
 _SECONDS = 20.0
 
 
+@unread_ends
 def main() -> int:
     """Exit code 0 where every wanted figure holds, 1 where one does not."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)

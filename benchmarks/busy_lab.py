@@ -12,6 +12,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from robots.broken_pipe import unread_ends
+
 ROBOT = "agilex_piper"
 _ROOT = Path(__file__).parents[1]
 _POLICY = ("--robot", ROBOT, "--port", "0", "--latency-ms", "80")
@@ -30,6 +32,7 @@ PATIENT = (
 )
 
 
+@unread_ends
 def main() -> int:
     """Stay up until a signal comes."""
     import django

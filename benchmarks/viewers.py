@@ -15,8 +15,10 @@ from urllib.parse import urlsplit
 from websockets.asyncio.client import ClientConnection, connect
 
 from evaweb.frames import decode
+from robots.broken_pipe import unread_ends
 
 
+@unread_ends
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("url")

@@ -19,6 +19,7 @@ from threading import Event
 
 import robots
 from benchmarks.wires_receiver import layout
+from robots.broken_pipe import unread_ends
 from runtime.clock import Clock
 from runtime.page import Page
 from runtime.sim import node, standin
@@ -78,6 +79,7 @@ class NotingServer(MjpegServer):
         super()._send_picture(client, data)
 
 
+@unread_ends
 def main(file: str, page: str, module: str, *arguments: str) -> int:
     """The exit code of the simulated robot."""
     if module == "cameras":

@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from robots import Robot, RobotError, description, load, names
+from robots.broken_pipe import unread_ends
 from robots.draft import draft
 from robots.inspection import Inspection, inspect
 from robots.loading import folders
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; returns 0, or 1 where a description or the question is wrong."""
     options = _parser().parse_args(arguments)

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from robots.broken_pipe import unread_ends
 from runtime import deployment, headless, lockstep, log
 from runtime.clock import MonotonicClock
 from runtime.deployment import Resolved
@@ -21,6 +22,7 @@ from runtime.supervisor import Supervisor
 from runtime.transitions import State
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0 where all went well, 1 where the run failed, 2 where the deployment is wrong."""
     given = _parser().parse_args(arguments)

@@ -7,6 +7,7 @@ import functools
 import inspect
 import itertools
 import json
+import sys
 import textwrap
 from collections.abc import Iterator, Mapping
 from typing import Any, get_args, get_origin
@@ -14,6 +15,7 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from robots.broken_pipe import unread_ends
 from runtime.config import Deployment
 
 Schema = Mapping[str, Any]
@@ -157,5 +159,12 @@ def _said_of_keys(model: type) -> dict[str, str]:
     }
 
 
-if __name__ == "__main__":
+@unread_ends
+def main() -> int:
+    """Print it."""
     print(reference(), end="")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from robots.broken_pipe import unread_ends
 from runtime.client import Refused, StationClient
 from runtime.errors import RuntimeFault, TransportError
 from runtime.terminal import aims, watching
@@ -19,21 +19,17 @@ from runtime.terminal.figures import line, report, tuning
 from runtime.terminal.settling import settle
 from runtime.terminal.syntax import parse
 
-DONE, FAILED, UNKNOWN, INTERRUPTED, UNREAD = 0, 1, 3, 130, 141  # exit codes; 2 is argparse's
+DONE, FAILED, UNKNOWN, INTERRUPTED = 0, 1, 3, 130  # exit codes; 2 is argparse's, 141 that of broken_pipe
 _RELEASE_S = 2.0
 
 
+@unread_ends
 def main(words: Sequence[str] | None = None) -> int:
     """Exit code 0 where it was done, 1 refused or failed, 3 where no answer came, 141 where nobody reads on."""
     given = parse(sys.argv[1:] if words is None else words)
     client = StationClient(Path(given.data_dir).expanduser().absolute() / "stations" / given.station)
     try:
-        code = _do(client, given)
-        sys.stdout.flush()  # here, where a pipe that was closed is no traceback
-        return code
-    except BrokenPipeError:  # `status | head -1`: who reads has enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush when the process ends
-        return UNREAD
+        return _do(client, given)
     except Refused as refusal:
         print(f"refused: {refusal}", file=sys.stderr)
     except TransportError as fault:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from robots.broken_pipe import unread_ends
 from runtime.client import StationClient
 from runtime.errors import RuntimeFault, SetupError
 from runtime.family import Plan, join
@@ -217,6 +218,7 @@ def summary(result: dict[str, Any]) -> list[str]:
     return ["", "How it went", *(f"  {name:<9} {text}" for name, text in rows)]
 
 
+@unread_ends
 def main() -> int:
     """Drive, print, leave the result in the station's folder; exit code 0 where all went well."""
     member = join("headless")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -19,6 +20,7 @@ log = logging.getLogger(__name__)
 _RATE_WINDOW = 40  # arrivals per stream
 _SILENT_S = 2.0  # after which a stream has no rate any more
 _REPEAT_S = 5.0  # between two events of one fault: thousands of lost frames are not thousands of lines
+_STANDING = "_unusable"  # ends the names of faults that are in every message of a node: said once in each run
 
 
 class Intake:
@@ -69,6 +71,7 @@ class Intake:
     def begin_run(self) -> None:
         """The source begins a run; its first frame is taken here, so that the run's first tick sees it."""
         self._source.begin_run()
+        self._said_at = {name: at for name, at in self._said_at.items() if not name.endswith(_STANDING)}
         self.pump(0.0)
 
     def end_run(self) -> None:
@@ -76,13 +79,17 @@ class Intake:
         self._source.end_run()
 
     def faults(self) -> dict[str, int]:
-        """How often what went wrong; a count that has grown is an event, each fault's 5 s apart, and so is news."""
+        """How often what went wrong; a count that has grown is an event, each fault's 5 s apart, and so is news.
+
+        What a node never sends in a usable form is an event once in each run.
+        """
         for event in self._source.news():
             self._say(event)
         now, faults = self._clock.now(), {**self._source.faults(), **self._too_large}
         for name, count in faults.items():
             known = self._faults[name] = min(count, self._faults.get(name, 0))  # a source begins anew at 0
-            if count > known and now - self._said_at.get(name, float("-inf")) >= _REPEAT_S:
+            again = math.inf if name.endswith(_STANDING) else _REPEAT_S
+            if count > known and now - self._said_at.get(name, -math.inf) >= again:
                 self._faults[name], self._said_at[name] = count, now
                 why = self._source.why(name)
                 named = name.replace("_", " ").replace(".", ": ")

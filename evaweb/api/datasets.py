@@ -20,10 +20,11 @@ router = Router(tags=["datasets"])
 
 
 class CheckOut(Schema):
-    """What the newest check found; `fresh` is false where the dataset has changed since."""
+    """What the newest check found; `remarks` are no damage, `fresh` is false where the dataset has changed since."""
 
     at: datetime
     problems: list[str]
+    remarks: list[str]
     fresh: bool
 
 
@@ -47,7 +48,7 @@ class DatasetOut(Schema):
         """With what its newest check found."""
         own = [name for name in DatasetOut.model_fields if name != "check"]
         checked = None if found.problem else work.checked(found.name)
-        check = checked and {"at": checked.at, "problems": list(checked.problems), "fresh": checked.fresh}
+        check = checked and {name: getattr(checked, name) for name in CheckOut.model_fields}
         return {**{name: getattr(found, name) for name in own}, "check": check}
 
 

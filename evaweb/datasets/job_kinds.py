@@ -33,10 +33,11 @@ def dataset(work: Work) -> Mapping[str, Any]:
 
 
 def _check(work: Work) -> Found:
-    from runtime.datasets.consistency import check  # web processes know this kind too, and never do it
+    from runtime.datasets.consistency import examine  # web processes know this kind too, and never do it
 
     work.tell("every file is compared with the metadata")
-    return {"problems": check(_source(work))}
+    found = examine(_source(work))
+    return {"problems": found.problems, "remarks": found.remarks}
 
 
 def _repair(work: Work) -> Found:

@@ -49,6 +49,7 @@ class Checked:
 
     at: datetime
     problems: tuple[str, ...]
+    remarks: tuple[str, ...]  # worth saying, and no damage
     fresh: bool
 
 
@@ -122,4 +123,5 @@ def checked(name: str) -> Checked | None:
         return None
     changed = datetime.fromtimestamp((dataset_found(name) / layout.INFO).stat().st_mtime, UTC)
     since = job.finished_at if job.args["what"] == "repair" else job.claimed_at
-    return Checked(job.finished_at, tuple(job.result["problems"]), changed <= since)
+    said = (tuple(job.result.get(name, ())) for name in ("problems", "remarks"))
+    return Checked(job.finished_at, *said, fresh=changed <= since)

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import zmq
 
+from robots.broken_pipe import unread_ends
 from runtime import deployment, log
 from runtime.bus import Endpoints
 from runtime.channel.door import Door, Names
@@ -32,6 +33,7 @@ _POLL_S = 0.1
 _AGAIN_S = 1.0
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until the supervisor is gone, or a signal; exit code 2 where the station is not known."""
     given = _parser().parse_args(arguments)

@@ -8,14 +8,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from robots.broken_pipe import unread_ends
 from runtime.datasets import layout, operations
 from runtime.datasets.assemble import Assembled
-from runtime.datasets.consistency import check
+from runtime.datasets.consistency import examine
 from runtime.datasets.hub import push
 from runtime.datasets.published import publish
 from runtime.errors import RecordingError, RuntimeFault
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """0 where all is well, 1 where a check found something or what was asked for was refused."""
     options = _parser().parse_args(arguments)
@@ -179,7 +181,10 @@ def _repair(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    return _report(options.dataset, check(options.dataset))
+    found = examine(options.dataset)
+    for remark in found.remarks:
+        print(f"remark: {remark}")
+    return _report(options.dataset, found.problems)
 
 
 def _push(options: argparse.Namespace) -> int:

@@ -8,10 +8,12 @@ import time
 from collections.abc import Sequence
 
 import robots
+from robots.broken_pipe import unread_ends
 from runtime.errors import RuntimeFault
 from runtime.kinematics import compiled
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compiles for the named robots, else for all that there are; returns 1 where one cannot be."""
     parser = argparse.ArgumentParser(prog="python -m runtime.kinematics", description=__doc__)

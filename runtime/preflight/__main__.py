@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from robots.broken_pipe import unread_ends
 from runtime import deployment, log
 from runtime.deployment import Resolved
 from runtime.errors import ConfigurationError, RuntimeFault
@@ -28,6 +29,7 @@ _LONGEST_S = 3600.0
 _BACKGROUND_NICE = 5  # stations of the same machine come first
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Fly once and print what was found."""
     parser = _parser()

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from robots.broken_pipe import unread_ends
 from runtime.datasets import layout
 from runtime.datasets.reader import open_dataset
 from runtime.errors import RecordingError
@@ -18,6 +19,7 @@ from runtime.quality.settings import QualitySettings, read_settings
 SHOWN = 20  # flags of an episode that are printed
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0 where every episode is clean, 1 where one is flagged, 2 where something cannot be judged."""
     options = _parser().parse_args(arguments)

@@ -9,12 +9,14 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
+from robots.broken_pipe import unread_ends
 from runtime.errors import RecordingError
 from runtime.recording.export import export
 from runtime.recording.reader import Episode, open_episode
 from runtime.recording.repair import Report, repair, repair_all
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0 where all is well, 1 where an episode is unreadable or the disk fails."""
     options = _parser().parse_args(arguments)

@@ -7,6 +7,7 @@ import contextlib
 import sys
 from collections.abc import Sequence
 
+from robots.broken_pipe import unread_ends
 from runtime.sim import standin
 from runtime.sim.camera_server import FAULTS, CameraServer
 from runtime.sim.mjpeg_server import MjpegServer
@@ -32,6 +33,7 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until told to end; 2 where the port is taken."""
     options = parser().parse_args(arguments)

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from robots.broken_pipe import unread_ends
 from runtime import deployment
 from runtime.errors import RuntimeFault, SetupError
 from runtime.headless import RESULT_NAME
@@ -56,6 +57,7 @@ class StandIns:
                 child.wait()
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0 where the run went well."""
     parser = argparse.ArgumentParser(prog="python -m runtime.sim.demo", description=__doc__)

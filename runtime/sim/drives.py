@@ -14,6 +14,7 @@ from typing import Any
 
 import zmq
 
+from robots.broken_pipe import unread_ends
 from runtime import codecs
 from runtime.transports.node_messages import DRIVE_FAULT_LENGTH, DRIVE_FAULTS_LIMIT
 
@@ -70,6 +71,7 @@ def tell(endpoint: str, word: str, fault: str = "") -> bool:
         socket.close()
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0 where the node was told, 1 where none listens."""
     line = argparse.ArgumentParser(

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import zmq
 
+from robots.broken_pipe import unread_ends
 from runtime import codecs
 from runtime.clock import Clock, MonotonicClock
 from runtime.errors import RuntimeFault
@@ -119,6 +120,7 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a leader until SIGTERM, SIGINT or the end of the lifeline."""
     import robots

@@ -19,6 +19,7 @@ from typing import Any
 
 import robots
 from robots import Robot
+from robots.broken_pipe import unread_ends
 from runtime import deployment, family, log
 from runtime.clock import Clock, VirtualClock
 from runtime.errors import RuntimeFault, SetupError
@@ -107,6 +108,7 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until SIGTERM, SIGINT or the end of the lifeline."""
     options = parser().parse_args(arguments)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from robots.broken_pipe import unread_ends
 from runtime import codecs
 from runtime.clock import Clock, MonotonicClock
 from runtime.errors import RuntimeFault, SetupError
@@ -250,6 +251,7 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a node until SIGTERM, SIGINT or the end of the lifeline."""
     import robots

@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robots.broken_pipe import unread_ends
 from runtime.clock import Clock, MonotonicClock
 from runtime.errors import RuntimeFault, SetupError
 from runtime.sim import ros1_modules, ros_robot, standin
@@ -129,6 +130,7 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until SIGTERM, SIGINT or the end of the lifeline; then print the truth of the bench as JSON."""
     import robots

@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+from robots.broken_pipe import unread_ends
 from runtime.clock import Clock, MonotonicClock
 from runtime.errors import RuntimeFault
 from runtime.sim import ros_robot, standin
@@ -133,6 +134,7 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until SIGTERM, SIGINT or the end of the lifeline; then print the truth of the bench as JSON."""
     import robots

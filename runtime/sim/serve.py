@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Protocol
 
+from robots.broken_pipe import unread_ends
 from runtime.errors import RuntimeFault, SetupError
 from runtime.sim import faults, standin
 from runtime.sim.script import Script, Waving
@@ -97,6 +98,7 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
+@unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until SIGTERM, SIGINT or the end of the lifeline."""
     import robots

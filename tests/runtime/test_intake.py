@@ -89,6 +89,21 @@ def test_a_fault_is_said_when_its_count_has_grown(gate: Gate) -> None:
     ]
 
 
+def test_what_a_node_never_sends_in_a_usable_form_is_said_once_in_each_run(gate: Gate) -> None:
+    def thirty_seconds() -> None:
+        for _ in range(900):
+            gate.source.counts["eef_unusable"] = gate.source.counts.get("eef_unusable", 0) + 1
+            assert gate.intake.faults() == gate.source.counts
+            gate.clock.advance(1 / RATE)
+
+    thirty_seconds()
+    for _ in range(2):
+        gate.intake.begin_run()
+        thirty_seconds()
+    assert [event.kind for event in gate.said] == ["source_eef_unusable"] * 3
+    assert [event.data["count"] for event in gate.said] == [1, 901, 1801]
+
+
 def test_a_fault_that_goes_on_is_said_every_five_seconds_and_nothing_of_it_is_lost(gate: Gate) -> None:
     for count in range(1, 101):
         gate.source.counts["frames_lost_cam"] = count

@@ -4,15 +4,20 @@ import json
 import os
 import re
 from collections.abc import Callable
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from runtime.datasets.consistency import check
+from runtime.datasets.__main__ import main
+from runtime.datasets.consistency import check, examine, rounded
 from runtime.datasets.published import publish
 from tests.runtime.datasets.small import record, write_video
 
@@ -90,3 +95,64 @@ def test_the_sample_episode_is_whole() -> None:
     if not sample:
         pytest.skip("EVA_SAMPLE_EPISODE does not name a LeRobot v2.1 dataset to try")
     assert check(Path(sample)) == []
+
+
+def single(values: Any) -> tuple[Any, Any]:
+    """Mean and deviation as LeRobot's running statistics have them: sums of float32, row by row."""
+    rows = np.asarray(values, np.float32)
+    total, squares = (reduce(np.add, each) for each in (rows, rows**2))
+    mean, square = total / np.float32(len(rows)), squares / np.float32(len(rows))
+    return mean, np.sqrt(np.maximum(square - mean**2, 0))
+
+
+def restate(dataset: Path, edit: Callable[[dict[str, Any]], object]) -> None:
+    path = dataset / "meta/episodes_stats.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    edit(lines[0]["stats"])
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def test_a_deviation_of_constant_joints_off_by_rounding_is_a_remark(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dataset = publish(record(tmp_path / "episodes", frames=20), tmp_path / "set").dataset
+
+    def still(column: Any) -> Any:
+        return pa.array([[2.1] * column.type.list_size] * len(column), column.type)
+
+    path = dataset / "data/chunk-000/episode_000000.parquet"
+    table = pq.read_table(path)
+    place = table.column_names.index("action")
+    pq.write_table(table.set_column(place, "action", still(table["action"])), path)
+    constant = np.asarray(still(table["action"]).to_pylist(), np.float32)
+    width = constant.shape[1]
+    exact = {name: [float(np.float32(2.1))] * width for name in ("min", "max", "mean")}
+    restate(dataset, lambda stats: stats["action"].update(exact, std=[0.0013] * width))
+    found = examine(dataset)
+    assert found.problems == []
+    (remark,) = found.remarks
+    assert remark.startswith("episode 0: std of 'action' is [0.0013, ")
+    assert main(["check", str(dataset)]) == 0
+    said = capsys.readouterr().out
+    assert f"remark: {remark}" in said
+    assert f"{dataset} is whole" in said
+    restate(dataset, lambda stats: stats["action"].update(std=[0.02] * width))
+    assert examine(dataset).remarks == []
+    assert "std of 'action' is [0.02" in check(dataset)[0]
+
+
+@given(
+    st.floats(-1e3, 1e3, width=32),
+    st.sampled_from([0.0, 1e-6, 1e-3, 1.0]),
+    st.integers(2, 3000),
+    st.integers(0, 99),
+)
+def test_sums_in_single_precision_are_never_called_wrong(
+    offset: float, spread: float, rows: int, seed: int
+) -> None:
+    noise = np.random.default_rng(seed).normal(0, spread, (rows, 1))
+    known = (np.float32(offset) + noise).astype(np.float32)
+    mean, std = single(known)
+    exact = known.astype(np.float64)
+    assert rounded("mean", mean, exact.mean(axis=0), exact)
+    assert rounded("std", std.astype(np.float64), exact.std(axis=0), exact)

@@ -1,0 +1,68 @@
+"""A terminal that reads on no more (`... | head -1`) ends a command without a traceback; here, below all programs."""
+
+from __future__ import annotations
+
+import io
+import os
+import select
+import sys
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec
+
+UNREAD = 141  # exit code, that of a shell for an end by SIGPIPE
+
+Given = ParamSpec("Given")
+
+
+def unread_ends(main: Callable[Given, int]) -> Callable[Given, int]:
+    """`main`, with the exit code 141 where standard output or error is a pipe that nobody reads any more.
+
+    A BrokenPipeError of anything else stays one.
+    """
+
+    @wraps(main)
+    def run(*given: Given.args, **named: Given.kwargs) -> int:
+        try:
+            try:
+                code = main(*given, **named)
+            except SystemExit:  # of argparse, which has printed its help
+                _flush()
+                raise
+            _flush()  # here, and not when the process ends
+        except BrokenPipeError:
+            if not _silenced():
+                raise
+            return UNREAD
+        return code
+
+    return run
+
+
+def _flush() -> None:
+    print(end="", flush=True)  # also where there is no standard output
+
+
+def _silenced() -> bool:
+    """Whether one of our streams has no reader; what waits to be written there goes nowhere from now on."""
+    unread = [
+        number for number in map(_descriptor, (sys.stdout, sys.stderr)) if number >= 0 and _unread(number)
+    ]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for number in unread:
+        os.dup2(nowhere, number)
+    os.close(nowhere)
+    return bool(unread)
+
+
+def _descriptor(stream: io.TextIOBase) -> int:
+    try:
+        return stream.fileno()
+    except (AttributeError, io.UnsupportedOperation):  # there is none, or it is no file
+        return -1
+
+
+def _unread(number: int) -> bool:
+    poll = select.poll()
+    poll.register(number, 0)
+    return any(told & select.POLLERR for _, told in poll.poll(0))

@@ -1,0 +1,125 @@
+"""`python -m ... | head -1` is no traceback, whatever the command is."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from robots.broken_pipe import UNREAD, unread_ends
+from tests.runtime.datasets.small import record
+
+ROOT = Path(__file__).parents[2]
+# What has its own standard output, or none: the processes of a station, of a tunnel, of a benchmark, ROS's Python.
+NOT_OF_A_TERMINAL = {
+    "runtime.control",
+    "runtime.guard",
+    "runtime.main",
+    "runtime.media",
+    "runtime.policies.tunnel.bound",
+    "runtime.transports.ros.rospy_node.__main__",
+    "benchmarks.first_chunk",
+    "benchmarks.recording_alone",
+    "benchmarks.recording_jobs",
+    "benchmarks.recording_lerobot",
+    "benchmarks.recording_listing",
+    "benchmarks.results_pages",
+    "benchmarks.sleeper",
+    "benchmarks.wires_receiver",
+    "evaweb.results.recompute.__main__",  # stands alone in a report
+}
+
+
+def programs() -> Iterator[str]:
+    """Modules that are run, by name."""
+    folders = [ROOT / top for top in ("runtime", "robots", "benchmarks", "evaweb")]
+    for path in [ROOT / "manage.py", *(path for folder in folders for path in folder.rglob("*.py"))]:
+        if '__name__ == "__main__"' in path.read_text("utf-8"):
+            yield ".".join(path.relative_to(ROOT).with_suffix("").parts)
+
+
+@contextmanager
+def nobody_reads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    read, written = os.pipe()
+    os.close(read)
+    with os.fdopen(written, "w") as pipe, monkeypatch.context() as patch:
+        patch.setattr("sys.stdout", pipe)
+        yield
+        pipe.write("goes nowhere, and ends nothing")
+
+
+@pytest.mark.parametrize("program", sorted(set(programs()) - NOT_OF_A_TERMINAL))
+def test_the_help_of_every_program_may_be_read_in_part(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = importlib.import_module(program)
+    name = "manage.py" if program == "manage" else program
+    if program in ("runtime.headless", "benchmarks.wires_sender"):  # they have no words of their own
+        assert module.main.__wrapped__
+        return
+    with nobody_reads(monkeypatch), monkeypatch.context() as patch:
+        patch.setattr("sys.argv", [name, "--help"])
+        assert module.main() == UNREAD
+
+
+def test_all_programs_are_known() -> None:
+    assert set(programs()) > NOT_OF_A_TERMINAL
+
+
+@pytest.fixture
+def episode(tmp_path: Path) -> Path:
+    return record(tmp_path / "episodes", frames=6)
+
+
+LISTS: list[tuple[str, Callable[[Path], list[str]]]] = [
+    ("robots", lambda episode: ["list"]),
+    ("runtime.recording", lambda episode: ["show", str(episode)]),
+    ("runtime.recording", lambda episode: ["export", str(episode)]),
+    ("runtime.datasets", lambda episode: ["publish", str(episode), "--to", str(episode.parents[1] / "set")]),
+    ("runtime.datasets", lambda episode: ["check", str(episode.parents[1] / "none")]),
+    ("runtime.quality", lambda episode: [str(episode)]),
+]
+
+
+@pytest.mark.parametrize(
+    ("program", "words"), LISTS, ids=lambda given: given if isinstance(given, str) else ""
+)
+def test_what_commands_print_may_be_read_in_part(
+    program: str, words: Callable[[Path], list[str]], episode: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    main = importlib.import_module(f"{program}.__main__").main
+    with nobody_reads(monkeypatch):
+        assert main(words(episode)) == UNREAD
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["-m", "robots", "list"], ["-m", "runtime.config_reference"], ["manage.py", "help"]],
+    ids=lambda words: words[-1],
+)
+def test_a_process_whose_output_nobody_reads_says_nothing_at_its_end(words: list[str]) -> None:
+    read, written = os.pipe()
+    os.close(read)
+    ended = subprocess.run(
+        [sys.executable, *words], cwd=ROOT, stdout=written, stderr=subprocess.PIPE, text=True, check=False
+    )
+    os.close(written)
+    assert (ended.returncode, ended.stderr) == (UNREAD, "")
+
+
+def test_the_break_of_any_other_pipe_is_an_error() -> None:
+    @unread_ends
+    def main() -> int:
+        raise BrokenPipeError("the robot has gone")
+
+    with pytest.raises(BrokenPipeError, match="the robot has gone"):
+        main()
+
+
+def test_a_command_without_standard_output_ends_as_it_would(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout", None)
+    assert unread_ends(lambda: 3)() == 3
