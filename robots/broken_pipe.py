@@ -8,7 +8,7 @@ import select
 import sys
 from collections.abc import Callable
 from functools import wraps
-from typing import ParamSpec
+from typing import ParamSpec, TextIO
 
 UNREAD = 141  # exit code, that of a shell for an end by SIGPIPE
 
@@ -55,7 +55,7 @@ def _silenced() -> bool:
     return bool(unread)
 
 
-def _descriptor(stream: io.TextIOBase) -> int:
+def _descriptor(stream: TextIO) -> int:
     try:
         return stream.fileno()
     except (AttributeError, io.UnsupportedOperation):  # there is none, or it is no file

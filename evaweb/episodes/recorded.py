@@ -11,6 +11,7 @@ from typing import Any
 from evaweb.episodes.models import EpisodeStatus
 from runtime.recording.files import RecordingError, read_document
 from runtime.recording.layout import Layout
+from runtime.recording.sealing import OUTCOME, read_outcome
 
 CLOSED = (EpisodeStatus.FINISHED, EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED)
 
@@ -54,8 +55,8 @@ def recorded_in(folder: Path) -> Recorded:
         "fps": layout.fps,
         "started_at": _time(manifest.get("started_wall")),
     }
-    path = folder / "outcome.json"
-    outcome = read_document(path) if path.exists() else {}
+    path = folder / OUTCOME
+    outcome = read_outcome(folder) if path.exists() else {}
     return Recorded(
         uuid=layout.uuid,
         station=_text(manifest, "station", 63),

@@ -17,6 +17,7 @@ from runtime.quality.luma import Film, VideoFilm
 from runtime.quality.report import Severity
 from runtime.recording.files import read_document
 from runtime.recording.layout import Layout
+from runtime.recording.sealing import OUTCOME, read_outcome
 from runtime.recording.tables import added, rows_schema
 
 _ROLES = {"qpos": "state", "action": "action", "eef": "poses", "eef_action": "poses"}
@@ -43,11 +44,11 @@ class JournalSource(Source):
 
     def _outcome(self) -> tuple[int | None, list[tuple[str, Severity, str]]]:
         """How many rows there should be, and what is to be said of how the recording ended."""
-        path = self._folder / "outcome.json"
+        path = self._folder / OUTCOME
         if not path.exists():
             return None, [("unfinished", "error", "it has no outcome: it is being recorded, or wants repair")]
         try:
-            outcome = read_document(path)
+            outcome = read_outcome(self._folder)
         except RecordingError as error:
             return None, [("unfinished", "error", str(error))]
         remarks: list[tuple[str, Severity, str]] = []

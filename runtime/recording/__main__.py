@@ -1,8 +1,9 @@
-"""`python -m runtime.recording repair|show|export PATH`: mend episodes after a crash, say what one holds, export."""
+"""`python -m runtime.recording repair|show|export|scrub PATH`: mend after a crash, say what it holds, export, verify."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
 import threading
@@ -12,19 +13,26 @@ from pathlib import Path
 from robots.broken_pipe import unread_ends
 from runtime.errors import RecordingError
 from runtime.recording.export import export
+from runtime.recording.quarantine import keep
 from runtime.recording.reader import Episode, open_episode
 from runtime.recording.repair import Report, repair, repair_all
+from runtime.recording.scrub import episodes_in, verify
 
 
 @unread_ends
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 0 where all is well, 1 where an episode is unreadable or the disk fails."""
+    """Exit code 0 where all is well, 1 where an episode is unreadable, damaged, or the disk fails.
+
+    Of a scrub 1 is damage alone, 2 that something could not be looked at.
+    """
     options = _parser().parse_args(arguments)
     try:
         if options.command == "export":
             if options.background:
                 _stand_back()
             return _export(options.paths, options.to)
+        if options.command == "scrub":
+            return _scrub(options.paths, options.json)
         return _repair(options.path) if options.command == "repair" else _show(options.path)
     except RecordingError as error:
         print(error, file=sys.stderr)
@@ -46,7 +54,36 @@ def _parser() -> argparse.ArgumentParser:
     out.add_argument(
         "--background", action="store_true", help="at the lowest priority; end when standard input ends"
     )
+    look = commands.add_parser("scrub", help="verify every file against its digest; exit code 1 tells damage")
+    look.add_argument(
+        "paths", type=Path, nargs="+", metavar="PATH", help="an episode, a folder of many, or the data folder"
+    )
+    look.add_argument("--json", action="store_true", help="one object per episode and line")
     return parser
+
+
+def _scrub(paths: Sequence[Path], as_json: bool) -> int:
+    """Every episode of `paths`; one that cannot be looked at does not keep the others."""
+    damaged = unknown = False
+    for path in paths:
+        try:
+            for folder in episodes_in(path):
+                damaged |= _scrubbed(folder, as_json)
+        except RecordingError as error:
+            unknown = True
+            print(error, file=sys.stderr)
+    return 1 if damaged else 2 if unknown else 0
+
+
+def _scrubbed(folder: Path, as_json: bool) -> bool:
+    """Tell and mark; whether it is damaged."""
+    verdict = verify(folder)
+    print(
+        json.dumps(verdict.document()) if as_json else f"{folder}: {verdict.state}: {verdict.text}",
+        flush=True,
+    )
+    keep(verdict)
+    return verdict.state == "damaged"
 
 
 def _repair(path: Path) -> int:
@@ -87,24 +124,13 @@ def _lines(episode: Episode) -> list[str]:
 def _export(paths: Sequence[Path], to: Path | None) -> int:
     """Every episode of `paths`; one that fails does not keep the others."""
     failed = 0
-    for folder in (episode for path in paths for episode in _episodes(path)):
+    for folder in (episode for path in paths for episode in episodes_in(path)):
         try:
             print(export(folder, to or _data_of(folder)), flush=True)
         except RecordingError as error:
             failed += 1
             print(error, file=sys.stderr)
     return int(failed > 0)
-
-
-def _episodes(path: Path) -> list[Path]:
-    if not path.is_dir():
-        raise RecordingError(f"{path} is no folder")
-    if (path / "manifest.json").exists():
-        return [path]
-    found = sorted(manifest.parent for manifest in path.glob("*/manifest.json"))
-    if not found:
-        raise RecordingError(f"{path} is no episode, and holds none: there is no manifest.json in it")
-    return found
 
 
 def _data_of(folder: Path) -> Path:

@@ -12,6 +12,7 @@ import av
 
 from runtime.errors import RecordingError
 from runtime.recording.backlog import Picture, PictureQueue, codings
+from runtime.recording.digests import rows_of_piece
 from runtime.recording.files import AppendFile
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.spread import Spread
@@ -28,7 +29,7 @@ class CameraEncoder:
         self.camera = camera
         self.path = path
         self.failure: RecordingError | None = None
-        self.file = AppendFile(path)
+        self.file = AppendFile(path, rows_of_piece(fps))
         self._fps = fps
         self._most_behind = max(2, round(settings.give_up_s * fps))  # frames
         self._abandoned = False

@@ -16,6 +16,7 @@ from runtime.errors import RecordingError
 from runtime.recording.admission import admit_chunk, admit_row, admit_tick
 from runtime.recording.base import VIDEO_LOST, ExecutedTick, Journal, Loss, Outcome, RawChunk, Record, Row
 from runtime.recording.columns import RecordedRow
+from runtime.recording.digests import FileDigest
 from runtime.recording.encoder import CameraEncoder
 from runtime.recording.files import (
     DiskFullError,
@@ -27,6 +28,7 @@ from runtime.recording.files import (
 )
 from runtime.recording.fragments import count_frames
 from runtime.recording.layout import Layout
+from runtime.recording.sealing import MANIFEST, OUTCOME, digest_of, digests_of, sealed
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.summary import summarise
 from runtime.recording.tables import read_table, rows_schema
@@ -67,7 +69,7 @@ class EpisodeJournal(Journal):
         require_room(self._root, self._settings.min_free_bytes)
         folder = _create(self._root, layout.uuid)
         try:
-            write_whole(folder / "manifest.json", text)
+            write_whole(folder / MANIFEST, text)
             recording = _Recording(folder, layout, self._settings, self._patience)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)  # it is ours and empty: no row was ever taken
@@ -227,8 +229,8 @@ class _Recording:
             )
             self._faults.tell()
         try:
-            conclusion = document(self._conclusion(outcome), "the outcome", indent=1)
-            write_whole(self.folder / "outcome.json", conclusion)
+            conclusion = sealed(self._conclusion(outcome), self._digests(stuck))
+            write_whole(self.folder / OUTCOME, conclusion)
         finally:
             if not stuck:  # a stuck encoder may still write: the folder stays marked until our process ends
                 os.close(self._lock)
@@ -270,6 +272,19 @@ class _Recording:
             "lost_cameras": {loss.camera: {"row": loss.row, "reason": loss.reason} for loss in lost},
             "muxed_ms": {camera: encoder.muxed_ms for camera, encoder in self._encoders.items()},
         }
+
+    def _digests(self, stuck: Sequence[CameraEncoder]) -> dict[str, FileDigest]:
+        """Of what was written; of what has failed as it lies on the disk, and none of what may still be written."""
+        if self._faults.first is not None:
+            digests = digests_of(self.folder, self._layout)
+        else:
+            digests = {MANIFEST: digest_of(self.folder / MANIFEST, self._layout), **self._writer.digests()}
+            for camera, encoder in self._encoders.items():
+                lies = digest_of(encoder.path, self._layout) if camera in self._lost else encoder.file.digest
+                digests[encoder.path.name] = lies
+        for encoder in stuck:
+            digests.pop(encoder.path.name, None)
+        return digests
 
     def _tell(self) -> None:
         self._look_at_encoders()

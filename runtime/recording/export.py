@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 from runtime.errors import RecordingError
 from runtime.recording.files import disk_fault, document, read_document, write_whole
 from runtime.recording.layout import Layout
+from runtime.recording.sealing import read_outcome, told
 from runtime.recording.tables import SCHEMAS, read_table
 
 FOLDER = "exports"
@@ -152,7 +153,7 @@ def _read(folder: Path, manifest: Mapping[str, object]) -> _Run:
         name: read_table(folder / f"{name}.arrow", SCHEMAS[name](layout)).table
         for name in ("ticks", "smoothed", "raw")
     }
-    return _Run(manifest, read_document(folder / "outcome.json"), **tables)
+    return _Run(manifest, told(read_outcome(folder)), **tables)
 
 
 def _content(run: _Run) -> bytes:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from runtime.errors import RecordingError
+from runtime.recording.digests import Digest, FileDigest
 
 _FULL = {errno.ENOSPC: "disk full", errno.EDQUOT: "disk quota used up"}
 _OTHERS = {errno.EFBIG: "file too large"}
@@ -25,11 +26,13 @@ class DiskFullError(RecordingError):
 class AppendFile:
     """A file that only grows, by whole writes: one that fails midway is cut away again.
 
-    One thread writes; another one may sync at the same time. Errors of the disk become RecordingError.
+    One thread writes; another one may sync at the same time. Errors of the disk become RecordingError. Its digest has
+    pieces of at least `least` rows.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, least: int = 1) -> None:
         self.path = path
+        self._digest = Digest(least)
         self.size = 0
         self._synced = 0
         try:
@@ -37,8 +40,13 @@ class AppendFile:
         except OSError as error:
             raise disk_fault("creating", path, error) from error
 
-    def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Append all of `data`, or nothing."""
+    @property
+    def digest(self) -> FileDigest:
+        """Of what was written; to be asked for once nothing more is."""
+        return self._digest.told()
+
+    def write(self, data: bytes | bytearray | memoryview, rows: int = 0) -> None:
+        """Append all of `data`, which has so many rows or lines, or nothing."""
         view = memoryview(data)
         written = 0
         try:
@@ -49,6 +57,7 @@ class AppendFile:
                 self._cut()
             raise disk_fault("writing", self.path, error) from error
         self.size += written
+        self._digest.add(data, rows)
 
     def sync(self) -> None:
         """Wait until what was written is on the disk; at once where nothing is new."""

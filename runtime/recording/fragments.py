@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -29,6 +31,43 @@ def whole_bytes(path: Path) -> int:
                 end = position
             before = kind
     return end
+
+
+def fragments(path: Path) -> Iterator[tuple[bytes, int]]:
+    """The file in parts, each with its frames: the header, the fragments, and whatever follows the last whole one."""
+    with open(path, "rb") as file:
+        total = file.seek(0, 2)
+        begin = end = 0
+        while (box := _box(file, end, total)) is not None:
+            kind, end = box
+            if kind in (b"moov", b"mdat"):
+                yield _part(file, begin, end)
+                begin = end
+        yield _part(file, begin, total)
+
+
+def _part(file: BinaryIO, begin: int, end: int) -> tuple[bytes, int]:
+    file.seek(begin)
+    data = file.read(end - begin)
+    return data, frames_in(data)
+
+
+def frames_in(data: bytes | bytearray) -> int:
+    """Frames of the whole fragments in `data`: the sample counts of their runs (ISO/IEC 14496-12, section 8.8.8)."""
+    return _samples(io.BytesIO(data), 0, len(data))
+
+
+def _samples(file: BinaryIO, position: int, total: int) -> int:
+    frames = 0
+    while (box := _box(file, position, total)) is not None:
+        kind, end = box
+        if kind in (b"moof", b"traf"):
+            frames += _samples(file, position + _HEADER.size, end)
+        elif kind == b"trun":
+            file.seek(position + _HEADER.size + 4)
+            frames += int.from_bytes(file.read(4), "big")
+        position = end
+    return frames
 
 
 def count_frames(path: Path) -> int:

@@ -11,12 +11,15 @@ from typing import Any
 from runtime.errors import RecordingError
 from runtime.recording.files import read_document
 from runtime.recording.layout import Layout
+from runtime.recording.sealing import OUTCOME, read_outcome, told
 from runtime.recording.tables import SCHEMAS, read_table
 
 
 @dataclass(frozen=True, slots=True)
 class Episode:
     """One episode as it lies on disk; tables are pyarrow.Table with the columns of runtime.recording.tables.
+
+    Its files are not verified against the digests of its outcome, which is left without them: runtime.recording.scrub.
 
     `rows` has exactly `frames` rows, and frame k of every video belongs to row k for k < `frames`; it may have more,
     and that of a camera that was lost has fewer: `shown`. Without an outcome the episode is being written or was cut
@@ -50,7 +53,7 @@ def open_episode(path: Path) -> Episode:
     """Read the episode in folder `path`; RecordingError names the file that is absent or damaged."""
     manifest = read_document(path / "manifest.json")
     layout = Layout.of(manifest)
-    outcome = read_document(path / "outcome.json") if (path / "outcome.json").exists() else None
+    outcome = told(read_outcome(path)) if (path / OUTCOME).exists() else None
     tables = {
         name: read_table(path / f"{name}.arrow", schema(layout)).table for name, schema in SCHEMAS.items()
     }

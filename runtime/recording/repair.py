@@ -12,10 +12,11 @@ from typing import Literal
 from runtime.errors import RecordingError
 from runtime.recording.base import VIDEO_LOST
 from runtime.recording.episode import lock
-from runtime.recording.files import disk_fault, document, read_document, sync_folder, write_whole
+from runtime.recording.files import disk_fault, read_document, sync_folder, write_whole
 from runtime.recording.fragments import count_frames, whole_bytes
 from runtime.recording.layout import Layout
 from runtime.recording.reader import read_events
+from runtime.recording.sealing import MANIFEST, OUTCOME, digests_of, sealed
 from runtime.recording.summary import summarise
 from runtime.recording.tables import SCHEMAS, read_table, write_table
 
@@ -65,7 +66,7 @@ def repair(path: Path) -> Report:
 def repair_all(root: Path) -> list[Report]:
     """Repair every episode in `root` that has no outcome; one that fails does not keep the others."""
     folders = [folder for folder in sorted(root.iterdir()) if folder.is_dir()] if root.is_dir() else []
-    return [_attempt(folder) for folder in folders if not (folder / "outcome.json").exists()]
+    return [_attempt(folder) for folder in folders if not (folder / OUTCOME).exists()]
 
 
 def _attempt(folder: Path) -> Report:
@@ -77,9 +78,9 @@ def _attempt(folder: Path) -> Report:
 
 def _judge(path: Path) -> Report:
     try:
-        layout = Layout.of(read_document(path / "manifest.json"))
-        if (path / "outcome.json").exists():
-            frames = read_document(path / "outcome.json").get("frames")
+        layout = Layout.of(read_document(path / MANIFEST))
+        if (path / OUTCOME).exists():
+            frames = read_document(path / OUTCOME).get("frames")
             return Report(path, "complete", frames=frames if isinstance(frames, int) else 0)
     except RecordingError as error:
         return Report(path, "unreadable", str(error))
@@ -93,7 +94,7 @@ def _complete(path: Path, layout: Layout) -> Report:
     going = [frames for camera, frames in videos.items() if camera not in lost]
     frames, cut, torn_tables = _mend_tables(path, layout, going)
     report = Report(path, "repaired", "", frames, cut, videos, torn_video + torn_tables, torn_lines, lost)
-    write_whole(path / "outcome.json", document(_outcome(report, layout, ended), "the outcome", indent=1))
+    write_whole(path / OUTCOME, sealed(_outcome(report, layout, ended), digests_of(path, layout)))
     return report
 
 

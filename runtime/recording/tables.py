@@ -151,7 +151,7 @@ class TableWriter:
         self._schema = SCHEMAS[name](layout)
         self._columns = COLUMNS[name]
         self._waiting: deque[Any] = deque()
-        self._unwritten = b""
+        self._unwritten, self._unwritten_rows = b"", 0
         self.file = AppendFile(folder / f"{name}.arrow")
         try:
             self.file.write(self._schema.serialize().to_pybytes())
@@ -172,9 +172,11 @@ class TableWriter:
         """Write what waits as one record batch; where that fails it is kept for the next attempt."""
         if not self._unwritten:
             records = [self._waiting.popleft() for _ in range(len(self._waiting))]
-            self._unwritten = self._batch(records) if records else b""
+            if records:
+                batch = self._batch(records)
+                self._unwritten, self._unwritten_rows = batch.serialize().to_pybytes(), batch.num_rows
         if self._unwritten:
-            self.file.write(self._unwritten)
+            self.file.write(self._unwritten, self._unwritten_rows)
             self._unwritten = b""
 
     def finish(self) -> None:
@@ -183,11 +185,10 @@ class TableWriter:
             self.flush()
         self.file.write(END_OF_STREAM)
 
-    def _batch(self, records: Sequence[Any]) -> bytes:
+    def _batch(self, records: Sequence[Any]) -> Any:
         columns = self._columns(self._layout, records)
         arrays = [_array(columns[field.name], field.type) for field in self._schema]
-        data: bytes = pa.RecordBatch.from_arrays(arrays, schema=self._schema).serialize().to_pybytes()
-        return data
+        return pa.RecordBatch.from_arrays(arrays, schema=self._schema)
 
 
 def _array(values: Any, kind: Any) -> Any:

@@ -15,6 +15,7 @@ from av.video.reformatter import ColorRange, Colorspace
 from runtime.recording import codecs
 from runtime.recording.backlog import RUN
 from runtime.recording.files import AppendFile
+from runtime.recording.fragments import frames_in
 from runtime.recording.ordinary import ordinary_threads
 from runtime.recording.planes import planes
 from runtime.recording.settings import RecordingSettings
@@ -127,7 +128,7 @@ class FragmentedVideo:
 
     def _store(self) -> None:
         if self._muxed.bytes:
-            self._file.write(self._muxed.bytes)
+            self._file.write(self._muxed.bytes, frames_in(self._muxed.bytes))
             self._muxed.bytes = bytearray()
 
 

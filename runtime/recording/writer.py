@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from runtime.errors import RecordingError
+from runtime.recording.digests import FileDigest
 from runtime.recording.files import AppendFile, require_room, sync_folder
 from runtime.recording.layout import Layout
 from runtime.recording.settings import RecordingSettings
@@ -67,7 +68,8 @@ class DiskWriter:
                 self._tables[name] = TableWriter(folder, name, layout)
                 undo.callback(self._tables[name].file.close)
             undo.pop_all()
-        self._files = [self._events, *(table.file for table in self._tables.values()), *others]
+        self._own = [self._events, *(table.file for table in self._tables.values())]
+        self._files = [*self._own, *others]
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
 
@@ -93,6 +95,10 @@ class DiskWriter:
         self._wake.set()
         self._thread.join(max(0.0, deadline - time.monotonic()))
         return not self._thread.is_alive()
+
+    def digests(self) -> dict[str, FileDigest]:
+        """Of its own files, by name, once it has finished."""
+        return {file.path.name: file.digest for file in self._own}
 
     def _hold_back(self, writer: TableWriter, patience: float) -> None:
         deadline = time.monotonic() + patience
@@ -139,7 +145,7 @@ class DiskWriter:
         if not self._unwritten_lines:
             self._unwritten_lines = b"".join(self._lines.popleft() for _ in range(len(self._lines)))
         if self._unwritten_lines:
-            self._events.write(self._unwritten_lines)
+            self._events.write(self._unwritten_lines, self._unwritten_lines.count(b"\n"))
             self._unwritten_lines = b""
 
     def _attempt(self, work: Callable[[], None]) -> None:

@@ -1,0 +1,53 @@
+"""Which recordings are damaged, as the disk has it: DATA/quarantine/<uuid>.json; they stay as and where they are."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from runtime.errors import RecordingError
+from runtime.recording.files import disk_fault, document, read_document, sync_folder, write_whole
+from runtime.recording.scrub import Verdict
+
+FOLDER = "quarantine"
+
+
+def keep(verdict: Verdict) -> None:
+    """Make the mark of an episode in DATA/episodes say what was found; one that is whole again loses it.
+
+    Of an episode that lies elsewhere nothing is kept. RecordingError where the disk does not take it.
+    """
+    folder = verdict.path.absolute()
+    if folder.parent.name != "episodes" or verdict.state == "open":
+        return
+    path = _file(folder.parents[1], folder.name)
+    if verdict.state != "damaged":
+        _remove(path)
+    elif marked(folder.parents[1], folder.name) != (damage := verdict.document()["damage"]):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        told = {"uuid": folder.name, "found": time.time(), "damage": damage}
+        write_whole(path, document(told, "the mark", indent=1))
+
+
+def marked(data: Path, uuid: str) -> list[dict[str, Any]]:
+    """What is wrong with an episode, a table per file as in Verdict.document; [] where nothing was found."""
+    try:
+        damage = read_document(_file(data, uuid)).get("damage")
+    except RecordingError:
+        return []
+    return damage if isinstance(damage, list) else []
+
+
+def _file(data: Path, uuid: str) -> Path:
+    return data / FOLDER / f"{uuid}.json"
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink()
+        sync_folder(path.parent)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise disk_fault("removing", path, error) from error

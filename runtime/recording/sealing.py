@@ -1,0 +1,99 @@
+"""The outcome of an episode with the digests of its files, and its own: what it says can be verified at any time."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from runtime.errors import RecordingError
+from runtime.recording.digests import Digest, FileDigest, rows_of_piece
+from runtime.recording.files import document, read_document
+from runtime.recording.fragments import fragments
+from runtime.recording.layout import Layout
+from runtime.recording.tables import SCHEMAS
+
+MANIFEST, OUTCOME = "manifest.json", "outcome.json"
+DIGESTS, SEAL = "digests", "seal"  # keys of the outcome
+_UNSEALED = b"0" * hashlib.sha256().digest_size * 2
+
+
+def digest_of(path: Path, layout: Layout) -> FileDigest:
+    """Of a file as it lies in the folder of an episode; RecordingError where it cannot be read."""
+    digest = Digest(rows_of_piece(layout.fps) if path.suffix == ".mp4" else 1)
+    try:
+        for data, rows in _parts(path):
+            digest.add(data, rows)
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+    return digest.told()
+
+
+def digests_of(folder: Path, layout: Layout) -> dict[str, FileDigest]:
+    """Of every file that an episode has, as they lie in `folder`."""
+    return {path.name: digest_of(path, layout) for path in sorted(folder.iterdir()) if _counts(path, layout)}
+
+
+def _counts(path: Path, layout: Layout) -> bool:
+    named = {MANIFEST, "events.jsonl", *(f"{camera}.mp4" for camera in layout.cameras)}
+    return path.name in named or (path.suffix == ".arrow" and path.name.partition(".")[0] in SCHEMAS)
+
+
+def sealed(outcome: Mapping[str, object], digests: Mapping[str, FileDigest]) -> bytes:
+    """outcome.json: with the digests of the files, and last that of itself, taken with zeros in its place."""
+    whole = {**outcome, DIGESTS: digests, SEAL: _UNSEALED.decode()}
+    text = document(whole, "the outcome", indent=1)
+    before, _, after = text.rpartition(_UNSEALED)
+    return before + hashlib.sha256(text).hexdigest().encode() + after
+
+
+def read_outcome(folder: Path) -> dict[str, Any]:
+    """The outcome of an episode; RecordingError where it is absent, torn, or not as it was sealed.
+
+    One from before there were digests has none, and no seal.
+    """
+    path = folder / OUTCOME
+    outcome = read_document(path)
+    if DIGESTS not in outcome and SEAL not in outcome:
+        return outcome
+    seal = str(outcome.get(SEAL)).encode()
+    if isinstance(outcome.get(DIGESTS), Mapping) and len(seal) == len(_UNSEALED):
+        before, _, after = path.read_bytes().rpartition(seal)
+        if hashlib.sha256(before + _UNSEALED + after).hexdigest().encode() == seal:
+            return outcome
+    raise RecordingError(f"{path} is damaged: it is not as it was sealed")
+
+
+def told(outcome: Mapping[str, object]) -> dict[str, object]:
+    """An outcome without its digests, for who copies it to where they mean nothing."""
+    return {name: value for name, value in outcome.items() if name not in (DIGESTS, SEAL)}
+
+
+def _parts(path: Path) -> Iterator[tuple[bytes, int]]:
+    """The file in parts, and how many rows or lines each has, as its writer would have told."""
+    if path.suffix == ".mp4":
+        yield from fragments(path)
+    elif path.suffix == ".arrow":
+        yield from _batches(path.read_bytes())
+    elif path.suffix == ".jsonl":
+        data = path.read_bytes()
+        yield data, data.count(b"\n")
+    else:
+        yield path.read_bytes(), 0
+
+
+def _batches(data: bytes) -> Iterator[tuple[bytes, int]]:
+    source = pa.BufferReader(data)
+    end = 0
+    try:
+        stream = pa.ipc.open_stream(source)
+        rows = 0
+        while True:
+            yield data[end : source.tell()], rows
+            end = source.tell()
+            rows = stream.read_next_batch().num_rows
+    except (StopIteration, pa.ArrowInvalid, OSError):
+        yield data[end:], 0
