@@ -25,6 +25,16 @@ router = Router(tags=["episodes"])
 _WITH = ("station", "trial__checkpoint", "trial__handout")
 
 
+class DamageOut(Schema):
+    """One file that is not what was recorded; `rows` and `times` [s] have first and last, of events.jsonl lines."""
+
+    file: str
+    what: str
+    rows: list[tuple[int, int]]
+    times: list[tuple[float, float]]
+    text: str
+
+
 class EpisodeOut(Schema):
     """One recorded run or demonstration; `trial` is the id of the trial that it was recorded for.
 
@@ -53,6 +63,8 @@ class EpisodeOut(Schema):
     dataset: str
     dataset_index: int | None
     published_at: datetime | None
+    damage: list[DamageOut]
+    verified_at: datetime | None
 
     @staticmethod
     def of(episode: Episode, sight: Sight) -> dict[str, Any]:
@@ -101,6 +113,7 @@ class Filters(Schema):
     mode: EpisodeMode | None = None
     status: EpisodeStatus | None = None
     dataset: Annotated[str, Field(description="Relative to the data folder")] = ""
+    damaged: bool | None = None
 
 
 @router.get("", response={200: Page[EpisodeOut], **FAILURES}, summary="Episodes", url_name="episodes")
@@ -109,6 +122,8 @@ def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging
     rows = Episode.objects.select_related(*_WITH).order_by("-started_at", "-created_at", "pk")
     if filters.station:
         rows = rows.filter(station=station_get(name=filters.station))
+    if filters.damaged is not None:
+        rows = rows.exclude(damage=[]) if filters.damaged else rows.filter(damage=[])
     wanted = {
         "mode": filters.mode and filters.mode.value,
         "status": filters.status and filters.status.value,

@@ -135,6 +135,8 @@ def _recording(uuid: UUID) -> Recorded:
     row = episode_get(uuid=uuid)
     if row.status == EpisodeStatus.RECORDING:
         raise Conflict(f"episode {uuid} is still being recorded")
+    if row.damage:
+        raise Conflict(f"episode {uuid} is damaged: {'; '.join(one['text'] for one in row.damage)}")
     try:
         episode = open_episode(journal_folder(uuid))
     except RecordingError as error:

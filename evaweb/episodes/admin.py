@@ -24,6 +24,7 @@ class EpisodeAdmin(admin.ModelAdmin):
         "started_at",
         "frames",
         "dataset",
+        "verified_at",
     )
     list_filter = ("status", "kind", "mode", "station", "checkpoint")
     search_fields = ("uuid", "task", "checkpoint", "operator")

@@ -1,4 +1,4 @@
-"""The jobs of episodes: preview, export, smoothness, publish, reconcile; and what every worker looks after."""
+"""The jobs of episodes: preview, export, smoothness, publish, scrub, reconcile; and what every worker looks after."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from uuid import UUID
 from django.db.models.functions import Now
 from django.utils import timezone
 
-from evaweb.episodes import services
+from evaweb.episodes import services, verifying
 from evaweb.episodes.beside import sides_of
 from evaweb.episodes.folders import data_dir, datasets_dir, journal_folder, preview_folder, scores_file
 from evaweb.episodes.models import Episode, EpisodeStatus
@@ -26,6 +26,7 @@ from runtime.datasets.published import never_published, publish
 from runtime.recording.export import export
 from runtime.recording.files import RecordingError
 from runtime.recording.labels import newest
+from runtime.recording.scrub import DamagedError
 
 _AT_ONCE = 20  # asked for in one look
 
@@ -85,15 +86,19 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
     simulated = recorded.simulated or episode.station.simulated
     name = dataset_name(recorded, scored=success is not None, simulated=simulated)
     work.tell(f"into {name}")
-    with TemporaryDirectory() as beside:
-        placed = publish(
-            folder,
-            datasets_dir() / name,
-            success=success,
-            include_interrupted=success is not None,
-            version=work.args.get("version"),
-            sides=sides_of(episode.uuid, Path(beside)),
-        )
+    try:
+        with TemporaryDirectory() as beside:
+            placed = publish(
+                folder,
+                datasets_dir() / name,
+                success=success,
+                include_interrupted=success is not None,
+                version=work.args.get("version"),
+                sides=sides_of(episode.uuid, Path(beside)),
+            )
+    except DamagedError as error:
+        verifying.found(error.verdict)
+        return {"published": False, "why": str(error)}
     dataset = str(placed.dataset.relative_to(data_dir()))
     Episode.objects.filter(uuid=episode.uuid).update(
         dataset=dataset, dataset_index=placed.episode_index, published_at=Now()
@@ -105,7 +110,14 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
         "frames": placed.frames,
         "success": success,
         "created": placed.created,
+        **({"remark": placed.remark} if placed.remark else {}),
     }
+
+
+@job_kind("scrub")
+def scrub(work: Work) -> Mapping[str, Any]:
+    """Verify recordings against their digests, those that were not looked at for longest."""
+    return verifying.scrubbed(work)
 
 
 @job_kind("reconcile")
@@ -132,6 +144,12 @@ def reconcile_at_start() -> None:
 def look_for_closed() -> int:
     """Episodes that a station has repaired, or closed while the web was away."""
     return services.catch_up()
+
+
+@chore("recordings to be verified")
+def look_for_unverified() -> bool:
+    """Recordings that nobody has verified for long, while the worker has nothing else to do."""
+    return verifying.scrub_asked() is not None
 
 
 @chore("runs to be measured")

@@ -64,17 +64,26 @@ class Episode(models.Model):
     dataset = models.CharField(max_length=240, blank=True, help_text="Relative to the data folder.")
     dataset_index = models.PositiveIntegerField(null=True, blank=True)
     published_at = models.DateTimeField(null=True, blank=True)
+    damage = models.JSONField(
+        default=list,
+        blank=True,
+        help_text="Files that are not what was recorded; it is not published.",
+    )
+    verified_at = models.DateTimeField(
+        null=True, blank=True, help_text="When all of its files were last compared with their digests."
+    )
     created_at = models.DateTimeField(auto_now_add=True)
 
     class Meta:
         ordering = ("-started_at", "-created_at")
         indexes = [
+            models.Index(fields=("verified_at",), name="episode_verified"),
             # How many were measured is asked for whenever statistics are shown.
             models.Index(
                 fields=("smoothness",),
                 condition=models.Q(smoothness__isnull=False),
                 name="episode_measured",
-            )
+            ),
         ]
 
     def __str__(self) -> str:

@@ -32,6 +32,7 @@ QUALITY = {
     "clean": ("clean", Q(standing__clean=True)),
     "flagged": ("flagged", Q(standing__clean=False)),
     "unchecked": ("not checked", Q(standing__checked_at=None)),
+    "damaged": ("damaged", ~Q(damage=[])),
 }
 REVIEW = {
     "unreviewed": ("unreviewed", Q(standing__review=None, frames__gt=0) & ~Q(status=EpisodeStatus.RECORDING)),

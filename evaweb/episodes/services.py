@@ -14,7 +14,7 @@ from django.db.models.functions import Now
 from django.utils import timezone
 
 from evaweb.episodes.exporting import exported, job_key
-from evaweb.episodes.folders import journal_folder, preview_folder
+from evaweb.episodes.folders import data_dir, journal_folder, preview_folder
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.recorded import CLOSED, Recorded, recorded_in
 from evaweb.errors import EvaError
@@ -23,6 +23,7 @@ from evaweb.jobs.services import enqueue
 from evaweb.stations.models import Station
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError
+from runtime.recording.quarantine import marked
 
 log = logging.getLogger(__name__)
 
@@ -97,7 +98,10 @@ def episode_read(*, uuid: UUID, station: Station | None = None) -> Episode:
     RecordingError where the folder is absent or damaged.
     """
     recorded = recorded_in(journal_folder(uuid))
-    facts = dict(recorded.facts) | {"previewed_at": _previewed_at(uuid)}
+    facts = dict(recorded.facts) | {
+        "previewed_at": _previewed_at(uuid),
+        "damage": marked(data_dir(), str(uuid)),
+    }
     episode, _ = Episode.objects.update_or_create(
         uuid=uuid,
         defaults=facts,

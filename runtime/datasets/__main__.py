@@ -133,6 +133,8 @@ def _publish(options: argparse.Namespace) -> int:
     print(
         f"{verb}: {options.episode} as episode {done.episode_index} of {done.dataset}, {done.frames} frames"
     )
+    if done.remark:
+        print(f"remark: {done.remark}")
     return 0
 
 

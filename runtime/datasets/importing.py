@@ -27,6 +27,7 @@ from runtime.errors import RecordingError
 from runtime.recording.base import IMPORTED, ExecutedTick, Outcome, Row
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.files import disk_fault, sync_folder
+from runtime.recording.scrub import require_sound
 from runtime.recording.settings import RecordingSettings
 from runtime.types import Float32
 
@@ -73,11 +74,13 @@ def whose(dataset: Dataset, state: str = "", robot: str = "") -> Whose:
 def bring(dataset: Dataset, index: int, episodes: Path, told: Whose) -> tuple[str, bool]:
     """Make the folder of episode `index` in `episodes`; its uuid, and whether it was not there. RecordingError.
 
-    It appears whole or not at all. The dataset lies in the data folder that `episodes` is in.
+    It appears whole or not at all; DamagedError where it is there and is not what was imported. The dataset lies in the
+    data folder that `episodes` is in.
     """
     uuid = uuids_of(dataset.root)[index]
     folder, drafts = episodes / uuid, episodes.parent / f".{IMPORTED}"
     if folder.exists():
+        require_sound(folder)
         return uuid, False
     try:
         shutil.rmtree(drafts / uuid, ignore_errors=True)  # what a crash left

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,7 @@ from runtime.errors import RecordingError
 from runtime.recording.base import IMPORTED
 from runtime.recording.export import exported
 from runtime.recording.labels import newest
+from runtime.recording.scrub import UNSEALED, require_sound
 
 if TYPE_CHECKING:
     import numpy as np
@@ -48,6 +49,7 @@ class Published:
     episode_index: int
     frames: int
     created: bool  # False: it was there already and has been written anew at the same index
+    remark: str = ""  # what could not be verified of it
 
 
 def publish(
@@ -65,11 +67,13 @@ def publish(
     that is there already (by its uuid) is written anew at its index. `version` is that of a new dataset, v2.1 where
     None; one that is there keeps its own. The three action streams go along as a side file, and so does what `sides`
     names by kind ("annotations", "reviews": JSON Lines). Raises RecordingError where the episode is not finished,
-    discarded, incomplete, or of other features than the dataset.
+    discarded, incomplete, or of other features than the dataset, DamagedError where a file of it is not what was
+    recorded.
     """
     if version not in (None, *layout.WRITABLE_VERSIONS):
         raise RecordingError(f"version is {version!r}, published are {layout.WRITABLE_VERSIONS}")
     given = read_sides(sides or {})
+    verdict = require_sound(Path(episode))
     journal = read_journal(Path(episode))
     _require_publishable(journal, include_interrupted)
     if success is None and isinstance(journal.outcome.get("success"), bool):
@@ -89,7 +93,8 @@ def publish(
                 f"{root} is of version {catalog.version}, not {version}: publish to another folder, or convert it"
             )
         beside = {STREAMS: exported(journal.folder), **given}
-        return _publish(journal, catalog, success, version or layout.DEFAULT_VERSION, beside)
+        done = _publish(journal, catalog, success, version or layout.DEFAULT_VERSION, beside)
+    return replace(done, remark=UNSEALED if verdict.state == "unsealed" else "")
 
 
 def never_published(manifest: Mapping[str, object]) -> str:

@@ -54,6 +54,7 @@ class _Recorded:
     task: str
     robot: str  # "": it does not say
     names: Sequence[str]  # of the numbers; empty: it does not say
+    state: str = "unsealed"  # of its files, as in runtime.recording.scrub
 
 
 class ReplayPolicy(Policy):
@@ -94,7 +95,12 @@ class ReplayPolicy(Policy):
             action_space=config.space,
             horizon=config.horizon,
             rate=recorded.fps,
-            metadata={"rows": len(recorded.actions), "fps": recorded.fps, "task": recorded.task},
+            metadata={
+                "rows": len(recorded.actions),
+                "fps": recorded.fps,
+                "task": recorded.task,
+                "files": recorded.state,
+            },
         )
 
     def _is_recording(self) -> bool:
@@ -117,11 +123,13 @@ class ReplayPolicy(Policy):
 
     def _recording(self) -> _Recorded:
         from runtime.datasets.journal import read_journal
+        from runtime.recording.scrub import require_sound
 
         if self._config.episode:
             raise PolicyError(
                 f"policy.episode = {self._config.episode}, but {self._config.path} is one recorded episode; allowed: 0"
             )
+        state = require_sound(Path(self._config.path)).state
         journal = read_journal(Path(self._config.path))
         poses = self._config.space == "eef"
         column, key = ("eef_action", "eef_names") if poses else ("action", "joint_names")
@@ -135,7 +143,8 @@ class ReplayPolicy(Policy):
                 'policy.space = "joint"'
             )
         names = journal.manifest["robot"][key]
-        return _Recorded(journal.finite_vectors(column), journal.fps, journal.task, journal.robot, names)
+        actions = journal.finite_vectors(column)
+        return _Recorded(actions, journal.fps, journal.task, journal.robot, names, state)
 
     def _require_same_robot(self, recorded: _Recorded) -> None:
         """Numbers of another robot of ours, or in another order, would move this one nonsensically."""

@@ -17,6 +17,7 @@ from runtime.quality.luma import Film, VideoFilm
 from runtime.quality.report import Severity
 from runtime.recording.files import read_document
 from runtime.recording.layout import Layout
+from runtime.recording.scrub import verify
 from runtime.recording.sealing import OUTCOME, read_outcome
 from runtime.recording.tables import added, rows_schema
 
@@ -51,7 +52,9 @@ class JournalSource(Source):
             outcome = read_outcome(self._folder)
         except RecordingError as error:
             return None, [("unfinished", "error", str(error))]
-        remarks: list[tuple[str, Severity, str]] = []
+        remarks: list[tuple[str, Severity, str]] = [
+            ("damaged", "error", damage.text) for damage in verify(self._folder).damage
+        ]
         status, reason = outcome.get("status"), outcome.get("reason", "")
         if status == "failed":
             remarks.append(("recording_failed", "error", f"the recording failed: {reason}"))

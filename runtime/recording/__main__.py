@@ -1,4 +1,4 @@
-"""`python -m runtime.recording repair|show|export|scrub PATH`: mend after a crash, say what it holds, export, verify."""
+"""`python -m runtime.recording repair|show|export|scrub PATH`: mend after a crash, say what is there, export, scrub."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def _repair(path: Path) -> int:
         raise RecordingError(f"{path} is no folder")
     reports = [repair(path)] if (path / "manifest.json").exists() else repair_all(path)
     print(*(_line(report) for report in reports), sep="\n")
-    return int(any(report.verdict in ("unreadable", "failed") for report in reports))
+    return int(any(report.verdict in ("unreadable", "damaged", "failed") for report in reports))
 
 
 def _line(report: Report) -> str:

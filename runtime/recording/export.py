@@ -20,12 +20,15 @@ import pyarrow.parquet as pq
 from runtime.errors import RecordingError
 from runtime.recording.files import disk_fault, document, read_document, write_whole
 from runtime.recording.layout import Layout
+from runtime.recording.scrub import require_sound
 from runtime.recording.sealing import read_outcome, told
 from runtime.recording.tables import SCHEMAS, read_table
 
 FOLDER = "exports"
 FORMAT = 1
 NO_PROMPT = "no-prompt"
+_STREAMS = ("ticks", "smoothed", "raw")
+_FILES = ("manifest.json", *(f"{name}.arrow" for name in _STREAMS))
 _NAME_BYTES = 120  # of a folder's name; file systems take 255
 _ROWS_TOGETHER = 1 << 16
 _VECTOR = pa.list_(pa.float32())
@@ -90,6 +93,7 @@ def export(folder: Path, root: Path) -> Path:
     path = place(manifest, root)
     with _alone(path.parent):
         if not is_exported(folder, path):
+            require_sound(folder, _FILES)
             write_whole(path, _content(_read(folder, manifest)))
     return path
 
@@ -149,10 +153,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 def _read(folder: Path, manifest: Mapping[str, object]) -> _Run:
     layout = Layout.of(manifest)
-    tables = {
-        name: read_table(folder / f"{name}.arrow", SCHEMAS[name](layout)).table
-        for name in ("ticks", "smoothed", "raw")
-    }
+    tables = {name: read_table(folder / f"{name}.arrow", SCHEMAS[name](layout)).table for name in _STREAMS}
     return _Run(manifest, told(read_outcome(folder)), **tables)
 
 

@@ -16,7 +16,8 @@ from runtime.recording.files import disk_fault, read_document, sync_folder, writ
 from runtime.recording.fragments import count_frames, whole_bytes
 from runtime.recording.layout import Layout
 from runtime.recording.reader import read_events
-from runtime.recording.sealing import MANIFEST, OUTCOME, digests_of, sealed
+from runtime.recording.scrub import verify
+from runtime.recording.sealing import MANIFEST, OUTCOME, digests_of, read_outcome, sealed
 from runtime.recording.summary import summarise
 from runtime.recording.tables import SCHEMAS, read_table, write_table
 
@@ -28,12 +29,13 @@ UNCUT = "rows.uncut.arrow"  # the rows as they were found, where any had to go
 class Report:
     """What a repair found and did.
 
-    "complete": had an outcome, nothing done. "repaired": has one now. "recording": is being written right
+    "complete": had an outcome, nothing done. "damaged": had one too, and `problem` is what is not as it was recorded,
+    which nobody can mend. "repaired": has one now. "recording": is being written right
     now, nothing done. "unreadable": no manifest to go by, nothing done. "failed": `problem` stopped it.
     """
 
     path: Path
-    verdict: Literal["complete", "repaired", "recording", "unreadable", "failed"]
+    verdict: Literal["complete", "damaged", "repaired", "recording", "unreadable", "failed"]
     problem: str = ""
     frames: int = 0  # rows that have a frame in every video
     rows_cut: int = 0  # whole rows without a frame in every video
@@ -80,11 +82,18 @@ def _judge(path: Path) -> Report:
     try:
         layout = Layout.of(read_document(path / MANIFEST))
         if (path / OUTCOME).exists():
-            frames = read_document(path / OUTCOME).get("frames")
-            return Report(path, "complete", frames=frames if isinstance(frames, int) else 0)
+            return _closed(path)
     except RecordingError as error:
         return Report(path, "unreadable", str(error))
     return _complete(path, layout)
+
+
+def _closed(path: Path) -> Report:
+    found = verify(path)
+    if found.state == "damaged":
+        return Report(path, "damaged", found.text)
+    frames = read_outcome(path).get("frames")
+    return Report(path, "complete", frames=frames if isinstance(frames, int) else 0)
 
 
 def _complete(path: Path, layout: Layout) -> Report:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
@@ -21,10 +21,6 @@ UNSEALED = (
 )
 
 State = Literal["sound", "damaged", "unsealed", "open"]
-
-
-class DamagedError(RecordingError):
-    """A recording is not what was recorded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +73,19 @@ class Verdict:
         return {"episode": self.path.name, "state": self.state, "bytes": self.bytes, "damage": damage}
 
 
-def verify(folder: Path) -> Verdict:
-    """Read all files of the episode in `folder`; RecordingError where it is none, or cannot be read by us."""
+class DamagedError(RecordingError):
+    """A recording is not what was recorded."""
+
+    def __init__(self, verdict: Verdict) -> None:
+        self.verdict = verdict
+        super().__init__(
+            f"{verdict.path} is damaged: {verdict.text}. It is left as it is and never published; bring its files "
+            "back from a copy"
+        )
+
+
+def verify(folder: Path, files: Collection[str] = ()) -> Verdict:
+    """Read the files of the episode in `folder`, all or `files`; RecordingError where it is none, or closed to us."""
     if not (folder / OUTCOME).exists():
         if not (folder / MANIFEST).exists():
             raise RecordingError(f"{folder} is no episode: there is no {MANIFEST} in it")
@@ -90,9 +97,10 @@ def verify(folder: Path) -> Verdict:
     if DIGESTS not in outcome:
         return _unsealed(folder)
     manifest = _manifest(folder)
-    found = [_damage(folder / name, digest, manifest) for name, digest in outcome[DIGESTS].items()]
+    digests = {name: told for name, told in outcome[DIGESTS].items() if not files or name in files}
+    found = [_damage(folder / name, digest, manifest) for name, digest in digests.items()]
     damage = tuple(one for one in found if one is not None)
-    size = sum(digest["bytes"] for digest in outcome[DIGESTS].values())
+    size = sum(digest["bytes"] for digest in digests.values())
     return Verdict(folder, "damaged" if damage else "sound", damage, size)
 
 
@@ -105,14 +113,11 @@ def _unsealed(folder: Path) -> Verdict:
     return Verdict(folder, "unsealed")
 
 
-def require_sound(folder: Path) -> Verdict:
+def require_sound(folder: Path, files: Collection[str] = ()) -> Verdict:
     """As `verify`; DamagedError where a file is not what was recorded."""
-    verdict = verify(folder)
+    verdict = verify(folder, files)
     if verdict.state == "damaged":
-        raise DamagedError(
-            f"{folder} is damaged: {verdict.text}. It is left as it is and never published; bring its files back "
-            "from a copy"
-        )
+        raise DamagedError(verdict)
     return verdict
 
 

@@ -1,4 +1,3 @@
-import json
 from pathlib import Path
 
 import pytest
@@ -8,7 +7,7 @@ from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.reader import open_episode, read_events
 
-from .samples import CAMERAS, SETTINGS, manifest, row
+from .samples import CAMERAS, SETTINGS, manifest, row, unsealed
 
 
 @pytest.fixture
@@ -23,27 +22,22 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-def rewrite(folder: Path, **changes: object) -> None:
-    path = folder / "outcome.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
-
-
 def test_rows_are_cut_to_what_the_outcome_says(folder: Path) -> None:
-    rewrite(folder, frames=3)
+    unsealed(folder, frames=3)
     episode = open_episode(folder)
     assert episode.frames == 3
     assert episode.rows.column("index").to_pylist() == [0, 1, 2]
 
 
 def test_fewer_rows_than_the_outcome_says_are_an_error(folder: Path) -> None:
-    rewrite(folder, frames=6)
+    unsealed(folder, frames=6)
     with pytest.raises(RecordingError, match=r"rows\.arrow is damaged: 5 rows readable, its outcome says 6"):
         open_episode(folder)
 
 
 @pytest.mark.parametrize("frames", [None, -1, True, "5"])
 def test_an_outcome_without_a_count_is_an_error(folder: Path, frames: object) -> None:
-    rewrite(folder, frames=frames)
+    unsealed(folder, frames=frames)
     with pytest.raises(RecordingError, match=r"outcome\.json: frames is"):
         open_episode(folder)
 

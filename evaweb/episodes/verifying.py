@@ -1,0 +1,80 @@
+"""Recordings verified at leisure: a few at a time, those first that were not looked at for longest, round and round."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from datetime import timedelta
+from typing import Any
+from uuid import UUID
+
+from django.db.models import F, Q, QuerySet
+from django.utils import timezone
+
+from evaweb.episodes.folders import journal_folder
+from evaweb.episodes.models import Episode
+from evaweb.episodes.recorded import CLOSED
+from evaweb.jobs.kinds import Work
+from evaweb.jobs.models import Job, JobStatus
+from evaweb.jobs.services import enqueue
+from runtime.recording.files import RecordingError
+from runtime.recording.quarantine import keep
+from runtime.recording.scrub import Verdict, verify
+
+log = logging.getLogger(__name__)
+
+AGAIN_AFTER = timedelta(days=30)
+OLD_AFTER = timedelta(hours=1)  # what was just recorded is verified when it is published
+MOST_EPISODES, MOST_BYTES = 100, 1 << 30  # of one job: whatever is asked for meanwhile waits for its end
+
+
+def scrub_asked() -> Job | None:
+    """Have the worker verify what is due, once it has nothing else to do."""
+    at_work = Job.objects.filter(status__in=(JobStatus.QUEUED, JobStatus.RUNNING))
+    if at_work.exists() or not _due().exists():
+        return None
+    return enqueue(kind="scrub", key="scrub", args={})
+
+
+def scrubbed(work: Work) -> Mapping[str, Any]:
+    """Verify the next that are due, and remember each at once; what was found of how many."""
+    counts = dict.fromkeys(("sound", "damaged", "unsealed", "open"), 0)
+    damaged, problems, read = [], [], 0
+    for uuid in _next():
+        if read >= MOST_BYTES:
+            break
+        work.tell(f"{sum(counts.values())} verified, {len(damaged)} damaged")
+        try:
+            verdict = verify(journal_folder(uuid))
+            found(verdict)
+        except RecordingError as error:
+            problems.append(str(error))
+            Episode.objects.filter(uuid=uuid).update(verified_at=timezone.now())
+            continue
+        counts[verdict.state] += 1
+        read += verdict.bytes
+        damaged += [{"uuid": str(uuid), "why": verdict.text}] if verdict.state == "damaged" else []
+    return {**counts, "bytes": read, "found": damaged, "problems": problems}
+
+
+def found(verdict: Verdict) -> None:
+    """Keep what was found of an episode of this lab: on the disk, and in its row."""
+    if verdict.state == "damaged":
+        log.error("episode %s is damaged: %s", verdict.path.name, verdict.text)
+    keep(verdict)
+    Episode.objects.filter(uuid=UUID(verdict.path.name)).update(
+        damage=verdict.document()["damage"], verified_at=timezone.now()
+    )
+
+
+def _due() -> QuerySet[Episode]:
+    now = timezone.now()
+    fresh = Q(verified_at=None) & Q(created_at__gte=now - OLD_AFTER)
+    return Episode.objects.filter(
+        Q(verified_at=None) | Q(verified_at__lt=now - AGAIN_AFTER), status__in=CLOSED
+    ).exclude(fresh)
+
+
+def _next() -> Iterator[UUID]:
+    rows = _due().order_by(F("verified_at").asc(nulls_first=True), "created_at")
+    yield from rows.values_list("uuid", flat=True)[:MOST_EPISODES]
