@@ -18,7 +18,7 @@ from runtime.quality.report import Severity
 from runtime.recording.files import read_document
 from runtime.recording.layout import Layout
 from runtime.recording.scrub import verify
-from runtime.recording.sealing import OUTCOME, read_outcome
+from runtime.recording.sealing import DIGESTS, OUTCOME, read_outcome
 from runtime.recording.tables import added, rows_schema
 
 _ROLES = {"qpos": "state", "action": "action", "eef": "poses", "eef_action": "poses"}
@@ -52,9 +52,9 @@ class JournalSource(Source):
             outcome = read_outcome(self._folder)
         except RecordingError as error:
             return None, [("unfinished", "error", str(error))]
-        remarks: list[tuple[str, Severity, str]] = [
-            ("damaged", "error", damage.text) for damage in verify(self._folder).damage
-        ]
+        remarks: list[tuple[str, Severity, str]] = []
+        if DIGESTS in outcome:  # else what cannot be read is found below
+            remarks += [("damaged", "error", damage.text) for damage in verify(self._folder).damage]
         status, reason = outcome.get("status"), outcome.get("reason", "")
         if status == "failed":
             remarks.append(("recording_failed", "error", f"the recording failed: {reason}"))

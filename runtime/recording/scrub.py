@@ -67,7 +67,13 @@ class Verdict:
     def document(self) -> dict[str, Any]:
         """As JSON."""
         damage = [
-            {"file": one.file, "what": one.what, "rows": one.rows, "times": one.times, "text": one.text}
+            {
+                "file": one.file,
+                "what": one.what,
+                "rows": [list(span) for span in one.rows],
+                "times": [list(span) for span in one.times],
+                "text": one.text,
+            }
             for one in self.damage
         ]
         return {"episode": self.path.name, "state": self.state, "bytes": self.bytes, "damage": damage}
@@ -95,7 +101,7 @@ def verify(folder: Path, files: Collection[str] = ()) -> Verdict:
     except RecordingError as error:
         return Verdict(folder, "damaged", (Damage(OUTCOME, f"is damaged: {error}"),))
     if DIGESTS not in outcome:
-        return _unsealed(folder)
+        return Verdict(folder, "unsealed") if files else _unsealed(folder)
     manifest = _manifest(folder)
     digests = {name: told for name, told in outcome[DIGESTS].items() if not files or name in files}
     found = [_damage(folder / name, digest, manifest) for name, digest in digests.items()]

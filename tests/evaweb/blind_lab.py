@@ -26,6 +26,7 @@ from evaweb.trials.models import Checkpoint, Trial
 from runtime.recording.export import export
 from runtime.transitions import Happening
 from tests.evaweb.trials import builders
+from tests.runtime.recording.samples import resealed
 
 NAMES = ("pi0-secret-alder", "pi0-secret-birch")
 KEYS = (6606001, 6606002)  # in the database
@@ -173,6 +174,7 @@ class Lab:
             events.write(
                 json.dumps({"kind": "command", "text": f"stop by ann: failed, {ERROR}", "time": 1.0}) + "\n"
             )
+        resealed(folder)
         export(folder, self._data)
         self.episode = Episode.objects.create(
             uuid=folder.name,

@@ -20,7 +20,7 @@ from evaweb.jobs import services as jobs
 from evaweb.jobs.models import Job, JobStatus
 from runtime.datasets.consistency import check
 from runtime.datasets.staging import FOLDER, Staging
-from tests.runtime.recording.samples import decoded, numbers
+from tests.runtime.recording.samples import decoded, numbers, unsealed
 
 pytestmark = pytest.mark.django_db
 
@@ -172,8 +172,7 @@ def test_an_interrupted_episode_is_published_only_where_it_was_scored(closed: Cl
 
 def test_an_episode_without_rows_is_no_failure_and_in_no_dataset(closed: Closed, data: Path) -> None:
     episode = closed()
-    outcome = data / "episodes" / str(episode.uuid) / "outcome.json"
-    outcome.write_text(json.dumps(json.loads(outcome.read_text()) | {"frames": 0}))
+    unsealed(data / "episodes" / str(episode.uuid), frames=0)
     score(data, episode, False)
     job = publish(episode)
     assert job.status == JobStatus.DONE

@@ -26,6 +26,7 @@ from runtime.recording.reader import open_episode
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.video import FragmentedVideo
 from tests.runtime.datasets.small import CAMERAS, JOINTS, manifest, picture, record, row, seen
+from tests.runtime.recording.samples import unsealed
 from tests.runtime.recording.test_tables import old_raw
 
 CONFORMANCE = Path(__file__).parents[2] / "conformance"
@@ -683,4 +684,5 @@ def test_rows_of_a_simulated_robot_are_refused_whatever_the_manifest_says(tmp_pa
 def test_an_episode_from_before_strategies_were_written_down_is_published(tmp_path: Path) -> None:
     folder = record(tmp_path / "episodes", frames=4)
     old_raw(folder / "raw.arrow")
+    unsealed(folder)
     assert publish(folder, tmp_path / "set").frames == 4

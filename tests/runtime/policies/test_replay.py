@@ -19,6 +19,7 @@ from runtime.pose_format import PoseFormat
 from runtime.types import Observation
 from tests.runtime.datasets.foreign import Plan, column, write
 from tests.runtime.datasets.small import record, robot, write_dataset
+from tests.runtime.recording.samples import resealed
 
 FRAMES, FPS = 12, 10.0
 
@@ -219,6 +220,7 @@ def test_the_actions_of_another_robot_are_refused(tmp_path: Path) -> None:
     manifest = json.loads((episode / "manifest.json").read_text())
     manifest["robot"]["name"] = "ur5e"
     (episode / "manifest.json").write_text(json.dumps(manifest))
+    resealed(episode)
     policy = replay.build(Config(path=str(episode)), robot(), VirtualClock(), FPS)
     with pytest.raises(PolicyError, match="is of the robot ur5e, the station's is small"):
         policy.connect()
@@ -229,6 +231,7 @@ def test_the_same_joints_in_another_order_are_refused(tmp_path: Path) -> None:
     manifest = json.loads((episode / "manifest.json").read_text())
     manifest["robot"]["joint_names"].reverse()
     (episode / "manifest.json").write_text(json.dumps(manifest))
+    resealed(episode)
     policy = replay.build(Config(path=str(episode)), robot(), VirtualClock(), FPS)
     with pytest.raises(PolicyError, match="the actions are of the joints"):
         policy.connect()

@@ -12,6 +12,7 @@ from runtime.quality.inspection import inspect
 from runtime.quality.settings import QualitySettings, read_settings
 from tests.runtime.quality import built
 from tests.runtime.quality.built import FPS, FRAMES, at, late, record, shown
+from tests.runtime.recording.samples import unsealed
 
 
 @pytest.fixture(scope="module")
@@ -203,10 +204,11 @@ def test_missing_pictures_rows_and_videos_are_errors(good, tmp_path):
     cut = tmp_path / good.name
     shutil.copytree(good, cut)
     (cut / "cam_high.mp4").unlink()
+    assert [flag.text for flag in inspect(cut).flags if flag.kind == "damaged"] == ["cam_high.mp4 is absent"]
+    unsealed(cut)
     assert found(cut) == [("video", "error", -1, -1, "cam_high")]
 
-    outcome = json.loads((cut / "outcome.json").read_text())
-    (cut / "outcome.json").write_text(json.dumps(outcome | {"frames": FRAMES + 5}))
+    unsealed(cut, frames=FRAMES + 5)
     kinds = {kind for kind, *_ in found(cut)}
     assert kinds == {"video", "unreadable"}
 
@@ -216,12 +218,14 @@ def test_a_video_shorter_than_the_table_is_an_error(good, tmp_path):
     mixed = tmp_path / "mixed" / good.name
     shutil.copytree(good, mixed)
     shutil.copy(short / "cam_high.mp4", mixed / "cam_high.mp4")
+    unsealed(mixed)
     assert found(mixed) == [("video_length", "error", FRAMES - 20, FRAMES - 1, "cam_high")]
 
 
 def test_a_longer_video_is_only_a_remark(good, tmp_path):
     short = record(tmp_path, frames=FRAMES - 20)
     shutil.copy(good / "cam_high.mp4", short / "cam_high.mp4")
+    unsealed(short)
     report = inspect(short)
     assert [(flag.kind, flag.severity) for flag in report.flags] == [("video_length", "info")]
     assert report.clean
@@ -245,6 +249,7 @@ def test_pictures_of_another_size_than_declared_are_errors(good, tmp_path):
     told = json.loads((folder / "manifest.json").read_text())
     told["cameras"]["cam_high"] = {"width": 64, "height": 48}
     (folder / "manifest.json").write_text(json.dumps(told))
+    unsealed(folder)
     assert found(folder) == [("dimensions", "error", 0, 0, "cam_high")]
 
 

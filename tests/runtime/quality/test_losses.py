@@ -1,7 +1,5 @@
 """Pictures that were given and not kept: of some rows, or of all from one on; in episodes and in datasets."""
 
-import json
-
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -10,6 +8,7 @@ from runtime.datasets.published import publish
 from runtime.quality.inspection import inspect, inspect_dataset
 from tests.runtime.quality.built import CAMERAS, FRAMES, record, shown
 from tests.runtime.recording.failing import fail_at
+from tests.runtime.recording.samples import resealed
 
 CAMERA = CAMERAS[0]
 
@@ -30,6 +29,7 @@ def losing(root, *stretches):
     changed = table.set_column(table.column_names.index(name), table.schema.field(name), marked)
     with pa.OSFile(str(path), "wb") as file, pa.ipc.new_stream(file, table.schema) as stream:
         stream.write_table(changed)
+    resealed(folder)
     return folder
 
 
@@ -87,5 +87,4 @@ def test_a_loss_that_says_no_row_is_an_error_that_names_it(tmp_path):
 
 
 def told_of(folder, lost):
-    path = folder / "outcome.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"lost_cameras": lost}))
+    resealed(folder, lost_cameras=lost)

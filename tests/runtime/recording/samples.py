@@ -12,7 +12,8 @@ import av
 import numpy as np
 
 from runtime.recording.base import ExecutedTick, RawChunk, Row
-from runtime.recording.sealing import told
+from runtime.recording.layout import Layout
+from runtime.recording.sealing import digests_of, sealed, told
 from runtime.recording.settings import RecordingSettings
 
 HEIGHT, WIDTH = 48, 64
@@ -133,3 +134,11 @@ def unsealed(folder: Path, **changes: object) -> None:
     """Make the outcome one from before there were digests, with `changes`."""
     path = folder / "outcome.json"
     path.write_text(json.dumps(told(json.loads(path.read_text())) | changes))
+
+
+def resealed(folder: Path, **changes: object) -> None:
+    """Give an episode whose files a test has changed the digests of these, as if it had been recorded so."""
+    path = folder / "outcome.json"
+    outcome = told(json.loads(path.read_text())) | changes
+    layout = Layout.of(json.loads((folder / "manifest.json").read_text()))
+    path.write_bytes(sealed(outcome, digests_of(folder, layout)))

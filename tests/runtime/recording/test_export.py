@@ -20,7 +20,7 @@ from runtime.recording.episode import EpisodeJournal
 from runtime.recording.export import FOLDER, NO_PROMPT, SCHEMA, export, is_exported, place, slug
 from runtime.recording.files import document
 
-from .samples import DIM, SETTINGS, STARTED, chunk, manifest, row, tick
+from .samples import DIM, SETTINGS, STARTED, chunk, manifest, row, tick, unsealed
 
 
 def recorded(root: Path, **changes: Any) -> Path:
@@ -167,6 +167,7 @@ def test_an_episode_that_lost_a_table_or_a_video_is_exported_with_what_there_is(
     folder = recorded(tmp_path)
     (folder / "ticks.arrow").unlink()
     next(folder.glob("*.mp4")).unlink()
+    unsealed(folder)
     path = export(folder, tmp_path)
     assert rows(path, "executed") == []
     assert len(rows(path, "smoothed")) == 12
