@@ -7,11 +7,12 @@ import pytest
 from asgiref.sync import async_to_sync
 from django.test import AsyncClient
 
-from evaweb.episodes import services
+from evaweb.episodes import services, verifying
 from evaweb.episodes.models import Episode
 from evaweb.jobs import doorbell
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import work
+from runtime.recording.scrub import verify
 from tests.runtime.recording.test_export import recorded
 
 
@@ -44,6 +45,20 @@ def test_mode_strategy_and_figures_of_the_policy_are_told(rest, episode):
     status, refused = rest.get("episodes", mode="fast")
     assert status == 422
     assert "mode = 'fast'" in refused["error"]
+
+
+@pytest.mark.django_db
+def test_damage_is_told_with_its_rows_and_can_be_asked_for(rest, episode, tmp_path):
+    assert rest.get("episodes", damaged=True)[1]["total"] == 0
+    path = tmp_path / f"episodes/{episode.uuid}/ticks.arrow"
+    path.write_bytes(path.read_bytes()[:-100])
+    verifying.found(verify(path.parent))
+    _, found = rest.get("episodes", damaged=True)
+    (damage,) = found["items"][0]["damage"]
+    assert (damage["file"], damage["text"][:16]) == ("ticks.arrow", "ticks.arrow has ")
+    assert damage["rows"]
+    assert found["items"][0]["verified_at"]
+    assert rest.get("episodes", damaged=False)[1]["total"] == 0
 
 
 @pytest.mark.django_db

@@ -1,0 +1,173 @@
+"""Recordings are verified at leisure, round and round; what is damaged is shown, and never published."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+from django.contrib.auth.models import User
+from django.test import Client
+from django.utils import timezone
+
+from evaweb.datasets.on_robot import recorded_at
+from evaweb.episodes import selectors, services, verifying
+from evaweb.episodes.job_kinds import look_for_unverified
+from evaweb.episodes.models import Episode
+from evaweb.episodes.reconcile import reconcile
+from evaweb.errors import Conflict
+from evaweb.jobs import services as jobs
+from evaweb.jobs.models import Job, JobStatus
+from runtime.recording.quarantine import marked
+from runtime.recording.scrub import UNSEALED
+from tests.runtime.recording.samples import unsealed
+
+pytestmark = pytest.mark.django_db
+
+Closed = Callable[..., Episode]
+
+
+@pytest.fixture
+def old(closed: Closed) -> Episode:
+    """An episode of a week ago, whose worker has nothing else to do."""
+    episode = closed()
+    jobs.work("lab")
+    Episode.objects.update(created_at=timezone.now() - timedelta(days=7))
+    episode.refresh_from_db()
+    return episode
+
+
+@contextmanager
+def a_bit_off(path: Path) -> Iterator[None]:
+    whole = path.read_bytes()
+    content = bytearray(whole)
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    yield
+    path.write_bytes(whole)
+
+
+def scrubbed() -> Job:
+    """The worker's next look, and what it then does."""
+    assert look_for_unverified()
+    jobs.work("lab")
+    return Job.objects.filter(kind="scrub").latest("created_at")
+
+
+def folder_of(data: Path, episode: Episode) -> Path:
+    return data / "episodes" / str(episode.uuid)
+
+
+def test_an_old_recording_is_verified_once_and_again_after_a_month(old: Episode) -> None:
+    job = scrubbed()
+    assert job.status == JobStatus.DONE
+    assert (job.result["sound"], job.result["found"], job.result["problems"]) == (1, [], [])
+    assert job.result["bytes"] > 1000
+    assert not look_for_unverified()
+    Episode.objects.update(verified_at=timezone.now() - verifying.AGAIN_AFTER - timedelta(hours=1))
+    assert scrubbed().pk != job.pk
+    old.refresh_from_db()
+    assert (old.damage, old.verified_at is not None) == ([], True)
+
+
+def test_what_was_just_recorded_waits_and_so_does_a_scrub_while_anything_else_is_asked_for(
+    closed: Closed,
+) -> None:
+    episode = closed()
+    assert Job.objects.filter(status=JobStatus.QUEUED).exists()  # its preview
+    Episode.objects.update(created_at=timezone.now() - timedelta(days=7))
+    assert not look_for_unverified()
+    jobs.work("lab")
+    Episode.objects.update(created_at=timezone.now())
+    assert not look_for_unverified()
+    Episode.objects.filter(pk=episode.pk).update(created_at=timezone.now() - timedelta(days=7))
+    assert look_for_unverified()
+
+
+def test_a_scrub_goes_round_a_bounded_part_at_a_time(
+    old: Episode, put: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = put("interrupted")
+    services.episode_read(uuid=folder.name)
+    jobs.work("lab")
+    Episode.objects.update(created_at=timezone.now() - timedelta(days=7))
+    monkeypatch.setattr(verifying, "MOST_BYTES", 1)
+    assert scrubbed().result["sound"] == 1
+    assert Episode.objects.filter(verified_at=None).count() == 1
+    assert scrubbed().result["sound"] == 1
+    assert not Episode.objects.filter(verified_at=None).exists()
+    assert not look_for_unverified()
+
+
+def test_damage_is_kept_on_the_disk_and_shown_until_the_files_are_back(
+    old: Episode, data: Path, client: Client, vera: User
+) -> None:
+    client.force_login(vera)
+    with a_bit_off(folder_of(data, old) / "ticks.arrow"):
+        job = scrubbed()
+        assert (job.status, job.result["damaged"]) == (JobStatus.DONE, 1)
+        (found,) = job.result["found"]
+        assert found["uuid"] == str(old.uuid)
+        assert "ticks.arrow is changed, rows " in found["why"]
+        old.refresh_from_db()
+        assert old.damage == marked(data, str(old.uuid))
+        assert list(selectors.episode_list(quality="damaged")) == [old]
+        assert "ticks.arrow is changed" in client.get(f"/replay/{old.uuid}/").content.decode()
+        assert "ticks.arrow is changed" in client.get("/replay/?quality=damaged").content.decode()
+        Episode.objects.all().delete()  # the database is an index
+        reconcile()
+        old = Episode.objects.get(pk=old.pk)
+        assert [damage["file"] for damage in old.damage] == ["ticks.arrow"]
+        with pytest.raises(Conflict, match=r"is damaged: ticks\.arrow is changed"):
+            recorded_at(str(old.uuid))
+        jobs.work("lab")
+    Episode.objects.update(verified_at=None, created_at=timezone.now() - timedelta(days=7))
+    assert scrubbed().result["sound"] == 1
+    old.refresh_from_db()
+    assert (old.damage, marked(data, str(old.uuid))) == ([], [])
+    assert not selectors.episode_list(quality="damaged").exists()
+    assert recorded_at(str(old.uuid)).rows == old.frames
+
+
+@pytest.mark.parametrize(
+    "name", ["rows.arrow", "raw.arrow", "smoothed.arrow", "events.jsonl", "cam_high.mp4"]
+)
+def test_a_publication_finds_the_damage_itself_and_keeps_it(old: Episode, data: Path, name: str) -> None:
+    with a_bit_off(folder_of(data, old) / name):
+        job = services.publish_asked(episode=old)
+        jobs.work("lab")
+        job.refresh_from_db()
+    assert (job.status, job.attempts, job.result["published"]) == (JobStatus.DONE, 1, False)
+    assert f"is damaged: {name} is changed" in job.result["why"]
+    old.refresh_from_db()
+    assert ([damage["file"] for damage in old.damage], old.dataset_index) == ([name], None)
+    assert not (data / "datasets").exists()
+
+
+def test_figures_of_damaged_rows_are_not_measured(old: Episode, data: Path) -> None:
+    Episode.objects.update(smoothness=None, smoothness_detail=None)
+    with a_bit_off(folder_of(data, old) / "rows.arrow"):
+        assert services.smoothness_asked(most=1) == 1
+        jobs.work("lab")
+    old.refresh_from_db()
+    assert old.smoothness is None
+    assert "rows.arrow is changed" in old.smoothness_detail["why"]
+
+
+def test_an_older_recording_is_published_and_said_to_have_no_digests(old: Episode, data: Path) -> None:
+    unsealed(folder_of(data, old))
+    assert scrubbed().result["unsealed"] == 1
+    job = services.publish_asked(episode=old)
+    jobs.work("lab")
+    job.refresh_from_db()
+    assert (job.result["published"], job.result["remark"]) == (True, UNSEALED)
+
+
+def test_a_recording_that_is_gone_keeps_none_of_the_others(old: Episode, data: Path) -> None:
+    folder_of(data, old).rename(data / "elsewhere")
+    job = scrubbed()
+    assert (job.status, job.result["sound"]) == (JobStatus.DONE, 0)
+    assert "is no episode" in job.result["problems"][0]
+    assert not look_for_unverified()
