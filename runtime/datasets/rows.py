@@ -28,7 +28,7 @@ def read_rows(path: Path, episode: int | None, left_out: Collection[str] = ()) -
     if not path.is_file():
         raise RecordingError(f"there is no {path}, though the metadata list it")
     try:
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
             names = file.schema_arrow.names
             wanted = [name for name in names if name not in left_out] if left_out else None
             if episode is None:
@@ -56,12 +56,12 @@ def numbers(table: pa.Table, name: str) -> np.ndarray[Any, Any]:
 
 
 def write_table(table: pa.Table, path: Path) -> None:
-    """Write `table` to `path`; raises RecordingError."""
+    """Write `table` to `path`, with the checksums that the format has for its pages; raises RecordingError."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        pq.write_table(table, path)
+        pq.write_table(table, path, write_page_checksum=True)
     except (OSError, pa.ArrowException) as error:
         raise RecordingError(f"{path} cannot be written: {error}") from error
 

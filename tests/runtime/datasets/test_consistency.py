@@ -4,6 +4,7 @@ import json
 import os
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from hypothesis import strategies as st
 from runtime.datasets.__main__ import main
 from runtime.datasets.consistency import check, examine, rounded
 from runtime.datasets.published import publish
+from runtime.datasets.rows import read_rows, write_table
+from runtime.errors import RecordingError
 from tests.runtime.datasets.small import record, write_video
 
 
@@ -88,6 +91,23 @@ def test_whatever_is_spoiled_is_found(dataset: Path, spoil: Callable[[Path], obj
     spoil(dataset)
     problems = check(dataset)
     assert any(re.search(named, problem) for problem in problems), problems
+
+
+@given(at=st.floats(0, 1), bit=st.integers(0, 7))
+def test_no_damaged_number_is_read_from_rows_that_we_wrote(
+    tmp_path_factory: pytest.TempPathFactory, at: float, bit: int
+) -> None:
+    path = tmp_path_factory.mktemp("rows") / "rows.parquet"
+    noise = np.random.default_rng(0).normal(size=(50, 7)).astype(np.float32)
+    table = pa.table({"state": list(noise), "index": np.arange(50), "who": ["policy", "hold"] * 25})
+    write_table(table, path)
+    content = bytearray(path.read_bytes())
+    footer = len(content) - 8 - int.from_bytes(content[-8:-4], "little")
+    content[4 + int(at * (footer - 5))] ^= 1 << bit
+    path.write_bytes(content)
+    with suppress(RecordingError):
+        found = read_rows(path, None)
+        assert found.equals(table.cast(found.schema))
 
 
 def test_the_sample_episode_is_whole() -> None:
