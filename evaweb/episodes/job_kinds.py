@@ -26,7 +26,7 @@ from runtime.datasets.published import never_published, publish
 from runtime.recording.export import export
 from runtime.recording.files import RecordingError
 from runtime.recording.labels import newest
-from runtime.recording.scrub import DamagedError
+from runtime.recording.scrub import DamagedError, verify
 
 _AT_ONCE = 20  # asked for in one look
 
@@ -71,6 +71,17 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
     """
     episode = Episode.objects.select_related("station").get(uuid=UUID(work.args["uuid"]))
     folder = journal_folder(episode.uuid)
+    try:
+        return _published(work, episode, folder)
+    except RecordingError:
+        verdict = verify(folder)
+        if verdict.state != "damaged":
+            raise
+        verifying.found(verdict)
+        return {"published": False, "why": str(DamagedError(verdict))}
+
+
+def _published(work: Work, episode: Episode, folder: Path) -> Mapping[str, Any]:
     recorded = recorded_in(folder)
     if recorded.closed and not recorded.facts["frames"]:
         return {"published": False, "why": "it has no rows: its run ended before the first"}
@@ -86,19 +97,15 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
     simulated = recorded.simulated or episode.station.simulated
     name = dataset_name(recorded, scored=success is not None, simulated=simulated)
     work.tell(f"into {name}")
-    try:
-        with TemporaryDirectory() as beside:
-            placed = publish(
-                folder,
-                datasets_dir() / name,
-                success=success,
-                include_interrupted=success is not None,
-                version=work.args.get("version"),
-                sides=sides_of(episode.uuid, Path(beside)),
-            )
-    except DamagedError as error:
-        verifying.found(error.verdict)
-        return {"published": False, "why": str(error)}
+    with TemporaryDirectory() as beside:
+        placed = publish(
+            folder,
+            datasets_dir() / name,
+            success=success,
+            include_interrupted=success is not None,
+            version=work.args.get("version"),
+            sides=sides_of(episode.uuid, Path(beside)),
+        )
     dataset = str(placed.dataset.relative_to(data_dir()))
     Episode.objects.filter(uuid=episode.uuid).update(
         dataset=dataset, dataset_index=placed.episode_index, published_at=Now()

@@ -11,7 +11,8 @@ from typing import Any
 from evaweb.episodes.models import EpisodeStatus
 from runtime.recording.files import RecordingError, read_document
 from runtime.recording.layout import Layout
-from runtime.recording.sealing import OUTCOME, read_outcome
+from runtime.recording.scrub import require_sound
+from runtime.recording.sealing import MANIFEST, OUTCOME, read_outcome
 
 CLOSED = (EpisodeStatus.FINISHED, EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED)
 
@@ -56,6 +57,8 @@ def recorded_in(folder: Path) -> Recorded:
         "started_at": _time(manifest.get("started_wall")),
     }
     path = folder / OUTCOME
+    if path.exists():
+        require_sound(folder, (MANIFEST,))
     outcome = read_outcome(folder) if path.exists() else {}
     return Recorded(
         uuid=layout.uuid,

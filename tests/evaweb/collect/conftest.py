@@ -20,6 +20,7 @@ from runtime.recording.export import export
 from runtime.recording.labels import Label, append
 from tests.evaweb.episodes.conftest import data, recorded, station
 from tests.evaweb.trials.builders import Wire
+from tests.runtime.recording.samples import resealed
 
 __all__ = ["data", "recorded", "station"]
 
@@ -72,6 +73,7 @@ def demonstrate(data: Path, recorded: dict[str, Path], session: CollectSession) 
         told = {"kind": "demonstration", "mode": "collect", "task": chosen.task, "operator": "ann"}
         named = {"uuid": str(chosen.pk), "dataset": chosen.dataset}
         path.write_text(json.dumps(manifest | told | {"uuid": uuid, "session": named}))
+        resealed(target)
         export(target, data)
         event = {"kind": "episode_closed", "data": {"uuid": uuid, "status": status}}
         episodes.episode_closed(station=chosen.station, data=event["data"])

@@ -20,7 +20,7 @@ from evaweb.jobs import services as jobs
 from evaweb.jobs.models import Job, JobStatus
 from runtime.datasets.consistency import check
 from runtime.datasets.staging import FOLDER, Staging
-from tests.runtime.recording.samples import decoded, numbers, unsealed
+from tests.runtime.recording.samples import decoded, numbers, resealed, unsealed
 
 pytestmark = pytest.mark.django_db
 
@@ -202,6 +202,7 @@ def test_a_robot_whose_name_leads_out_of_the_folder_is_refused(closed: Closed, d
     manifest = json.loads(path.read_text())
     manifest["robot"]["name"] = "../../outside"
     path.write_text(json.dumps(manifest))
+    resealed(path.parent)
     assert "robot.name is '../../outside'" in publish(episode).error
 
 
@@ -290,6 +291,7 @@ def test_the_table_is_made_once_and_stays(closed: Closed, data: Path) -> None:
 def sim_manifest(data: Path, episode: Episode) -> None:
     path = data / "episodes" / str(episode.uuid) / "manifest.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"mode": "sim"}))
+    resealed(path.parent)
 
 
 def test_a_run_with_a_simulated_robot_is_not_even_queued(closed: Closed, data: Path) -> None:

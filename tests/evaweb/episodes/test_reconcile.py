@@ -21,6 +21,7 @@ from evaweb.jobs.models import Job
 from evaweb.stations.models import Station
 from runtime.datasets.operations import convert
 from tests.runtime.datasets.foreign import Plan, write
+from tests.runtime.recording.samples import resealed
 
 pytestmark = pytest.mark.django_db
 
@@ -196,6 +197,7 @@ def test_a_station_that_is_gone_is_known_to_be_simulated_from_its_recordings(
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["configuration"]["transport"] = {"kind": "zmq", "simulated": True}
     (folder / "manifest.json").write_text(json.dumps(manifest))
+    resealed(folder)
     reconcile()
     assert Station.objects.get().simulated is True
 
