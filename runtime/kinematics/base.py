@@ -105,5 +105,5 @@ class Kinematics(Forward):
         its velocity limit from one frame to the next; `anchor` [D] is what is commanded in the step before row
         `anchor_row`, the first that will be executed: that row is bound to it by the same velocity, and the rows
         before it, which are stale, by joint limits alone. Without an anchor the first row is bound by joint limits
-        alone. What is not reached is flagged, never hidden.
+        alone. What is not reached is flagged, never hidden. What a pose leaves open is the backend's.
         """

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import Literal
+from functools import partial
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
 from robots import Chain, Group, Robot
 from runtime.errors import SetupError
 from runtime.kinematics.base import IkResult, Kinematics, KinematicsError, KinematicsSettings
+from runtime.kinematics.replanning import missed, postures, replanned
 from runtime.kinematics.tables import Records, Way, chains_of
 from runtime.types import Float64
 
@@ -18,6 +21,8 @@ _WRONG = {  # by what runtime.kinematics.kernels.chunks says
     1: "a target, the seed or the anchor holds a number that is not finite",
     2: "a target's quaternion has length zero; allowed: any other",
 }
+_ROOM = 0.8  # rad (m) that joints with a choice keep from limits, where home does
+_TRIED = 24  # postures, besides home, from which the end of a missed chunk is solved
 _log = logging.getLogger(__name__)
 
 
@@ -25,6 +30,9 @@ class Config(KinematicsSettings):
     """Damped least squares in loops that numba compiles: microseconds per frame and arm."""
 
     kind: Literal["compiled"] = "compiled"
+    home_rate: Annotated[float, Field(ge=0)] = 4.0
+    """Of the way home that what a pose leaves open (arms with more than six joints) goes per second, no joint faster
+    than at a fifth of its velocity; limits push at the same rate. 0: it stays as it is."""
 
 
 def build(config: Config, robot: Robot) -> CompiledKinematics:
@@ -47,12 +55,20 @@ class CompiledKinematics(Kinematics):
         own = [(group, chain) for group in robot.arms if (chain := group.chain) is not None]
         self._whole = chains_of([_whole(group, chain) for group, chain in own])
         self._arms = _arms_of(robot, own, config.velocity_scale)
+        self._postures = [
+            postures(robot.poses["home"][dims], robot.lower[dims], robot.upper[dims], _TRIED)
+            for dims in (group.joint_dims for group, _ in own)
+        ]
         self._is_kept, self._forget = compiling.is_kept, compiling.forget
         self._poses_of, self._solve_chunk = chains.poses_of, chunks.solve_chunk
         self._reach_type = chains.reach_type(self._whole["drive"].shape[1])
         self._scratch_type = chunks.scratch_type(*_lengths(self._arms))
         self._costs = frames.Costs(
-            config.position_weight, config.rotation_weight, config.rest_weight, config.max_iterations
+            config.position_weight,
+            config.rotation_weight,
+            config.rest_weight,
+            config.home_rate,
+            config.max_iterations,
         )
         self._tolerances = chunks.Tolerances(
             config.position_tolerance, config.rotation_tolerance, config.singular_below
@@ -113,18 +129,54 @@ class CompiledKinematics(Kinematics):
         if anchor_row < 0:
             raise KinematicsError(f"anchor_row = {anchor_row} was given; allowed: 0 or above")
         held = seed if anchor is None else self._vector("an anchor", anchor)
-        frames = (len(targets), len(self._arms))
+        row = -1 if anchor is None else int(anchor_row)
+        found = self._sweep(self._arms, targets, seed, dt, held, row)
+        if dt is not None:
+            self._replan(found, targets, seed, dt, held, row)
+        return found
+
+    def _replan(
+        self, found: IkResult, targets: Float64, seed: Float64, dt: float, held: Float64, row: int
+    ) -> None:
+        """Puts another plan into `found` for arms that meet the pose they begin with and miss a later one."""
+        begin = row if row >= 0 else 1
+        for index in missed(found, begin):
+            arm = self._arms[index : index + 1]
+            dims = arm["dims"][0, : arm["joints"][0]]
+            start = seed.copy()
+            start[dims] = (held if row >= 0 else found.q[0])[dims]
+            poses = np.ascontiguousarray(targets[begin:, index : index + 1])
+            plan = replanned(partial(self._sweep, arm), poses, start, dt, dims, self._postures[index])
+            if plan is not None:
+                found.q[begin:, dims] = plan.q[:, dims]
+                found.position_error[begin:, index] = plan.position_error[:, 0]
+                found.rotation_error[begin:, index] = plan.rotation_error[:, 0]
+                found.flags[begin:, index] = plan.flags[:, 0]
+
+    def _sweep(
+        self,
+        arms: Records,
+        targets: Float64,
+        seed: Float64,
+        dt: float | None,
+        anchor: Float64,
+        anchor_row: int,
+        guide: Float64 | None = None,
+    ) -> IkResult:
+        """One call of the loop, for some of the arms; contiguous arrays, anchor_row -1: no anchor."""
+        frames = (len(targets), len(arms))
         q, away, astray = np.empty((len(targets), self._dim)), np.empty(frames), np.empty(frames)
         flags = np.empty(frames, dtype=np.uint8)
         wrong = self._solve_chunk(
-            self._arms,
+            arms,
             self._costs,
             self._tolerances,
             targets,
             seed[None],
             float(dt or 0.0),
-            held,
-            -1 if anchor is None else int(anchor_row),
+            anchor,
+            anchor_row,
+            np.empty((0, self._dim)) if guide is None else guide,
             np.empty(1, dtype=self._scratch_type),
             q,
             away,
@@ -173,6 +225,9 @@ def _arms_of(robot: Robot, own: Sequence[tuple[Group, Chain]], velocity_scale: f
         arm["lower"][:count] = robot.lower[dims]
         arm["upper"][:count] = robot.upper[dims]
         arm["speed"][:count] = robot.velocity[dims] * velocity_scale
+        arm["home"][:count] = home = robot.poses["home"][dims]
+        arm["below"][:count] = np.minimum(_ROOM, home - robot.lower[dims])
+        arm["above"][:count] = np.minimum(_ROOM, robot.upper[dims] - home)
     return arms
 
 

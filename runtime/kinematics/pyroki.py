@@ -27,7 +27,10 @@ _BOX_WEIGHT = 100.0  # per rad beyond the box; what is left beyond it is cut off
 
 
 class Config(KinematicsSettings):
-    """PyRoki's least squares in JAX: for those who have it, and to compare with."""
+    """PyRoki's least squares in JAX: for those who have it, and to compare with.
+
+    What poses leave open stays as it is: nothing leads home, and no missed chunk is planned again.
+    """
 
     kind: Literal["pyroki"] = "pyroki"
 

@@ -12,6 +12,7 @@ import pytest
 
 from benchmarks.ik import _Call, _case, _compared, _enough, _figures
 from benchmarks.ik_paths import CHUNKS, OUT_OF_REACH, ROWS, Chunk, arm_dims, invented
+from benchmarks.ik_postures import path, worst
 from robots import Robot, load
 from runtime.kinematics.base import IkFlag, IkResult, Kinematics
 
@@ -80,7 +81,7 @@ def test_no_two_chunks_are_the_same_and_those_out_of_reach_leave_by_more_than_a_
 
 def row(robot: Robot, backend: Kinematics, chunk: Chunk, trajectory: str = "smooth") -> dict[str, object]:
     made = _case(robot, {"compiled": backend}, [chunk], 0.0)[0]
-    return {"robot": "r", "trajectory": trajectory, **made}
+    return {"robot": "r", "trajectory": trajectory, "joints": 6, **made}
 
 
 def test_speed_counts_from_the_seed_and_what_is_beyond_a_limit_is_counted() -> None:
@@ -157,3 +158,39 @@ def test_the_ratio_is_of_processor_time() -> None:
     assert [
         (figure.name, figure.value) for figure in _compared([of("compiled", 0.05), of("other", 25.0)])
     ] == [("ratio.r.t.other", 500.0)]
+
+
+def test_a_chunk_of_all_arms_may_take_as_long_as_its_arms_together() -> None:
+    made = row(ROBOT, guess(np.tile(chunks()["smooth"][0].seed, (ROWS, 1)), 0.0), chunks()["smooth"][0])
+    assert made["arm_ms"] == pytest.approx(made["chunk_ms"] / 2)
+    for joints, holds in ((6, False), (7, True)):
+        (figure,) = (f for f in _figures({**made, "arm_ms": 0.15, "joints": joints}) if "arm_ms" in f.name)
+        assert figure.holds is holds
+
+
+def test_paths_move_joints_unhurried_on_short_legs_away_from_their_limits() -> None:
+    joints = path(ROBOT, 3)
+    assert (joints[:, DIMS] >= ROBOT.lower[DIMS] + 0.05 - 1e-12).all()
+    assert (joints[:, DIMS] <= ROBOT.upper[DIMS] - 0.05 + 1e-12).all()
+    share = np.abs(np.diff(joints, axis=0))[:, DIMS] * ROBOT.control_rate / ROBOT.velocity[DIMS]
+    assert 0.3 < share.max() <= 0.4 + 1e-9
+    assert len(joints) > ROWS
+    np.testing.assert_array_equal(joints, path(ROBOT, 3))
+
+
+def test_a_path_is_solved_from_where_it_begins_and_chunks_from_the_last_command() -> None:
+    class Told(Guess):
+        def forward(self, q: np.ndarray) -> np.ndarray:
+            return np.zeros((*q.shape[:-1], 2, 7))
+
+        def solve(self, targets: np.ndarray, seed: np.ndarray, *_: Any, **more: Any) -> IkResult:
+            seeds.append(seed)
+            shape = (len(targets), 2)
+            q = np.tile(seed, (len(targets), 1)) + 1
+            return IkResult(q, np.full(shape, float(len(seeds))), np.zeros(shape), np.zeros(shape, np.uint8))
+
+    seeds: list[np.ndarray] = []
+    joints = np.zeros((2 * ROWS + 1, ROBOT.dim))
+    told = Told(guess(joints, 0.0)._result)
+    np.testing.assert_array_equal(worst(ROBOT, told, joints, ROWS), [3.0, 3.0])
+    np.testing.assert_array_equal(np.stack(seeds)[:, 0], [0.0, 1.0, 2.0])

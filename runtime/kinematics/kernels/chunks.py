@@ -10,6 +10,7 @@ import numpy as np
 from runtime.kinematics.kernels.chains import reach_for, reach_type
 from runtime.kinematics.kernels.compiling import kernel, part
 from runtime.kinematics.kernels.frames import Costs, frame_type, near_singular, solve_frame
+from runtime.kinematics.kernels.postures import POSED, lean, look
 from runtime.kinematics.kernels.rotations import matrix_of
 from runtime.kinematics.tables import Record, Records, chain_type
 from runtime.types import Float64, UInt8
@@ -21,6 +22,7 @@ _WITHIN = 1 - 1e-9  # of the way that a velocity allows is used, so that roundin
 _FAST = 1 - 1e-6  # of that way: as fast as it may
 _FOLLOWED = 1e-6  # weighted squared error (20 um) up to which a frame's motion is worth going on with
 _KEPT = 0.9  # of a motion is what a frame rests on: what poses leave open dies away within some ten frames
+_GUIDED = 0.5  # of the way that a velocity allows is used to come closer to a guide
 _SHORTEST = 1e-12  # square of a quaternion's length
 
 
@@ -28,7 +30,8 @@ def arm_type(moving: int, carrying: int, size: int) -> np.dtype[np.void]:
     """An arm whose own chain, of so many moving joints, `size` numbers drive, at the end of the chain that carries it.
 
     Of these numbers the first `joints` are its own, at the places `dims` of the robot's vector, within `lower` and
-    `upper`, no faster than `speed`; the others stand still at 0.
+    `upper`, no faster than `speed`; the others stand still at 0. Their limits push where they are nearer than `below`
+    and `above`.
     """
     return np.dtype(
         [
@@ -39,6 +42,9 @@ def arm_type(moving: int, carrying: int, size: int) -> np.dtype[np.void]:
             ("lower", np.float64, (size,)),
             ("upper", np.float64, (size,)),
             ("speed", np.float64, (size,)),
+            ("home", np.float64, (size,)),
+            ("below", np.float64, (size,)),
+            ("above", np.float64, (size,)),
         ]
     )
 
@@ -66,6 +72,7 @@ def solve_chunk(
     dt: float,
     anchor: Float64,
     anchor_row: int,
+    guide: Float64,
     scratches: Records,
     q: Float64,
     position_error: Float64,
@@ -74,8 +81,8 @@ def solve_chunk(
 ) -> int:
     """Joints q [T, D], errors and flags [T, A] for targets [T, A, 7] from seed [1, D].
 
-    dt [s] 0: no velocity limit; anchor [D]; anchor_row -1: no anchor; one scratch is needed. FINE, or what is wrong
-    with the numbers given.
+    dt [s] 0: no velocity limit; anchor [D]; anchor_row -1: no anchor; guide [T, D] is what rows are to come close
+    to, [0, D]: nothing; one scratch is needed. FINE, or what is wrong with the numbers given.
     """
     wrong = _wrong(targets, seed, anchor)
     if wrong != FINE:
@@ -88,6 +95,9 @@ def solve_chunk(
         arm = arms[index]
         reach_for(arm.carrier, seed, 0, carried)
         _begin(arm, seed, frame)
+        free = dt > 0 and arm.joints > POSED
+        if free:
+            look(arm.own, costs, frame)
         bound, going = False, False
         for row in range(len(targets)):
             if row == anchor_row:
@@ -96,6 +106,10 @@ def solve_chunk(
                     frame.before[i] = anchor[arm.dims[i]]
             _wall_in(arm, dt if bound else 0.0, frame)
             _set_start(going, frame)
+            if len(guide) > 0:
+                _steer(arm, guide, row, dt, frame)
+            elif free:
+                lean(arm, costs, dt, going, frame)
             _set_goal(targets, row, index, carried.frames, frame.goal)
             missed = solve_frame(arm.own, costs, frame)
             away, astray = _errors(costs, frame)
@@ -163,6 +177,16 @@ def _set_start(going: bool, frame: Record) -> None:
         frame.begin[i] = begin
         frame.centre[i] = begin + _KEPT * motion
         frame.tried[0, i] = min(max(begin + motion, frame.lower[i]), frame.upper[i])
+
+
+@part
+def _steer(arm: Record, guide: Float64, row: int, dt: float, frame: Record) -> None:
+    """Has the frame begin at, and rest on, what is closest to the guide's row and not too far from the frame before."""
+    for i in range(arm.joints):
+        way = _GUIDED * arm.speed[i] * dt
+        there = min(max(guide[row, arm.dims[i]], frame.before[i] - way), frame.before[i] + way)
+        frame.centre[i] = min(max(there, frame.lower[i]), frame.upper[i])
+        frame.tried[0, i] = frame.centre[i]
 
 
 @part

@@ -21,11 +21,15 @@ _LEAST_DAMPING = 1e-8  # below it there is none
 
 
 class Costs(NamedTuple):
-    """What a solve weighs: a metre and a radian beside the pose, a radian (m) away from what a frame rests on."""
+    """What a solve weighs: a metre and a radian beside the pose, a radian (m) away from what a frame rests on.
+
+    `home_rate` [1/s] is how fast what the pose leaves open goes home.
+    """
 
     position: float
     rotation: float
     rest: float
+    home_rate: float
     max_iterations: int
 
 
@@ -49,6 +53,9 @@ def frame_type(moving: int, size: int) -> np.dtype[np.void]:
             ("error", np.float64, (6,)),  # weighted: position, then rotation vector from goal to tip
             ("attempt", np.float64, (6,)),  # that of `tried`
             ("normal", np.float64, (6, 6)),
+            ("free", np.float64, (2, size)),  # steps that are to move no pose: towards home, and on as before
+            ("stiffness", np.float64, vector),  # of what pulls towards home
+            ("moved", np.float64, (2, 6)),  # what they would move
         ]
     )
 
@@ -156,7 +163,7 @@ def near_singular(joints: int, below: float, costs: Costs, frame: Record) -> boo
     It does where J J^T - below^2 (J^T J with fewer than six joints) has a pivot that is not positive.
     """
     normal = frame.normal
-    _set_normal(joints, costs, frame)
+    set_normal(joints, costs, frame)
     for i in range(6):
         normal[i, i] -= below * below
     for j in range(6):
@@ -171,7 +178,7 @@ def near_singular(joints: int, below: float, costs: Costs, frame: Record) -> boo
 
 
 @part
-def _set_normal(joints: int, costs: Costs, frame: Record) -> None:
+def set_normal(joints: int, costs: Costs, frame: Record) -> None:
     """J J^T below its diagonal; J^T J, filled up with an identity, where there are fewer than six joints."""
     normal, jacobian = frame.normal, frame.jacobian
     metre, radian = 1 / (costs.position * costs.position), 1 / (costs.rotation * costs.rotation)

@@ -1,0 +1,116 @@
+"""Which of the postures that meet a pose: what more than six joints leave open leads home, and away from limits."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.kinematics.kernels.chains import jacobian_of, reach_for
+from runtime.kinematics.kernels.compiling import part
+from runtime.kinematics.kernels.frames import Costs, set_normal
+from runtime.kinematics.tables import Record
+
+POSED = 6  # numbers that a pose holds: joints beyond them are free
+_FARTHEST = 0.6  # rad (m) from home beyond which the pull no longer grows, so that limits outweigh it
+_REPELLED = 4.0  # rad (m) that a limit pushes where the room is half of what it is kept at
+_TOUCHING = 0.01  # rad (m) of room below which that no longer grows
+_UNHURRIED = 0.2  # of the joints' velocities is the most that is used for it
+_SINGULAR = 0.002  # smallest singular value, about, at which the pull has half its strength
+_DEFINITE = 1e-9  # of a pivot must be left
+
+
+@part
+def look(chain: Record, costs: Costs, frame: Record) -> None:
+    """Into frame.jacobian that of frame.q, before a frame is solved."""
+    for i in range(len(frame.q)):
+        frame.tried[0, i] = frame.q[i]
+    reach_for(chain, frame.tried, 0, frame.reach)
+    jacobian_of(chain, frame.reach, costs.position, costs.rotation, frame.jacobian)
+
+
+@part
+def lean(arm: Record, costs: Costs, dt: float, going: bool, frame: Record) -> None:
+    """Adds to where a frame is searched from and to what it rests on a step in the null space of frame.jacobian.
+
+    The step goes down a potential of distance from home and of nearness to limits (gradient projection, Liegeois
+    1977), and takes the place of the null space's share of the motion that goes on: it depends on the posture alone,
+    so that a path that closes closes in the joints as well. It moves no pose, and fades out by singularities, where
+    what is open is a branch, not a posture.
+    """
+    free = frame.free
+    for i in range(len(frame.q)):
+        free[0, i] = costs.home_rate * dt * _pull(arm, i, frame) if i < arm.joints else 0.0
+        free[1, i] = frame.centre[i] - frame.begin[i] if going else 0.0
+    freedom = _project(arm.joints, costs, frame)
+    square, bend, fastest = 0.0, 0.0, 1.0
+    for i in range(arm.joints):
+        square += free[0, i] * free[0, i]
+        bend += frame.stiffness[i] * free[0, i] * free[0, i]
+        fastest = max(fastest, abs(free[0, i]) / (_UNHURRIED * arm.speed[i] * dt))
+    part_of = 1 / max(fastest, 1 + costs.home_rate * dt * bend / square) if square > 0 else 0.0
+    for i in range(len(frame.q)):
+        step = freedom * (part_of * free[0, i] - free[1, i])
+        frame.centre[i] += step
+        frame.tried[0, i] = min(max(frame.tried[0, i] + step, frame.lower[i]), frame.upper[i])
+
+
+@part
+def _pull(arm: Record, joint: int, frame: Record) -> float:
+    """Down the potential, in rad (m): home, and off a limit that is nearer than it is kept at home.
+
+    Into frame.stiffness how fast that changes with the joint.
+    """
+    value = frame.begin[joint]
+    away = arm.home[joint] - value
+    pull, stiffness = min(max(away, -_FARTHEST), _FARTHEST), 1.0 if abs(away) < _FARTHEST else 0.0
+    below, above = value - arm.lower[joint], arm.upper[joint] - value
+    if below < arm.below[joint]:
+        room = max(below, _TOUCHING)
+        pull += _REPELLED * (arm.below[joint] / room - 1)
+        stiffness += _REPELLED * arm.below[joint] / (room * room)
+    if above < arm.above[joint]:
+        room = max(above, _TOUCHING)
+        pull -= _REPELLED * (arm.above[joint] / room - 1)
+        stiffness += _REPELLED * arm.above[joint] / (room * room)
+    frame.stiffness[joint] = stiffness
+    return float(pull)
+
+
+@part
+def _project(joints: int, costs: Costs, frame: Record) -> float:
+    """Takes out of both rows of frame.free what moves the tip; how far that is from a singularity, 0 to 1.
+
+    free - J^T (J J^T)^-1 J free, by L D L^T: of J J^T stays L D below the diagonal and D on it, above it comes L
+    transposed.
+    """
+    normal, jacobian, free, moved = frame.normal, frame.jacobian, frame.free, frame.moved
+    set_normal(joints, costs, frame)
+    for j in range(POSED):
+        weight = 1 / (costs.position if j < 3 else costs.rotation)
+        for side in range(2):
+            total = 0.0
+            for k in range(len(frame.q)):
+                total += weight * jacobian[j, k] * free[side, k]
+            moved[side, j] = total
+    smallest = np.inf
+    for j in range(POSED):
+        pivot = normal[j, j]
+        if not pivot > _DEFINITE:
+            return 0.0
+        smallest = min(smallest, pivot)
+        for i in range(j + 1, POSED):
+            share = normal[i, j] / pivot
+            normal[j, i] = share
+            for side in range(2):
+                moved[side, i] -= share * moved[side, j]
+            for k in range(j + 1, i + 1):
+                normal[i, k] -= share * normal[k, j]
+    for side in range(2):
+        for i in range(POSED - 1, -1, -1):
+            total = moved[side, i] / normal[i, i]
+            for j in range(i + 1, POSED):
+                total -= normal[i, j] * moved[side, j]
+            moved[side, i] = total
+            weight = 1 / (costs.position if i < 3 else costs.rotation)
+            for k in range(len(frame.q)):
+                free[side, k] -= weight * jacobian[i, k] * total
+    return smallest / (smallest + _SINGULAR * _SINGULAR)
