@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,6 +10,11 @@ from numpy.typing import NDArray
 
 from robots.rotations import slerp
 from runtime.types import Float64
+
+
+def length(count: int, rate: float, wanted_rate: float) -> int:
+    """How many rows `count` rows of `rate` Hz are at `wanted_rate` Hz: those from the first to the last, at least 1."""
+    return math.floor((count - 1) * wanted_rate / rate + 1e-9) + 1
 
 
 def resample(
@@ -21,12 +27,13 @@ def resample(
     """`rows` [H, W] of `rate` Hz at `wanted_rate` Hz, and the row each one was made from (the one not after it).
 
     Numbers are linear between rows; the columns `held` (binary grippers) keep their row's value, and four
-    columns from each of `quaternions` on (unit) turn on the shorter arc. The last row lasts its own period.
+    columns from each of `quaternions` on (unit) turn on the shorter arc. Nothing is made beyond the last row: to
+    hold it on would say what the policy did not, and pull the mean of chunks that agree towards the past.
     """
     if rate == wanted_rate or not len(rows):
         return rows, np.arange(len(rows), dtype=np.int64)
-    count = int(np.floor(len(rows) * wanted_rate / rate + 1e-9))
-    position = np.minimum(np.arange(count) * (rate / wanted_rate), len(rows) - 1)
+    steps = np.arange(length(len(rows), rate, wanted_rate))
+    position = np.minimum(steps * (rate / wanted_rate), len(rows) - 1)
     lower = np.floor(position + 1e-9).astype(np.int64)
     before, after = rows[lower], rows[np.minimum(lower + 1, len(rows) - 1)]
     part = np.clip(position - lower, 0.0, 1.0)

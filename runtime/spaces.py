@@ -15,7 +15,7 @@ from runtime.formats import PoseRows, continuous
 from runtime.kinematics.base import IkResult, Kinematics
 from runtime.pose_format import CANONICAL, PoseFormat
 from runtime.poses import absolute
-from runtime.resampling import resample
+from runtime.resampling import length, resample
 from runtime.types import EEF_WIDTH, ActionChunk, Float64, Observation
 
 _GRIPPER = EEF_WIDTH - 1
@@ -252,7 +252,7 @@ class Spaces(EndEffectors):
                 f"the policy answered with {chunk.space} actions of shape {rows.shape}; "
                 f"{self._robot.name} takes [H, {width}] with at least one row"
             )
-        _check_length(len(rows), max(1.0, self._control_rate / rate))
+        _check_length(len(rows), length(len(rows), rate, self._control_rate))
         wrong = np.argwhere(~np.isfinite(rows))
         if len(wrong):
             row, column = wrong[0]
@@ -263,9 +263,9 @@ class Spaces(EndEffectors):
         return rows
 
 
-def _check_length(count: int, stretched: float) -> None:
-    if count * stretched > _LONGEST:
-        at_rate = "" if stretched == 1.0 else f", {count * stretched:.0f} at control rate"
+def _check_length(count: int, made: int) -> None:
+    if max(count, made) > _LONGEST:
+        at_rate = "" if made <= count else f", {made} at control rate"
         raise ShapeError(
             f"the policy answered with {count} rows{at_rate}; allowed: at most {_LONGEST} in one chunk"
         )
