@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from runtime.strategies.base import Arrival, Merge, Merged, join
 from runtime.timeline import Dims, Timeline, difference
 from runtime.types import Float64
 
+log = logging.getLogger(__name__)
 _JOINED_AT_ONCE = 0.05  # [rad] that a run's first action may be off without being blended in
 _ONE_BY_ONE: tuple[Mode, ...] = ("step", "preview")  # a person asks for each chunk
 
@@ -74,6 +76,7 @@ class Follow(Behaviour):
         self._switched = False  # the kind of the strategy, since the last chunk that was merged
         # For the first chunk of all, or after a wait: no starvation yet, the policy's deadline bounds it.
         self._expecting = True
+        self._useless = False  # the newest chunk was dropped though the robot had waited for it
         self._starved_since: float | None = None
 
     def target(self, step: int, elapsed: float) -> Target | None:
@@ -89,10 +92,26 @@ class Follow(Behaviour):
         self._switched = self._switched or chosen.kind != self._strategy.kind
         if self._starved_since is None and self.waits and not self.timeline.remaining(step):
             self._expecting = True  # what the old strategy waited for is no gap of the new one
-        self._strategy = chosen
+        self._strategy, self._useless = chosen, False
 
     def join(self, chunk: PostedChunk, step: int, commanded: Float64) -> Joined:
-        """Let a chunk join the plan from `step`, the first one not yet sent, on; `commanded` [D] was sent last."""
+        """Let a chunk join the plan from `step`, the first one not yet sent, on; `commanded` [D] was sent last.
+
+        One that is dropped, for whatever reason, ends the wait for the first; one that the robot waited for and
+        that is of no use ends the waiting. Always dropped is starving.
+        """
+        try:
+            joined = self._join(chunk, step, commanded)
+        except Exception as error:  # about one chunk: it must not end what keeps the robot held
+            log.exception("chunk %d cannot be used", chunk.chunk_id)
+            joined = Joined(
+                dropped(chunk, step, f"control cannot use it: {type(error).__name__}: {error}")
+            )
+        self._expecting = False
+        self._useless = bool(joined.merged.dropped) and chunk.waited
+        return joined
+
+    def _join(self, chunk: PostedChunk, step: int, commanded: Float64) -> Joined:
         rows, dim = chunk.rows, len(commanded)
         if rows.ndim != 2 or rows.shape[1] != dim or not len(rows):
             shape = f"it has the shape {list(rows.shape)}; expected [H, {dim}], H from 1 on"
@@ -112,10 +131,7 @@ class Follow(Behaviour):
         away, where = self._away_where_used(arrival, step, commanded)
         far = f"{where}: blended in" if away > safety.first_action_far else ""
         held = commanded if away > _JOINED_AT_ONCE or self.starved else None
-        switched, self._expecting = (
-            self._switched,
-            False,
-        )  # also where it is dropped: always too late is starving
+        switched = self._switched
         merged = join(
             self._strategy.merge,
             self.timeline,
@@ -164,6 +180,8 @@ class Follow(Behaviour):
     @property
     def waits(self) -> bool:
         """Whether an empty timeline is as it should be: a person, or the strategy, asks when it is empty."""
+        if self._useless:
+            return False
         return self._expecting or self._one_by_one or self._strategy.merge.waits
 
     @property

@@ -19,6 +19,7 @@ from runtime.messages import ChunkMerged, Event, Mode, PolicyAnswer, PostedChunk
 from runtime.orders import Orders
 from runtime.page import Page
 from runtime.policies.base import Policy
+from runtime.runner import telling
 from runtime.sight import StaleObservationError
 from runtime.strategies.base import Progress, Query, StrategyParameters
 from runtime.tally import Tally
@@ -244,9 +245,11 @@ class Inference:
     # --- asking and answering --------------------------------------------------------------------------------
 
     def pump(self) -> PolicyAnswer | None:
-        """Collect an answer, or ask; returns the answer, for the record. Raises PolicyError."""
-        if not self._run:
-            return None
+        """Collect an answer, or ask; returns the answer, for the record. Raises PolicyError, and no other error."""
+        with telling("the policy's answer cannot be used"):
+            return self._pump() if self._run else None
+
+    def _pump(self) -> PolicyAnswer | None:
         self.asking.glance()
         if self._flight is not None:
             if not self.runner.ready(self._flight):
@@ -255,7 +258,7 @@ class Inference:
             return self._take(flight.result())
         # A late answer of an earlier run may keep the policy busy: a request would grow old in the queue.
         if not self.runner.busy and self._wants() and self._try_to_ask():
-            return self.pump()
+            return self._pump()
         return None
 
     def retries(self, error: RuntimeFault) -> bool:
@@ -313,7 +316,6 @@ class Inference:
         return found
 
     def _take(self, answered: Answered) -> PolicyAnswer:
-        self._recovered()
         step, chunk = answered.observation.step, answered.chunk
         self.asking.note(answered)
         made = Made(self._orders.next_chunk(), answered.made.rows, answered)
@@ -327,7 +329,9 @@ class Inference:
             self.shown = ShownChunk(made.number, self._run, "proposed", step, nowhere, made.rows, ik=ik)
         else:
             self._post(made)
-        return self._record(made)
+        recorded = self._record(made)
+        self._recovered()  # not before: one whose answers cannot be used is not back
+        return recorded
 
     def _record(self, made: Made) -> PolicyAnswer:
         answered, solved = made.answered, made.answered.made.solved

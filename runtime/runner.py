@@ -6,8 +6,9 @@ import logging
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
@@ -44,19 +45,24 @@ class Runner(ABC):
         """Take no further calls."""
 
 
+@contextmanager
+def telling(what: str) -> Iterator[None]:
+    """Tell every error within as a PolicyError, `what` and why, its traceback in the log: one answer must not end main."""
+    try:
+        yield
+    except RuntimeFault:
+        raise
+    except Exception as error:
+        log.exception(what)
+        raise PolicyError(f"{what}: {type(error).__name__}: {error}") from error
+
+
 def _told(call: Callable[[], Result]) -> Callable[[], Result]:
-    """`call`, with every error of a policy's own code told as a PolicyError: it must not end main."""
-
-    def telling() -> Result:
-        try:
+    def told() -> Result:
+        with telling("the policy's own code failed"):
             return call()
-        except RuntimeFault:
-            raise
-        except Exception as error:
-            log.exception("the policy's own code failed")
-            raise PolicyError(f"the policy's own code failed: {type(error).__name__}: {error}") from error
 
-    return telling
+    return told
 
 
 def _settle(future: Future[Result], call: Callable[[], Result]) -> None:

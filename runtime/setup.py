@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from concurrent.futures import Future
 from enum import StrEnum
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from runtime import resampling
 from runtime.asking import Answered
 from runtime.bench_reset import BenchReset
 from runtime.cameras.telling import complaints
@@ -23,6 +23,7 @@ from runtime.orders import Orders
 from runtime.page import Page
 from runtime.policies.base import PolicyInfo
 from runtime.requests import LeastTimes
+from runtime.runner import telling
 from runtime.timeline import difference
 from runtime.types import Float64
 
@@ -137,8 +138,9 @@ class SetUp:
         if self.stage is Stage.CONNECT:
             ready = self._inference.runner.ready(self._connection)
             if ready and self._rested("connect_s", self._least.connect_s):
-                self.info = self._connection.result()
-                check_info(self.info, self._plan, self._inference.continues)
+                with telling("what the policy says of itself cannot be used"):
+                    self.info = self._connection.result()
+                    check_info(self.info, self._plan, self._inference.continues)
                 self._enter(Stage.OBSERVE)
         elif self.stage is Stage.OBSERVE:
             return self._observe()
@@ -261,8 +263,9 @@ class SetUp:
             return False
         if not self._inference.runner.ready(self._asked):
             return False
-        answered, self._asked = self._asked.result(), None
-        self._validate(answered)
+        asked, self._asked = self._asked, None
+        with telling("the policy's answer cannot be used"):
+            self._validate(asked.result())
         self._left -= 1
         return True
 
@@ -300,7 +303,7 @@ def check_info(info: PolicyInfo, plan: Plan, continues: bool) -> None:
     wanted = plan.deployment.strategy.execution_horizon
     if wanted is None or info.horizon is None or "execution_horizon" not in plan.strategy.USES:
         return
-    steps = math.floor(info.horizon * plan.rate / (info.rate or plan.rate) + 1e-9)
+    steps = resampling.length(info.horizon, info.rate or plan.rate, plan.rate)
     if wanted > steps:
         raise SetupError(
             f"strategy.execution_horizon = {wanted} control steps, but the policy {info.name!r} says that its "

@@ -225,7 +225,7 @@ class Course:
             space=chunk.space,
             mode=chunk.mode,
             rate=rate,
-            seconds=len(chunk.actions) / rate,
+            seconds=len(made.rows) / plan.rate,
             command_rows=len(made.rows),
             joints=made.rows.shape[1],
             first_away=first["distance"],

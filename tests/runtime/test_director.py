@@ -10,7 +10,7 @@ from runtime.errors import SetupError
 from runtime.hearing import UNHEARD
 from runtime.messages import Command, EpisodeOpened, Event, encode
 from runtime.transitions import State
-from tests.runtime.station import STANDS, Station, plan
+from tests.runtime.station import STANDS, Station, plan, ramp
 
 
 def without(station: Station, process: str, seconds: float) -> None:
@@ -31,6 +31,33 @@ def test_a_process_that_hangs_in_a_run_holds_it_and_is_named(tmp_path: Path, pro
     station.command("resume")
     station.go(5)
     assert station.state is State.RUNNING
+    station.close()
+
+
+@pytest.mark.parametrize(("answer", "state"), [("slow", State.HOLDING), ("hold", State.HOLDING), ("stop", State.READY)])
+def test_a_run_whose_chunks_all_come_too_late_is_ended_by_the_rule_of_starvation(
+    tmp_path: Path, answer: str, state: State
+) -> None:
+    late = plan(tmp_path, lambda seen, number: ramp(seen.step, 2), delay=4, faults={"starvation": answer})
+    station = Station(late).ready()
+    station.command("run")
+    station.reach(state, 5.0)
+    assert "no usable chunk" in station.reason
+    assert "all in the past" in station.events("chunk_dropped")[0]
+    station.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "state"), [("slow", State.HOLDING), ("hold", State.HOLDING), ("stop", State.READY)]
+)
+def test_a_run_of_which_no_answer_can_be_used_is_ended_by_the_rule_of_errors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, state: State
+) -> None:
+    station = Station(plan(tmp_path, faults={"policy_error": answer, "starvation": "slow"})).ready()
+    monkeypatch.setattr(station.main.inference.asking, "note", lambda answered: [][0])
+    station.command("run")
+    station.reach(state, 10.0)
+    assert "the policy's answer cannot be used: IndexError" in station.reason
     station.close()
 
 

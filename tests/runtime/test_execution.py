@@ -62,6 +62,41 @@ def test_a_chunk_of_a_wrong_shape_is_dropped_by_name_and_control_goes_on(rows):
     assert len(bench.sink.sent) == 4
 
 
+NO_ROWS = np.zeros((0, 2))
+
+
+@pytest.mark.parametrize("mode", ["continuous", "step", "preview", "sim"])
+@pytest.mark.parametrize("kind", ["sync", "async", "naive", "ensemble", "rtc"])
+def test_a_run_of_whose_chunks_none_can_be_used_starves_and_holds(kind, mode):
+    bench = Bench({"kind": kind})
+    bench.say("follow", run=1, mode=mode)
+    for number in range(1, 41):
+        bench.chunk(number, NO_ROWS, waited=kind == "sync" or mode in ("step", "preview"))
+        bench.run()
+    assert [event.kind for event in bench.said()] == ["starved", "starvation"]
+
+
+def test_one_useless_chunk_is_forgiven_where_the_next_is_none():
+    bench = Bench({"kind": "sync"})
+    bench.say("follow", run=1)
+    bench.chunk(1, NO_ROWS, waited=True)
+    bench.run(10)
+    bench.chunk(2, wave(5), waited=True)
+    bench.run(60)
+    assert [event.kind for event in bench.said()] == ["starved", "recovered"]
+    assert bench.status["waiting"]
+
+
+def test_what_goes_wrong_with_one_chunk_drops_it_and_control_goes_on(monkeypatch, caplog):
+    bench = following(Bench())
+    monkeypatch.setattr("runtime.execution.join", lambda *given, **more: [][0])
+    bench.chunk(2, wave(60))
+    bench.run(3)
+    assert merged(bench)[-1].dropped == "control cannot use it: IndexError: list index out of range"
+    assert "Traceback" in caplog.text
+    assert len(bench.sink.sent) == 4
+
+
 @pytest.mark.parametrize("kind", ["sync", "async", "naive", "ensemble", "rtc"])
 def test_a_run_whose_first_action_is_far_takes_over_from_the_held_target(kind):
     bench = Bench({"kind": kind})

@@ -404,6 +404,40 @@ def test_a_policy_that_fails_raises_once_and_posts_nothing(answer: Any, sentence
     assert desk.inference.pump() is not None
 
 
+def test_an_error_about_one_answer_is_told_as_the_policys_and_the_next_is_taken(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def note(answered: object) -> None:
+        raise IndexError("index 3 is out of bounds")
+
+    desk.going()
+    with monkeypatch.context() as patch:
+        patch.setattr(desk.asking, "note", note)
+        with pytest.raises(PolicyError, match="cannot be used: IndexError: index 3 is out of bounds"):
+            desk.inference.pump()
+    assert "Traceback" in caplog.text
+    assert desk.posted() == []
+    assert desk.inference.pump() is not None
+    assert len(desk.posted()) == 1
+
+
+def test_a_policy_whose_answers_cannot_be_used_is_not_back(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk.going()
+    monkeypatch.setattr(desk.asking, "note", lambda answered: [][0])
+    for _ in range(100):
+        with pytest.raises(PolicyError) as told:
+            while True:
+                desk.observe()
+                desk.inference.pump()
+                desk.clock.advance(0.1)
+        if not desk.inference.retries(told.value):
+            break
+    assert not desk.inference.retries(told.value)
+    assert [note.kind for note in desk.inference.notes] == ["policy_failed"]
+
+
 def test_a_gap_in_the_observations_is_waited_out_and_an_error_where_it_lasts(desk: Desk) -> None:
     desk.clock.advance(0.5)
     assert desk.inference.pump() is None

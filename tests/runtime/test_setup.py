@@ -11,9 +11,10 @@ from runtime import deployment
 from runtime.errors import PolicyError, SetupError
 from runtime.policies.base import PolicyInfo
 from runtime.setup import Stage
+from runtime.spaces import CommandRows
 from runtime.transitions import State
 from runtime.types import Observation
-from tests.runtime.station import STANDS, Station, on_time, plan, ramp
+from tests.runtime.station import MOVED, STANDS, Station, on_time, plan, ramp
 
 
 def failed(station: Station) -> str:
@@ -271,7 +272,7 @@ def with_horizon(tmp_path: Path, steps: int, **said: Any) -> Station:
 
 
 @pytest.mark.parametrize(
-    "said", [{"horizon": 20}, {"horizon": 10, "rate": 15.0}, {"horizon": 40, "rate": 60.0}]
+    "said", [{"horizon": 20}, {"horizon": 11, "rate": 15.5}, {"horizon": 40, "rate": 60.0}]
 )
 def test_no_more_steps_can_be_executed_of_an_answer_than_it_has(tmp_path: Path, said: dict[str, Any]) -> None:
     station = with_horizon(tmp_path, 21, **said)
@@ -282,7 +283,39 @@ def test_no_more_steps_can_be_executed_of_an_answer_than_it_has(tmp_path: Path, 
     station.close()
 
 
-@pytest.mark.parametrize("said", [{"horizon": 20}, {"horizon": 10, "rate": 15.0}, {}])
+@pytest.mark.parametrize("strategy", ["sync", "async", "ensemble", "naive"])
+@pytest.mark.parametrize(("rate", "count"), [(60.0, 1), (45.0, 1), (60.0, 2), (10.0, 1)])
+def test_a_short_fast_chunk_is_set_up_and_moves_the_robot(
+    tmp_path: Path, strategy: str, rate: float, count: int
+) -> None:
+    station = Station(plan(tmp_path, lambda seen, number: ramp(seen.step, count), strategy))
+    infer = station.policy.infer
+    station.policy.infer = lambda *asked: replace(infer(*asked), rate=rate)  # type: ignore[method-assign]
+    station.ready().command("run")
+    station.go(60)
+    assert station.state is State.RUNNING, station.reason
+    assert station.robot.sent[-1, MOVED[0]] == pytest.approx(0.002 * station.main.page.control.read()["step"], abs=0.1)
+    assert len(np.unique(station.robot.sent[:, MOVED[0]])) > 10
+    station.close()
+
+
+def test_what_goes_wrong_with_an_answer_ends_the_set_up_and_not_main(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    station = Station(plan(tmp_path))
+    monkeypatch.setattr(CommandRows, "meant", property(lambda made: made.rows[len(made.rows)]))
+    assert "the policy's answer cannot be used: IndexError: index 20 is out of bounds" in failed(station)
+    assert "Traceback" in caplog.text
+    station.close()
+
+
+def test_what_a_policy_says_of_itself_ends_the_set_up_and_not_main(tmp_path: Path) -> None:
+    station = with_horizon(tmp_path, 5, horizon="twenty")
+    assert "what the policy says of itself cannot be used: TypeError" in failed(station)
+    station.close()
+
+
+@pytest.mark.parametrize("said", [{"horizon": 20}, {"horizon": 11, "rate": 15.0}, {}])
 def test_as_many_steps_as_it_has_can_be(tmp_path: Path, said: dict[str, Any]) -> None:
     with_horizon(tmp_path, 20, **said).ready().close()
 
