@@ -65,6 +65,9 @@ class GripperTable(Table):
     """Whether it knows only open and close."""
     threshold: float | None = None
     """Where a binary gripper switches; a value at or above it means open if `open` is above `close`."""
+    hysteresis: Annotated[float, Field(ge=0, lt=1)] | None = None
+    """Around the threshold, the part of its travel within which a binary gripper stays as it was; 0.05 where it is
+    not given, less where the threshold is nearer to an end than that."""
     fingers: dict[str, Pair] = {}
     """URDF joints that move with it: their values [rad or m] at `lower` and at `upper`; drawing only."""
     apart: Pair | None = None

@@ -16,6 +16,8 @@ from robots.robot import Gripper
 from robots.rotations import Float64, matrix_of_quaternion
 from robots.urdf import Urdf
 
+_HYSTERESIS = 0.05  # of the travel
+
 
 @dataclass(frozen=True, slots=True)
 class GripperChoice:
@@ -23,6 +25,7 @@ class GripperChoice:
 
     binary: bool | None = None
     threshold: float | None = None
+    hysteresis: float | None = None
     open: float | None = None
     close: float | None = None
 
@@ -43,7 +46,7 @@ def _with_gripper(group: GroupTable, choice: GripperChoice) -> GroupTable:
     assert group.gripper is not None
     given = {key: value for key in GripperChoice.__slots__ if (value := getattr(choice, key)) is not None}
     if choice.binary is False:
-        given["threshold"] = None
+        given = {"threshold": None, "hysteresis": None} | given
     return group.model_copy(update={"gripper": group.gripper.model_copy(update=given)})
 
 
@@ -61,10 +64,30 @@ def gripper_of(key: str, tree: Urdf, table: GripperTable, dof: int) -> Gripper:
     if table.threshold is not None and not low < table.threshold < high:
         raise RobotError(f"{key}.gripper.threshold = {table.threshold}; allowed: between {low} and {high}")
     return Gripper(
-        **table.model_dump(exclude={"velocity", "tip", "fingers", "apart"}),
+        **table.model_dump(exclude={"velocity", "tip", "hysteresis", "fingers", "apart"}),
+        hysteresis=_hysteresis(key, table),
         fingers=_fingers(key, tree, table.fingers),
         apart=_apart(key, table),
     )
+
+
+def _hysteresis(key: str, table: GripperTable) -> float | None:
+    if table.threshold is None:
+        if table.hysteresis is not None:
+            raise RobotError(
+                f"{key}.gripper.hysteresis = {table.hysteresis}; allowed only with binary = true"
+            )
+        return None
+    nearer = min(abs(table.threshold - table.open), abs(table.threshold - table.close))
+    most = 2 * nearer / abs(table.open - table.close)
+    if table.hysteresis is None:
+        return min(_HYSTERESIS, most)
+    if table.hysteresis > most:
+        raise RobotError(
+            f"{key}.gripper.hysteresis = {table.hysteresis}; allowed with the threshold {table.threshold}: 0 to "
+            f"{most:g} of the travel, or it could not switch back"
+        )
+    return table.hysteresis
 
 
 def _apart(key: str, table: GripperTable) -> tuple[float, float] | None:

@@ -143,9 +143,9 @@ def _gripper(group: Group) -> Iterator[str]:
     gripper = group.gripper
     if gripper is None:
         return
-    switch = (
-        f"binary, switches at {gripper.threshold:g}" if gripper.threshold is not None else "any value between"
-    )
+    switch = "any value between"
+    if gripper.threshold is not None:
+        switch = f"binary, switches at {gripper.threshold:g}, hysteresis {gripper.hysteresis:g} of its travel"
     yield f"  gripper in {gripper.unit}: open {gripper.open:g}, close {gripper.close:g}, {switch}"
     if gripper.apart is not None:
         closed, opened = (1000 * value for value in gripper.apart)

@@ -24,7 +24,8 @@ class Gripper:
     """One number of a group in the robot's own `unit`; `index` is its place inside the group.
 
     `fingers` are URDF joints and their values [rad or m] where the number is `lower` and where it is `upper`;
-    `apart` is how far the fingers are apart [m] at `close` and at `open`, None where nobody said.
+    `apart` is how far the fingers are apart [m] at `close` and at `open`, None where nobody said. A binary one
+    switches at `threshold`, with a `hysteresis` that is a part of its travel; else both are None.
     """
 
     index: int
@@ -35,6 +36,7 @@ class Gripper:
     unit: str
     binary: bool
     threshold: float | None
+    hysteresis: float | None
     fingers: Mapping[str, tuple[float, float]]
     apart: tuple[float, float] | None
 

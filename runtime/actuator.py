@@ -18,6 +18,7 @@ from runtime.motion import Brake
 from runtime.page import EStop, Page
 from runtime.safety import Limits, RobotState, SafetySettings, braking
 from runtime.seen import Seen
+from runtime.switching import Switch
 from runtime.timeline import Dims, difference
 from runtime.transports.base import Sink
 from runtime.types import Float32, Float64, RobotCommand
@@ -36,6 +37,7 @@ class TickSettings:
     starvation: Answer
     starvation_hold: float  # until "slow" holds
     moves_robot: bool = True  # commands reach something that can break
+    switches: tuple[Switch, ...] = ()
     publication: Callable[[Float64], Float32] | None = (
         None  # poses of a joint command, where they are published too
     )

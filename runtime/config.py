@@ -203,6 +203,8 @@ class GripperSettings(Section):
     """Whether it knows only open and close."""
     threshold: float | None = None
     """Where a binary gripper switches, in its own unit."""
+    hysteresis: float | None = Field(default=None, ge=0, lt=1)
+    """Around the threshold, the part of its travel within which a binary gripper stays as it was."""
     open: float | None = None
     """Its number when open."""
     close: float | None = None

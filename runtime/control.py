@@ -17,6 +17,7 @@ from runtime.family import Lifeline, Plan, join
 from runtime.page import Page
 from runtime.report import StatusRecord
 from runtime.safety import SafetyFilter
+from runtime.switching import switches
 from runtime.tick import Tick, TickSettings
 from runtime.transports.base import Sink
 from runtime.workspace import Workspace
@@ -44,6 +45,7 @@ def make_tick(plan: Plan, page: Page, sink: Sink, now: Callable[[], float]) -> T
             starvation=deployment.faults.starvation,
             starvation_hold=deployment.control.starvation_hold_s,
             moves_robot=plan.capabilities.moves_robot,
+            switches=switches(plan.robot),
             publication=plan.publication(),
         ),
         now,

@@ -104,9 +104,7 @@ class Follow(Behaviour):
             joined = self._join(chunk, step, commanded)
         except Exception as error:  # about one chunk: it must not end what keeps the robot held
             log.exception("chunk %d cannot be used", chunk.chunk_id)
-            joined = Joined(
-                dropped(chunk, step, f"control cannot use it: {type(error).__name__}: {error}")
-            )
+            joined = Joined(dropped(chunk, step, f"control cannot use it: {type(error).__name__}: {error}"))
         self._expecting = False
         self._useless = bool(joined.merged.dropped) and chunk.waited
         return joined

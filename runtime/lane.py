@@ -14,6 +14,7 @@ from runtime.motion import Trajectory
 from runtime.report import Report
 from runtime.safety import SafetyFilter
 from runtime.seen import Seen
+from runtime.switching import Dwell
 from runtime.timeline import difference
 from runtime.types import Float64
 
@@ -22,7 +23,7 @@ _QUIET_S = 1.0  # without a refusal: the next one is told again
 
 
 class Lane:
-    """Behaviour -> target -> locked grippers -> safety -> actuator, once per tick.
+    """Behaviour -> target -> locked grippers, how often they switch -> safety -> actuator, once per tick.
 
     What safety refuses is replaced by the next point of a stop, so that something is sent on every tick; too many
     refusals, or too long with nothing planned, make it hold for that reason.
@@ -34,6 +35,7 @@ class Lane:
         self.actuator = actuator
         self._safety = safety
         self._locks = locks
+        self._dwell = Dwell(settings.limits)
         self._settings = settings
         self._report = report
         self._standing: Hold | None = None  # a stop in place of what could not be sent
@@ -95,9 +97,15 @@ class Lane:
     def move(self, goal: Float64, speed: float) -> None:
         """Come to a stand, then go to `goal` at `speed`, a part of the speed of motions of ours.
 
-        Dimensions that are NaN stay where they come to a stand, and what is a speed ends at 0.
+        Dimensions that are NaN stay where they come to a stand, and what is a speed ends at 0. Binary grippers are
+        open or closed at its end, and switch at its beginning.
         """
         self._begin()
+        goal = goal.copy()
+        for switch in self._settings.switches:
+            if not np.isnan(goal[switch.dim]):
+                before = float(self.actuator.commanded[switch.dim])
+                goal[switch.dim] = switch.snapped(goal[switch.dim : switch.dim + 1], before)[0]
         self._go(goal, speed)
 
     def follow(self, run: Follow) -> None:
@@ -126,7 +134,8 @@ class Lane:
         if turning := list(self._settings.dims.wrapping):  # endless joints go the shorter way
             goal[turning] = (start + difference(goal, start, turning))[turning]
         top = limits.velocity * safety.motion_velocity_scale * speed
-        path = Trajectory(start, goal, top, safety.motion_acceleration * limits.reach)
+        begin = np.where(limits.binary, goal, start)
+        path = Trajectory(begin, goal, top, safety.motion_acceleration * limits.reach)
         self.behaviour = Move(brake, path, goal, speed)
 
     def _holding(self) -> Hold:
@@ -136,6 +145,13 @@ class Lane:
 
     def drive(self, step: int, planned: float, seen: Seen) -> Sent:
         """Tell the robot what the behaviour wants, as far as locks and safety let it pass."""
+        before = self.actuator.commanded
+        sent = self._drive(step, planned, seen)
+        if sent.executed is not None:
+            self._dwell.sent(before, sent.executed, planned)
+        return sent
+
+    def _drive(self, step: int, planned: float, seen: Seen) -> Sent:
         target = self.behaviour.target(step, self.actuator.elapsed(planned))
         if target is None:
             return self._nothing_planned(step, planned, seen)
@@ -149,7 +165,7 @@ class Lane:
         return sent
 
     def _judge(self, step: int, planned: float, target: Target, seen: Seen) -> Sent:
-        action, notes = self._locks.apply(target.action)
+        action, notes = self._permitted(target.action, planned)
         state = self.actuator.state(seen, planned, self._aim)
         verdict = self._safety.judge(action, state, target.path or "policy")
         if verdict.action is None:
@@ -169,7 +185,7 @@ class Lane:
         if target.source == "estop":
             action = self._approach(action, seen, planned)
         else:
-            locked, notes = self._locks.apply(action)
+            locked, notes = self._permitted(action, planned)
             if notes:
                 state = self.actuator.state(seen, planned, locked)
                 action = np.where(self._locks.on, self._safety.reachable(locked, state, "motion"), action)
@@ -183,6 +199,12 @@ class Lane:
         reachable = self._safety.reachable(where, state).copy()
         reachable[list(self._settings.limits.speeds)] = where[list(self._settings.limits.speeds)]
         return reachable
+
+    def _permitted(self, action: Float64, planned: float) -> tuple[Float64, tuple[str, ...]]:
+        """`action` [D] as far as locks, and how often a gripper may switch, let it be; and notes on that."""
+        action, locked = self._locks.apply(action)
+        action, kept = self._dwell.apply(action, self.actuator.commanded, planned)
+        return action, (*locked, *kept)
 
     def _refuse(self, step: int, planned: float, target: Target, notes: tuple[str, ...], seen: Seen) -> Sent:
         self.refused += 1

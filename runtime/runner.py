@@ -47,7 +47,7 @@ class Runner(ABC):
 
 @contextmanager
 def telling(what: str) -> Iterator[None]:
-    """Tell every error within as a PolicyError, `what` and why, its traceback in the log: one answer must not end main."""
+    """Tell every error within as a PolicyError, its traceback in the log: what is wrong with an answer ends no main."""
     try:
         yield
     except RuntimeFault:

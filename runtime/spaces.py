@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ from runtime.kinematics.base import IkResult, Kinematics
 from runtime.pose_format import CANONICAL, PoseFormat
 from runtime.poses import absolute
 from runtime.resampling import length, resample
+from runtime.switching import switches
 from runtime.types import EEF_WIDTH, ActionChunk, Float64, Observation
 
 _GRIPPER = EEF_WIDTH - 1
@@ -80,7 +82,8 @@ class Spaces(EndEffectors):
         self._wrapping = np.flatnonzero(np.isinf(robot.lower) & np.isinf(robot.upper))
         self._quaternions = [EEF_WIDTH * arm + 3 for arm in range(self._count)]
         pairs = zip(self._gripped, self._grippers, strict=True)
-        self._held = [EEF_WIDTH * arm + _GRIPPER for arm, dim in pairs if dim in robot.binary_dims]
+        self._gripper_columns = {dim: EEF_WIDTH * arm + _GRIPPER for arm, dim in pairs}
+        self._switches = switches(robot)
         self._layout: PoseRows | None = None
 
     def to_command(
@@ -92,28 +95,40 @@ class Spaces(EndEffectors):
         against those that it holds, else those of its joints, in the frame in which they are declared); resampled;
         poses solved, the first row from the observed joints, each further one from the row before within velocity
         limits, from `onset` on (without one the robot stands where it was observed); joints without limits
-        unwrapped from the observed ones on. Grippers are taken as they are; what the rows say nothing of stays as
-        in `onset`. Raises PolicyError for a wrong width, a number that is not finite, or numbers that determine no
+        unwrapped from the observed ones on. Grippers are taken as they are, but binary ones are snapped before rows
+        are resampled, and the hysteresis begins with what is commanded; what the rows say nothing of stays as in
+        `onset`. Raises PolicyError for a wrong width, a number that is not finite, or numbers that determine no
         orientation.
         """
         qpos = np.asarray(observation.qpos, dtype=np.float64)
         rate = chunk.rate or self._control_rate
+        onset = onset or Onset(qpos, qpos)
         if chunk.space == "joint":
             rows = self._checked(chunk, rate, self._robot.dim, self._robot.joint_names)
             rows = self._absolute_joints(rows, chunk, qpos, self._all)
-            rows, source = resample(rows, rate, self._control_rate, self._robot.binary_dims)
+            held = self._snap(rows, {int(dim): int(dim) for dim in self._all}, onset, rate)
+            rows, source = resample(rows, rate, self._control_rate, held)
             return CommandRows(rows, source, None)
         layout = self._layout_of(chunk.pose)
         rows = self._checked(chunk, rate, layout.width, layout.names)
         rows = self._absolute_poses(rows, layout, chunk, observation)
-        binary = [
-            self._count * EEF_WIDTH + place
-            for place, dim in enumerate(layout.dims)
-            if dim in self._robot.binary_dims
-        ]
-        rows, source = resample(rows, rate, self._control_rate, [*self._held, *binary], self._quaternions)
-        onset = self._near(onset or Onset(qpos, qpos), qpos)
+        following = {int(dim): self._count * EEF_WIDTH + place for place, dim in enumerate(layout.dims)}
+        held = self._snap(rows, self._gripper_columns | following, onset, rate)
+        rows, source = resample(rows, rate, self._control_rate, held, self._quaternions)
+        onset = self._near(onset, qpos)
         return self._solved(rows, source, layout, qpos, onset)
+
+    def _snap(self, rows: Float64, columns: Mapping[int, int], onset: Onset, rate: float) -> list[int]:
+        """Let binary grippers in `rows` [H, W] be open or closed; `columns` by dimension. Returns their columns.
+
+        What is commanded now is what the first row that can still be executed follows, and not rows before it.
+        """
+        first = int(onset.row * rate / self._control_rate + 1e-9)
+        found = [(switch, columns[switch.dim]) for switch in self._switches if switch.dim in columns]
+        for switch, column in found:
+            for part in (slice(0, first), slice(first, None)):
+                rows[part, column] = switch.snapped(rows[part, column], float(onset.held[switch.dim]))
+        return [column for _, column in found]
 
     def disagreement(self, measured: ArrayLike, q: ArrayLike) -> str:
         """How far measured poses [8 * arms] are from those of the joints q [D], worst arm; "" where they agree."""

@@ -40,6 +40,7 @@ class Gesture:
         self._speed = np.minimum(robot.velocity, _SPEED)
         for dim in robot.gripper_dims:
             self._speed[dim] = (robot.upper - robot.lower)[dim] / _GRIPPER_TIME
+        self._speed[list(robot.binary_dims)] = np.inf
 
     def at(self, phase: float, q: Float64) -> Float64:
         """Joints [D] on the path; places that do not take part are those of `q`."""

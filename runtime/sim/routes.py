@@ -203,6 +203,10 @@ class Planner:
         u = np.linspace(0.0, 1.0, 1 + math.ceil(seconds * self._rate))
         s = u**3 * (10 - 15 * u + 6 * u * u)
         rows = np.vander(s, len(stations), increasing=True) @ powers
+        switched = list(
+            self._robot.binary_dims
+        )  # on a way through numbers between they would begin anew at each look
+        rows[:, switched] = stations[-1, switched]
         return np.asarray(np.clip(rows, self._robot.lower, self._robot.upper))
 
 

@@ -168,6 +168,12 @@ def test_a_robot_travels_between_processes() -> None:
         ("binary = false", "binary = true", "threshold = None; needed if and only if binary = true"),
         ("binary = false", "threshold = 0.05", "threshold = 0.05; needed if and only if binary = true"),
         ("binary = false", "binary = true\nthreshold = 0.1", "threshold = 0.1; allowed: between 0.0 and 0.1"),
+        ("binary = false", "hysteresis = 0.1", "hysteresis = 0.1; allowed only with binary = true"),
+        (
+            "binary = false",
+            "binary = true\nthreshold = 0.09\nhysteresis = 0.3",
+            "hysteresis = 0.3; allowed with the threshold 0.09: 0 to 0.2 of the travel, or it could not switch back",
+        ),
         ("wxyz = [0.7071067811865476", "wxyz = [0.5", "mount.wxyz has length"),
         ("[poses.home]", "[poses.start]", "poses: start, ready given; needed: home"),
         ("left_arm = [0.0,", "arm = [0.0,", "poses.home gives arm, right_arm; needed: left_arm, right_arm"),

@@ -34,7 +34,9 @@ def test_a_process_that_hangs_in_a_run_holds_it_and_is_named(tmp_path: Path, pro
     station.close()
 
 
-@pytest.mark.parametrize(("answer", "state"), [("slow", State.HOLDING), ("hold", State.HOLDING), ("stop", State.READY)])
+@pytest.mark.parametrize(
+    ("answer", "state"), [("slow", State.HOLDING), ("hold", State.HOLDING), ("stop", State.READY)]
+)
 def test_a_run_whose_chunks_all_come_too_late_is_ended_by_the_rule_of_starvation(
     tmp_path: Path, answer: str, state: State
 ) -> None:

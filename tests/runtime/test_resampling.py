@@ -47,7 +47,9 @@ def test_every_row_is_of_a_time_that_the_given_rows_cover_and_linear_between_the
     times, last = np.arange(len(made)) / wanted, (count - 1) / rate
     assert 1 <= len(made) == length(count, rate, wanted)
     assert times[-1] <= last + 1e-9 < times[-1] + 1 / wanted + 2e-9
-    np.testing.assert_allclose(made[:, 0], np.interp(times, np.arange(count) / rate, given_rows[:, 0]), atol=1e-6)
+    np.testing.assert_allclose(
+        made[:, 0], np.interp(times, np.arange(count) / rate, given_rows[:, 0]), atol=1e-6
+    )
     np.testing.assert_array_equal(source, np.floor(times * rate + 1e-9))
 
 

@@ -294,7 +294,9 @@ def test_a_short_fast_chunk_is_set_up_and_moves_the_robot(
     station.ready().command("run")
     station.go(60)
     assert station.state is State.RUNNING, station.reason
-    assert station.robot.sent[-1, MOVED[0]] == pytest.approx(0.002 * station.main.page.control.read()["step"], abs=0.1)
+    assert station.robot.sent[-1, MOVED[0]] == pytest.approx(
+        0.002 * station.main.page.control.read()["step"], abs=0.1
+    )
     assert len(np.unique(station.robot.sent[:, MOVED[0]])) > 10
     station.close()
 

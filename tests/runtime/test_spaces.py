@@ -283,7 +283,8 @@ def test_a_delta_is_summed_at_the_policys_rate_before_it_is_resampled() -> None:
 SWITCHED = replace(
     ROBOT,
     groups=tuple(
-        replace(group, gripper=replace(group.gripper, binary=True, threshold=0.05)) for group in ROBOT.groups
+        replace(group, gripper=replace(group.gripper, binary=True, threshold=0.05, hysteresis=0.05))
+        for group in ROBOT.groups
     ),
 )
 ENDLESS_DIM = 5

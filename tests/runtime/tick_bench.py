@@ -25,6 +25,7 @@ from runtime.messages import (
 )
 from runtime.page import EStop, Page, PageLayout
 from runtime.safety import Limits, SafetyFilter, SafetySettings
+from runtime.switching import Switch
 from runtime.tick import Tick, TickSettings
 from runtime.timeline import Dims
 from runtime.transports.base import Sink
@@ -81,6 +82,7 @@ class Bench:
         starvation: Answer = "slow",
         seen: bool = True,
         workspace: Workspace | None = None,
+        switches: tuple[Switch, ...] = (),
         **safety: Any,
     ) -> None:
         self.limits, self.workspace = limits, workspace
@@ -94,6 +96,7 @@ class Bench:
         self.chosen: Strategy = strategy(chosen or {"kind": "async"}, self.dims)
         self.safety = SafetySettings(**safety)
         self.starvation: Answer = starvation
+        self.switches = switches
         self.before_send: Callable[[], object] = lambda: None
         self.tick = self.new_tick()
         self.feed = self.alive = True
@@ -131,6 +134,7 @@ class Bench:
             heartbeat_timeout=1.0,
             starvation=self.starvation,
             starvation_hold=1.0,
+            switches=self.switches,
         )
         safety = SafetyFilter(self.safety, self.limits, self._judged)
         return Tick(self.page, self.sink, safety, self.chosen, settings, self.clock.now)

@@ -1,0 +1,88 @@
+"""Binary grippers: which of its two numbers a wish means, and how soon one may switch again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from robots import Robot
+from runtime.limits import Limits
+from runtime.types import Float64
+
+DWELL_S = 0.2  # between two switches of one gripper
+_SAME = 1e-3  # of its travel
+_ROUNDING = 1.0 - 1e-9  # an end of the travel may be the edge of the hysteresis, and must count
+_EARLY_S = 1e-6  # moments are sums of floats
+
+
+@dataclass(frozen=True, slots=True)
+class Switch:
+    """One binary gripper: its place in the robot's vector, its two numbers, and where it goes from one to the other.
+
+    A number farther than half the `hysteresis` from the `threshold` opens or closes it, one nearer leaves it as it
+    was. One at the threshold opens it where there is no hysteresis.
+    """
+
+    dim: int
+    open: float
+    close: float
+    threshold: float
+    hysteresis: float  # in the gripper's own unit
+
+    def is_open(self, number: float) -> bool:
+        """On which side of the threshold `number` is."""
+        return number >= self.threshold if self.open > self.close else number <= self.threshold
+
+    def snapped(self, wanted: Float64, before: float) -> Float64:
+        """`wanted` [H], one after the other, as `open` and `close`; `before` is what it was told to be until then."""
+        upwards = np.sign(self.open - self.close)
+        beyond = upwards * (wanted - self.threshold)
+        half = 0.5 * self.hysteresis * _ROUNDING
+        decided = np.concatenate([[True], (beyond >= half) | (beyond <= -half)])
+        opened = np.concatenate([[self.is_open(before)], beyond >= half])
+        newest = np.maximum.accumulate(np.where(decided, np.arange(len(decided)), 0))
+        return np.where(opened[newest][1:], self.open, self.close)
+
+
+def switches(robot: Robot) -> tuple[Switch, ...]:
+    """Those of all its binary grippers."""
+    made = []
+    for group in robot.groups:
+        gripper, dim = group.gripper, group.gripper_dim
+        if gripper is None or dim is None or gripper.threshold is None or gripper.hysteresis is None:
+            continue
+        width = gripper.hysteresis * abs(gripper.open - gripper.close)
+        made.append(Switch(dim, gripper.open, gripper.close, gripper.threshold, width))
+    return tuple(made)
+
+
+class Dwell:
+    """Keeps each binary gripper of one robot from switching again within DWELL_S, whoever wants it to."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._names = limits.names
+        self._binary = limits.binary
+        self._same = _SAME * (limits.upper - limits.lower)
+        self._switched = np.full(len(limits.binary), -np.inf)  # when [s]
+
+    def apply(self, action: Float64, commanded: Float64, now: float) -> tuple[Float64, tuple[str, ...]]:
+        """`action` [D] with grippers that would switch too soon where they are `commanded` [D], and notes on these."""
+        early = now - self._switched < DWELL_S - _EARLY_S
+        if not early.any() or action.shape != commanded.shape:
+            return action, ()
+        kept = early & self._switches(action, commanded)
+        if not kept.any():
+            return action, ()
+        notes = tuple(
+            f"{self._names[i]} kept at {round(float(commanded[i]), 4):g}: it switches once per {DWELL_S:g} s at most"
+            for i in np.flatnonzero(kept)
+        )
+        return np.where(kept, commanded, action), notes
+
+    def sent(self, before: Float64, now_sent: Float64, now: float) -> None:
+        """The robot was told `now_sent` [D] after `before` [D]."""
+        self._switched[self._switches(now_sent, before)] = now
+
+    def _switches(self, action: Float64, before: Float64) -> np.ndarray:
+        return np.asarray(self._binary & (np.abs(action - before) > self._same))
