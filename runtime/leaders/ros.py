@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -21,6 +21,7 @@ from runtime.types import Float64
 
 if TYPE_CHECKING:
     from robots import Group, Robot
+    from robots.description import RosGroupTable
 
 NODE = "eva_web_leader"
 TABLE = "collection.leader"
@@ -29,8 +30,9 @@ TABLE = "collection.leader"
 class LedGroup(Section):
     """Where the leader of one group speaks."""
 
-    topic: Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$")]
-    """sensor_msgs/JointState, its gripper among the numbers."""
+    topic: Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$")] | None = None
+    """sensor_msgs/JointState, its gripper among the numbers; the `leader` that the robot's description names for the
+    group where it is not given."""
     joints: list[str] | None = None
     """What the messages call the group's joints, in its order, where that is not what the robot's description does."""
 
@@ -56,6 +58,7 @@ class RosLeader(Leader):
     def __init__(
         self,
         config: LedGroups,
+        version: Literal[1, 2],
         robot: Robot,
         clock: Clock,
         quality: Quality,
@@ -64,7 +67,10 @@ class RosLeader(Leader):
     ) -> None:
         super().__init__(robot, clock)
         self._groups = _known(config.groups, robot)
-        self._parts = {name: _part(self._groups[name], led) for name, led in config.groups.items()}
+        own = robot.ros.groups if robot.ros is not None and robot.ros.version == version else {}
+        self._parts = {
+            name: _part(self._groups[name], led, own.get(name)) for name, led in config.groups.items()
+        }
         self._names, self._quality, self._wire, self._open = (
             config.joint_names,
             quality,
@@ -157,11 +163,16 @@ def _known(led: Mapping[str, LedGroup], robot: Robot) -> dict[str, Group]:
     return groups
 
 
-def _part(group: Group, led: LedGroup) -> Part:
+def _part(group: Group, led: LedGroup, own: RosGroupTable | None) -> Part:
     names = group.joints if led.joints is None else tuple(led.joints)
     if len(names) != group.dof or len(set(names)) != len(names):
         raise ConfigurationError(
             f"{TABLE}.groups.{group.name}.joints = {list(names)}; "
             f"allowed: {group.dof} different names, in the order of {', '.join(group.joints)}"
         )
-    return Part("joints", group.name, led.topic, "JointState", names)
+    topic = led.topic or (own.leader if own is not None else None)
+    if topic is None:
+        raise ConfigurationError(
+            f"{TABLE}.groups.{group.name}.topic is missing, and the robot's description names no `leader` of that group"
+        )
+    return Part("joints", group.name, topic, "JointState", names)

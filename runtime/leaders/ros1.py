@@ -25,4 +25,4 @@ class Config(ros1.Link, LedGroups):
 
 def build(config: Config, robot: Robot, clock: Clock) -> RosLeader:
     """The leader, not yet connected; ConfigurationError names a group or joint that is not the robot's."""
-    return RosLeader(config, robot, clock, _NEWEST, packed, lambda: ros1.middleware(config, NODE))
+    return RosLeader(config, 1, robot, clock, _NEWEST, packed, lambda: ros1.middleware(config, NODE))

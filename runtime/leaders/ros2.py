@@ -38,4 +38,4 @@ class Config(ros2.Link, LedGroups):
 def build(config: Config, robot: Robot, clock: Clock) -> RosLeader:
     """The leader, not yet connected; ConfigurationError names a group or joint that is not the robot's."""
     quality = config.qos.otherwise(SENSOR_QUALITY)
-    return RosLeader(config, robot, clock, quality, cdr, lambda: ros2.middleware(config, NODE))
+    return RosLeader(config, 2, robot, clock, quality, cdr, lambda: ros2.middleware(config, NODE))

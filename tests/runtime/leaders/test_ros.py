@@ -148,6 +148,16 @@ def test_groups_that_do_not_fit_are_named(groups: dict[str, Any], why: str) -> N
         ros2.build(ros2.Config.model_validate({"groups": groups}), ROBOT, VirtualClock())
 
 
+def test_a_group_without_a_topic_is_led_on_the_one_that_the_robot_names() -> None:
+    bare = {LEFT.name: {}, RIGHT.name: {"topic": "/leader/right"}}
+    own = ros1.build(ros1.Config.model_validate({"groups": bare}), ROBOT, VirtualClock())
+    assert own.name == "the leader on /eva/hil/input_joint_state_arm_left, /leader/right"
+    with pytest.raises(
+        ConfigurationError, match=r"left_arm.topic is missing, and the robot's description names no"
+    ):
+        ros2.build(ros2.Config.model_validate({"groups": bare}), ROBOT, VirtualClock())  # its stack is ROS 1
+
+
 def test_a_link_beyond_this_machine_has_to_be_asked_for() -> None:
     with pytest.raises(ConfigurationError, match=r"collection\.leader\.network"):
         ros2.Config.model_validate({"groups": BOTH, "network": "eth0"})
