@@ -16,10 +16,8 @@ _RETURNED_AWAY = 0.1  # [rad] that an arm may be off after it was not seen, by s
 def silent_sibling(page: Page, now: float, allowed: float) -> str:
     """The process whose heartbeat is older than `allowed` seconds, in a sentence; "" where none is."""
     for process in ("main", "guard"):
-        beat = page.last_beat(process)
-        if now - beat > allowed:
-            since = f"for {now - beat:.1f} s" if beat else "since it was restarted"
-            return f"no sign of life from {process} {since}"
+        if not page.alive(process, now, allowed):
+            return f"no sign of life from {process} {page.silence(process, now)}"
     return ""
 
 

@@ -206,6 +206,11 @@ class Collecting:
         if episode:
             self._asked.append(episode)
 
+    def unopened(self) -> None:
+        """The recording of the open run could not be opened: there is no such episode to speak of."""
+        if self.run is not None and self.run.uuid in self._asked:
+            self._asked.remove(self.run.uuid)
+
     def closed(self, message: EpisodeClosed) -> None:
         """An episode is on disk."""
         if self._settings is None or message.uuid not in self._asked:

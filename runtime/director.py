@@ -132,7 +132,7 @@ class Director:
             for payload in self.page.rings[ring].drain():
                 self._hear(decode(payload))
         for noticed in self._watch.notice(self.session.state, self.runs.open):
-            self._observe(noticed.happening, noticed.reason)
+            self._observe(*noticed)
         if missed := self.collecting.look(self.session.state):
             self._observe(*missed)
         for event in self._punctuality.look(self.clock.now()):
@@ -227,6 +227,7 @@ class Director:
             self.say(Event("episode_opened", f"recording {opened.uuid}", self.clock.now()))
         failure = self.runs.opened(opened, self.session.state is State.RUNNING)
         if failure:
+            self.collecting.unopened()
             self._observe(Happening.RUN_FAILED, failure)
 
     def say(self, event: Event) -> None:
@@ -238,18 +239,26 @@ class Director:
         self.events.append(event)
         log.info("%s: %s", event.kind, event.text)
 
-    def _observe(self, happening: Happening, reason: str) -> None:
+    def _observe(self, happening: Happening, reason: str, process: str = "") -> None:
+        """Tell the session; `process` is the one that was restarted."""
         if happening is Happening.FAMILY_DIED:
             self.say(Event("family_died", reason, self.clock.now()))
             self.unheard = {}  # a control that is started anew says so again
-            self.runs.lost()
+            self.runs.lost(process, reason)
+        if happening is Happening.ESTOPPED:
+            self.runs.interrupt_alone(reason)
         if happening in (Happening.FAMILY_DIED, Happening.ESTOPPED):
             self._unlock()
         self.collecting.noticed(happening, reason)
-        before = self.session.state
+        before, run = self.session.state, self.runs.open
         if self.session.observe(happening, reason):
             text = f"{before} -> {self.session.state}: {reason}"
-            self.say(Event("state", text, self.clock.now(), data={"state": str(self.session.state)}))
+            data = {"state": str(self.session.state), **self._unbegun(run)}
+            self.say(Event("state", text, self.clock.now(), data=data))
+
+    def _unbegun(self, run: Run | None) -> dict[str, Any]:
+        """What an event says of `run` where that is over and never began."""
+        return {} if run is None or run is self.runs.open else run.unbegun
 
     # --- what goes on ----------------------------------------------------------------------------------------
 
@@ -306,7 +315,7 @@ class Director:
             return self._aim(command)
         if command.kind in PREFLIGHT_QUERIES:
             return self.preflights.handle(command, self.boot)
-        before, sequence = self.session.state, self.session.sequence
+        before, sequence, run = self.session.state, self.session.sequence, self.runs.open
         ack = self.session.handle(command)
         if ack.status == "accepted" and command.kind in ("setup", "run"):
             self.preflights.cancel(f"{command.kind} by {command.user or command.holder}")
@@ -316,8 +325,8 @@ class Director:
             self.collecting.touch()
             who = command.user or command.holder
             what = f"{command.kind} by {who}: {ack.status}" + (f", {ack.reason}" if ack.reason else "")
-            data = {"uuid": command.uuid, "from": str(before), "to": str(self.session.state)}
-            self.say(Event("command", what, self.clock.now(), data=data))
+            told = {"uuid": command.uuid, "from": str(before), "to": str(self.session.state)}
+            self.say(Event("command", what, self.clock.now(), data=told | self._unbegun(run)))
         return ack
 
     def _events_since(self, command: Command) -> Ack:

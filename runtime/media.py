@@ -134,10 +134,12 @@ class Media:
             recorder.answered(message)
         elif isinstance(message, Event):
             recorder.mark(event_row(message))
-        elif isinstance(message, BeginEpisode) and self._closing is not None:
-            self._waiting, self._waiting_since = message, self._clock.now()
         elif isinstance(message, BeginEpisode):
-            self._begin(message)
+            self.end("interrupted", "its end was never told, and another recording begins")
+            if self._closing is None:
+                self._begin(message)
+            else:
+                self._waiting, self._waiting_since = message, self._clock.now()
         elif isinstance(message, EndEpisode):
             self._drain("ticks")  # those that control did before main decided to end
             self._say_truth(message.details.get("reached") or {})
@@ -259,9 +261,8 @@ def main() -> None:
             else:
                 media.digest()
                 clock.sleep_until(now + 0.1)
-            silent = now - page.last_beat("main")
-            if media.recording and silent > plan.deployment.control.heartbeat_timeout_s:
-                media.end("interrupted", f"main has given no sign of life for {silent:.1f} s")
+            if media.recording and not page.alive("main", now, plan.deployment.control.heartbeat_timeout_s):
+                media.end("interrupted", f"main has given no sign of life {page.silence('main', now)}")
     finally:
         media.end("interrupted", "the station's supervisor ended")
         ended = clock.now()

@@ -138,9 +138,9 @@ class Operations(Effects):
         self._orders.tune(self.plan.deployment.strategy.model_dump())
         collecting = self.collecting
         if mode != "collect":
-            return {"episode": self.runs.begin(self.setup.info, asked)}
+            return {"episode": self.runs.begin(self.setup.info, asked, command=self.command)}
         self.by_hand.require_robot("run in the mode collect")
-        episode = self.runs.begin(self.setup.info, asked, collecting.manifest(asked))
+        episode = self.runs.begin(self.setup.info, asked, collecting.manifest(asked), self.command)
         collecting.begun(episode, asked)
         return {"episode": episode}
 
@@ -168,6 +168,10 @@ class Operations(Effects):
         mode = self._mode(asked)
         if mode != "continuous":
             raise RuntimeFault(f"a trial runs in the mode continuous, and {mode} was asked for")
+        if not self.plan.deployment.recording.enabled:
+            raise RuntimeFault(
+                "a trial counts by its recording, and recording.enabled = false; allowed: true"
+            )
         if self._tuned:
             raise RuntimeFault("strategy or task were tuned since the set-up: set up again for a trial")
         if not np.isnan(self.by_hand.grippers.locks).all():

@@ -175,6 +175,11 @@ class Page:
         """Whether `process` has said so in the last `within` seconds."""
         return now - self.last_beat(process) <= within
 
+    def silence(self, process: str, now: float) -> str:
+        """For how long `process` has given no sign of life at `now`, as a sentence ends with it."""
+        beat = self.last_beat(process)
+        return f"for {now - beat:.1f} s" if beat else "since it was restarted"
+
     def generation(self, process: str) -> int:
         """How often the supervisor has started `process`; a change means that it died and was restarted."""
         return int(self._generations[process][0])

@@ -40,7 +40,9 @@ class Run:
     followed: float = -math.inf  # since when it does, without a hold between
     held_since: float | None = None
     held: float = 0.0  # in total
+    command: str = ""  # uuid of the command that asked for it
     opened: bool = False  # media is ready for it
+    unopened: bool = False  # its recording could not be opened: there is none, and it never began
     waiting: bool = False  # begins when what it needs is loaded
     unrecorded: str = ""  # why its recording ended before it did
     counted: Mapping[str, Any] = field(default_factory=dict)  # control's figures when it was asked for
@@ -53,6 +55,13 @@ class Run:
         """
         since = {key: now[key] - self.counted.get(key, 0) for key in _COUNTS}
         return {**now, **({} if min(since.values()) < 0 else since)}
+
+    @property
+    def unbegun(self) -> dict[str, Any]:
+        """What those who asked for it are told where it ended before control followed; {} where it began."""
+        if self.begun is not None:
+            return {}
+        return {"unbegun": {"command": self.command, "episode": self.uuid, "unopened": self.unopened}}
 
     def begin(self, now: float) -> None:
         """Control follows: its clock starts."""

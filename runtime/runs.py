@@ -24,6 +24,7 @@ from runtime.messages import (
 from runtime.orders import Orders
 from runtime.page import Page
 from runtime.policies.base import PolicyInfo
+from runtime.recording.files import require_room
 from runtime.requests import RunRequest
 from runtime.run import Provenance, Run
 from runtime.types import Float64
@@ -64,21 +65,37 @@ class Runs:
         """Whether a run that is not recorded must not go on."""
         return self._plan.deployment.recording.on_failure == "hold"
 
+    def _must_record(self, trial: bool, mode: str) -> bool:
+        """Whether a run must not begin without its recording: a trial and a demonstration are nothing without one."""
+        return self._evidence or trial or mode == "collect"
+
+    def _require_room(self) -> None:
+        """RecordingError where the disk of the episodes has too little room for another one."""
+        settings = self._plan.deployment
+        require_room(settings.episodes_dir, settings.recording.min_free_bytes)
+
     # --- runs ----------------------------------------------------------------------------------------------
 
     def begin(
-        self, info: PolicyInfo | None, asked: RunRequest, more: Mapping[str, Any] = MappingProxyType({})
+        self,
+        info: PolicyInfo | None,
+        asked: RunRequest,
+        more: Mapping[str, Any] = MappingProxyType({}),
+        command: str = "",
     ) -> str:
         """Ask media to open an episode; the run begins when it has. Returns the episode's uuid, "" for none.
 
-        `more` stands in the manifest in place of what it would say else.
+        `more` stands in the manifest in place of what it would say else. RuntimeFault where the disk has no room for
+        what must be recorded.
         """
         if self._alone:
             raise RuntimeFault("a recording without a run is open: record stop first")
         settings = self._plan.deployment
+        mode = asked.mode or settings.run.mode
+        if settings.recording.enabled and self._must_record(asked.trial is not None, mode):
+            self._require_room()
         self._count += 1
         limit = settings.run.duration_s if asked.duration_s is None else asked.duration_s
-        mode = asked.mode or settings.run.mode
         sim_state = asked.sim_state or settings.run.sim_state
         manifest = None
         if settings.recording.enabled:
@@ -96,6 +113,7 @@ class Runs:
             limit,
             mode,
             asked.trial is not None,
+            command=command,
             counted=self._figures(),
         )
         return identity if manifest else ""
@@ -107,7 +125,8 @@ class Runs:
         run = self.open
         if run is None or message.run != run.number or run.begun is not None:
             return ""
-        if message.error and self._evidence:
+        if message.error and self._must_record(run.trial, run.mode):
+            run.unopened = True
             return message.error
         if message.error:
             self._tell(BeginEpisode(run.number, None))  # unrecorded; the source plays all the same
@@ -139,7 +158,7 @@ class Runs:
             self._start(run)
 
     def end(self, status: str, reason: str) -> None:
-        """Decelerate, hold, close what is open; a recording alone only where it is interrupted."""
+        """Decelerate, hold, close the open run."""
         self._inference.pause()
         self._inference.asking.sight.simulated = False
         self._orders.give("hold", reason=reason)
@@ -153,9 +172,6 @@ class Runs:
             details = {"run_seconds": seconds, "control": run.figures(self._figures()), "policy": policy}
             details |= {"reached": run.reached} if run.reached else {}
             self.note(EndEpisode(status, reason, details))  # a stop is not refused because media hangs
-        if self._alone and status != "finished":
-            self.note(self._end_alone(status, reason))
-            self._alone = ""
 
     def saw(self, truth: Mapping[str, Any], running: bool) -> None:
         """Note when a simulated bench first says of a milestone that it is reached, in a run that is not held."""
@@ -232,6 +248,7 @@ class Runs:
         """Open an episode of whatever control does; returns its uuid."""
         if self._alone:
             raise RuntimeFault("a recording is open already")
+        self._require_room()
         manifest = self.provenance.manifest("observe", info)
         self._tell(BeginEpisode(0, manifest))
         self._alone = str(manifest["uuid"])
@@ -247,9 +264,18 @@ class Runs:
     def _end_alone(self, status: str, reason: str) -> EndEpisode:
         return EndEpisode(status, reason, {"control": self._figures()})
 
-    def lost(self) -> None:
-        """Media was restarted: what it recorded was closed by repair."""
-        self._alone = ""
+    def interrupt_alone(self, reason: str) -> None:
+        """Close a recording without a run, where one is open; media may hang."""
+        if self._alone:
+            self.note(self._end_alone("interrupted", reason))
+            self._alone = ""
+
+    def lost(self, process: str, reason: str) -> None:
+        """That process was restarted: of a recording without a run media held the files and control the ticks."""
+        if process == "media":
+            self._alone = ""  # repair closes it
+        elif process == "control":
+            self.interrupt_alone(reason)
 
     def closed(self, message: EpisodeClosed) -> Event:
         """An episode is on disk; the event that says so."""

@@ -170,7 +170,7 @@ class Session:
         if self.state is State.SETTING_UP and command.kind in CANCELLING:
             rule = CANCEL
         asked = read(command.kind, rule.takes, command.args) if rule.takes else None
-        self._effects.by = command.user or command.holder
+        self._effects.by, self._effects.command = command.user or command.holder, command.uuid
         told = rule.effect(self._effects, asked)
         after = rule.next(self.state, asked)
         if after:

@@ -29,6 +29,7 @@ class Noticed(NamedTuple):
 
     happening: Happening
     reason: str
+    process: str = ""  # that was restarted
 
 
 class Watch:
@@ -82,11 +83,11 @@ class Watch:
             if generation != self._generations[name]:
                 self._generations[name] = generation
                 reason = f"the process {name} died and was restarted: set up again"
-                yield Noticed(Happening.FAMILY_DIED, reason)
+                yield Noticed(Happening.FAMILY_DIED, reason, name)
         absent = self.absent() if state is State.RUNNING else ""  # a set-up looks for itself
         if absent:
-            silent = self._clock.now() - self._page.last_beat(absent)
-            yield Noticed(Happening.HELD, f"no sign of life from the process {absent} for {silent:.1f} s")
+            silent = self._page.silence(absent, self._clock.now())
+            yield Noticed(Happening.HELD, f"no sign of life from the process {absent} {silent}")
 
     def _estop(self, state: State) -> Iterator[Noticed]:
         latched = self._page.estop is EStop.LATCHED

@@ -111,10 +111,10 @@ def _create(root: Path, name: str) -> Path:
     folder = root / name
     try:
         root.mkdir(parents=True, exist_ok=True)
+        if folder.exists():
+            raise RecordingError(f"episode {folder} exists already; an episode is never written twice")
         folder.mkdir()
         sync_folder(root)
-    except FileExistsError:
-        raise RecordingError(f"episode {folder} exists already; an episode is never written twice") from None
     except OSError as error:
         raise disk_fault("creating", folder, error) from error
     return folder

@@ -66,6 +66,42 @@ def test_a_killed_process_is_restarted_and_nothing_moves_until_set_up_again(lab,
     lab.ready()
 
 
+@pytest.mark.parametrize(
+    ("process", "status", "reason"),
+    [
+        ("control", "interrupted", "the process control died and was restarted"),
+        ("main", "interrupted", "main has given no sign of life since it was restarted"),
+        ("media", "interrupted", "the recorder ended without closing the episode"),
+        ("guard", "finished", "stopped by the operator"),
+    ],
+)
+def test_a_recording_without_a_run_is_never_left_half_open_by_a_kill(lab, process, status, reason):
+    lab.up().ready()
+    alone = lab.client.command("record_start").data["episode"]
+    lab.client.wait(lambda s: s["recording"]["rows"] > 15, 30)
+    before = lab.pids()
+    lab.kill(process)
+    eventually(lambda: lab.pids()[process] != before[process], 10, "a restart")
+    eventually(lab.answers, 10, "the station answers again")
+    lab.reach("idle", seconds=15)
+    lab.ready()
+    if process == "guard":  # it held nothing of the recording
+        assert lab.client.status()["recording"]["uuid"] == alone
+        lab.client.command("record_stop")
+    run = lab.client.command("run").data["episode"]
+    lab.client.wait(lambda s: s["run"]["elapsed"] > 0.5, 30)
+    lab.client.command("stop")
+    found = {}
+    for episode in (alone, run):
+        folder = lab.data / "episodes" / episode
+        eventually((folder / "outcome.json").exists, 15, f"the outcome of {episode}")
+        found[episode] = open_episode(folder)
+        assert found[episode].frames > 10
+    assert (found[alone].outcome["status"], found[run].outcome["status"]) == (status, "finished")
+    assert reason in found[alone].outcome["reason"]
+    assert {path.name for path in lab.episodes()} == {alone, run}
+
+
 @pytest.mark.parametrize("state", ["idle", "running", "recording"])
 def test_nothing_is_left_ten_seconds_after_the_supervisor_was_killed(lab, state):
     to_state(lab, state)

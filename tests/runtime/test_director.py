@@ -109,6 +109,65 @@ def test_a_recording_without_a_run_that_fails_is_over_and_a_run_may_begin(tmp_pa
     station.close()
 
 
+def restarted(station: Station, process: str) -> None:
+    """As the supervisor says it."""
+    station.page.set_generation(process, station.page.generation(process) + 1)
+    station.go(3)
+
+
+def test_the_death_of_control_closes_a_recording_without_a_run_and_a_run_records_its_own(
+    tmp_path: Path,
+) -> None:
+    station = Station(plan(tmp_path)).ready()
+    alone = station.command("record_start").data["episode"]
+    station.go(5)
+    restarted(station, "control")
+    assert (station.state, station.media.recording) == (State.IDLE, False)
+    ended = station.main.runs.last_episode
+    assert (ended["uuid"], ended["status"]) == (alone, "interrupted")
+    assert ended["reason"] == "the process control died and was restarted: set up again"
+    station.ready()
+    own = station.command("run").data["episode"]
+    station.go(5)
+    assert station.state is State.RUNNING
+    assert station.stop().manifest["uuid"] == own
+    station.close()
+
+
+def test_the_death_of_the_guard_leaves_a_recording_without_a_run_open_until_it_is_stopped(
+    tmp_path: Path,
+) -> None:
+    station = Station(plan(tmp_path)).ready()
+    alone = station.command("record_start").data["episode"]
+    station.go(5)
+    restarted(station, "guard")
+    assert (station.state, station.media.recording) == (State.IDLE, True)
+    station.ready()
+    with pytest.raises(SetupError, match="a recording without a run is open: record stop first"):
+        station.command("run")
+    station.command("record_stop")
+    station.go(3)
+    ended = station.main.runs.last_episode
+    assert (ended["uuid"], ended["status"]) == (alone, "finished")
+    station.command("run")
+    station.go(5)
+    assert station.stop().frames > 0
+    station.close()
+
+
+def test_a_process_that_was_restarted_and_says_nothing_yet_is_not_told_to_be_silent_since_the_machine_started(
+    tmp_path: Path,
+) -> None:
+    station = Station(plan(tmp_path)).running(60)
+    station.page.beat("media", 0.0)  # as the supervisor does before it starts one anew
+    beat = station.page.beat
+    station.page.beat = lambda name, now: None if name == "media" else beat(name, now)
+    station.go(3)
+    assert station.reason == "no sign of life from the process media since it was restarted"
+    station.page.beat = beat
+    station.close()
+
+
 def test_the_snapshot_says_how_the_last_run_ended(tmp_path: Path) -> None:
     station = Station(plan(tmp_path, run={"duration_s": 0.5}))
     station.running(30)

@@ -499,13 +499,67 @@ def test_a_halt_while_it_homes_stops_it(tmp_path: Path) -> None:
     station.close()
 
 
-def test_a_recording_that_cannot_begin_fails_the_run_before_anything_moves(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["run", "record_start"])
+def test_without_room_on_the_disk_nothing_is_begun_and_the_refusal_says_how_much_is_wanted(
+    tmp_path: Path, kind: str
+) -> None:
     station = Station(plan(tmp_path, recording={"min_free_bytes": 10**15})).ready()
+    wanted = rf"room to record in {tmp_path}/episodes: \d+ bytes free, at least {10**15} wanted"
+    with pytest.raises(SetupError, match=wanted):
+        station.command(kind)
+    station.go(5)
+    assert (station.state, station.main.run, station.main.runs.alone) == (State.READY, None, False)
+    assert station.robot.commands == []
+    assert not (tmp_path / "episodes").exists()
+    station.close()
+
+
+@pytest.mark.parametrize("on_failure", ["hold", "continue"])
+def test_a_recording_that_cannot_be_opened_ends_a_trial_before_it_began_and_says_so(
+    tmp_path: Path, on_failure: str
+) -> None:
+    station = Station(plan(tmp_path, recording={"on_failure": on_failure})).ready()
+    (tmp_path / "episodes").write_text("in its place")
+    ack = station.command("run", trial={"id": 1})
+    station.go(5)
+    assert (station.state, station.main.run) == (State.READY, None)
+    assert "disk error while creating" in station.reason
+    assert station.robot.commands == []
+    told = [event for event in station.main.events.since(0) if event["data"].get("state") == "ready"][-1]
+    assert told["data"]["unbegun"] == {
+        "command": ack.uuid,
+        "episode": ack.data["episode"],
+        "unopened": True,
+    }
+    (tmp_path / "episodes").unlink()
+    station.command("run", trial={"id": 1})  # it is as it was
+    station.go(5)
+    assert station.stop().frames > 0
+    station.close()
+
+
+def test_a_run_that_is_stopped_before_it_began_is_told_as_such(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path)).ready()
+    run = station.command("run").uuid
+    station.command("stop")  # before media has heard of either
+    station.go(5)
+    said = [event["data"] for event in station.main.events.since(0) if event["kind"] == "command"][-1]
+    assert (said["unbegun"]["command"], said["unbegun"]["unopened"]) == (run, False)
+    assert station.robot.commands == []
+    assert station.episode().frames == 0
     station.command("run")
     station.go(5)
-    assert station.state is State.READY
-    assert "free" in station.reason
-    assert station.robot.commands == []
+    station.command("stop")
+    said = [event["data"] for event in station.main.events.since(0) if event["kind"] == "command"][-1]
+    assert "unbegun" not in said
+    station.close()
+
+
+def test_a_trial_is_refused_where_nothing_is_recorded(tmp_path: Path) -> None:
+    station = Station(plan(tmp_path, recording={"enabled": False})).ready()
+    with pytest.raises(SetupError, match=r"a trial counts by its recording, and recording\.enabled = false"):
+        station.command("run", trial={"id": 1})
+    station.command("run")
     station.close()
 
 

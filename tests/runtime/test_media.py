@@ -297,6 +297,22 @@ def test_an_event_that_cannot_be_written_fails_the_recording_too(desk: Desk) -> 
     assert not desk.media.recording
 
 
+def test_a_recording_whose_end_was_never_told_is_closed_where_another_one_begins(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin(run=0)
+    desk.tick(0, 1)
+    desk.media.pump(0.0)
+    desk.post(BeginEpisode(2, {"uuid": "two"}))
+    desk.media.pump(0.0)
+    messages = [decode(payload) for payload in desk.page.rings["media_events"].drain()]
+    (closed,) = [m for m in messages if isinstance(m, EpisodeClosed)]
+    assert (closed.uuid, closed.status, closed.rows) == ("one", "interrupted", 1)
+    assert closed.reason == "its end was never told, and another recording begins"
+    opened = [m for m in messages if isinstance(m, EpisodeOpened)][-1]
+    assert (opened.uuid, opened.error) == ("two", "")
+    assert desk.media.recording
+
+
 def test_what_was_addressed_to_a_predecessor_is_not_obeyed(desk: Desk) -> None:
     desk.receive(1)
     desk.post(BeginEpisode(1, {"uuid": "old"}))

@@ -1,0 +1,144 @@
+"""Whatever dies, is pressed or cannot be written, in whatever order: what main thinks is recorded is what media records."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from runtime.messages import Ack
+from runtime.recording.reader import open_episode
+from runtime.transitions import State
+from tests.runtime.station import Station, plan
+
+SETTLED = 4  # ticks after which an order has gone to media and its answer to main
+ticks = st.integers(0, 6)
+
+
+class Recorded(RuleBasedStateMachine):
+    """A lockstep station whose disk fails and whose siblings are restarted."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = tempfile.TemporaryDirectory()
+        self.asked: dict[str, bool] = {}  # episodes of accepted runs, and whether each was ever seen to run
+
+    @initialize(on_failure=st.sampled_from(["hold", "continue"]))
+    def begin(self, on_failure: str) -> None:
+        self.episodes = Path(self.folder.name) / "episodes"
+        self.station = Station(plan(Path(self.folder.name), recording={"on_failure": on_failure}))
+        self.go(3)
+
+    def go(self, count: int) -> None:
+        for _ in range(count):
+            self.station.go(1)
+            run = self.station.main.run
+            if run is not None and run.begun is not None:
+                self.asked[run.uuid] = True
+
+    @property
+    def broken(self) -> bool:
+        return self.episodes.is_file()
+
+    def give(self, kind: str, **arguments: object) -> Ack:
+        self.station._handle("lease_claim")
+        return self.station._handle(kind, arguments)
+
+    @rule(trial=st.booleans(), wait=ticks)
+    def run(self, trial: bool, wait: int) -> None:
+        if self.station.state is State.IDLE:
+            self.station.prepare()
+        ack = self.give("run", **({"trial": {"id": 1}} if trial else {}))
+        if ack.status == "accepted":
+            self.asked[ack.data["episode"]] = False
+        self.go(wait)
+
+    @rule(kind=st.sampled_from(["stop", "halt", "resume", "record_start", "record_stop"]), wait=ticks)
+    def press(self, kind: str, wait: int) -> None:
+        self.give(kind)
+        self.go(wait)
+
+    @rule(process=st.sampled_from(["control", "guard"]), wait=ticks)
+    def dies(self, process: str, wait: int) -> None:
+        page = self.station.page
+        page.set_generation(process, page.generation(process) + 1)
+        self.go(wait)
+
+    @rule(wait=ticks)
+    def estop(self, wait: int) -> None:
+        self.station.guard.press("anna", "a test")
+        self.go(wait)
+        self.go(1)
+        self.give("release")
+        self.go(3)
+
+    @rule()
+    def disk(self) -> None:
+        """A file where the folder should be: nothing can be opened, what is open goes on."""
+        aside = self.episodes.with_name("aside")
+        if self.broken:
+            self.episodes.unlink()
+            if aside.exists():
+                aside.rename(self.episodes)
+        elif not self.station.media.recording:
+            if self.episodes.exists():
+                self.episodes.rename(aside)
+            self.episodes.write_text("in its place")
+
+    @rule()
+    def settles(self) -> None:
+        """Nothing is half open, whatever came before."""
+        self.go(SETTLED)
+        runs = self.station.main.runs
+        open_in_main = runs._alone or (runs.open.uuid if runs.open and not runs.open.unrecorded else "")
+        recording = self.station.media._recorder.recording
+        assert recording == open_in_main or (runs.open is not None and not recording and not runs.open.opened)
+
+    @rule()
+    def works_again(self) -> None:
+        """With a disk that takes it a run can always be begun and leaves rows."""
+        if self.broken:
+            self.disk()
+        for kind in ("stop", "record_stop"):
+            self.give(kind)
+            self.go(SETTLED)
+        self.run(trial=True, wait=SETTLED)
+        assert self.station.state is State.RUNNING
+        assert self.station.stop().frames > 0
+
+    @invariant()
+    def what_never_began_is_told_and_nothing_else_is(self) -> None:
+        if not hasattr(self, "station"):
+            return
+        told = {}
+        for event in self.station.main.events.since(0):
+            if unbegun := event["data"].get("unbegun"):
+                told[unbegun["episode"]] = unbegun["unopened"]
+        run = self.station.main.run
+        for episode, ran in self.asked.items():
+            assert (episode in told) == (not ran and (run is None or run.uuid != episode))
+        for episode, unopened in told.items():
+            folder = next((root / episode for root in self.roots() if (root / episode).exists()), None)
+            assert folder is None or not unopened
+            if folder is not None and (folder / "outcome.json").exists():
+                assert open_episode(folder).frames == 0
+
+    def roots(self) -> list[Path]:
+        return [root for root in (self.episodes, self.episodes.with_name("aside")) if root.is_dir()]
+
+    def teardown(self) -> None:
+        if hasattr(self, "station"):
+            self.station.close()
+        self.folder.cleanup()
+
+
+TestRecorded = Recorded.TestCase
+TestRecorded.settings = settings(
+    max_examples=25,
+    stateful_step_count=20,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)
