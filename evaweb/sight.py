@@ -30,6 +30,8 @@ _HARMLESS = re.compile(
     | (abandoned|chosen\ again)(\ \([\w.@+-]+\))?
     | the\ e-stop\ was\ (pressed|released)[\w .,:@+-]*
     | lease\ [\w .,]*
+    | too\ little\ room\ to\ record\ in\ [^\n:]*:\ [\w ,]*\ wanted\ [\w .;()]*
+    | disk\ (full|error)\ while\ creating\ [^\n:]*:\ [\w ;]*\ free\ in\ [^\n:]*
     """,
     re.VERBOSE,
 )

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 from uuid import UUID
 
+from django.db import transaction
+
 from evaweb.collect.following import demonstration_bound
 from evaweb.collect.models import CollectSession
 from evaweb.collect.selectors import session_get
@@ -43,16 +45,24 @@ def session_command(
         _require_fit(session, kind)
     row = issue(user=user, station=session.station, kind=kind, args={**beside, **own}, uuid=identity, **given)
     if kind == "run" and row.status in CARRIED_OUT and row.data.get("episode"):
-        episode = episode_opened(
-            station=session.station,
-            uuid=row.data["episode"],
-            kind="demonstration",
-            mode="collect",
-            task=session.task,
-            operator=user.get_username(),
-        )
-        demonstration_bound(episode=episode, session=session)
+        _begun(session, row, user.get_username())
     return row
+
+
+@transaction.atomic
+def _begun(session: CollectSession, row: Command, operator: str) -> None:
+    """Its episode has a row, unless the station has said meanwhile that it could not be opened."""
+    if Command.objects.select_for_update().get(pk=row.pk).unopened:
+        return
+    episode = episode_opened(
+        station=session.station,
+        uuid=row.data["episode"],
+        kind="demonstration",
+        mode="collect",
+        task=session.task,
+        operator=operator,
+    )
+    demonstration_bound(episode=episode, session=session)
 
 
 def _own(session: CollectSession, kind: str, user: Any) -> dict[str, Any]:

@@ -165,10 +165,15 @@ def _advance(station: Station, boot: str, number: int) -> None:
 
 def _hand_on(station: Station, boot: str, event: Mapping[str, Any]) -> None:
     """An event that a service cannot take must not keep those after it out of the database."""
+    unbegun = event["data"].get("unbegun") or {}
     try:
         if event["kind"] == "episode_closed":
             episodes.episode_closed(station=station, data=event["data"])
+        if unbegun.get("unopened"):
+            commands.run_unopened(station=station, uuid=unbegun["command"], reason=event["text"])
         trials.run_changed(station=station, event=event, boot=boot)
+        if unbegun.get("unopened"):
+            episodes.episode_unopened(uuid=unbegun["episode"])
         if event["kind"] in collect.TOLD:
             collect.demonstration_told(event=event)
     except Error:

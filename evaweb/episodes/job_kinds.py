@@ -71,6 +71,8 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
     """
     episode = Episode.objects.select_related("station").get(uuid=UUID(work.args["uuid"]))
     folder = journal_folder(episode.uuid)
+    if not folder.exists():
+        return {"published": False, "why": "there is no folder of it: nothing of its run is on this disk"}
     try:
         return _published(work, episode, folder)
     except RecordingError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 from uuid import UUID
 
@@ -25,12 +25,14 @@ log = logging.getLogger(__name__)
 class Kept:
     """What the disk keeps of one run: its folder, if `recorded`, and the whole `lines` of its scores file.
 
-    `uuid` is the episode's; of a run that was not recorded, whatever those who wrote the lines named it by.
+    `uuid` is the episode's; of a run that was not recorded, whatever those who wrote the lines named it by. `say` takes
+    a sentence about what a person should look at.
     """
 
     uuid: UUID
     recorded: bool
     lines: Sequence[Mapping[str, Any]]
+    say: Callable[[str], None] = field(default=log.warning, compare=False)
 
 
 Restorer = Callable[[Kept], int]
@@ -114,7 +116,8 @@ def _restored(read: Sequence[UUID], problems: list[str]) -> int:
     for uuid in (*(uuid for uuid in in_order if uuid in recorded), *sorted(scored - recorded)):
         try:
             lines = _lines(uuid, problems) if uuid in scored else ()
-            restored += sum(restore(Kept(uuid, uuid in recorded, lines)) for restore in _restorers)
+            kept = Kept(uuid, uuid in recorded, lines, problems.append)
+            restored += sum(restore(kept) for restore in _restorers)
         except (RecordingError, EvaError, DataError, IntegrityError) as error:
             problems.append(f"run {uuid}: {error}")
     return restored

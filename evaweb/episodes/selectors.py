@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from uuid import UUID
 
@@ -10,10 +11,14 @@ from django.db.models import F, Q, QuerySet
 
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.recorded import CLOSED
 from evaweb.errors import NotFound
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import job_newest
 from evaweb.sight import EVERYTHING, Sight
+from runtime.recording.files import RecordingError, read_document
+from runtime.recording.layout import Layout
+from runtime.recording.tables import read_table, rows_schema
 
 # What a page says of an episode beside its own facts; trial and standing are bound to it from above.
 _WITH = (
@@ -119,6 +124,29 @@ def stage_of(*, episode: Episode) -> Stage:
     if not episode.frames:
         return Stage("empty", f"Nothing was recorded: {episode.reason or 'it has no rows'}.")
     return _preparing(job_newest(key=f"preview:{episode.uuid}"))
+
+
+def unrecorded_because(*, episode: Episode | None) -> str:
+    """Why there is no evidence that a run ever moved anything, not one recorded row; "" where there is."""
+    if episode is None:
+        return "nothing of its run was recorded"
+    if episode.frames:
+        return ""
+    if episode.status in CLOSED:
+        return f"episode {episode.uuid} of its run has no rows"
+    folder = journal_folder(episode.uuid)
+    if not folder.is_dir():
+        return f"episode {episode.uuid} of its run has no folder: nothing of it is on this disk"
+    return "" if _rows_written(folder) else f"no row of episode {episode.uuid} is on the disk yet"
+
+
+def _rows_written(folder: Path) -> int:
+    """Rows on the disk of an episode that is not closed yet; 0 where its files cannot be read."""
+    try:
+        layout = Layout.of(read_document(folder / "manifest.json"))
+        return int(read_table(folder / "rows.arrow", rows_schema(layout)).table.num_rows)
+    except RecordingError:
+        return 0
 
 
 def _preparing(job: Job | None) -> Stage:

@@ -69,16 +69,25 @@ def episode_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
         return episode_read(uuid=uuid, station=station)
     except RecordingError as error:
         log.warning("episode %s: %s", uuid, error)
-        status = data.get("status")
+        status, rows = data.get("status"), data.get("rows")
         facts = {
             "status": EpisodeStatus(status) if status in CLOSED else EpisodeStatus.FAILED,
             "reason": f"{data.get('reason') or 'no reason was given'} ({error})",
+            "frames": rows if isinstance(rows, int) and rows > 0 else 0,
         }
     with transaction.atomic():
         episode, _ = Episode.objects.update_or_create(
             uuid=uuid, defaults=facts, create_defaults={"station": station, "robot": station.robot, **facts}
         )
     return episode
+
+
+@transaction.atomic
+def episode_unopened(*, uuid: UUID | str) -> None:
+    """Forget an episode that was announced and could not be opened; one that has a folder, or a trial, stays."""
+    announced = Episode.objects.filter(uuid=_uuid(uuid), status=EpisodeStatus.RECORDING, trial=None)
+    if not journal_folder(_uuid(uuid)).exists():
+        announced.delete()
 
 
 @transaction.atomic

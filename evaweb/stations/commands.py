@@ -130,6 +130,11 @@ def settle(*, row: Command) -> Command:
     return row
 
 
+def run_unopened(*, station: Station, uuid: UUID | str, reason: str) -> None:
+    """Keep of an accepted run that its recording could not be opened: its answer may be heard of later still."""
+    Command.objects.filter(pk=identity_of(uuid), station=station, kind="run").update(unopened=reason)
+
+
 def unsettled(*, station: Station) -> list[Command]:
     """The commands of the last hour whose answers were lost."""
     now = timezone.now()

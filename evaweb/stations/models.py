@@ -138,6 +138,10 @@ class Command(models.Model):
     reason = models.TextField(blank=True)
     allowed = models.JSONField(default=list, blank=True, help_text="What would have been accepted then.")
     data = models.JSONField(default=dict, blank=True)
+    unopened = models.TextField(
+        blank=True,
+        help_text="Of an accepted run: why its recording could not be opened, so that it never began.",
+    )
     issued_at = models.DateTimeField(default=timezone.now, editable=False)
     answered_at = models.DateTimeField(null=True, blank=True)
 

@@ -1,4 +1,4 @@
-"""What a station's events do to its trial: begun, paused, resumed, ended, interrupted, its recording closed.
+"""What a station's events do to its trial: begun, paused, resumed, ended, given back, its recording closed.
 
 Every event may come more than once, from several web processes, and after a gap: a trial knows the number of
 the newest event that it has taken, and takes none before that again.
@@ -52,8 +52,10 @@ def run_changed(*, station: Station, event: Mapping[str, Any], boot: str | None 
 def run_begun(trial: Trial, *, command: Command, episode: UUID | None) -> None:
     """The station has accepted the command to run: at the answer, or where that was lost, at the event.
 
-    The caller holds the trial's row. Taken twice it changes nothing.
+    The caller holds the trial's row. Taken twice it changes nothing, nor does that of a run that never began.
     """
+    if Command.objects.filter(pk=command.pk).exclude(unopened="").exists():
+        return
     if trial.run is None and _may_begin(trial):
         lifecycle.apply(trial, Move.RUN)
         trial.run, trial.run_boot, trial.reason = command.pk, command.boot, ""
@@ -128,19 +130,37 @@ def _state_entered(station: Station, event: Mapping[str, Any], boot: str) -> Tri
         return _runtime_restarted(trial)
     if trial.run_event is None or event["number"] <= trial.run_event:
         return None
-    move = _MEANING.get(state, Move.INTERRUPT)
+    move = _meaning(state, data.get("unbegun") or {})
     if not lifecycle.allows(trial, move):  # it is there already
         return None
-    _moved(trial, move, _reason(event), _time(event))
-    trial.run_event = event["number"]
+    if move is Move.GIVE_BACK:
+        _given_back(trial, _reason(event))
+    else:
+        _moved(trial, move, _reason(event), _time(event))
+        trial.run_event = event["number"]
     trial.save()
     return trial
+
+
+def _meaning(state: str, unbegun: Mapping[str, Any]) -> Move:
+    """A run that never began is no attempt: it is made again as it is where nothing of it was opened, else repeated."""
+    if unbegun:
+        return Move.GIVE_BACK if unbegun.get("unopened") else Move.INTERRUPT
+    return _MEANING.get(state, Move.INTERRUPT)
+
+
+def _given_back(trial: Trial, reason: str) -> None:
+    """It is as it was before its run was asked for, and says why."""
+    lifecycle.apply(trial, Move.GIVE_BACK)
+    trial.run = trial.run_event = trial.run_since = trial.episode = None
+    trial.started_at = trial.duration_s = None
+    trial.run_boot, trial.reason = "", reason
 
 
 def _runtime_restarted(trial: Trial) -> Trial:
     """Its events are lost: what the recording says counts."""
     episode = trial.episode
-    if episode is not None and episode.status == EpisodeStatus.FINISHED:
+    if episode is not None and episode.status == EpisodeStatus.FINISHED and episode.frames:
         _moved(trial, Move.END, episode.reason or "ended while the web was away", None)
         trial.duration_s = episode.duration_s
     else:
@@ -177,6 +197,8 @@ def _episode_closed(station: Station, event: Mapping[str, Any]) -> Trial | None:
     trial = _held(station=station, episode_id=_uuid(data.get("uuid")))
     if trial is None:
         return None
+    if data.get("rows") == 0 and lifecycle.allows(trial, Move.INTERRUPT):
+        _moved(trial, Move.INTERRUPT, f"nothing of it was recorded: {data.get('reason')}", _time(event))
     _closed_as(trial, str(data.get("status")), str(data.get("reason") or ""), _time(event))
     if trial.episode is not None and trial.episode.duration_s is not None:
         trial.duration_s = trial.episode.duration_s

@@ -14,6 +14,7 @@ class Move(StrEnum):
     RUN = "run"
     PAUSE = "paused"
     RESUME = "resumed"
+    GIVE_BACK = "given back"
     END = "ended"
     INTERRUPT = "interrupted"
     SCORE = "scored"
@@ -26,6 +27,8 @@ MOVES: dict[tuple[TrialStatus, Move], TrialStatus] = {
     (_S.PREPARED, Move.RUN): _S.RUNNING,
     (_S.PREPARED, Move.ABANDON): _S.ABANDONED,
     (_S.ABANDONED, Move.RUN): _S.RUNNING,  # it was given up, then the lost answer says that it runs
+    (_S.RUNNING, Move.GIVE_BACK): _S.PREPARED,  # its recording could not be opened: it never ran
+    (_S.PAUSED, Move.GIVE_BACK): _S.PREPARED,
     (_S.RUNNING, Move.PAUSE): _S.PAUSED,
     (_S.RUNNING, Move.END): _S.ENDED,
     (_S.RUNNING, Move.INTERRUPT): _S.INTERRUPTED,

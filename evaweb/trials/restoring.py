@@ -22,6 +22,7 @@ from evaweb.episodes.folders import journal_folder
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import Kept, restores
 from evaweb.episodes.recorded import CLOSED, recorded_in
+from evaweb.episodes.selectors import unrecorded_because
 from evaweb.errors import EvaError
 from evaweb.roles import known_person
 from evaweb.trials import lifecycle, placeholders
@@ -39,6 +40,7 @@ from runtime.recording.reader import read_events
 log = logging.getLogger(__name__)
 
 _BEHIND = (*lifecycle.OPEN, TrialStatus.ABANDONED)  # what a trial with a closed recording cannot be
+_GHOST_S = 0.1  # the clock of a run that never began stood at a few hundredths of a second
 _JUDGED = (TrialStatus.SCORED, TrialStatus.VOIDED)
 
 
@@ -58,7 +60,17 @@ def restore(kept: Kept) -> int:
         _judged(trial, lines)
         if made or scores:
             _publish(trial, made=made)
+    if never := _never_ran(trial):
+        kept.say(never)
     return made + scores
+
+
+def _never_ran(trial: Trial) -> str:
+    """What is said of a score that earlier versions took for a run whose recording could not be opened; "" else."""
+    if trial.status != TrialStatus.SCORED or trial.episode is None or (trial.duration_s or 0.0) >= _GHOST_S:
+        return ""
+    why = unrecorded_because(episode=trial.episode)
+    return why and f"trial {trial.pk} is scored and never ran, {why}: void it with a reason"
 
 
 def _judgements(kept: Kept) -> list[KeptScore | KeptVoid]:
@@ -154,7 +166,8 @@ def _course(facts: KeptTrial, episode: Episode | None) -> dict[str, Any]:
     """How the run went: what is kept of the trial itself first, then what its recording says."""
     ended_at, truth = _end(episode) if episode else (None, None)
     exact = episode.duration_s if episode else None
-    whole = episode is None or episode.status in (EpisodeStatus.FINISHED, EpisodeStatus.MISSING)
+    missing = episode is None or episode.status == EpisodeStatus.MISSING
+    whole = missing or (episode.status == EpisodeStatus.FINISHED and episode.frames > 0)
     return {
         "episode": episode,
         "status": TrialStatus.ENDED if whole else TrialStatus.INTERRUPTED,

@@ -14,6 +14,7 @@ from django.db.models import Max
 from django.utils import timezone
 
 from evaweb.episodes.lines import text
+from evaweb.episodes.selectors import unrecorded_because
 from evaweb.episodes.services import publish_asked
 from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.roles import Role, require
@@ -326,6 +327,11 @@ def _check_scorable(trial: Trial, reason: str) -> None:
         raise Conflict(
             f"trial {trial.pk} was interrupted and has been repeated since: its repetition counts; "
             "score that one"
+        )
+    unrecorded = "" if trial.status == TrialStatus.SCORED else unrecorded_because(episode=trial.episode)
+    if unrecorded:
+        raise Conflict(
+            f"trial {trial.pk} cannot be scored: {unrecorded}; void it with a reason, and repeat it as a new attempt"
         )
 
 

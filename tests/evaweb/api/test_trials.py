@@ -28,7 +28,7 @@ def test_a_trial_is_prepared_scored_corrected_and_voided(rest, bench):
         1,
         "open bench bench-1",
     )
-    Trial.objects.update(status="ended", duration_s=12.5)
+    builders.over(Trial.objects.get())
     where = f"trials/{made['id']}"
     status, scored = rest.post(f"{where}/score", milestones=ticks(bench, True, True, True), note="clean")
     assert (status, scored["success"], scored["score"], scored["note"]) == (200, True, 1.0, "clean")
@@ -112,7 +112,7 @@ def test_a_running_trial_is_not_scored(rest, bench):
 )
 def test_scores_that_make_no_sense_are_refused(rest, body, status):
     _, made = prepare(rest)
-    Trial.objects.update(status="ended")
+    builders.over(Trial.objects.get())
     got, answer = rest.post(f"trials/{made['id']}/score", **body)
     assert got == status
     assert answer["error"]

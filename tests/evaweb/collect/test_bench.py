@@ -11,8 +11,12 @@ from django.contrib.auth.models import User
 from evaweb.collect import services
 from evaweb.collect.bench import session_command
 from evaweb.collect.models import CollectSession, Demonstration
+from evaweb.console.chronicle import events_written
+from evaweb.console.feed import History
+from evaweb.episodes.models import Episode
 from evaweb.errors import Conflict, EvaError
-from evaweb.stations.models import Command, CommandStatus
+from evaweb.stations.models import Command, CommandStatus, Station
+from runtime import messages
 from tests.evaweb.collect.conftest import SETUP, collecting
 from tests.evaweb.trials.builders import Wire
 
@@ -54,6 +58,28 @@ def test_a_refused_run_has_no_episode(session: CollectSession, at: Wire, ann: Us
     at.status_word, at.reason = "refused", "not armed"
     assert give(session, ann, "run").status == CommandStatus.REFUSED
     assert not Demonstration.objects.exists()
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_demonstration_whose_recording_could_not_be_opened_leaves_nothing_behind(
+    session: CollectSession, at: Wire, ann: User, late: bool
+) -> None:
+    def told(command: messages.Command) -> None:
+        never = {"command": command.uuid, "episode": str(at.episode), "unopened": True}
+        text = "running -> ready: no room"
+        data = {"state": "ready", "unbegun": never}
+        row = {"number": 1, "kind": "state", "text": text, "time": 1.0, "data": data}
+        events_written(station=Station.objects.get(), history=History("b", (row,)))
+
+    if late:  # the answer is heard after the event
+        answer = at.request
+        at.request = lambda command, **how: (told(command), answer(command, **how))[1]  # type: ignore[method-assign]
+    assert give(session, ann, "run").status == CommandStatus.ACCEPTED
+    if not late:
+        told(at.heard[-1])
+    assert not Demonstration.objects.exists()
+    assert not Episode.objects.exists()
+    assert Command.objects.get().unopened == "running -> ready: no room"
 
 
 def test_a_station_that_has_changed_is_not_run_and_the_differences_are_listed(

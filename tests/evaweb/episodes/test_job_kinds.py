@@ -18,6 +18,7 @@ from evaweb.episodes import services
 from evaweb.episodes.models import Episode
 from evaweb.jobs import services as jobs
 from evaweb.jobs.models import Job, JobStatus
+from evaweb.stations.models import Station
 from runtime.datasets.consistency import check
 from runtime.datasets.staging import FOLDER, Staging
 from tests.runtime.recording.samples import decoded, numbers, resealed, unsealed
@@ -178,6 +179,17 @@ def test_an_episode_without_rows_is_no_failure_and_in_no_dataset(closed: Closed,
     assert job.status == JobStatus.DONE
     assert job.result == {"published": False, "why": "it has no rows: its run ended before the first"}
     assert not (data / "datasets").exists()
+
+
+def test_an_episode_without_a_folder_is_not_published_and_that_is_no_failure(
+    data: Path, station: Station
+) -> None:
+    job = publish(Episode.objects.create(station=station, status="recording"))
+    assert job.status == JobStatus.DONE
+    assert job.result == {
+        "published": False,
+        "why": "there is no folder of it: nothing of its run is on this disk",
+    }
 
 
 def test_an_episode_that_is_still_being_written_is_tried_again(closed: Closed, data: Path) -> None:

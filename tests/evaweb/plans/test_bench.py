@@ -6,7 +6,6 @@ from evaweb.plans import pictures
 from evaweb.plans.models import Achieved, CameraCheck, Plan, Reference
 from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
 from evaweb.trials import services as trials
-from evaweb.trials.models import Trial
 from tests.evaweb.plans.lab import jpeg
 from tests.evaweb.trials import builders
 
@@ -92,8 +91,7 @@ def test_a_bench_that_does_not_match_needs_a_reason_and_both_pictures_are_kept(b
 def test_after_the_reveal_nothing_is_voided(bench, plan, owner, shown):
     looking.cameras_confirm(user=bench.operator, station=bench.station, first=True)
     trial = looking.next_trial(user=bench.operator, station=bench.station, plan=plan).trial
-    Trial.objects.filter(pk=trial.pk).update(status="ended")
-    trial.refresh_from_db()
+    builders.over(trial)
     trials.trial_score(user=bench.operator, trial=trial, milestones=bench.ticks(True, True, True))
     plan_close(user=owner, plan=plan, reason="enough")
     plan_reveal(user=owner, plan=plan)

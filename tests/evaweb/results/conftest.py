@@ -1,13 +1,12 @@
 import pytest
 
 from evaweb.episodes.folders import preview_folder
-from evaweb.episodes.models import Episode
 from evaweb.plans.handing import hand_out
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
 from evaweb.results import caching
 from evaweb.trials import services
-from evaweb.trials.models import Checkpoint, Trial
+from evaweb.trials.models import Checkpoint
 from tests.evaweb.trials import builders
 
 
@@ -50,7 +49,7 @@ def plan(bench, owner):
 def carry_out(bench):
     """Makes the next trials of a plan; the new checkpoint succeeds three times of four, the old one once of four."""
 
-    def carry(plan, n, recorded=True):
+    def carry(plan, n, pictures=True):
         for _ in range(n):
             trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
             new = trial.checkpoint.name == "pi0-new"
@@ -59,14 +58,10 @@ def carry_out(bench):
                 -5.0 - 0.1 * trial.number if trial.number > 1 else None
             )  # the first of each was not measured
             facts = {"smoothness": smooth, "smoothness_commanded": smooth and smooth + 0.5 * new}
-            row = {"station": bench.station, "status": "finished", "cameras": ["top"], **facts}
-            episode = Episode.objects.create(**row) if recorded else None
-            if episode:
-                preview_folder(episode.uuid).mkdir(parents=True)  # it can be watched
-            Trial.objects.filter(pk=trial.pk).update(
-                status="ended", duration_s=8.0 + trial.number + 0.25 * new, episode=episode
-            )
-            trial.refresh_from_db()
+            facts |= {"cameras": ["top"] if pictures else []}
+            builders.over(trial, 8.0 + trial.number + 0.25 * new, **facts)
+            if pictures:
+                preview_folder(trial.episode_id).mkdir(parents=True)  # it can be watched
             services.trial_score(
                 user=bench.operator,
                 trial=trial,

@@ -165,6 +165,7 @@ def test_what_has_no_pictures_is_passed_over_and_named(plan, carry_out, rater, b
     none = judging.to_rate(rater)
     assert (none.found, none.left, len(none.passed)) == (None, left, left)
     journal_folder(first.trial.episode_id).mkdir(parents=True)
+    Episode.objects.filter(pk=first.trial.episode_id).update(frames=0)
     assert judging.to_rate(rater).found is None  # it is empty
     Episode.objects.filter(pk=first.trial.episode_id).update(frames=100)  # its preview may come yet
     assert judging.to_rate(rater)[::2] == (first, ())

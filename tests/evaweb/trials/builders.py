@@ -6,9 +6,11 @@ import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
+from unittest.mock import patch
 
 from django.contrib.auth.models import Group, User
 
+from evaweb.episodes.models import Episode
 from evaweb.stations.models import Station
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene, Trial
@@ -39,6 +41,15 @@ def scene(name: str = "block-on-plate", required: bool = True) -> Scene:
     return made
 
 
+def over(trial: Trial, seconds: float | None = 12.5, **facts: Any) -> Trial:
+    """The trial as a run leaves it that was recorded; `facts` are those of its episode."""
+    row = {"station": trial.station, "status": "finished", "frames": 375, "duration_s": seconds, **facts}
+    episode = Episode.objects.create(**row)
+    Trial.objects.filter(pk=trial.pk).update(status="ended", duration_s=seconds, episode=episode)
+    trial.refresh_from_db()
+    return trial
+
+
 @dataclass
 class Bench:
     """A station, a scene, a checkpoint, an operator: what a trial is made of."""
@@ -66,16 +77,23 @@ class Bench:
 
     def ended(self, position: int = 1, seconds: float = 12.5, **given: Any) -> Trial:
         """A trial whose run is over, without a station."""
-        trial = self.prepare(position, **given)
-        Trial.objects.filter(pk=trial.pk).update(status="ended", duration_s=seconds)
-        trial.refresh_from_db()
-        return trial
+        return over(self.prepare(position, **given), seconds)
 
     def scored(self, success: bool = True, **given: Any) -> Trial:
         """A trial that has its score."""
         trial = self.ended(**given)
         ticks = self.ticks(True, success, success)
         services.trial_score(user=self.operator, trial=trial, milestones=ticks)
+        return trial
+
+    def unrecorded(self, success: bool = True, seconds: float = 12.5) -> Trial:
+        """A scored trial without a recording, as earlier versions took it."""
+        trial = self.prepare()
+        Trial.objects.filter(pk=trial.pk).update(status="ended", duration_s=seconds)
+        trial.refresh_from_db()
+        with patch.object(services, "unrecorded_because", return_value=""):
+            ticks = self.ticks(True, success, success)
+            services.trial_score(user=self.operator, trial=trial, milestones=ticks)
         return trial
 
     def event(self, kind: str, text: str = "", time: float = 0.0, **data: Any) -> Trial | None:

@@ -146,7 +146,8 @@ def test_a_restarted_station_interrupts_what_was_under_way(bench, running):
 
 
 def test_a_run_that_ended_while_the_web_was_away_has_ended(bench, running):
-    Episode.objects.filter(pk=running.episode_id).update(status=EpisodeStatus.FINISHED, duration_s=9.25)
+    whole = {"status": EpisodeStatus.FINISHED, "duration_s": 9.25, "frames": 278}
+    Episode.objects.filter(pk=running.episode_id).update(**whole)
     row = {"number": 0, "kind": "state", "text": "restarted -> idle", "time": None, "data": {"state": "idle"}}
     found = services.run_changed(station=bench.station, event=row, boot="boot-2")
     assert (found.status, found.duration_s) == ("ended", 9.25)
@@ -178,12 +179,29 @@ def test_a_recording_that_is_not_whole_makes_an_ended_trial_an_interrupted_one(b
 
 def test_a_trial_that_was_scored_before_its_recording_closed_stays_scored_and_is_published(bench, running):
     enter(bench, "ready", 110.0)
+    Episode.objects.filter(pk=running.episode_id).update(frames=300)
     ticks = bench.ticks(True, True, True)
     services.trial_score(user=bench.operator, trial=running, milestones=ticks)
     Job.objects.all().delete()
     found = bench.event("episode_closed", uuid=str(running.episode_id), status="failed", reason="disk full")
     assert found.status == "scored"
     assert Job.objects.filter(key=f"publish:{running.episode_id}").count() == 1
+
+
+@pytest.mark.parametrize("before", ["running", "ended"])
+def test_a_recording_without_a_row_is_of_no_attempt_that_counts(bench, running, before):
+    if before == "ended":
+        enter(bench, "ready", 100.02)
+    closed = {"uuid": str(running.episode_id), "status": "finished", "reason": "stopped", "rows": 0}
+    found = bench.event("episode_closed", **closed)
+    assert (found.status, found.reason) == ("interrupted", "nothing of it was recorded: stopped")
+    assert bench.prepare().attempt == 2
+
+
+def test_a_run_that_ended_before_it_began_is_interrupted_even_where_the_station_is_ready(bench, running):
+    never = {"command": str(running.run), "episode": str(running.episode_id), "unopened": False}
+    found = bench.event("state", "running -> ready: stopped", 100.1, state="ready", unbegun=never)
+    assert found.status == "interrupted"
 
 
 def test_the_truth_of_a_simulated_bench_is_kept_with_its_trial(bench, running):

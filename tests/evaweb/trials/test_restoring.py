@@ -177,7 +177,7 @@ def judged(lab):
     voided = lab.run()
     lab.score(voided, True, False, False)
     services.trial_void(user=lab.bench.operator, trial=voided, reason="a hand was in the picture")
-    lab.bench.scored(success=False)
+    lab.bench.unrecorded(success=False)
     lab.run(smoke=True)
     assert [trial.status for trial in trial_list().order_by("pk")] == [
         "scored",
@@ -215,6 +215,41 @@ def test_what_is_all_there_is_left_alone(judged):
     found = everything()
     assert reconcile().restored == 0
     assert everything() == found
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_score_that_an_earlier_version_took_for_a_run_that_never_began_is_named(lab, lost):
+    trial = lab.bench.prepare()
+    ghost = Episode.objects.create(station=lab.bench.station, status="recording")
+    Trial.objects.filter(pk=trial.pk).update(status="ended", duration_s=0.01, episode=ghost)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(services, "unrecorded_because", lambda episode: "")
+        lab.score(trial, True, True, True)
+    if lost:
+        lose(*RECORDS)
+    for _ in range(2):
+        (problem,) = reconcile().problems
+        assert problem.startswith(
+            f"trial {trial.pk} is scored and never ran, episode {ghost.pk} of its run has no"
+        )
+        assert problem.endswith(": void it with a reason")
+    trial = Trial.objects.get()
+    services.trial_void(user=lab.bench.operator, trial=trial, reason="it never ran")
+    assert reconcile().problems == ()
+
+
+def test_a_closed_recording_without_a_row_comes_back_as_an_attempt_that_does_not_count(lab):
+    trial = lab.bench.prepare()
+    lab.station.until(lambda: str(lab.station.state) == "idle", 30.0, "a state to set up from")
+    lab.give(trial, "setup")
+    lab.station.until(lambda: str(lab.station.state) == "ready", 60.0, "set-up")
+    lab.give(trial, "run")
+    lab.give(trial, "stop")
+    lab.station.go(5)
+    lab.listen()
+    lose(*RECORDS)
+    reconcile()
+    assert (Trial.objects.get().status, Trial.objects.get().episode.frames) == ("interrupted", 0)
 
 
 def test_scenes_checkpoints_and_people_that_are_gone_too_are_made_switched_off(judged):

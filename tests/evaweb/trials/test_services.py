@@ -7,12 +7,13 @@ from django.db import IntegrityError, connection, transaction
 from django.db.models import ProtectedError
 
 from evaweb.episodes import lines as disk
-from evaweb.episodes.services import episode_opened
+from evaweb.episodes.models import Episode
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
 from evaweb.trials import journal, services
 from evaweb.trials.lifecycle import MOVES, Move
 from evaweb.trials.models import Checkpoint, Evaluation, Milestone, Position, Score, Trial, TrialStatus
+from evaweb.trials.selectors import statistics
 from tests.evaweb.trials import builders
 
 
@@ -334,7 +335,7 @@ def test_what_has_not_ended_or_does_not_count_cannot_be_scored(bench, status):
 
 
 def test_an_interrupted_trial_can_be_scored_until_it_is_repeated(bench):
-    first = bench.prepare()
+    first = bench.ended()
     Trial.objects.filter(pk=first.pk).update(status="interrupted")
     assert score(bench, first, False, False, False, failure="collision").success is False
     second = bench.prepare()
@@ -346,10 +347,8 @@ def test_an_interrupted_trial_can_be_scored_until_it_is_repeated(bench):
 
 
 def test_every_score_is_a_line_on_the_disk_beside_its_row(bench):
-    uuid = uuid4()
     trial = bench.ended()
-    trial.episode = episode_opened(station=bench.station, uuid=uuid)
-    trial.save()
+    uuid = trial.episode_id
     note = "zuerst ⟂ daneben,\nthen “on it” — 好\t\u2028end"
     score(bench, trial, True, True, False, note=note, failure="slipped")
     score(bench, trial, True, True, True, reason="seen on the video")
@@ -366,10 +365,32 @@ def test_every_score_is_a_line_on_the_disk_beside_its_row(bench):
     assert [first["uuid"], second["uuid"]] == [str(row.uuid) for row in trial.scores.all()]
 
 
-def test_a_trial_without_an_episode_has_its_scores_under_its_own_name(bench):
+@pytest.mark.parametrize("status", ["ended", "interrupted"])
+@pytest.mark.parametrize(
+    ("episode", "why"),
+    [
+        (None, "nothing of its run was recorded"),
+        ({"status": "finished"}, "episode .* of its run has no rows"),
+        ({"status": "recording"}, "episode .* of its run has no folder: nothing of it is on this disk"),
+        ({"status": "missing"}, "episode .* of its run has no folder"),
+    ],
+)
+def test_what_left_no_recorded_row_is_never_scored_and_can_be_voided(bench, status, episode, why):
+    trial = bench.prepare()
+    found = Episode.objects.create(station=bench.station, **episode) if episode else None
+    Trial.objects.filter(pk=trial.pk).update(status=status, duration_s=0.01, episode=found)
+    with pytest.raises(Conflict, match=f"trial {trial.pk} cannot be scored: {why}.*; void it with a reason"):
+        score(bench, trial)
+    assert not journal.path_of(trial.episode_id or trial.uuid).exists()
+    assert [row.summary.success.n for row in statistics()] == [0]
+    assert services.trial_void(user=bench.operator, trial=trial, reason="it never ran").status == "voided"
+
+
+def test_a_correction_of_what_counted_already_needs_no_recording_any_more(bench):
     trial = bench.scored()
-    assert lines(trial.uuid)[0]["score"] == 1.0
-    assert Job.objects.count() == 0
+    Episode.objects.update(status="missing", frames=0)
+    trial.refresh_from_db()
+    assert score(bench, trial, False, False, False, reason="seen on a copy").success is False
 
 
 def test_a_line_that_was_torn_by_a_crash_stays_a_line_of_its_own():
@@ -396,10 +417,8 @@ def test_what_cannot_be_written_to_the_disk_is_no_score(bench, monkeypatch):
 
 
 def test_a_score_and_a_correction_ask_for_publication(bench):
-    uuid = uuid4()
     trial = bench.ended()
-    trial.episode = episode_opened(station=bench.station, uuid=uuid)
-    trial.save()
+    uuid = trial.episode_id
     score(bench, trial)
     job = Job.objects.get(key=f"publish:{uuid}")
     job.status = "done"
@@ -440,7 +459,7 @@ def test_void_is_not_fail_and_says_who_and_why(bench):
     assert (trial.status, trial.reason) == ("voided", "a hand was in the picture")
     assert trial.voided_by == bench.operator
     assert trial.scores.count() == 1
-    assert [line["kind"] for line in lines(trial.uuid)] == ["score", "void"]
+    assert [line["kind"] for line in lines(trial.episode_id)] == ["score", "void"]
 
 
 @pytest.mark.parametrize("reason", ["", "  \n"])
