@@ -213,7 +213,7 @@ class Collecting:
 
     def closed(self, message: EpisodeClosed) -> None:
         """An episode is on disk."""
-        if self._settings is None or message.uuid not in self._asked:
+        if self._settings is None or message.uuid not in self._asked or message.waits:
             return
         label = newest(self._data, message.uuid)
         self.last = {

@@ -38,6 +38,7 @@ from runtime.recorder import Closed, Grid, Recorder
 from runtime.recording.episode import EpisodeJournal
 from runtime.transports.base import Source
 from runtime.types import Observation
+from runtime.unclosed import Unclosed
 
 log = logging.getLogger(__name__)
 _REPORT_PERIOD = 0.2
@@ -65,6 +66,7 @@ class Media:
         self._intake = Intake(page, source, clock, self._say, recorder.see, preview)
         self._closer = closer
         self._on_disk = on_disk  # hears of every episode that was closed
+        self._unclosed = Unclosed(closer, clock.now)
         self._closing: Future[Closed] | None = None
         self._closing_uuid = ""
         self._waiting: BeginEpisode | None = None  # for the episode before it to be closed
@@ -173,18 +175,29 @@ class Media:
             self.collect()
         if self._closing is not None:
             log.error("episode %s was not closed within %g s", self._closing_uuid, seconds)
+        while (late := self._unclosed.finish(seconds)) is not None:
+            self._closed(late)
+        for uuid, why in self._unclosed.why.items():
+            log.error("episode %s has no outcome, the next start completes it: %s", uuid, why)
 
     def collect(self) -> None:
-        """Tell main of an episode that has been closed."""
+        """Tell main of episodes that have been closed, at last or at once."""
+        if (late := self._unclosed.look()) is not None:
+            self._closed(late)
         if self._closing is None or not self._closing.done():
             return
         closed, self._closing, self._closing_uuid = self._closing.result(), None, ""
-        self._tell(
-            EpisodeClosed(
-                closed.uuid, str(closed.path), closed.status, closed.reason, closed.rows, closed.error
-            )
-        )
-        self._on_disk(closed.path)
+        self._closed(closed)
+
+    def _closed(self, closed: Closed) -> None:
+        waits = closed.again is not None
+        path, told = str(closed.path), (closed.status, closed.reason, closed.rows, closed.error)
+        self._tell(EpisodeClosed(closed.uuid, path, *told, waits))
+        if waits:
+            log.error("episode %s waits for room on the disk: %s", closed.uuid, closed.error)
+            self._unclosed.add(closed)
+        else:
+            self._on_disk(closed.path)
 
     def _fail(self, error: RecordingError) -> None:
         log.error("recording failed: %s", error)
@@ -198,7 +211,7 @@ class Media:
         faults, rates = intake.faults(), intake.rates()
         recording = recorder.recording or self._closing_uuid  # until it is on disk
         rows, repeated = recorder.rows, recorder.repeated
-        told = (intake.truth, intake.drives, intake.cameras)
+        told = (intake.truth, intake.drives, intake.cameras, self._unclosed.why)
         self._tell(MediaReport(now, rates, faults, rows, recording, repeated, *told))
 
     def _say_truth(self, reached: Mapping[str, float]) -> None:

@@ -195,6 +195,7 @@ class EpisodeClosed:
     reason: str
     rows: int
     error: str = ""
+    waits: bool = False  # for room on the disk: told again when it is closed
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,6 +215,7 @@ class MediaReport:
     cameras: Mapping[str, Any] = field(
         default_factory=dict
     )  # of the deployment's own, as by Source.camera_health
+    unclosed: Mapping[str, str] = field(default_factory=dict)  # episodes that wait for room, and why
 
 
 # --- clients <-> runtime -----------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from runtime.errors import RecordingError
 from runtime.messages import ChunkMerged, Event, PolicyAnswer, TickDone, event_row
 from runtime.recorded_chunks import RecordedChunks
 from runtime.recording.base import VIDEO_LOST, ExecutedTick, Journal, Outcome, Row, Status
+from runtime.recording.files import UnclosedError
 from runtime.recording.schema import Schema
 from runtime.recording.settings import RecordingSettings
 from runtime.shown import Shown
@@ -47,6 +49,7 @@ class Closed:
     reason: str
     rows: int
     error: str = ""
+    again: Callable[[], Closed] | None = None  # where its end waits for room on the disk: tries once more
 
 
 class Recorder:
@@ -135,17 +138,26 @@ class Recorder:
         self._uuid = ""
         outcome = Outcome("failed" if error else status, error or reason, time.time(), details)
 
-        def close() -> Closed:
-            failure, told = error, list(lost)
+        told = list(lost)
+
+        def attempt(finish: Callable[[], None]) -> Closed:
+            failure, again = error, None
             try:
-                self._journal.end(outcome)
+                finish()
+            except UnclosedError as fault:
+                failure, again = str(fault), partial(attempt, fault.again)
             except RecordingError as fault:
                 failure = str(fault)
-            told += [loss.text for loss in self._journal.losses()]
             why = "; ".join(filter(None, (failure or reason, *told)))
-            return Closed(identity, path, "failed" if failure else status, why, rows, failure)
+            return Closed(identity, path, "failed" if failure else status, why, rows, failure, again)
 
-        return close
+        def end_journal() -> None:
+            try:
+                self._journal.end(outcome)
+            finally:
+                told.extend(loss.text for loss in self._journal.losses())
+
+        return partial(attempt, end_journal)
 
     def news(self) -> list[Event]:
         """What has happened to the open episode since the last call; it is in the episode already."""

@@ -278,7 +278,7 @@ class Runs:
             self.interrupt_alone(reason)
 
     def closed(self, message: EpisodeClosed) -> Event:
-        """An episode is on disk; the event that says so."""
+        """An episode is on disk, or waits for room there; the event that says so."""
         if self.open is not None and self.open.uuid == message.uuid:
             self.open.unrecorded = message.error or message.reason
         if self._alone == message.uuid:
@@ -290,8 +290,10 @@ class Runs:
             "reason": message.reason,
             "rows": message.rows,
             "error": message.error,
+            "waits": message.waits,
         }
-        text = f"episode {message.uuid} {message.status}, {message.rows} rows: {message.reason}"
+        how = "waits for room on the disk" if message.waits else message.status
+        text = f"episode {message.uuid} {how}, {message.rows} rows: {message.reason}"
         return Event("episode_closed", text, self._clock.now(), data=self.last_episode)
 
     def note(self, message: Message) -> None:

@@ -92,6 +92,7 @@ def snapshot(view: View) -> dict[str, Any]:
             "uuid": view.media.recording,
             "rows": view.media.rows,
             "repeated": view.media.repeated,
+            "unclosed": dict(view.media.unclosed),
         },
         "episode": view.runs.last_episode,
         "control": control_figures(view.page, view.plan.rate),

@@ -112,7 +112,8 @@ def stage_of(*, episode: Episode) -> Stage:
     if episode.status == EpisodeStatus.RECORDING:
         return Stage(
             "recording",
-            f"{episode.station} is still writing it. If the station was cut off meanwhile, it completes the "
+            episode.reason
+            or f"{episode.station} is still writing it. If the station was cut off meanwhile, it completes the "
             "episode when it starts again.",
         )
     if episode.status == EpisodeStatus.MISSING or not journal_folder(episode.uuid).is_dir():

@@ -61,12 +61,16 @@ def episode_opened(
 def episode_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
     """The station says that an episode is on disk: read it there, and ask for its preview.
 
-    `data` is that of the runtime's event: uuid, status, reason, rows, error. Where the folder is not on this
+    `data` is that of the runtime's event: uuid, status, reason, rows, error, waits. Where the folder is not on this
     machine, or damaged, the event's own words are kept. EvaError where it names no episode.
     """
     uuid = _uuid(data.get("uuid"))
     try:
-        return episode_read(uuid=uuid, station=station)
+        episode = episode_read(uuid=uuid, station=station)
+        if data.get("waits") and episode.status == EpisodeStatus.RECORDING:
+            episode.reason = f"its end waits for room on the disk: {data.get('reason')}"
+            episode.save(update_fields=["reason"])
+        return episode
     except RecordingError as error:
         log.warning("episode %s: %s", uuid, error)
         status, rows = data.get("status"), data.get("rows")

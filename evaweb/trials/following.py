@@ -195,7 +195,7 @@ def _episode_closed(station: Station, event: Mapping[str, Any]) -> Trial | None:
     """The recording is on disk: its duration is the exact one, and what is not whole is interrupted."""
     data = event.get("data") or {}
     trial = _held(station=station, episode_id=_uuid(data.get("uuid")))
-    if trial is None:
+    if trial is None or data.get("waits"):  # for room on the disk: it is told again when it is closed
         return None
     if data.get("rows") == 0 and lifecycle.allows(trial, Move.INTERRUPT):
         _moved(trial, Move.INTERRUPT, f"nothing of it was recorded: {data.get('reason')}", _time(event))

@@ -13,7 +13,7 @@ import av
 from runtime.errors import RecordingError
 from runtime.recording.backlog import Picture, PictureQueue, codings
 from runtime.recording.digests import rows_of_piece
-from runtime.recording.files import AppendFile
+from runtime.recording.files import AppendFile, DiskFullError
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.spread import Spread
 from runtime.recording.video import FragmentedVideo
@@ -32,7 +32,7 @@ class CameraEncoder:
         self.file = AppendFile(path, rows_of_piece(fps))
         self._fps = fps
         self._most_behind = max(2, round(settings.give_up_s * fps))  # frames
-        self._abandoned = False
+        self._abandoned = self._refused = self._all_coded = False
         self._captured: deque[float] = (
             deque()
         )  # of the frames in the encoder [s, monotonic]; NaN for a repeat
@@ -68,6 +68,7 @@ class CameraEncoder:
         nothing, and one that is too far behind fails.
         """
         if self.failure is not None:
+            self._refused = True
             return False
         taken = self._queue.put(picture, patience, captured)
         if not patience and not taken and (waiting := self._queue.waiting()) > self._most_behind:
@@ -84,6 +85,16 @@ class CameraEncoder:
         """Wait for the thread's end until `deadline` (time.monotonic); False where it is still at work."""
         self._thread.join(max(0.0, deadline - time.monotonic()))
         return not self._thread.is_alive()
+
+    def save(self) -> None:
+        """Write what a full disk did not take of an ended video; DiskFullError where it still does not.
+
+        Pictures that were dropped meanwhile are lost, and remain a failure.
+        """
+        if isinstance(self.failure, DiskFullError):
+            self._video.close()
+            if self._all_coded and not self._refused:
+                self.failure = None
 
     def abandon(self) -> None:
         """Give up on a thread that does not end; it writes no more than the frame it is at."""
@@ -105,8 +116,9 @@ class CameraEncoder:
     def _run(self) -> None:
         try:
             while (entry := self._queue.take()) is not None:
-                self._encode(entry)
+                self._keep(entry)
             if not self._abandoned:
+                self._all_coded = True
                 self._video.close()
         except RecordingError as error:
             self.failure = self.failure or type(error)(f"camera {self.camera}: {error}")
@@ -116,6 +128,13 @@ class CameraEncoder:
             self.failure = self.failure or failure
         finally:
             self._queue.close(discard=True)
+
+    def _keep(self, entry: Picture | int) -> None:
+        """Code it; what a full disk does not take stays in memory, for the next write or the end."""
+        try:
+            self._encode(entry)
+        except DiskFullError as error:
+            self.failure = self.failure or DiskFullError(f"camera {self.camera}: {error}")
 
     def _encode(self, entry: Picture | int) -> None:
         begun = time.monotonic()

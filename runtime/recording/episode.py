@@ -20,6 +20,7 @@ from runtime.recording.digests import FileDigest
 from runtime.recording.encoder import CameraEncoder
 from runtime.recording.files import (
     DiskFullError,
+    UnclosedError,
     disk_fault,
     document,
     require_room,
@@ -93,7 +94,8 @@ class EpisodeJournal(Journal):
         """Drain, close every file, and rename the outcome into place last.
 
         The figures found (frames, duration_s, ...) win over `outcome.details`. An error of a thread makes the
-        status "failed"; it is raised, after everything else was saved, unless `append` has told it already.
+        status "failed"; it is raised, after everything else was saved, unless `append` has told it already. Where the
+        disk has no room for the end UnclosedError is raised: nothing is lost, and it can be tried again meanwhile.
         """
         recording, self._recording = self._begun(), None
         try:
@@ -160,6 +162,7 @@ class _Recording:
         self._faults = Faults()
         self._lost: dict[str, Loss] = {}
         self._told = 0
+        self._ending = False
         self._encoders: dict[str, CameraEncoder] = {}
         with ExitStack() as undo:
             self._lock = _locked(folder)
@@ -220,22 +223,48 @@ class _Recording:
 
     def end(self, outcome: Outcome) -> None:
         deadline = time.monotonic() + self._settings.drain_timeout_s
+        self._ending = True
         stuck = self._drain(deadline)
         # Of its own, also where the encoders took all of theirs: without an outcome the episode waits for a repair.
         last = time.monotonic() + max(self._settings.drain_timeout_s, _LEAST_DISK_SECONDS)
-        if not self._writer.finish(last, leave=[encoder.file for encoder in stuck]):
+        ended = [encoder for encoder in self._encoders.values() if encoder not in stuck]
+        if not self._writer.finish(
+            last, leave=[encoder.file for encoder in stuck], others=[encoder.save for encoder in ended]
+        ):
             self._faults.report(
                 RecordingError(f"the disk did not take the end of episode {self.folder} in time")
             )
             self._faults.tell()
+        self._faults.forget_full()
+        self._conclude(outcome, stuck)
+
+    def _conclude(self, outcome: Outcome, stuck: Sequence[CameraEncoder]) -> None:
+        """Write the outcome; UnclosedError, with the folder still marked as being written, where there is no room."""
+        full: DiskFullError | None = self._writer.full
         try:
-            conclusion = sealed(self._conclusion(outcome), self._digests(stuck))
-            write_whole(self.folder / OUTCOME, conclusion)
+            if full is None:
+                self._look_at_losses()
+                conclusion = sealed(self._conclusion(outcome), self._digests(stuck))
+                write_whole(self.folder / OUTCOME, conclusion)
+        except DiskFullError as error:
+            full = error
         finally:
-            if not stuck:  # a stuck encoder may still write: the folder stays marked until our process ends
+            if full is None and not stuck:  # a stuck encoder may still write: marked until our process ends
                 os.close(self._lock)
+        if full is not None:
+            raise UnclosedError(str(full), lambda: self._conclude_again(outcome, stuck)) from full
         if not self._faults.told:
             self._faults.tell()
+
+    def _conclude_again(self, outcome: Outcome, stuck: Sequence[CameraEncoder]) -> None:
+        self._writer.save()
+        self._conclude(outcome, stuck)
+
+    def _look_at_losses(self) -> None:
+        """Pictures that a disk without room made an encoder drop are lost, also where there is room again."""
+        for encoder in self._encoders.values():
+            if isinstance(encoder.failure, DiskFullError):
+                self._faults.report(encoder.failure)
 
     def _drain(self, deadline: float) -> list[CameraEncoder]:
         """End all encoders; returns those that did not end in time."""
@@ -295,7 +324,8 @@ class _Recording:
         for camera, encoder in self._encoders.items():
             failure = encoder.failure
             if isinstance(failure, DiskFullError):
-                self._faults.report(failure)
+                if not self._ending:  # else what it holds is written with the rest
+                    self._faults.report(failure)
             elif failure is not None and camera not in self._lost:
                 loss = self._lost[camera] = Loss(camera, encoder.frames, str(failure))
                 event = {"camera": camera, "row": loss.row}

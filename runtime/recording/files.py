@@ -7,7 +7,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,14 @@ _OTHERS = {errno.EFBIG: "file too large"}
 
 class DiskFullError(RecordingError):
     """Nothing more can be written, to whichever file of an episode."""
+
+
+class UnclosedError(DiskFullError):
+    """The end of an episode found no room; `again` writes what is left of it, or raises this error anew."""
+
+    def __init__(self, why: str, again: Callable[[], None]) -> None:
+        super().__init__(why)
+        self.again = again
 
 
 class AppendFile:

@@ -152,6 +152,7 @@ class TableWriter:
         self._columns = COLUMNS[name]
         self._waiting: deque[Any] = deque()
         self._unwritten, self._unwritten_rows = b"", 0
+        self._ended = False
         self.file = AppendFile(folder / f"{name}.arrow")
         try:
             self.file.write(self._schema.serialize().to_pybytes())
@@ -180,10 +181,12 @@ class TableWriter:
             self._unwritten = b""
 
     def finish(self) -> None:
-        """Write what waits and the mark of the stream's end."""
+        """Write what waits and the mark of the stream's end; what failed is written by the next attempt."""
         while self._unwritten or self._waiting:
             self.flush()
-        self.file.write(END_OF_STREAM)
+        if not self._ended:
+            self.file.write(END_OF_STREAM)
+            self._ended = True
 
     def _batch(self, records: Sequence[Any]) -> Any:
         columns = self._columns(self._layout, records)

@@ -42,7 +42,7 @@ class FragmentedVideo:
         self._muxed = _Muxed()
         self._rate = Fraction(fps).limit_denominator(1001)
         self._size = size
-        self._key_next = False
+        self._key_next = self._ended = False
         self._picture = planes(np.zeros((*size, 3), dtype=np.uint8), size)
         options = {
             "movflags": _FRAGMENTS,
@@ -84,9 +84,11 @@ class FragmentedVideo:
         self._store()
 
     def close(self) -> None:
-        """End the file; the descriptor stays open."""
-        self._mux(self._stream.encode(None))
-        self._container.close()
+        """End the file, whose descriptor stays open; again, write what the file did not take of its end."""
+        if not self._ended:
+            self._mux(self._stream.encode(None))
+            self._container.close()
+            self._ended = True
         self._store()
 
     def _code(self, *, key: bool) -> list[Any]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from runtime.errors import RecordingError
 from runtime.recording.digests import FileDigest
-from runtime.recording.files import AppendFile, require_room, sync_folder
+from runtime.recording.files import AppendFile, DiskFullError, require_room, sync_folder
 from runtime.recording.layout import Layout
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.tables import SCHEMAS, TableWriter
@@ -33,6 +33,11 @@ class Faults:
             self.first = error
         elif error is not self.first:
             self.first.add_note(str(error))
+
+    def forget_full(self) -> None:
+        """A full disk that nobody was told of has cost nothing yet: what it did not take is still held."""
+        if isinstance(self.first, DiskFullError) and not self.told:
+            self.first = None
 
     def tell(self) -> None:
         """Raise what was reported, every time."""
@@ -60,6 +65,9 @@ class DiskWriter:
         self._lines: deque[bytes] = deque()
         self._unwritten_lines = b""
         self._left: Sequence[AppendFile] = ()
+        self._others: Sequence[Callable[[], None]] = ()
+        self._saved = False
+        self.full: DiskFullError | None = None  # why the end could not be written yet
         self._tables: dict[str, TableWriter] = {}
         with ExitStack() as undo:
             self._events = AppendFile(folder / "events.jsonl")
@@ -85,12 +93,18 @@ class DiskWriter:
         """Queue one line of events.jsonl."""
         self._lines.append(line + b"\n")
 
-    def finish(self, deadline: float, leave: Sequence[AppendFile] = ()) -> bool:
-        """Write and sync everything, end the streams, close the files but those in `leave`.
+    def finish(
+        self,
+        deadline: float,
+        leave: Sequence[AppendFile] = (),
+        others: Sequence[Callable[[], None]] = (),
+    ) -> bool:
+        """Write and sync everything, what `others` have too, end the streams, close the files but those in `leave`.
 
-        False where the disk has not done so by `deadline` (time.monotonic).
+        False where the disk has not done so by `deadline` (time.monotonic). Where it has no room `full` says so, the
+        files stay open, and `save` tries again.
         """
-        self._left = leave
+        self._left, self._others = leave, others
         self._closing.set()
         self._wake.set()
         self._thread.join(max(0.0, deadline - time.monotonic()))
@@ -118,7 +132,7 @@ class DiskWriter:
             self._wake.clear()
             if self._faults.first is None:
                 self._attempt(self._flush)
-        self._finish()
+        self.save()
 
     def _flush(self) -> None:
         self._write_lines()
@@ -127,15 +141,19 @@ class DiskWriter:
         self._sync()
         require_room(self._folder, self._settings.min_free_bytes)
 
-    def _finish(self) -> None:
+    def save(self) -> None:
         """Save what can be saved: one file that fails does not keep the others from being closed properly."""
-        self._attempt(self._write_lines)
-        for table in self._tables.values():
-            self._attempt(table.finish)
-        for file in self._files:
-            self._attempt(file.sync)
-            if file not in self._left:
-                self._attempt(file.close)
+        if self._saved:
+            return
+        self.full = None
+        tables, syncs = [table.finish for table in self._tables.values()], [file.sync for file in self._files]
+        for work in (*self._others, self._write_lines, *tables, *syncs):
+            self._attempt(work, last=True)
+        if self.full is None:
+            self._saved = True
+            for file in self._files:
+                if file not in self._left:
+                    self._attempt(file.close)
 
     def _sync(self) -> None:
         for file in self._files:
@@ -148,10 +166,14 @@ class DiskWriter:
             self._events.write(self._unwritten_lines, self._unwritten_lines.count(b"\n"))
             self._unwritten_lines = b""
 
-    def _attempt(self, work: Callable[[], None]) -> None:
+    def _attempt(self, work: Callable[[], None], last: bool = False) -> None:
+        """Report what goes wrong; at the last a disk without room is no loss yet."""
         try:
             work()
         except RecordingError as error:
-            self._faults.report(error)
+            if last and isinstance(error, DiskFullError):
+                self.full = self.full or error
+            else:
+                self._faults.report(error)
         except Exception as error:  # a record that no column takes, a descriptor that is gone: say so, go on
             self._faults.report(RecordingError(f"episode {self._folder}: {error!r}"))

@@ -71,6 +71,7 @@ def report(status: Mapping[str, Any], me: str) -> list[str]:
         ("first", away(status["first_action"], "the policy's first action")),
         ("chunk", away(status["proposal"], "the chunk that is shown")),
         ("recording", status["recording"]["uuid"] or "none"),
+        *(("unclosed", f"{uuid}: {why}") for uuid, why in status["recording"].get("unclosed", {}).items()),
         ("allowed", ", ".join(status["allowed"])),
     ]
     return [line(status), *(f"  {name:<9} {text}" for name, text in rows if text)]

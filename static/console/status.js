@@ -83,8 +83,10 @@ function drawFigures(store, snapshot) {
     element.title = TITLES[store.lease] ?? `${held} commands this station`;
   }
   drawStage(snapshot);
-  const { uuid, rows, repeated } = snapshot.recording;
-  write("recording", uuid ? `recording ${rows} rows, ${repeated} with a repeated picture` : "not recording");
+  const { uuid, rows, repeated, unclosed } = snapshot.recording;
+  const waiting = Object.values(unclosed ?? {});
+  const waits = waiting.length ? `; ${waiting.length} not closed yet: ${waiting[0]}` : "";
+  write("recording", (uuid ? `recording ${rows} rows, ${repeated} with a repeated picture` : "not recording") + waits);
 }
 
 /** How far the set-up is, or what an idle station waits for: the reason why a set-up failed among it. */

@@ -30,6 +30,8 @@ from runtime.messages import (
 )
 from runtime.page import Page, PageLayout
 from runtime.recorder import Grid, Recorder
+from runtime.recording.base import Outcome
+from runtime.recording.files import UnclosedError
 from runtime.recording.repair import Report
 from runtime.transports.base import Source
 from runtime.types import Observation
@@ -413,6 +415,88 @@ def test_a_run_is_refused_where_the_disk_takes_its_time(slow: Desk, disk: SlowDi
     slow.media.digest()
     slow.begin(run=3, uuid="three")
     assert slow.told(EpisodeOpened)[-1].uuid == "three"
+
+
+class FullDisk:
+    """Takes the end of an episode when the test gives it room."""
+
+    def __init__(self, desk: Desk) -> None:
+        self.room, self.tries, self._end = False, 0, desk.journal.end
+        desk.journal.end = self.end  # type: ignore[method-assign]
+
+    def end(self, outcome: Outcome) -> None:
+        self.tries += 1
+        if not self.room:
+            raise UnclosedError("disk full while writing it", lambda: self.end(outcome))
+        self._end(outcome)
+
+
+def unclosed(desk: Desk) -> FullDisk:
+    """An episode has ended and found no room."""
+    full = FullDisk(desk)
+    desk.receive(1)
+    desk.begin()
+    desk.tick(0, 1)
+    desk.post(EndEpisode("finished", "over"))
+    desk.media.pump(0.0)
+    return full
+
+
+def test_the_end_of_an_episode_that_found_no_room_is_tried_again_and_told_twice(desk: Desk) -> None:
+    full = unclosed(desk)
+    (waits,) = desk.told(EpisodeClosed)
+    assert (waits.waits, waits.status, waits.error) == (True, "failed", "disk full while writing it")
+    assert desk.on_disk == []
+    times = []
+    for _ in range(700):
+        desk.clock.advance(0.1)
+        before = full.tries
+        desk.media.digest()
+        times += [round(desk.clock.now(), 1)] if full.tries > before else []
+    assert desk.told(MediaReport)[-1].unclosed == {"one": "disk full while writing it"}
+    gaps = np.diff(times).round(1).tolist()
+    assert gaps == pytest.approx([2.0, 4.0, 8.0, 16.0, 30.0], abs=0.11)
+    full.room = True
+    desk.clock.advance(30.0)
+    desk.media.digest()
+    (closed,) = desk.told(EpisodeClosed)
+    assert (closed.uuid, closed.waits, closed.status, closed.reason, closed.rows) == (
+        "one",
+        False,
+        "finished",
+        "over",
+        1,
+    )
+    assert desk.on_disk == [Path("/episodes/one")]
+    desk.clock.advance(30.0)
+    desk.media.digest()
+    assert desk.told(MediaReport)[-1].unclosed == {}
+
+
+def test_an_episode_that_waits_for_room_is_in_no_other_ones_way(desk: Desk) -> None:
+    full = unclosed(desk)
+    desk.begin(run=2, uuid="two")
+    assert desk.told(EpisodeOpened)[-1].uuid == "two"
+    full.room = True
+    desk.clock.advance(1.5)
+    desk.media.digest()
+    assert desk.media.recording
+    assert desk.told(EpisodeClosed)[-1].uuid == "one"
+
+
+@pytest.mark.parametrize("room", [True, False])
+def test_at_the_end_of_the_process_what_waits_is_tried_once_more(
+    desk: Desk, room: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    full = unclosed(desk)
+    full.room = room
+    tries = full.tries
+    desk.media.finish(1.0)
+    assert full.tries == tries + 1
+    assert (desk.told(EpisodeClosed)[-1].waits, "the next start completes it" in caplog.text) == (
+        not room,
+        not room,
+    )
 
 
 def test_a_run_that_is_not_recorded_waits_for_no_disk_longer_than_that(slow: Desk) -> None:

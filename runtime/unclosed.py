@@ -1,0 +1,61 @@
+"""Episodes whose end found no room on the disk: tried again while the station lives, until there is some."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+
+from runtime.back_off import BackOff
+from runtime.closing import Close
+from runtime.recorder import Closed
+
+_FIRST_S, _MOST_S = 1.0, 30.0  # between two attempts, doubled each time
+
+
+class Unclosed:
+    """The oldest is tried first; a disk that takes its end takes the next one at once."""
+
+    def __init__(self, closer: Callable[[Close], Future[Closed]], now: Callable[[], float]) -> None:
+        self._closer = closer
+        self._now = now
+        self._episodes: deque[Closed] = deque()
+        self._attempt: Future[Closed] | None = None
+        self._back_off = BackOff(_FIRST_S, _MOST_S)
+
+    @property
+    def why(self) -> dict[str, str]:
+        """What each of them waits for, by uuid."""
+        return {episode.uuid: episode.error for episode in self._episodes}
+
+    def add(self, episode: Closed) -> None:
+        """One that has `again`."""
+        if not self._episodes:
+            self._back_off.failed(self._now())
+        self._episodes.append(episode)
+
+    def look(self) -> Closed | None:
+        """One that is closed now, None where none is; begins an attempt where one is due. Never waits for the disk."""
+        if self._attempt is None and self._episodes and not self._back_off.waiting(self._now()):
+            again = self._episodes[0].again
+            assert again is not None
+            self._attempt = self._closer(again)
+        if self._attempt is None or not self._attempt.done():
+            return None
+        closed, self._attempt = self._attempt.result(), None
+        if closed.again is None:
+            self._episodes.popleft()
+            self._back_off.forget()
+            return closed
+        self._episodes[0] = closed
+        self._back_off.failed(self._now())
+        return None
+
+    def finish(self, seconds: float) -> Closed | None:
+        """Try once more, and wait at most so long; the same as `look`. What is left then, repair completes."""
+        self._back_off.forget()
+        closed = self.look()
+        if closed is None and self._attempt is not None:
+            wait([self._attempt], seconds)
+            closed = self.look()
+        return closed
