@@ -118,7 +118,7 @@ class RecordingChoice(RecordingSettings):
     """Recording of every run."""
 
     enabled: bool = True
-    """Whether runs are recorded; one that is not leaves nothing behind."""
+    """Whether runs are recorded; one that is not leaves nothing behind, and a trial is refused."""
     fps: float | None = Field(default=None, gt=0)
     """Rows per second of the dataset grid; the control rate where it is not given."""
     kind: Literal["rollout", "demonstration"] = "rollout"
@@ -126,7 +126,8 @@ class RecordingChoice(RecordingSettings):
     export: bool = True
     """Whether the streams of every run are exported as one table when it is closed."""
     on_failure: Literal["hold", "continue"] = "hold"
-    """What a run does when its recording fails: an unrecorded run is no evidence."""
+    """What a run does when its recording fails: an unrecorded run is no evidence. Trials and demonstrations never begin
+    without."""
 
 
 class PublishSettings(Section):

@@ -230,6 +230,15 @@ def test_a_full_disk_ends_the_recording_with_a_sentence_and_holds_the_robot(smal
     assert episode.frames > 15
     lab.client.command("stop")
     lab.reach("ready")
+    status = lab.client.wait(lambda s: s["recording"]["unclosed"], 15)
+    assert "disk full while writing" in status["recording"]["unclosed"][episode.path.name]
+    assert not (episode.path / "outcome.json").exists()
+    subprocess.run(["mount", "-o", "remount,size=8m", str(lab.data / "episodes")], check=True)
+    lab.client.wait(lambda s: not s["recording"]["unclosed"], 60)
+    whole = open_episode(episode.path)
+    assert whole.outcome["status"] == "failed"
+    assert whole.frames >= episode.frames
+    assert lab.pids()["media"] == media
 
 
 def test_a_file_that_may_not_grow_ends_the_recording_and_holds_the_robot(lab):

@@ -1,4 +1,4 @@
-"""Whatever dies, is pressed or cannot be written, in whatever order: what main thinks is recorded is what media records."""
+"""Whatever dies, is pressed or cannot be written, in any order: what main takes for recorded is what media records."""
 
 from __future__ import annotations
 

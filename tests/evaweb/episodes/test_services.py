@@ -13,6 +13,7 @@ from django.utils import timezone
 
 from evaweb.episodes import services
 from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.selectors import stage_of
 from evaweb.errors import EvaError
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Station
@@ -49,6 +50,24 @@ def test_closing_reads_the_folder_and_asks_for_one_preview(
     assert episode.duration_s == pytest.approx(18 / 30, abs=3 / 30)
     assert episode.checkpoint == "good", "what the folder does not know stays"
     assert [job.key for job in Job.objects.all()] == [f"preview:{folder.name}"]
+
+
+def test_an_episode_that_waits_for_room_says_so_until_it_is_closed(
+    put: Callable[..., Path], station: Station
+) -> None:
+    folder = put()
+    (folder / "outcome.json").rename(folder / "aside")
+    told = {"uuid": folder.name, "status": "failed", "reason": "disk full while writing it", "waits": True}
+    waits = services.episode_closed(station=station, data=told)
+    sentence = "its end waits for room on the disk: disk full while writing it"
+    assert (waits.status, waits.reason, stage_of(episode=waits).sentence) == (
+        EpisodeStatus.RECORDING,
+        sentence,
+        sentence,
+    )
+    (folder / "aside").rename(folder / "outcome.json")
+    closed = services.episode_closed(station=station, data=told | {"status": "finished", "waits": False})
+    assert (closed.status, closed.reason) == (EpisodeStatus.FINISHED, "stopped by the operator")
 
 
 def test_an_episode_that_opens_after_it_was_closed_stays_closed(

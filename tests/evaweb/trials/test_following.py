@@ -188,6 +188,16 @@ def test_a_trial_that_was_scored_before_its_recording_closed_stays_scored_and_is
     assert Job.objects.filter(key=f"publish:{running.episode_id}").count() == 1
 
 
+def test_a_recording_that_waits_for_room_ends_nothing_until_it_is_closed(bench, running):
+    enter(bench, "ready", 110.0)
+    told = {"uuid": str(running.episode_id), "rows": 300}
+    assert bench.event("episode_closed", status="failed", reason="disk full", waits=True, **told) is None
+    running.refresh_from_db()
+    assert running.status == "ended"
+    found = bench.event("episode_closed", status="finished", reason="stopped", waits=False, **told)
+    assert (found.status, found.ended_at) == ("ended", running.ended_at)
+
+
 @pytest.mark.parametrize("before", ["running", "ended"])
 def test_a_recording_without_a_row_is_of_no_attempt_that_counts(bench, running, before):
     if before == "ended":
