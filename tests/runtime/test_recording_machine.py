@@ -11,6 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from runtime.messages import Ack
 from runtime.recording.reader import open_episode
+from runtime.run import Run
 from runtime.transitions import State
 from tests.runtime.station import Station, plan
 
@@ -24,20 +25,26 @@ class Recorded(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.folder = tempfile.TemporaryDirectory()
-        self.asked: dict[str, bool] = {}  # episodes of accepted runs, and whether each was ever seen to run
+        self.asked: dict[
+            str, bool
+        ] = {}  # episodes of accepted runs, and whether control was ever told to follow each
 
     @initialize(on_failure=st.sampled_from(["hold", "continue"]))
     def begin(self, on_failure: str) -> None:
         self.episodes = Path(self.folder.name) / "episodes"
         self.station = Station(plan(Path(self.folder.name), recording={"on_failure": on_failure}))
+        runs = self.station.main.runs
+        follow = runs._follow
+
+        def followed(run: Run, fresh: bool) -> None:
+            self.asked[run.uuid] = True
+            follow(run, fresh)
+
+        runs._follow = followed  # type: ignore[method-assign]
         self.go(3)
 
     def go(self, count: int) -> None:
-        for _ in range(count):
-            self.station.go(1)
-            run = self.station.main.run
-            if run is not None and run.begun is not None:
-                self.asked[run.uuid] = True
+        self.station.go(count)
 
     @property
     def broken(self) -> bool:
@@ -53,7 +60,7 @@ class Recorded(RuleBasedStateMachine):
             self.station.prepare()
         ack = self.give("run", **({"trial": {"id": 1}} if trial else {}))
         if ack.status == "accepted":
-            self.asked[ack.data["episode"]] = False
+            self.asked.setdefault(ack.data["episode"], False)
         self.go(wait)
 
     @rule(kind=st.sampled_from(["stop", "halt", "resume", "record_start", "record_stop"]), wait=ticks)
@@ -137,7 +144,7 @@ class Recorded(RuleBasedStateMachine):
 
 TestRecorded = Recorded.TestCase
 TestRecorded.settings = settings(
-    max_examples=25,
+    max_examples=20,
     stateful_step_count=20,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
