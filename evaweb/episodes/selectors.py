@@ -138,7 +138,8 @@ def unrecorded_because(*, episode: Episode | None) -> str:
     folder = journal_folder(episode.uuid)
     if not folder.is_dir():
         return f"episode {episode.uuid} of its run has no folder: nothing of it is on this disk"
-    return "" if _rows_written(folder) else f"no row of episode {episode.uuid} is on the disk yet"
+    later = "look again once it is closed"
+    return "" if _rows_written(folder) else f"no row of episode {episode.uuid} is on the disk yet: {later}"
 
 
 def _rows_written(folder: Path) -> int:

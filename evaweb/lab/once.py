@@ -147,7 +147,7 @@ def run_to_its_end(page: LivePage, trial: int, limit: float, lockstep: bool = Fa
 
 
 def score_by_truth(visitor: Visitor, trial: int) -> Mapping[str, Any]:
-    """Tick what the bench says was reached, and when, once the trial waits to be scored and its truth is there."""
+    """Tick what the bench says was reached, and when, once truth and recording of the trial are there."""
     facts = until(
         lambda: visitor.get(f"trials/{trial}"),
         lambda found: found["status"] in ("ended", "interrupted") and found["truth"] is not None,
@@ -161,6 +161,7 @@ def score_by_truth(visitor: Visitor, trial: int) -> Mapping[str, Any]:
         for milestone in milestones
         if reached[str(milestone["id"])]
     }
+    recorded(visitor, trial)
     words = {"note": "scored from the bench's truth", "source": "truth"}
     content = {"milestones": reached, "times": when, "uuid": str(uuid4()), **words}
     scored: Mapping[str, Any] = until(

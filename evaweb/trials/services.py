@@ -331,7 +331,8 @@ def _check_scorable(trial: Trial, reason: str) -> None:
     unrecorded = "" if trial.status == TrialStatus.SCORED else unrecorded_because(episode=trial.episode)
     if unrecorded:
         raise Conflict(
-            f"trial {trial.pk} cannot be scored: {unrecorded}; void it with a reason, and repeat it as a new attempt"
+            f"trial {trial.pk} cannot be scored: {unrecorded}; what never ran is voided with a reason and repeated as "
+            "a new attempt"
         )
 
 

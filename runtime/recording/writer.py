@@ -160,9 +160,9 @@ class DiskWriter:
             file.sync()
 
     def _write_lines(self) -> None:
-        if not self._unwritten_lines:
-            self._unwritten_lines = b"".join(self._lines.popleft() for _ in range(len(self._lines)))
-        if self._unwritten_lines:
+        while self._unwritten_lines or self._lines:  # what was refused before, then what came since
+            if not self._unwritten_lines:
+                self._unwritten_lines = b"".join(self._lines.popleft() for _ in range(len(self._lines)))
             self._events.write(self._unwritten_lines, self._unwritten_lines.count(b"\n"))
             self._unwritten_lines = b""
 

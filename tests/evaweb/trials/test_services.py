@@ -8,13 +8,18 @@ from django.db.models import ProtectedError
 
 from evaweb.episodes import lines as disk
 from evaweb.episodes.models import Episode
+from evaweb.episodes.selectors import unrecorded_because
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
 from evaweb.trials import journal, services
 from evaweb.trials.lifecycle import MOVES, Move
 from evaweb.trials.models import Checkpoint, Evaluation, Milestone, Position, Score, Trial, TrialStatus
 from evaweb.trials.selectors import statistics
+from runtime.recording.base import Outcome
 from tests.evaweb.trials import builders
+from tests.processes import eventually
+from tests.runtime.recording.samples import row
+from tests.runtime.recording.test_episode import begun
 
 
 def lines(uuid):
@@ -379,11 +384,26 @@ def test_what_left_no_recorded_row_is_never_scored_and_can_be_voided(bench, stat
     trial = bench.prepare()
     found = Episode.objects.create(station=bench.station, **episode) if episode else None
     Trial.objects.filter(pk=trial.pk).update(status=status, duration_s=0.01, episode=found)
-    with pytest.raises(Conflict, match=f"trial {trial.pk} cannot be scored: {why}.*; void it with a reason"):
+    with pytest.raises(
+        Conflict, match=f"trial {trial.pk} cannot be scored: {why}.*; what never ran is voided"
+    ):
         score(bench, trial)
     assert not journal.path_of(trial.episode_id or trial.uuid).exists()
     assert [row.summary.success.n for row in statistics()] == [0]
     assert services.trial_void(user=bench.operator, trial=trial, reason="it never ran").status == "voided"
+
+
+def test_what_is_still_being_closed_is_scored_as_soon_as_a_row_of_it_is_on_the_disk(bench, tmp_path):
+    journal_of, folder = begun(tmp_path / "episodes")
+    trial = builders.over(bench.prepare(), uuid=folder.name, status="recording", frames=0)
+    with pytest.raises(
+        Conflict, match=r"no row of episode .* is on the disk yet: look again once it is closed"
+    ):
+        score(bench, trial)
+    journal_of.append(row(0))
+    eventually(lambda: not unrecorded_because(episode=trial.episode), 10, "a row on the disk")
+    assert score(bench, trial).success is True
+    journal_of.end(Outcome("finished", "stopped", 1.7e9))
 
 
 def test_a_correction_of_what_counted_already_needs_no_recording_any_more(bench):

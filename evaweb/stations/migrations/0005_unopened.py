@@ -5,7 +5,7 @@ from django.db import migrations, models
 
 class Migration(migrations.Migration):
     dependencies = [
-        ("stations", "0003_collect"),
+        ("stations", "0004_issued_when_given"),
     ]
 
     operations = [
