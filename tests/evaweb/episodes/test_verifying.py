@@ -139,7 +139,7 @@ def test_a_publication_finds_the_damage_itself_and_keeps_it(old: Episode, data: 
         job = services.publish_asked(episode=old)
         jobs.work("lab")
         job.refresh_from_db()
-    assert (job.status, job.attempts, job.result["published"]) == (JobStatus.DONE, 1, False)
+    assert (job.status, job.attempts, job.result["published"]) == (JobStatus.DONE, 0, False)
     assert f"is damaged: {name} is " in job.result["why"]
     old.refresh_from_db()
     assert ([damage["file"] for damage in old.damage], old.dataset_index) == ([name], None)
