@@ -1,8 +1,9 @@
 """What it takes to record, and what a kill takes: a station's recorder, LeRobot's beside it, kill -9, a long list.
 
-One station records three cameras of 640x480 at 30 Hz, ends and publishes. Then the recorder alone and LeRobot's own
-writer are given the same frames at the same pace, if an interpreter with LeRobot is there: this one, or one that
-EVA_LEROBOT_PYTHONS names. Then processes are killed at random moments, and the page of 10,000 episodes is asked for.
+One station records three cameras of 640x480 at 30 Hz, ends and publishes; others record beside busy loops. Then the
+recorder alone and LeRobot's own writer are given the same frames at the same pace, if an interpreter with LeRobot is
+there: this one, or one that EVA_LEROBOT_PYTHONS names. Then processes are killed at random moments, and the page of
+10,000 episodes is asked for.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from benchmarks import recording_frames, recording_station
+from benchmarks import recording_busy, recording_frames, recording_station
 from benchmarks.busy_lab import PATIENT
 from benchmarks.labs import ROOT
 from benchmarks.recording_kills import Many, food, kill_recording, kill_worker
@@ -27,6 +28,7 @@ from benchmarks.report import Figure, Report
 
 SECONDS = 60.0
 _LONG_S = 600.0
+_LONG_BUSY_S = 300.0
 _KILLED_S = (
     200.0,
     60.0,
@@ -37,7 +39,7 @@ _MODES = ("default", "streaming")
 
 
 def measure(seconds: float, long: bool = False) -> Report:
-    """`frames_lost`, `memory_growth_mb`, `cpu_core_percent`, `stop_to_saved_s`, `kill9_worst_loss_s`, `list_10000_ms`.
+    """`frames_lost`, `intake_age_p99_ms`, `memory_growth_mb`, `cpu_core_percent`, `kill9_worst_loss_s` and others.
 
     And what they were made of; `load_1min` is of the machine at the end, each part's own stands in its row.
     """
@@ -45,15 +47,17 @@ def measure(seconds: float, long: bool = False) -> Report:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         station = _timed(recording_station.record, _made(folder / "station"), _LONG_S if long else seconds)
+        busy = _timed(recording_busy.record, _made(folder / "busy"), _LONG_BUSY_S if long else seconds)
         frames = recording_frames.write(folder / "frames.npy")
         beside = _timed(_beside, folder, frames)
         kills = _timed(_kills, folder, frames, long, seed)
         listing = _timed(_listing, _made(folder / "listing"))
     return Report(
         "recording",
-        figures(station, beside, kills, listing),
+        figures(station, busy, beside, kills, listing),
         [
             {"part": "station", **station},
+            {"part": "busy", **busy},
             {"part": "beside", **beside},
             {"part": "kills", "seed": seed, **kills},
             {"part": "listing", **listing},
@@ -63,17 +67,26 @@ def measure(seconds: float, long: bool = False) -> Report:
 
 def figures(
     station: Mapping[str, Any],
+    busy: Mapping[str, Any],
     beside: Mapping[str, Any],
     kills: Mapping[str, Any],
     listing: Mapping[str, Any],
 ) -> list[Figure]:
-    """What is wanted of the four parts, and what is only told."""
+    """What is wanted of the five parts, and what is only told."""
     memory, disk = station["memory_mb"], station["to_disk_ms"]
     rows: Sequence[Mapping[str, Any]] = kills["rows"]
     return [
         Figure("frames_lost", station["frames_lost"], "", "== 0"),
         Figure("cpu_core_percent", station["cpu_core_percent"], "%", "<= 50"),
+        Figure("cpu_core_percent.reception", station["cpu_core_percent_reception"], "%"),
         Figure("cpu_core_percent.not_recording", station["cpu_core_percent_not_recording"], "%"),
+        *(
+            Figure(f"intake_age_p99_ms.{row['case']}", row["age_ms"]["p99"], "ms", "<= 60")
+            for row in busy["rows"]
+        ),
+        *(Figure(f"holds.{row['case']}", len(row["holds"]), "", "== 0") for row in busy["rows"]),
+        *(Figure(f"pictures_lost.{row['case']}", row["lost"], "") for row in busy["rows"]),
+        Figure("pictures_lost_silently", sum(row["silent"] for row in busy["rows"]), "", "== 0"),
         Figure("memory_growth_mb", memory["peak"] - memory["start"], "MB", "<= 50"),
         *(Figure(f"memory_{when}_mb", memory[when], "MB") for when in ("before", "start", "end", "peak")),
         *(Figure(f"capture_to_disk_{q}_ms", value, "ms") for q, value in disk.items()),

@@ -1,4 +1,4 @@
-"""One recording of a whole station: what media takes, how soon frames are on disk, how it ends and is published."""
+"""One recording of a whole station: what it takes, how soon frames are on disk, how it ends and is published."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ class PatientLab(Lab):
 
 
 class Watch:
-    """Looks at media and at the videos of an episode from outside, on a thread, until `end`."""
+    """Looks at both processes and at the videos of an episode from outside, on a thread, until `end`."""
 
-    def __init__(self, media: psutil.Process, folder: Path) -> None:
-        self._media = media
+    def __init__(self, media: psutil.Process, reception: psutil.Process, folder: Path) -> None:
+        self._media, self._reception = media, reception
         self._folder = folder
         self._ending = threading.Event()
-        self.memory: list[float] = []  # resident [MB], every half second from when it has settled
-        self.processor = 0.0  # [s], from then on
+        self.memory: list[float] = []  # of media, resident [MB], every half second from when it has settled
+        self.processor = self.receiving = 0.0  # of media, and of reception [s], from then on
         self.seconds = 0.0
         self.sizes: dict[str, list[tuple[float, int]]] = {}  # (monotonic, bytes) whenever a video has grown
         self._thread = threading.Thread(target=self._run)
@@ -68,14 +68,15 @@ class Watch:
         settled = time.monotonic() + _SETTLED_S
         while not self._ending.wait(_SIZES_PERIOD_S) and time.monotonic() < settled:
             self._look()
-        begun, before = time.monotonic(), _used(self._media)
+        begun, before, received = time.monotonic(), _used(self._media), _used(self._reception)
         next_memory = begun
         while not self._ending.wait(_SIZES_PERIOD_S):
             self._look()
             if time.monotonic() >= next_memory:
                 next_memory += _MEMORY_PERIOD_S
                 self.memory.append(resident_mb(self._media))
-        self.processor, self.seconds = _used(self._media) - before, time.monotonic() - begun
+        self.processor, self.receiving = _used(self._media) - before, _used(self._reception) - received
+        self.seconds = time.monotonic() - begun
 
     def _look(self) -> None:
         for video in self._folder.glob("*.mp4"):
@@ -101,16 +102,16 @@ def record(folder: Path, seconds: float) -> dict[str, Any]:
     try:
         lab.node(*SIZE).server()
         lab.up(*PATIENT, f"run.duration_s={seconds + 600}", "bus.preview_rate=15")
-        media = psutil.Process(lab.pids()["media"])
+        media, reception = (psutil.Process(lab.pids()[name]) for name in ("media", "reception"))
         lab.ready()
-        before = resident_mb(media), _used(media), time.monotonic()
+        before = resident_mb(media), _used(media) + _used(reception), time.monotonic()
         time.sleep(_SETTLED_S)
-        idle = (_used(media) - before[1]) / (time.monotonic() - before[2]) * 100.0
+        idle = (_used(media) + _used(reception) - before[1]) / (time.monotonic() - before[2]) * 100.0
         missed = _missed(lab)
         lab.client.command("run")
         uuid = lab.client.wait(lambda status: status["recording"]["uuid"], lab.patience)["recording"]["uuid"]
         episode = lab.data / "episodes" / uuid
-        watch = Watch(media, episode)
+        watch = Watch(media, reception, episode)
         time.sleep(seconds)
         stopped = time.monotonic()
         lab.client.command("stop")
@@ -126,7 +127,8 @@ def record(folder: Path, seconds: float) -> dict[str, Any]:
     found = open_episode(episode)
     return {
         "seconds": seconds,
-        "cpu_core_percent": watch.processor / watch.seconds * 100.0,
+        "cpu_core_percent": (watch.processor + watch.receiving) / watch.seconds * 100.0,
+        "cpu_core_percent_reception": watch.receiving / watch.seconds * 100.0,
         "cpu_core_percent_not_recording": idle,
         "memory_mb": {
             "before": before[0],

@@ -1,4 +1,4 @@
-"""The receiving side of a transport in a process of its own, as media is: `python -m benchmarks.wires_receiver JSON`.
+"""The receiving side of a transport in a process, as reception is: `python -m benchmarks.wires_receiver JSON`.
 
 The JSON is a `Receiving`. Observations go into the page whose descriptor it inherits, until standard input ends.
 With `fast`, which is for recordings, a virtual clock goes on by a frame as soon as the one before is in the page, and
@@ -29,7 +29,7 @@ from runtime.transports.base import Source
 from runtime.types import Observation
 
 FPS = 30.0
-_PUMP_S = 0.002  # as media does
+_PUMP_S = 0.005  # as reception does
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ def main(text: str) -> None:
     player = _Player()
     page = Page.attach(layout(robot), given.page)
     with contextlib.closing(source(given, robot, clock)) as opened:
-        intake = Intake(page, opened, clock, _say, player.see, lambda observation: None)
+        intake = Intake(page, opened, clock, _say, lambda observation, numbers: player.see(observation))
         opened.connect()
         opened.begin_run()
         while not select.select([sys.stdin], [], [], 0.0)[0]:

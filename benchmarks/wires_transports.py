@@ -1,6 +1,6 @@
 """The way of observations through each transport: three cameras and joints, from who sends them to the control loop.
 
-The sender, the receiving side (`benchmarks.wires_receiver`, as media without recording and previews) and the control
+The sender, the receiving side (`benchmarks.wires_receiver`, as reception) and the control
 loop are processes of their own. The control loop is this one: it looks at the page at 100 Hz, so that what it sees is
 evenly spread between two pictures. Live, pictures of 640x480 come at 30 Hz. How old they are is counted from the
 moment at which their sender began to draw and pack them: they carry their numbers. Recordings have no sender: their

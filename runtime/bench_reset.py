@@ -9,7 +9,7 @@ from typing import Any
 from runtime.clock import Clock
 from runtime.errors import SetupError
 from runtime.family import Plan
-from runtime.messages import Event, MediaReport
+from runtime.messages import Event, ReceptionReport
 from runtime.orders import Orders
 from runtime.requests import BenchRequest
 
@@ -20,11 +20,13 @@ _REPEAT_S = 0.2  # a control word may be lost on its way
 class BenchReset:
     """One reset at a time; a node that simulates no bench has none."""
 
-    def __init__(self, plan: Plan, orders: Orders, clock: Clock, media: Callable[[], MediaReport]) -> None:
+    def __init__(
+        self, plan: Plan, orders: Orders, clock: Clock, reception: Callable[[], ReceptionReport]
+    ) -> None:
         self._plan = plan
         self._orders = orders
         self._clock = clock
-        self._media = media  # what it last reported
+        self._reception = reception  # what it last reported
         self._refused = ""
 
     def of(self, bench: BenchRequest | None) -> dict[str, Any] | None:
@@ -36,7 +38,7 @@ class BenchReset:
                 f"setup: bench with seed {bench.seed}: the transport is not declared simulated; allowed: no "
                 "bench, or a node that simulates one, with transport.simulated = true in the deployment"
             )
-        if bench.id is not None and bench.id == self._media().truth.get("reset"):
+        if bench.id is not None and bench.id == self._reception().truth.get("reset"):
             raise SetupError(
                 f"setup: bench.id = {bench.id!r}: the bench was reset under this id already; allowed: an id "
                 "of its own for each reset, or none"
@@ -58,7 +60,7 @@ class BenchReset:
 
     def done(self) -> bool:
         """Whether what the policy is shown from now on is the new bench; SetupError where it will not be."""
-        if self._media().truth.get("reset") == self._reset["id"]:
+        if self._reception().truth.get("reset") == self._reset["id"]:
             return True
         now = self._clock.now()
         if self._refused:
@@ -71,7 +73,7 @@ class BenchReset:
         return False
 
     def _why_not(self) -> str:
-        if not self._media().truth:
+        if not self._reception().truth:
             return "the node says no truth of a bench; does it simulate one?"
         before = self._refused_before
         new = [reason for reason, count in self._refused_by_node().items() if count > before.get(reason, 0)]
@@ -79,5 +81,5 @@ class BenchReset:
 
     def _refused_by_node(self) -> dict[str, int]:
         prefix = "node_refused."
-        faults = self._media().faults.items()
+        faults = self._reception().faults.items()
         return {name.removeprefix(prefix): count for name, count in faults if name.startswith(prefix)}

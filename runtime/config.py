@@ -60,7 +60,8 @@ class ControlSettings(Section):
     rate: float | None = Field(default=None, gt=0, le=1000)
     """Ticks per second [Hz]; the robot's own rate where it is not given."""
     realtime: Literal["auto", "off"] = "auto"
-    """"auto" asks for SCHED_FIFO and locked memory and says what it got; "off" does not ask."""
+    """"auto" asks for SCHED_FIFO and locked memory and says what it got; "off" does not ask. Reception likewise, one
+    priority below."""
     realtime_priority: int = Field(default=20, ge=1, le=99)
     """Priority within SCHED_FIFO."""
     heartbeat_timeout_s: float = Field(default=1.0, gt=0)

@@ -28,6 +28,7 @@ from runtime.messages import (
     Event,
     MediaReport,
     Message,
+    ReceptionReport,
     decode,
 )
 from runtime.operations import Operations, Parts
@@ -48,6 +49,7 @@ from runtime.tuning import strategy_of
 from runtime.watch import Watch
 
 log = logging.getLogger(__name__)
+_TO_MAIN = ("control_events", "reception_events", "media_events")  # rings
 # Control's own reasons to hold, as events of these kinds.
 _HOLDS = ("refusals", "implausible", "unmeasured", "family", "orphaned", "too_far", "moved_away")
 
@@ -66,7 +68,8 @@ class Director:
         self.events = EventLog()
         self.lease = Lease(settings.lease.ttl_s)
         self._orders = orders = Orders(page)
-        self.media_report = MediaReport(0.0, {}, {}, 0, "", 0)
+        self.media_report = MediaReport(0.0, 0, "", 0)
+        self.reception_report = ReceptionReport(0.0)
         self.unheard: dict[str, str] = {}  # as by Sink.unheard
         kinematics = Loading(ChainForward(plan.robot), plan.kinematics, runner.aside)
         self.spaces = plan.spaces(kinematics)
@@ -76,8 +79,8 @@ class Director:
         self.inference = Inference(
             asking, strategy_of(plan), page, self._orders, clock, patience, Commitment(plan.rate)
         )
-        self.setup = SetUp(plan, self.inference, self._orders, page, clock, lambda: self.media_report)
-        self._watch = Watch(plan, page, self.lease, clock, self.people, lambda: self.media_report)
+        self.setup = SetUp(plan, self.inference, self._orders, page, clock, lambda: self.reception_report)
+        self._watch = Watch(plan, page, self.lease, clock, self.people, lambda: self.reception_report)
         control = settings.control
         self._punctuality = Punctuality(
             page, plan.rate, control.realtime_priority, control.realtime == "auto"
@@ -107,7 +110,7 @@ class Director:
 
     def _take_over(self) -> None:
         """Keep the events from before there was a main, or since one died; act on nothing that was told to that one."""
-        for ring in ("control_events", "media_events"):
+        for ring in _TO_MAIN:
             for payload in self.page.rings[ring].drain():
                 if isinstance(message := decode(payload), Event):
                     self._note(message)
@@ -128,7 +131,7 @@ class Director:
     def pump(self) -> None:
         """Hear the family, notice what happened, advance set-up and inference."""
         self.page.beat("main", self.clock.now())
-        for ring in ("control_events", "media_events"):
+        for ring in _TO_MAIN:
             for payload in self.page.rings[ring].drain():
                 self._hear(decode(payload))
         for noticed in self._watch.notice(self.session.state, self.runs.open):
@@ -154,6 +157,7 @@ class Director:
                 setup=self.setup,
                 runs=self.runs,
                 media=self.media_report,
+                reception=self.reception_report,
                 unheard=self.unheard,
                 by_hand=self.by_hand,
                 collecting=self.collecting,
@@ -187,6 +191,8 @@ class Director:
             self.collecting.closed(message)
         elif isinstance(message, MediaReport):
             self.media_report = message
+        elif isinstance(message, ReceptionReport):
+            self.reception_report = message
             self.runs.saw(message.truth, self.session.state is State.RUNNING)
 
     def _unlock(self) -> None:
@@ -216,7 +222,7 @@ class Director:
             self._observe(Happening.DISPLACED, event.text)
 
     def _note(self, event: Event) -> None:
-        self._log(event)  # control and media write their own events into the episode
+        self._log(event)  # the others write their own events into the episode
         if event.kind in (UNHEARD, HEARD):
             self.unheard = dict(event.data["unheard"])
 

@@ -38,6 +38,10 @@ from runtime.spaces import Spaces
 from runtime.timeline import Dims
 from runtime.transports.base import Capabilities, Source
 
+_OUTLIVES_S = (
+    1.0  # how long guard and reception stay after control's own end: to the last it can see, and be stopped
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Plan:
@@ -273,6 +277,10 @@ class Member:
     page: Page
     boot: str  # of the supervisor: names this start of the station
     lifeline: Lifeline
+
+    def needed(self, now: float) -> bool:
+        """Whether there is still something to do for who outlives control: until then the supervisor may be gone."""
+        return not self.lifeline.cut or self.page.alive("control", now, _OUTLIVES_S)
 
 
 class Lifeline:

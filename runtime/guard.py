@@ -8,14 +8,13 @@ import zmq
 
 from runtime.bus import CommandServer, Endpoints
 from runtime.clock import Clock, MonotonicClock
-from runtime.family import Member, join
+from runtime.family import join
 from runtime.latch import Latch
 from runtime.messages import Ack, Command
 from runtime.page import EStop, Page
 
 log = logging.getLogger(__name__)
 _POLL_S = 0.005
-_OUTLIVES_S = 1.0  # how long it stays after control's own end, so that a press is possible to the last
 
 
 class Guard:
@@ -116,7 +115,7 @@ def main() -> None:
     server = CommandServer(zmq.Context.instance(), settings.bus.host, settings.bus.estop_port)
     guard = Guard(member.page, Latch(settings.station_dir), clock, 1.0 / member.plan.rate, settings.station)
     Endpoints(settings.station_dir).write("guard", {"estop": server.endpoint})
-    while _needed(member, clock.now()):
+    while member.needed(clock.now()):
         member.page.beat("guard", clock.now())
         guard.watch()
         if server.socket.poll(int(_POLL_S * 1000)):
@@ -125,10 +124,6 @@ def main() -> None:
                 address, command = received
                 server.answer(address, guard.answer(command))
     server.close()
-
-
-def _needed(member: Member, now: float) -> bool:
-    return not member.lifeline.cut or now - member.page.last_beat("control") < _OUTLIVES_S
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What media receives: observations into the page, with their rates, faults, drives and truth."""
+"""What reception receives: observations into the page, with their rates, faults, ages, drives and truth."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import logging
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from runtime.clock import Clock
 from runtime.drives import Drives
@@ -18,15 +21,17 @@ from runtime.types import Observation
 
 log = logging.getLogger(__name__)
 _RATE_WINDOW = 40  # arrivals per stream
+_AGES_KEPT = 2000  # over a minute at 30 Hz
 _SILENT_S = 2.0  # after which a stream has no rate any more
 _REPEAT_S = 5.0  # between two events of one fault: thousands of lost frames are not thousands of lines
 _STANDING = "_unusable"  # ends the names of faults that are in every message of a node: said once in each run
 
 
 class Intake:
-    """The way of an observation: pictures into their slots, `see`, numbers into the page, `preview`.
+    """The way of an observation: pictures into their slots, `hand_on` with their numbers, numbers into the page.
 
-    `truth` is what a simulated bench last said of itself. Events are given to `say`.
+    Numbers of observations and of pictures go on where a predecessor in the same page ended. `truth` is what a
+    simulated bench last said of itself. Events are given to `say`.
     """
 
     def __init__(
@@ -35,14 +40,15 @@ class Intake:
         source: Source,
         clock: Clock,
         say: Callable[[Event], None],
-        see: Callable[[Observation], None],
-        preview: Callable[[Observation], None],
+        hand_on: Callable[[Observation, Mapping[str, int]], None],
     ) -> None:
         self._page = page
         self._source = source
         self._clock = clock
-        self._say, self._see, self._preview = say, see, preview
-        self._numbers: Counter[str] = Counter({c: self._newest(c) for c in page.layout.cameras})
+        self._say, self._hand_on = say, hand_on
+        self._before = int(page.observation.read()["sequence"])  # observations of predecessors
+        self._numbers = {camera: slots.newest for camera, slots in page.pictures.items()}
+        self._ages: deque[float] = deque(maxlen=_AGES_KEPT)
         self._captured: dict[str, float] = {}
         self._arrivals: dict[str, deque[float]] = {}
         self._faults: dict[str, int] = {}  # as they were last said
@@ -72,6 +78,7 @@ class Intake:
         """The source begins a run; its first frame is taken here, so that the run's first tick sees it."""
         self._source.begin_run()
         self._said_at = {name: at for name, at in self._said_at.items() if not name.endswith(_STANDING)}
+        self._captured.clear()  # its pictures are new ones, even where time stands still between two frames
         self.pump(0.0)
 
     def end_run(self) -> None:
@@ -102,9 +109,12 @@ class Intake:
         now = self._clock.now()
         return {stream: _rate(times, now) for stream, times in self._arrivals.items()}
 
-    def _newest(self, camera: str) -> int:
-        record = self._page.observation.read()
-        return int(record["picture_number"][self._page.layout.cameras.index(camera)])
+    def age_ms(self) -> dict[str, float]:
+        """How old joints were when they came into the page: p50, p99 and max of the newest 2000 [ms]."""
+        if not self._ages:
+            return {}
+        p50, p99, worst = (1000.0 * np.percentile(self._ages, (50, 99, 100))).tolist()
+        return {"p50": p50, "p99": p99, "max": worst}
 
     def _receive(self, timeout: float) -> Observation | None:
         """What the source has; a failure is said once, and control holds when what it sees is old."""
@@ -121,23 +131,33 @@ class Intake:
             self._failure = ""
         return observation
 
-    def _take(self, observation: Observation) -> None:
+    def _take(self, given: Observation) -> None:
+        observation = self._that_fits(replace(given, sequence=self._before + given.sequence))
         for camera, picture in observation.pictures.items():
             captured = observation.captured.get(camera, observation.arrived)
-            if camera in self._numbers and captured != self._captured.get(camera):
+            if captured != self._captured.get(camera):
                 self._captured[camera] = captured
                 self._count(camera, observation.arrived)
-                if picture.nbytes > self._page.layout.picture_bytes:
-                    self._too_large[f"picture_too_large_{camera}"] += 1
-                    continue
                 self._numbers[camera] += 1
                 self._page.pictures[camera].write(self._numbers[camera], picture)
         self._count("joints", observation.arrived)
         self.truth = observation.truth or {}
         self._hear_drives(observation)
-        self._see(observation)
+        self._hand_on(observation, self._numbers)
         self._page.publish_observation(observation, self._numbers)
-        self._preview(observation)
+        self._ages.append(self._clock.now() - observation.captured.get("joints", observation.arrived))
+
+    def _that_fits(self, observation: Observation) -> Observation:
+        """Without pictures of other cameras than the page's, and without those that have no room in it."""
+        most = self._page.layout.picture_bytes
+        ours = {camera: seen for camera, seen in observation.pictures.items() if camera in self._numbers}
+        large = {camera for camera, picture in ours.items() if picture.nbytes > most}
+        self._too_large.update(f"picture_too_large_{camera}" for camera in large)
+        return replace(
+            observation,
+            pictures={camera: picture for camera, picture in ours.items() if camera not in large},
+            captured={name: time for name, time in observation.captured.items() if name not in large},
+        )
 
     def _hear_drives(self, observation: Observation) -> None:
         change = self._drives.see(observation.drives, observation.arrived)

@@ -23,6 +23,8 @@ from runtime.media import Media, make_recorder
 from runtime.messages import Ack, Command
 from runtime.page import Page
 from runtime.plugins import variants
+from runtime.realtime import LOCKSTEP
+from runtime.reception import Reception
 from runtime.recorder import Closed
 from runtime.runner import LockstepRunner, Runner
 from runtime.transitions import State
@@ -56,7 +58,7 @@ class Around:
 
 
 class Lockstep:
-    """One station without processes; each `tick` is media, main, control in that order.
+    """One station without processes; each `tick` is reception, media, main, control in that order.
 
     `clock` and `around` are given where somebody else has a part in it.
     """
@@ -71,9 +73,8 @@ class Lockstep:
         self._source = plan.source(clock)
         self._sink = plan.transport.sink(settings.transport, plan.robot, clock)
         recorder = make_recorder(plan, clock.now, patient=True)
-        self.media = Media(
-            self.page, self._source, recorder, clock, around.preview, around.closer, around.on_disk
-        )
+        self.media = Media(self.page, recorder, clock, around.preview, around.closer, around.on_disk)
+        self.reception = Reception(self.page, self._source, clock, LOCKSTEP)
         self._runner = around.runner or LockstepRunner(settings.lockstep.delay_ticks)
         self.main = Director(plan, self.page, clock, self._runner, around.people)
         self._tick = make_tick(plan, self.page, self._sink, self.clock.now)
@@ -87,10 +88,13 @@ class Lockstep:
     def tick(self) -> None:
         """One control period."""
         now = self.clock.now()
-        for process in ("control", "guard", "media"):
+        for process in ("control", "guard", "reception", "media"):
             self.page.beat(process, now)
         self.guard.watch()
-        self.media.pump(0.0)
+        self.reception.pump(0.0)
+        self.media.digest()
+        if self.reception.hear():  # a run begins with its source, in this tick
+            self.media.digest()
         self.main.pump()
         self._tick(self.step, now)
         self._runner.tick()

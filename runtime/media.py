@@ -1,4 +1,4 @@
-"""The process that receives every observation, records, and makes previews; the one writer of an episode."""
+"""The process that records, and makes previews; the one writer of an episode."""
 
 from __future__ import annotations
 
@@ -12,21 +12,25 @@ from runtime import heap
 from runtime.aside import Aside
 from runtime.clock import Clock, MonotonicClock
 from runtime.closing import Close, at_once, in_background
-from runtime.errors import RecordingError, RuntimeFault
+from runtime.errors import RecordingError
 from runtime.exports import Exports
 from runtime.family import Plan, join
-from runtime.intake import Intake
 from runtime.leftovers import start_repair
+from runtime.memory import TornReadError
 from runtime.messages import (
     BeginEpisode,
+    BeginRun,
     ChunkMerged,
     EndEpisode,
+    EndRun,
     EpisodeClosed,
     EpisodeOpened,
     Event,
     MediaReport,
     Message,
+    Observed,
     PolicyAnswer,
+    RunBegun,
     TickDone,
     decode,
     encode,
@@ -34,26 +38,26 @@ from runtime.messages import (
 )
 from runtime.page import Page
 from runtime.previews import Previews
+from runtime.received import as_observation
 from runtime.recorder import Closed, Grid, Recorder
 from runtime.recording.episode import EpisodeJournal
-from runtime.transports.base import Source
 from runtime.types import Observation
 from runtime.unclosed import Unclosed
 
 log = logging.getLogger(__name__)
 _REPORT_PERIOD = 0.2
+_PERIOD_S = 0.002  # between two looks at what the family says
 _LAST_S = 8.0  # for the last episode, before the supervisor's patience ends
 _EXPORT_S = 3.0  # of it, for the exports that are under way; the worker, or a person, makes up for them
 _CLOSING_S = 1.0  # how long a new episode waits for the one before it; longer is a disk in trouble
 
 
 class Media:
-    """One `pump` receives what there is, passes it on, and writes it down; lockstep calls it tick by tick."""
+    """One `digest` writes down what there is; lockstep calls it tick by tick."""
 
     def __init__(
         self,
         page: Page,
-        source: Source,
         recorder: Recorder,
         clock: Clock,
         preview: Callable[[Observation], None] = lambda observation: None,
@@ -63,7 +67,7 @@ class Media:
         self._page = page
         self._recorder = recorder
         self._clock = clock
-        self._intake = Intake(page, source, clock, self._say, recorder.see, preview)
+        self._preview = preview
         self._closer = closer
         self._on_disk = on_disk  # hears of every episode that was closed
         self._unclosed = Unclosed(closer, clock.now)
@@ -71,10 +75,14 @@ class Media:
         self._closing_uuid = ""
         self._waiting: BeginEpisode | None = None  # for the episode before it to be closed
         self._waiting_since = 0.0
+        self._opened: EpisodeOpened | None = None  # main is told when the source has begun the run
+        self._newest = 0  # number of the newest observation
+        self._truth: Mapping[str, Any] = {}  # of a simulated bench, as its node last said it
         self._next_report = 0.0
-        for ring in ("minutes", "ticks"):
+        for ring in ("observations", "minutes", "ticks"):
             for _ in page.rings[ring].drain():
                 pass  # addressed to a predecessor that died
+        self._ask_source(EndRun())
 
     @property
     def recording(self) -> bool:
@@ -85,14 +93,10 @@ class Media:
         """Whether the last episode is still being closed."""
         return self._closing is not None
 
-    def pump(self, timeout: float) -> None:
-        """Take one observation if there is one within `timeout` seconds, then all that the family says."""
-        self._intake.pump(timeout)
-        self.digest()
-
     def digest(self) -> None:
-        """Write down what control and main have posted."""
+        """Write down what reception, control and main have posted."""
         self.collect()
+        self._drain("observations")
         self._drain("minutes")
         self._drain("ticks")
         for event in self._recorder.news():
@@ -128,7 +132,11 @@ class Media:
 
     def _write(self, message: Message) -> None:
         recorder = self._recorder
-        if isinstance(message, TickDone):
+        if isinstance(message, Observed):
+            self._observe(message)
+        elif isinstance(message, TickDone):
+            if message.sequence > self._newest:  # it was handed on before the tick could see it
+                self._drain("observations")
             recorder.tick(message)
         elif isinstance(message, ChunkMerged):
             recorder.merged(message)
@@ -142,24 +150,53 @@ class Media:
                 self._begin(message)
             else:
                 self._waiting, self._waiting_since = message, self._clock.now()
+        elif isinstance(message, RunBegun):
+            self._run_begun(message)
         elif isinstance(message, EndEpisode):
             self._drain("ticks")  # those that control did before main decided to end
             self._say_truth(message.details.get("reached") or {})
             self.end(message.status, message.reason, message.details)
-            self._intake.end_run()
+            self._opened = None
+            self._ask_source(EndRun())
+
+    def _observe(self, message: Observed) -> None:
+        observation = as_observation(message, self._page)
+        self._newest, self._truth = message.sequence, message.truth or {}
+        self._recorder.see(observation)
+        self._preview(observation)
 
     def _begin(self, message: BeginEpisode) -> None:
-        identity, path, error = "", Path(), ""
-        if message.manifest is not None and self._closing is not None:
+        opened = EpisodeOpened(message.run, "", "")
+        if message.manifest is not None:
+            opened = self._open(message.run, message.manifest)
+        if opened.error or not message.run:
+            self._tell(opened)
+        else:
+            self._opened = opened
+            self._ask_source(BeginRun(message.run))
+
+    def _open(self, run: int, manifest: Mapping[str, Any]) -> EpisodeOpened:
+        if self._closing is not None:
             error = "the last episode is still being written: is the disk slow? try again in a moment"
-        elif message.manifest is not None:
-            try:
-                identity, path = self._recorder.begin(message.manifest, message.run)
-            except RecordingError as fault:
-                error = str(fault)
-        if not error and message.run:
-            self._intake.begin_run()
-        self._tell(EpisodeOpened(message.run, identity, str(path), error))
+            return EpisodeOpened(run, "", "", error)
+        try:
+            # With its pictures as they are now: those of an earlier one may be overwritten by the time they are read.
+            if (newest := self._page.read_observation(self._page.layout.cameras)) is not None:
+                self._recorder.see(newest)
+            identity, path = self._recorder.begin(manifest, run)
+        except (RecordingError, TornReadError) as fault:
+            return EpisodeOpened(run, "", "", str(fault))
+        return EpisodeOpened(run, identity, str(path))
+
+    def _run_begun(self, message: RunBegun) -> None:
+        """The source has: its first frame is here, and the run's first tick sees it."""
+        if self._opened is not None and self._opened.run == message.run:
+            self._tell(self._opened)
+            self._opened = None
+
+    def _ask_source(self, message: BeginRun | EndRun) -> None:
+        if not self._page.rings["source"].push(encode(message)):
+            log.warning("reception does not read: %s lost", type(message).__name__)
 
     def end(self, status: str, reason: str, details: Mapping[str, Any] | None = None) -> None:
         """Close the open episode, if there is one; main is told when that is done."""
@@ -206,17 +243,15 @@ class Media:
 
     def report(self) -> None:
         """Tell main how it goes; done by itself five times a second."""
-        intake, recorder, now = self._intake, self._recorder, self._clock.now()
+        recorder, now = self._recorder, self._clock.now()
         self._next_report = now + _REPORT_PERIOD
-        faults, rates = intake.faults(), intake.rates()
         recording = recorder.recording or self._closing_uuid  # until it is on disk
-        rows, repeated = recorder.rows, recorder.repeated
-        told = (intake.truth, intake.drives, intake.cameras, self._unclosed.why)
-        self._tell(MediaReport(now, rates, faults, rows, recording, repeated, *told))
+        told = (recorder.rows, recording, recorder.repeated, self._unclosed.why)
+        self._tell(MediaReport(now, *told))
 
     def _say_truth(self, reached: Mapping[str, float]) -> None:
         """How a simulated bench is left, and when its milestones were reached: what the episode is scored by."""
-        truth = self._intake.truth
+        truth = self._truth
         if truth:
             how = "success" if truth["success"] else "no success"
             data = {**truth, "reached": dict(reached), "episode": self._recorder.recording}
@@ -258,48 +293,22 @@ def main() -> None:
     page.beat("media", clock.now())
     exports = Exports(plan.deployment.data, plan.deployment.recording.export)
     start_repair(plan.deployment.episodes_dir, plan.deployment.station, exports.start)
-    source = plan.source(clock)
-    previews = Aside(
-        Previews(plan)
-    )  # late on a busy machine, rather than what control sees and what is recorded
-    media = Media(page, source, make_recorder(plan, clock.now), clock, previews, in_background, exports.start)
-    connected = False
+    previews = Aside(Previews(plan))  # late on a busy machine, rather than what is recorded
+    media = Media(page, make_recorder(plan, clock.now), clock, previews, in_background, exports.start)
     try:
         while not member.lifeline.cut:
             now = clock.now()
             page.beat("media", now)
-            connected = connected or _connect(source, now)
-            if connected:
-                media.pump(0.002)
-            else:
-                media.digest()
-                clock.sleep_until(now + 0.1)
+            media.digest()
             if media.recording and not page.alive("main", now, plan.deployment.control.heartbeat_timeout_s):
                 media.end("interrupted", f"main has given no sign of life {page.silence('main', now)}")
+            clock.sleep_until(now + _PERIOD_S)
     finally:
         media.end("interrupted", "the station's supervisor ended")
         ended = clock.now()
         media.finish(_LAST_S)
         exports.finish(min(_EXPORT_S, _LAST_S - (clock.now() - ended)))
         previews.close()
-        source.close()
-
-
-_retry_at = 0.0
-
-
-def _connect(source: Source, now: float) -> bool:
-    """Connect, at most once a second; says why it could not."""
-    global _retry_at
-    if now < _retry_at:
-        return False
-    try:
-        source.connect()
-    except RuntimeFault as error:
-        log.warning("%s", error)
-        _retry_at = now + 1.0
-        return False
-    return True
 
 
 if __name__ == "__main__":

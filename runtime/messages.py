@@ -200,14 +200,65 @@ class EpisodeClosed:
 
 @dataclass(frozen=True, slots=True)
 class MediaReport:
-    """What media sees, a few times a second."""
+    """What media writes, a few times a second."""
 
     time: float
-    rates: Mapping[str, float]  # measured [Hz] per stream
-    faults: Mapping[str, int]
     rows: int
     recording: str  # uuid of the open episode, "" where none is
     repeated: int
+    unclosed: Mapping[str, str] = field(default_factory=dict)  # episodes that wait for room, and why
+
+
+# --- reception -> media, and back --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """An observation as in runtime.types.Observation, its pictures by their numbers in the slots of the page."""
+
+    sequence: int
+    arrived: float
+    captured: Mapping[str, float]
+    qpos: Float32
+    pictures: Mapping[str, int]
+    qvel: Float32 | None = None
+    effort: Float32 | None = None
+    eef: Float32 | None = None
+    reported_action: Float32 | None = None
+    reported_action_eef: Float32 | None = None
+    last: bool = False
+    truth: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class BeginRun:
+    """The source begins the run with that number: a recording plays from its start."""
+
+    run: int
+
+
+@dataclass(frozen=True, slots=True)
+class RunBegun:
+    """It has begun, and its first frame was handed on before this."""
+
+    run: int
+
+
+@dataclass(frozen=True, slots=True)
+class EndRun:
+    """The source's run is over."""
+
+
+# --- reception -> main -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class ReceptionReport:
+    """What reception sees, a few times a second."""
+
+    time: float
+    rates: Mapping[str, float] = field(default_factory=dict)  # measured [Hz] per stream
+    faults: Mapping[str, int] = field(default_factory=dict)
     truth: Mapping[str, Any] = field(default_factory=dict)  # of a simulated bench, as its node last said it
     drives: Mapping[str, Any] = field(
         default_factory=dict
@@ -215,7 +266,10 @@ class MediaReport:
     cameras: Mapping[str, Any] = field(
         default_factory=dict
     )  # of the deployment's own, as by Source.camera_health
-    unclosed: Mapping[str, str] = field(default_factory=dict)  # episodes that wait for room, and why
+    age_ms: Mapping[str, float] = field(
+        default_factory=dict
+    )  # of joints when they came into the page: p50, p99, max of the newest
+    scheduling: str = ""  # the class of the process, as by runtime.realtime
 
 
 # --- clients <-> runtime -----------------------------------------------------------------------------------
@@ -272,6 +326,11 @@ Message = (
     | EpisodeOpened
     | EpisodeClosed
     | MediaReport
+    | Observed
+    | BeginRun
+    | RunBegun
+    | EndRun
+    | ReceptionReport
     | Command
     | Ack
 )

@@ -18,16 +18,19 @@ from runtime.memory import Record, Ring, aligned
 from runtime.types import Observation, UInt8
 
 _LINE = 64
-PICTURE_SLOTS = 6
+PICTURE_SLOTS = 12  # 0.4 s of a camera at 30 Hz: for so long may media be late
 RING_BYTES = {
     "orders": 1 << 20,  # main -> control: orders and chunks
     "minutes": 4 << 20,  # main -> media: begin, raw chunks, events, end
     "ticks": 4 << 20,  # control -> media: one record per tick
+    "observations": 2 << 20,  # reception -> media: observations and events in their order
+    "source": 1 << 12,  # media -> reception: a run of the source begins, or is over
     "control_events": 1 << 19,  # control -> main
+    "reception_events": 1 << 19,  # reception -> main
     "media_events": 1 << 19,  # media -> main
 }
 DOUBT_BYTES = 200
-PROCESSES = ("control", "main", "media", "guard")
+PROCESSES = ("control", "main", "reception", "media", "guard")
 
 
 class EStop(IntEnum):
@@ -40,7 +43,7 @@ class EStop(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class PageLayout:
-    """The sizes everything in the page follows from; equal in all four processes."""
+    """The sizes everything in the page follows from; equal in all of the family."""
 
     dim: int
     eef_dim: int
@@ -207,7 +210,7 @@ class Page:
         self._shared[self._estop] = int(state)
 
     def publish_observation(self, observation: Observation, pictures: Mapping[str, int]) -> None:
-        """Media's half: the observation's numbers, and for each camera the number of its newest picture."""
+        """Reception's half: the observation's numbers, and for each camera the number of its newest picture."""
         record = np.zeros((), self.layout.observation_dtype())
         record["sequence"], record["arrived"] = observation.sequence, observation.arrived
         record["joints_captured"] = observation.captured.get("joints", observation.arrived)
@@ -289,6 +292,11 @@ class PictureSlots:
     def size(picture_bytes: int) -> int:
         """Bytes that the slots of one camera take in the shared file."""
         return PICTURE_SLOTS * (_LINE + aligned(picture_bytes))
+
+    @property
+    def newest(self) -> int:
+        """The largest number that a picture was begun with, whole or not; 0 before the first."""
+        return max(int(begun[0]) for begun in self._begun)
 
     def write(self, number: int, picture: UInt8) -> None:
         """Store `picture` as number `number` (counted from 1); raises ValueError where it is too large."""

@@ -32,9 +32,13 @@ class Previews:
         Endpoints(plan.deployment.station_dir).write("media", {"cameras": self._publisher.endpoint})
 
     def __call__(self, observation: Observation) -> None:
-        for camera, picture in observation.pictures.items():
+        for camera in observation.pictures:
             captured = observation.captured.get(camera, observation.arrived)
             if observation.arrived < self._due.get(camera, 0.0) or captured == self._shown.get(camera):
+                continue
+            if (
+                picture := observation.pictures.get(camera)
+            ) is None:  # overwritten: the next one comes at once
                 continue
             self._shown[camera] = captured
             # A little early counts, so that 15 of 30 pictures a second are shown and not 10.

@@ -1,7 +1,8 @@
-"""Asks Linux for a steady control tick: real-time class, locked memory, fine timers, no surprise from gc."""
+"""Asks Linux for a steady control tick, and for what it sees: real-time class, locked memory, a quiet gc."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import os
@@ -9,7 +10,7 @@ import resource
 import struct
 
 _PR_SET_TIMERSLACK = 29
-_MCL_CURRENT, _MCL_FUTURE = 1, 2
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _SYS_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 _SLICE_NS = 100_000
 LOCKSTEP = "lockstep"  # the class of ticks that keep no time
@@ -23,10 +24,36 @@ def enter(priority: int) -> str:
     """
     libc = ctypes.CDLL(None, use_errno=True)
     _fine_timers(libc)
-    locked = _locked_memory(libc)
+    locked = _locked_memory(libc, _MCL_CURRENT | _MCL_FUTURE)
     _quiet_gc()
-    got = _fifo(priority) or ("slice 0.1 ms" if _short_slice(libc) else "ordinary")
-    return got if locked else f"{got} unlocked"
+    return _class(libc, priority, locked)
+
+
+def enter_below(priority: int) -> str:
+    """The same for a process that is next after the one at `priority`, and has threads and large, sparse memory.
+
+    Threads that are started from now on are of the class that it got, unless they `leave` it. What is mapped by now
+    is locked as it is used, nothing that comes later: that could be refused in the middle of the work.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    _fine_timers(libc)
+    locked = _locked_memory(libc, _MCL_CURRENT | _MCL_ONFAULT)
+    gc.collect()
+    gc.freeze()
+    return _class(libc, priority, locked, below=1)
+
+
+def leave(thread: int = 0) -> None:
+    """That thread, 0: the calling one, leaves a real-time class; those that it starts from now on are in none."""
+    with contextlib.suppress(ProcessLookupError):  # it has ended
+        if os.sched_getscheduler(thread) in (os.SCHED_FIFO, os.SCHED_RR):
+            os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+
+
+def leave_all() -> None:
+    """All threads of this process leave it."""
+    for thread in os.listdir("/proc/self/task"):
+        leave(int(thread))
 
 
 def advice(scheduling: str, priority: int) -> str:
@@ -45,8 +72,8 @@ def _fine_timers(libc: ctypes.CDLL) -> None:
     libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
 
 
-def _locked_memory(libc: ctypes.CDLL) -> bool:
-    return int(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE)) == 0
+def _locked_memory(libc: ctypes.CDLL, what: int) -> bool:
+    return int(libc.mlockall(what)) == 0
 
 
 def _quiet_gc() -> None:
@@ -56,9 +83,15 @@ def _quiet_gc() -> None:
     gc.disable()
 
 
-def _fifo(priority: int) -> str:
+def _class(libc: ctypes.CDLL, priority: int, locked: bool, below: int = 0) -> str:
+    got = _fifo(priority, below) or ("slice 0.1 ms" if _short_slice(libc) else "ordinary")
+    return got if locked else f"{got} unlocked"
+
+
+def _fifo(priority: int, below: int = 0) -> str:
+    """`below` what another process gets that asks for `priority`."""
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
-    for wanted in (priority, min(priority, limit)):
+    for wanted in (priority - below, min(priority, limit) - below):
         try:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(wanted))
         except OSError:  # not permitted, or no priority of this kernel: what is next best is asked for

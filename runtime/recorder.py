@@ -24,7 +24,9 @@ from runtime.recording.settings import RecordingSettings
 from runtime.shown import Shown
 from runtime.types import Float32, Observation
 
-_OBSERVATIONS_KEPT = 24  # ticks reach us within a few ms; at 30 Hz this is most of a second
+_OBSERVATIONS_KEPT = (
+    256  # ticks reach us within a few ms, after a stall of ours later; at 200 Hz this is a second
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +176,7 @@ class Recorder:
     # --- what comes in -------------------------------------------------------------------------------------
 
     def see(self, observation: Observation) -> None:
-        """An observation from the source, before any tick has seen it."""
+        """An observation from reception, before the record of a tick that has seen it."""
         self._seen.append(observation)
 
     def mark(self, event: Mapping[str, Any]) -> None:
@@ -264,6 +266,7 @@ class Recorder:
             eef_action_reported=reported is not None,
             intervention=tick.source == "teleop",
             stale=self._shown.stale,
+            lost=self._shown.lost,
         )
         self._journal.append(row)
         self.rows += 1

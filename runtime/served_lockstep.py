@@ -177,6 +177,7 @@ class ServedLockstep(Lockstep):
         if not self.media.closing and (closing or (rests and self._told_at != self.step)):
             self._told_at = self.step
             self.media.report()
+            self.reception.report()
         self.main.pump()
         if (now := self._people.now()) >= self._again_at:
             self._again_at = now + _AGAIN_S

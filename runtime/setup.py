@@ -18,7 +18,7 @@ from runtime.errors import PolicyError, SetupError
 from runtime.family import Plan
 from runtime.going import Going
 from runtime.inference import Inference
-from runtime.messages import Event, MediaReport
+from runtime.messages import Event, ReceptionReport
 from runtime.orders import Orders
 from runtime.page import Page
 from runtime.policies.base import PolicyInfo
@@ -26,6 +26,7 @@ from runtime.requests import LeastTimes
 from runtime.runner import telling
 from runtime.timeline import difference
 from runtime.types import Float64
+from runtime.watch import SIBLINGS
 
 
 class Stage(StrEnum):
@@ -55,15 +56,15 @@ class SetUp:
         orders: Orders,
         page: Page,
         clock: Clock,
-        media: Callable[[], MediaReport],
+        reception: Callable[[], ReceptionReport],
     ) -> None:
         self._plan = plan
         self._inference = inference
         self._page = page
         self._clock = clock
-        self._media = media  # what it last reported
+        self._reception = reception  # what it last reported
         self._going = Going(plan, orders, page, clock)
-        self.bench = BenchReset(plan, orders, clock, media)
+        self.bench = BenchReset(plan, orders, clock, reception)
         self.stage = Stage.IDLE
         self.info: PolicyInfo | None = None
         self.validated = ""
@@ -176,13 +177,13 @@ class SetUp:
             self._inference.notes.append(Event("zero_joints", text, self._clock.now()))
 
     def _check_drives(self) -> None:
-        drives = self._media().drives
+        drives = self._reception().drives
         if self._plan.capabilities.moves_robot and drives.get("enabled") is False:
             faults = ", ".join(map(str, drives.get("faults", ()))) or "no fault named"
             raise DrivesDisabledError(f"the robot says that its drives are disabled ({faults}): enable them")
 
     def _check_cameras(self) -> None:
-        found = complaints(self._media().cameras)
+        found = complaints(self._reception().cameras)
         if found:
             raise SetupError("; ".join(found))
 
@@ -212,7 +213,7 @@ class SetUp:
     def _require_family(self) -> None:
         """An order to a control that is still starting would be lost, and without a guard it only holds."""
         within = self._plan.deployment.control.heartbeat_timeout_s
-        for process in ("control", "media", "guard"):
+        for process in SIBLINGS:
             if not self._page.alive(process, self._clock.now(), within):
                 raise SetupError(f"the process {process} gives no sign of life")
 

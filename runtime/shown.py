@@ -21,6 +21,9 @@ class Shown:
         self._began: float | None = None
         self._silences = Silences(cameras)
         self.stale: frozenset[str] = frozenset()  # cameras whose newest picture is too old for the newest row
+        self.lost: frozenset[str] = (
+            frozenset()
+        )  # cameras whose picture for the newest row was there, and is gone
 
     def sizes(self, seen: Observation) -> dict[str, dict[str, int]]:
         """How large each video is, and the pictures of its camera where they are scaled for it."""
@@ -34,16 +37,21 @@ class Shown:
         return sizes
 
     def pictures(self, seen: Observation | None) -> Mapping[str, UInt8 | None]:
-        """The observation's pictures; None for a camera whose picture an earlier row has already."""
-        pictures: dict[str, UInt8 | None] = {}
+        """The observation's pictures; None for a camera whose picture an earlier row has already, or that is lost."""
+        pictures: dict[str, UInt8 | None] = dict.fromkeys(self._cameras)
+        lost = set()
+        if seen is None:  # what the row's tick saw has not come to us: nor have its pictures
+            self.lost = frozenset(self._cameras)
+            return pictures
         for camera in self._cameras:
-            picture = None if seen is None else seen.pictures.get(camera)
-            captured = math.nan if seen is None else seen.captured.get(camera, math.nan)
-            if captured == self._captured.get(camera):
-                picture = None
-            if picture is not None:
-                self._captured[camera] = captured
-            pictures[camera] = picture
+            captured = seen.captured.get(camera, math.nan)
+            if camera not in seen.pictures or captured == self._captured.get(camera):
+                continue
+            self._captured[camera] = captured
+            pictures[camera] = seen.pictures.get(camera)
+            if pictures[camera] is None:
+                lost.add(camera)
+        self.lost = frozenset(lost)
         return pictures
 
     def look(self, now: float, row: int) -> list[Event]:

@@ -15,7 +15,7 @@ from runtime.collecting import Collecting
 from runtime.family import Plan
 from runtime.inference import Inference
 from runtime.lease import Lease
-from runtime.messages import MediaReport, PolicyMode
+from runtime.messages import MediaReport, PolicyMode, ReceptionReport
 from runtime.page import Page
 from runtime.plugins import variants
 from runtime.runs import Runs
@@ -37,6 +37,7 @@ class View:
     setup: SetUp
     runs: Runs
     media: MediaReport
+    reception: ReceptionReport
     unheard: Mapping[str, str]  # as by Sink.unheard
     by_hand: ByHand
     collecting: Collecting
@@ -73,13 +74,13 @@ def snapshot(view: View) -> dict[str, Any]:
         "first_action": _first_action(view),
         "proposal": _proposal(view),
         "grippers": view.by_hand.grippers.told(view.by_hand.commanded()),
-        "drives": dict(view.media.drives),
+        "drives": dict(view.reception.drives),
         "collect": view.collecting.shown(),
         "validated": view.setup.validated,
         "task": settings.task,
         "checkpoint": dict(view.runs.provenance.checkpoint),
         "simulated": view.plan.capabilities.resets_bench,
-        "truth": dict(view.media.truth),
+        "truth": dict(view.reception.truth),
         "transport": settings.transport.kind,
         "policy": {"kind": settings.policy.kind, **_inference(view)},
         "strategy": settings.strategy.kind,
@@ -260,8 +261,10 @@ def _link(view: View) -> dict[str, Any]:
         ages[camera] = view.now - float(record["picture_captured"][index]) if seen else math.inf
     return {
         "ages": ages,
-        "rates": dict(view.media.rates),
-        "faults": dict(view.media.faults),
-        "cameras": {key: dict(told) for key, told in view.media.cameras.items()},
+        "rates": dict(view.reception.rates),
+        "faults": dict(view.reception.faults),
+        "cameras": {key: dict(told) for key, told in view.reception.cameras.items()},
         "unheard": dict(view.unheard),
+        "age_ms": dict(view.reception.age_ms),
+        "scheduling": view.reception.scheduling,
     }

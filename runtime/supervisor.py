@@ -1,4 +1,4 @@
-"""The family's parent: starts control, main, media and guard, restarts what dies, ends what must end."""
+"""The family's parent: starts control, main, reception, media and guard, restarts what dies, ends what must end."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from runtime.family import Lifeline, Plan
 from runtime.page import PROCESSES, Page
 
 log = logging.getLogger(__name__)
-_START_ORDER = ("guard", "media", "control", "main")
+_START_ORDER = ("guard", "reception", "media", "control", "main")
 MOST_RESTARTS, RESTART_WINDOW_S = 5, 60.0
 _PATIENCE_S = 9.0  # after the lifeline is cut; then what is left is killed
 _DRIVER_PATIENCE_S = 2.0  # for what drives a headless run, after it was told to end

@@ -12,12 +12,12 @@ from runtime.clock import Clock
 from runtime.family import Plan
 from runtime.latch import Latch
 from runtime.lease import Lease
-from runtime.messages import MediaReport
+from runtime.messages import ReceptionReport
 from runtime.page import EStop, Page
 from runtime.run import Run
 from runtime.transitions import Happening, State
 
-SIBLINGS = ("control", "media", "guard")
+SIBLINGS = ("control", "reception", "media", "guard")
 _LINK_LOST_S = 2.0
 _CONNECTED_S = 1.0
 _EARLY_S = 1e-6  # moments are sums of floats
@@ -42,14 +42,14 @@ class Watch:
         lease: Lease,
         clock: Clock,
         people: Clock,
-        media: Callable[[], MediaReport],
+        reception: Callable[[], ReceptionReport],
     ) -> None:
         self._plan = plan
         self._page = page
         self._lease = lease
         self._clock = clock
         self._people = people  # the clock of leases
-        self._media = media  # what it last reported
+        self._reception = reception  # what it last reported
         self._latch = Latch(plan.deployment.station_dir)
         self._generations = {name: page.generation(name) for name in SIBLINGS}
         self._lease_held = False
@@ -122,16 +122,16 @@ class Watch:
         if age < _CONNECTED_S and not missing:
             yield Noticed(Happening.CONNECTED, "observations arrive: set up")
         elif age < _CONNECTED_S:
-            why = "".join(f"; {sentence}" for sentence in complaints(self._media().cameras, missing))
+            why = "".join(f"; {sentence}" for sentence in complaints(self._reception().cameras, missing))
             yield Noticed(Happening.INCOMPLETE, f"no picture has arrived from {', '.join(missing)}{why}")
         elif age > _LINK_LOST_S and not record["last"]:
             yield Noticed(Happening.LINK_LOST, f"no observation for {age:.1f} s: {self._who_is_silent()}")
 
     def _who_is_silent(self) -> str:
         now, within = self._clock.now(), self._plan.deployment.control.heartbeat_timeout_s
-        if self._page.alive("media", now, within):
+        if self._page.alive("reception", now, within):
             return "is the execution node running?"
-        return "our process media gives no sign of life (a disk that hangs?)"
+        return "our process reception gives no sign of life"
 
     def _end_of(self, run: Run) -> Iterator[Noticed]:
         limit = run.duration_s

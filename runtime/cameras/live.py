@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 
+from runtime import realtime
 from runtime.back_off import BackOff
 from runtime.cameras.base import Address, Camera, CameraError, CameraSettings, Condition, Health, Shot
 from runtime.cameras.feed import Feed
@@ -67,6 +68,7 @@ class LiveCamera(Camera):
 
     def _go_on(self) -> None:
         """The thread: nothing that happens in it may end it, because nobody else looks."""
+        realtime.leave()  # decoding comes after who may stop the robot
         while not self._ending.is_set():
             try:
                 self._watch()

@@ -7,6 +7,7 @@ import math
 import threading
 from collections.abc import Callable
 
+from runtime import realtime
 from runtime.cameras import file
 from runtime.cameras.base import Camera, CameraError, Condition, Health, Shot
 from runtime.cameras.feed import Feed, Frame
@@ -149,6 +150,7 @@ class FileCamera(Camera):
             self._player.close()
 
     def _go_on(self) -> None:
+        realtime.leave()  # decoding comes after who may stop the robot
         while not self._ending:
             self._step()
             due = self._player.due if self._healthy() else self._clock.now() + _RETRY_S
@@ -179,7 +181,7 @@ class FileCamera(Camera):
         except CameraError as error:
             self._fail(str(error))
             return
-        except Exception as error:  # of a decoder: it must not end the thread, or media
+        except Exception as error:  # of a decoder: it must not end the thread, or reception
             log.exception("camera %s: playing %s failed", self.key, self.shown)
             self._fail(f"playing it failed: {type(error).__name__}: {error}")
             return

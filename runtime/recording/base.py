@@ -41,6 +41,7 @@ class Row:
     eef_action_reported: bool = False  # likewise eef_action, for this very action
     intervention: bool = False
     stale: frozenset[str] = frozenset()  # cameras that have given no new picture for too long
+    lost: frozenset[str] = frozenset()  # cameras that gave one which could not be kept
 
 
 @dataclass(frozen=True, slots=True)

@@ -204,7 +204,7 @@ class _Recording:
         self._rows += 1
         self._newest = row.tick_time
         unseen = {camera for camera in repeated if row.pictures[camera] is not None}
-        lost = unseen | self._lost.keys()
+        lost = row.lost | unseen | self._lost.keys()
         self._writer.add("rows", RecordedRow(kept, frozenset(repeated), frozenset(lost)), self._patience)
 
     def _taken(self, row: Row, camera: str) -> float:

@@ -1,4 +1,4 @@
-"""What a transport is: a source of observations (held by media) and a sink for commands (held by control)."""
+"""What a transport is: a source of observations (held by reception) and a sink for commands (held by control)."""
 
 from __future__ import annotations
 

@@ -19,6 +19,7 @@ const TEXTS = [
   ["Poses", ({ policy: p }) => (p.ik?.over ? "" : reachWords(p.ik))],
   ["Out of reach", ({ policy: p }) => (p.ik?.over ? reachWords(p.ik) : ""), "warn"],
   ["Joints", ({ link: l }) => `${age(l.ages.joints ?? Infinity)} old`],
+  ["Received", ({ link: l }) => received(l)],
   ["Own cameras", ({ link: l, clock }) => (troubled(l) ? "" : summary(l.cameras, clock))],
   ["Camera", ({ link: l, clock }) => (troubled(l) ? summary(l.cameras, clock) : ""), "warn"],
   ["Commands", ({ link: l }) => Object.entries(l.unheard ?? {}).map(([topic, why]) => why || `nobody listens to ${topic}`).join("; "), "warn"],
@@ -33,6 +34,10 @@ const DISTRIBUTIONS = [
   ["Connection", "Latency", ({ policy: p }) => p.latencies_ms, { unit: "ms", nothing: NO_ANSWER, narrow: 10 }],
   ["Connection", "Delay", ({ policy: p }) => p.delays, { unit: "ticks", nothing: NO_ANSWER, whole: true }],
 ];
+
+function received({ age_ms: ages, scheduling }) {
+  return ages?.p99 === undefined ? "" : `p50 ${figure(ages.p50, 1, "ms")}, p99 ${figure(ages.p99, 1, "ms")} old, ${scheduling}`;
+}
 
 function troubled(link) {
   return Object.values(link.cameras ?? {}).some((told) => trouble(told, 0));

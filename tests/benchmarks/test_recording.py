@@ -11,6 +11,7 @@ import pyarrow as pa
 import pytest
 
 from benchmarks import __main__ as command_line
+from benchmarks import recording_busy
 from benchmarks.recording import figures
 from benchmarks.recording_kills import _loss
 from benchmarks.recording_pace import Frames, finish, give
@@ -65,6 +66,14 @@ def test_a_missing_row_and_a_short_video_are_losses_and_skipped_pictures_are_not
     assert lost(episode([0.0, 0.03, 0.1], [False] * 3, frames=1))["frames_lost"] == 2
 
 
+def test_a_picture_that_is_not_in_the_video_is_silent_where_no_row_says_so() -> None:
+    made = episode([0.0, 0.03, 0.03, 0.06, 0.09], [False, True, True, True, True])
+    flags = pa.array([False, False, False, True, False])
+    rows = made.rows.append_column(f"lost.{CAMERA}", flags)
+    found = recording_busy.pictures(SimpleNamespace(rows=rows, layout=made.layout))  # type: ignore[arg-type]
+    assert found == {"rows": 5, "lost": 1, "silent": 2}
+
+
 def test_the_loss_of_a_kill_is_from_the_end_of_the_last_row() -> None:
     whole = episode([0.0] * 31, [False] * 31)
     assert _loss(whole, STARTED + 1.0 + 1 / 30)["lost_s"] == pytest.approx(0.0, abs=1e-9)
@@ -110,6 +119,7 @@ def parts(**changes: Any) -> Any:
     station = {
         "frames_lost": 0,
         "cpu_core_percent": 40.0,
+        "cpu_core_percent_reception": 8.0,
         "cpu_core_percent_not_recording": 10.0,
         "memory_mb": {"before": 90.0, "start": 100.0, "end": 110.0, "peak": 120.0},
         "to_disk_ms": {"p50": 100.0},
@@ -117,6 +127,16 @@ def parts(**changes: Any) -> Any:
         "publish_s": 1.0,
         "publish_changed_frames": 0,
     } | changes
+    busy = [
+        {
+            "case": case,
+            "age_ms": {"p99": changes.get("age", 20.0)},
+            "holds": changes.get("holds", []),
+            "lost": 7,
+        }
+        | {"silent": changes.get("silent", 0)}
+        for case in recording_busy.CASES
+    ]
     beside = [
         {"writer": "ours", "capture_cpu_s": 3.0, "save_cpu_s": 1.0, "save_s": 0.5, "frames": 100},
         {"writer": "lerobot", "capture_cpu_s": 10.0, "save_cpu_s": 10.0, "save_s": 5.0, "frames": 100},
@@ -129,7 +149,7 @@ def parts(**changes: Any) -> Any:
         {"median_ms": 20.0, "processor_ms": 10.0},
         {"median_ms": changes.get("listing", 60.0), "processor_ms": 30.0},
     ]
-    made = figures(station, {"rows": beside}, {"rows": kills}, {"rows": listing})
+    made = figures(station, {"rows": busy}, {"rows": beside}, {"rows": kills}, {"rows": listing})
     return {figure.name: figure for figure in made}
 
 
@@ -148,6 +168,9 @@ def test_every_figure_that_is_wanted_can_be_missed() -> None:
         lost_s=1.1,
         problems=["gone"],
         listing=201.0,
+        age=61.0,
+        holds=["joints are 0.21 s old"],
+        silent=1,
     )
     wanted = {name for name, figure in good.items() if figure.wanted}
     assert {name for name, figure in bad.items() if figure.holds is False} == wanted

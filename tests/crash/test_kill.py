@@ -12,7 +12,7 @@ from tests.crash.lab import ROOT
 from tests.processes import alive, eventually
 
 pytestmark = pytest.mark.slow
-FAMILY = ("control", "main", "media", "guard")
+FAMILY = ("control", "main", "reception", "media", "guard")
 
 
 def to_state(lab, state):

@@ -71,7 +71,7 @@ def bystander(ssh_server):
 
 
 @pytest.mark.parametrize(
-    "victims", [["supervisor"], ["main"], ["supervisor", "main", "control", "media", "guard"]]
+    "victims", [["supervisor"], ["main"], ["supervisor", "main", "control", "reception", "media", "guard"]]
 )
 def test_no_tunnel_outlives_what_was_killed(lab, ssh_server, bystander, victims):
     ssh = up_through_a_tunnel(lab, ssh_server)

@@ -1,4 +1,6 @@
+import random
 import time
+from collections.abc import Iterator
 
 import pytest
 from hypothesis import given
@@ -141,3 +143,97 @@ def test_a_jump_of_any_size_is_counted_once_and_the_map_is_right_again_at_once(o
     jumped = after < 2 * len(delays)
     counted = (clock_map.leaps, clock_map.restarts)
     assert counted == ((jumped, 0) if jump > 0 else (0, jumped))
+
+
+# --- steps of any size ---------------------------------------------------------------------------------------
+
+JITTER_S = 0.003  # of the way, and by a twentieth of its period of the node
+RATES = st.sampled_from([10.0, 30.0, 30.0, 100.0, 200.0])
+STEPS = st.one_of(st.floats(0.03, 0.5), st.floats(0.5, 1e6), st.sampled_from([1 / 30, 0.1, 0.2, 0.3]))
+
+
+class Stream:
+    """What a node stamps, and when it arrives: in its order, never before the way's least time."""
+
+    def __init__(self, rate: float, seed: int, drift: float = 0.0) -> None:
+        self.rate, self.random, self.drift = rate, random.Random(seed), drift
+        self.sent = self.arrived = 1000.0
+        self.offset = 0.0  # of the node's clock
+        self.blocked_until = 0.0  # the way
+
+    def messages(self, seconds: float, lost: float = 0.0) -> Iterator[tuple[float, float, float]]:
+        """(sent on our clock, stamp, arrival) for so long, a part of them `lost`."""
+        end = self.sent + seconds
+        while self.sent < end:
+            self.sent += (1.0 + self.random.uniform(-0.05, 0.05)) / self.rate
+            if self.random.random() < lost:
+                continue
+            on_time = self.sent + 0.001 + self.random.uniform(0.0, JITTER_S)
+            self.arrived = max(on_time, self.arrived, self.blocked_until)
+            yield self.sent, self.sent * (1.0 + self.drift) + self.offset, self.arrived
+
+    def block(self, seconds: float) -> None:
+        """Nothing arrives for so long, and then all at once."""
+        self.blocked_until = self.sent + seconds
+
+
+@given(
+    rate=RATES,
+    step=STEPS,
+    back=st.booleans(),
+    seed=st.integers(0, 1 << 16),
+    drift=st.floats(-1e-4, 1e-4),
+    before=st.floats(1.5, 4.0),
+)
+def test_a_step_of_any_size_is_counted_once_and_ages_nothing_for_longer_than_0_3_s(
+    rate, step, back, seed, drift, before
+):
+    clock_map, stream = ClockMap(tolerance=0.1), Stream(rate, seed, drift)
+    for _, stamp, arrival in stream.messages(before):
+        clock_map.map(stamp, arrival)
+    assert (clock_map.restarts, clock_map.leaps) == (0, 0)
+    stream.offset, stepped = -step if back else step, stream.sent
+    for sent, stamp, arrival in stream.messages(3.0):
+        mapped = clock_map.map(stamp, arrival)
+        if sent > stepped + 0.3:
+            assert mapped - sent == pytest.approx(0.001, abs=2 * JITTER_S)
+    assert (clock_map.restarts, clock_map.leaps) == ((1, 0) if back else (0, 1))
+
+
+@given(
+    rate=RATES,
+    seed=st.integers(0, 1 << 16),
+    blocks=st.lists(st.tuples(st.floats(0.1, 2.0), st.floats(0.01, 1.5)), max_size=6),
+    lost=st.sampled_from([0.0, 0.0, 0.1]),
+    drift=st.floats(-1e-4, 1e-4),
+)
+def test_what_comes_late_and_in_bursts_is_as_old_as_it_is_and_no_step(rate, seed, blocks, lost, drift):
+    clock_map, stream = ClockMap(tolerance=0.1), Stream(rate, seed, drift)
+    for quiet, blocked in [(1.5, 0.0), *blocks, (1.0, 0.0)]:
+        for sent, stamp, arrival in stream.messages(quiet, lost):
+            mapped = clock_map.map(stamp, arrival)
+            assert mapped - sent <= 0.001 + 2 * JITTER_S, "a late message was believed to be fresh"
+        stream.block(blocked)
+    assert (clock_map.restarts, clock_map.leaps) == (0, 0)
+
+
+@pytest.mark.parametrize("step", [0.05, 0.08, 0.3])
+def test_a_clock_set_back_while_nothing_came_is_noticed_by_what_comes_then(step):
+    clock_map, stream = ClockMap(tolerance=0.1), Stream(30.0, 1)
+    for _, stamp, arrival in stream.messages(2.0):
+        clock_map.map(stamp, arrival)
+    stream.sent += 5.0
+    stream.offset = -step
+    for _, stamp, arrival in stream.messages(1.3):
+        mapped = clock_map.map(stamp, arrival)
+    assert mapped - stream.sent == pytest.approx(0.001, abs=2 * JITTER_S)
+    assert clock_map.restarts == 1
+
+
+def test_two_that_stamp_one_stream_are_no_clock_that_goes_to_and_fro():
+    clock_map, first, second = ClockMap(), Stream(30.0, 1), Stream(30.0, 2)
+    second.offset = -0.04
+    for one, other in zip(first.messages(3.0), second.messages(3.0), strict=False):
+        clock_map.map(*one[1:])
+        clock_map.map(*other[1:])
+    assert (clock_map.restarts, clock_map.leaps) == (0, 0)

@@ -21,7 +21,7 @@ def without(station: Station, process: str, seconds: float) -> None:
     station.page.beat = beat
 
 
-@pytest.mark.parametrize("process", ["control", "media"])
+@pytest.mark.parametrize("process", ["control", "reception", "media"])
 def test_a_process_that_hangs_in_a_run_holds_it_and_is_named(tmp_path: Path, process: str) -> None:
     station = Station(plan(tmp_path)).running(10)
     without(station, process, 1.5)

@@ -19,20 +19,21 @@ RATE = 30.0
 
 
 class Gate:
-    """An intake with one camera; `order` says who heard of which observation, one after the other."""
+    """An intake with one camera; `order` says what was handed on, and whether the page had it by then."""
 
     def __init__(self) -> None:
         layout = PageLayout(2, 8, ("cam",), 75)
         self.page = Page(layout, mmap.mmap(-1, Page.size(layout)))
         self.clock, self.source = VirtualClock(100.0), FakeSource()
         self.said: list[Event] = []
-        self.order: list[tuple[str, int, bool]] = []
-        self.intake = Intake(
-            self.page, self.source, self.clock, self.said.append, self.hears("see"), self.hears("preview")
-        )
+        self.order: list[tuple[int, dict[str, int], bool]] = []
+        self.intake = self.begun()
 
-    def hears(self, name: str) -> Any:
-        return lambda seen: self.order.append((name, seen.sequence, self.published() == seen.sequence))
+    def begun(self) -> Intake:
+        return Intake(self.page, self.source, self.clock, self.said.append, self.hand_on)
+
+    def hand_on(self, seen: Observation, numbers: Any) -> None:
+        self.order.append((seen.sequence, dict(numbers), self.published() == seen.sequence))
 
     def published(self) -> int:
         seen = self.page.read_observation(())
@@ -61,9 +62,30 @@ def gate() -> Gate:
     return Gate()
 
 
-def test_the_recorder_sees_an_observation_before_anybody_else_and_the_preview_comes_last(gate: Gate) -> None:
+def test_an_observation_is_handed_on_with_its_pictures_in_place_before_the_page_has_it(gate: Gate) -> None:
     gate.receive(1)
-    assert gate.order == [("see", 1, False), ("preview", 1, True)]
+    assert gate.order == [(1, {"cam": 1}, False)]
+    assert gate.page.pictures["cam"].read(1) is not None
+    assert gate.published() == 1
+
+
+def test_a_successor_goes_on_counting_also_where_the_page_was_not_told_of_the_last_picture(
+    gate: Gate,
+) -> None:
+    gate.receive(2)
+    gate.page.pictures["cam"].write(3, np.ones((5, 5, 3), np.uint8))  # and then it died
+    gate.intake = gate.begun()
+    gate.receive(1)
+    assert gate.order[-1] == (3, {"cam": 4}, False)
+    assert gate.published() == 3
+
+
+def test_how_old_joints_are_when_they_are_in_the_page_is_told(gate: Gate) -> None:
+    assert gate.intake.age_ms() == {}
+    for late in (0.01, 0.02, 0.03):
+        now = gate.clock.now()
+        gate.receive(1, captured={"joints": now - late, "cam": now})
+    assert gate.intake.age_ms() == pytest.approx({"p50": 20.0, "p99": 29.8, "max": 30.0})
 
 
 def test_rates_are_those_of_arrivals_and_none_after_a_silence(gate: Gate) -> None:

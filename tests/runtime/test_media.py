@@ -24,11 +24,13 @@ from runtime.messages import (
     Event,
     MediaReport,
     Message,
+    ReceptionReport,
     TickDone,
     decode,
     encode,
 )
-from runtime.page import Page, PageLayout
+from runtime.page import PICTURE_SLOTS, Page, PageLayout
+from runtime.reception import Reception
 from runtime.recorder import Grid, Recorder
 from runtime.recording.base import Outcome
 from runtime.recording.files import UnclosedError
@@ -48,7 +50,7 @@ class FakeSource(Source):
         self.waiting: deque[Observation | Exception] = deque()
         self.first: Observation | None = None
         self.counts: dict[str, int] = {}
-        self.begun = 0
+        self.begun = self.ended = 0
 
     def connect(self) -> None:
         pass
@@ -69,6 +71,9 @@ class FakeSource(Source):
         if self.first is not None:
             self.waiting.append(self.first)
 
+    def end_run(self) -> None:
+        self.ended += 1
+
     def faults(self) -> dict[str, int]:
         return dict(self.counts)
 
@@ -84,7 +89,8 @@ class Desk:
         self.previewed: list[int] = []
         self.on_disk: list[Path] = []
         preview = lambda o: self.previewed.append(o.sequence)  # noqa: E731
-        self.media = Media(self.page, self.source, recorder, self.clock, preview, closer, self.on_disk.append)
+        self.media = Media(self.page, recorder, self.clock, preview, closer, self.on_disk.append)
+        self.reception = Reception(self.page, self.source, self.clock)
 
     def observation(self, sequence: int, **changes: Any) -> Observation:
         now = self.clock.now()
@@ -98,10 +104,17 @@ class Desk:
         }
         return Observation(**(fields | changes))
 
+    def pump(self, timeout: float = 0.0) -> None:
+        """What both processes do, and what comes of it at once."""
+        self.reception.pump(timeout)
+        self.media.digest()
+        if self.reception.hear():
+            self.media.digest()
+
     def receive(self, *sequences: int) -> None:
         for sequence in sequences:
             self.source.waiting.append(self.observation(sequence))
-            self.media.pump(0.0)
+            self.pump()
             self.clock.advance(1 / RATE)
 
     def post(self, message: Message, ring: str = "minutes") -> None:
@@ -109,15 +122,19 @@ class Desk:
 
     def begin(self, run: int = 1, **manifest: Any) -> None:
         self.post(BeginEpisode(run, {"uuid": "one"} | manifest))
-        self.media.pump(0.0)
+        self.pump()
 
     def tick(self, step: int, sequence: int, run: int = 1) -> None:
         now, q = self.clock.now(), np.zeros(2, np.float32)
         self.post(TickDone(step, run, now, now, sequence, "policy", q, None, q, [], [], [], False), "ticks")
 
     def told(self, kind: type[Any]) -> list[Any]:
-        found = [decode(payload) for payload in self.page.rings["media_events"].drain()]
-        return [message for message in found if isinstance(message, kind)]
+        return [message for message in self.heard() if isinstance(message, kind)]
+
+    def heard(self) -> list[Message]:
+        """All that main has not heard yet, that of reception first."""
+        rings = (self.page.rings[name] for name in ("reception_events", "media_events"))
+        return [decode(payload) for ring in rings for payload in ring.drain()]
 
 
 @pytest.fixture
@@ -137,17 +154,17 @@ def test_an_observation_reaches_the_page_with_its_pictures_and_the_preview(desk:
 def test_a_picture_that_is_not_new_is_not_written_again(desk: Desk) -> None:
     desk.receive(1)
     desk.source.waiting.append(desk.observation(2, captured={"joints": 100.2, "left": 100.0, "right": 100.2}))
-    desk.media.pump(0.0)
+    desk.pump()
     record = desk.page.observation.read()
     assert record["picture_number"].tolist() == [1, 2]
     assert record["picture_captured"].tolist() == [100.0, 100.2]
 
 
-def test_a_restarted_media_goes_on_counting_pictures(desk: Desk) -> None:
+def test_a_restarted_reception_goes_on_counting_pictures(desk: Desk) -> None:
     desk.receive(1, 2)
-    again = Media(desk.page, desk.source, desk.media._recorder, desk.clock)
+    desk.reception = Reception(desk.page, desk.source, desk.clock)
     desk.source.waiting.append(desk.observation(3))
-    again.pump(0.0)
+    desk.pump()
     assert desk.page.observation.read()["picture_number"].tolist() == [3, 3]
     seen = desk.page.read_observation(CAMERAS)
     assert seen is not None
@@ -156,12 +173,12 @@ def test_a_restarted_media_goes_on_counting_pictures(desk: Desk) -> None:
 
 def test_rates_are_measured_per_stream(desk: Desk) -> None:
     desk.receive(*range(1, 31))
-    report = desk.told(MediaReport)[-1]
+    report = desk.told(ReceptionReport)[-1]
     assert report.rates["joints"] == pytest.approx(RATE)
     assert report.rates["left"] == pytest.approx(RATE)
     desk.clock.advance(3.0)
-    desk.media.digest()
-    assert desk.told(MediaReport)[-1].rates["joints"] == 0.0
+    desk.pump()
+    assert desk.told(ReceptionReport)[-1].rates["joints"] == 0.0
 
 
 def test_malformed_messages_are_counted_told_once_per_change_and_written_into_the_episode(desk: Desk) -> None:
@@ -170,26 +187,26 @@ def test_malformed_messages_are_counted_told_once_per_change_and_written_into_th
     desk.told(Event)
     desk.source.counts = {"malformed": 3}
     desk.clock.advance(1.0)
-    desk.media.pump(0.0)
+    desk.pump()
     desk.clock.advance(1.0)
-    desk.media.pump(0.0)
-    messages = [decode(payload) for payload in desk.page.rings["media_events"].drain()]
+    desk.pump()
+    messages = desk.heard()
     events = [m for m in messages if isinstance(m, Event)]
     assert [(e.kind, e.text) for e in events] == [("source_malformed", "source: malformed (3 so far)")]
-    assert [m.faults for m in messages if isinstance(m, MediaReport)] == [{"malformed": 3}] * 2
+    assert [m.faults for m in messages if isinstance(m, ReceptionReport)] == [{"malformed": 3}] * 2
     assert [event["kind"] for event in desk.journal.events] == ["source_malformed"]
 
 
 def test_a_source_that_fails_is_told_once_and_received_from_again(desk: Desk) -> None:
     desk.source.waiting.extend([TransportError("frame 7 cannot be decoded")] * 3)
     for _ in range(3):
-        desk.media.pump(0.01)
+        desk.pump(0.01)
     assert [e.text for e in desk.told(Event)] == ["frame 7 cannot be decoded"]
     assert desk.clock.now() == pytest.approx(100.03)  # it waits and does not spin
     desk.receive(1)
     assert desk.page.observation.read()["sequence"] == 1
     desk.source.waiting.append(TransportError("frame 7 cannot be decoded"))
-    desk.media.pump(0.0)
+    desk.pump()
     assert len(desk.told(Event)) == 1
 
 
@@ -197,7 +214,7 @@ def test_a_picture_too_large_for_the_page_is_named_and_the_rest_goes_on(desk: De
     large = np.zeros((11, 11, 3), np.uint8)
     pictures = {"left": large, "right": np.zeros((5, 5, 3), np.uint8)}
     desk.source.waiting.append(desk.observation(1, pictures=pictures))
-    desk.media.pump(0.0)
+    desk.pump()
     assert [e.kind for e in desk.told(Event)] == ["source_picture_too_large_left"]
     assert desk.page.observation.read()["picture_number"].tolist() == [0, 1]
     assert desk.page.observation.read()["sequence"] == 1
@@ -217,7 +234,7 @@ def test_a_run_begins_with_the_first_frame_of_the_source(desk: Desk) -> None:
 def test_a_run_that_is_not_recorded_begins_all_the_same(desk: Desk) -> None:
     desk.receive(1)
     desk.post(BeginEpisode(4, None))
-    desk.media.pump(0.0)
+    desk.pump()
     assert desk.source.begun == 1
     (opened,) = desk.told(EpisodeOpened)
     assert (opened.run, opened.uuid, opened.error) == (4, "", "")
@@ -248,9 +265,9 @@ def test_ticks_become_rows_and_the_end_is_told(desk: Desk) -> None:
     desk.begin()
     desk.tick(0, 1)
     desk.tick(1, 1)
-    desk.media.pump(0.0)
+    desk.pump()
     desk.post(EndEpisode("finished", "over", {"a": 1}))
-    desk.media.pump(0.0)
+    desk.pump()
     (closed,) = desk.told(EpisodeClosed)
     assert (closed.uuid, closed.status, closed.reason, closed.rows, closed.error) == (
         "one",
@@ -268,7 +285,7 @@ def test_a_tick_done_before_the_end_was_decided_is_still_recorded(desk: Desk) ->
     desk.begin()
     desk.tick(0, 1)
     desk.post(EndEpisode("finished", "over"))  # both wait in their rings when media comes to them
-    desk.media.pump(0.0)
+    desk.pump()
     assert desk.told(EpisodeClosed)[0].rows == 1
 
 
@@ -279,8 +296,8 @@ def test_a_recording_that_fails_is_an_event_and_closes_the_episode(desk: Desk) -
     desk.journal.failing = {"append"}
     desk.tick(0, 1)
     desk.tick(1, 1)
-    desk.media.pump(0.0)
-    messages = [decode(payload) for payload in desk.page.rings["media_events"].drain()]
+    desk.pump()
+    messages = desk.heard()
     assert [m.text for m in messages if isinstance(m, Event)] == ["disk full while append"]
     (closed,) = [m for m in messages if isinstance(m, EpisodeClosed)]
     assert (closed.status, closed.reason) == ("failed", "disk full while append")
@@ -294,7 +311,7 @@ def test_an_event_that_cannot_be_written_fails_the_recording_too(desk: Desk) -> 
     desk.begin()
     desk.journal.failing = {"mark"}
     desk.post(Event("x", "y", 1.0))
-    desk.media.pump(0.0)
+    desk.pump()
     assert [m.kind for m in desk.told(Event)] == ["recording_failed"]
     assert not desk.media.recording
 
@@ -319,7 +336,7 @@ def test_what_was_addressed_to_a_predecessor_is_not_obeyed(desk: Desk) -> None:
     desk.receive(1)
     desk.post(BeginEpisode(1, {"uuid": "old"}))
     desk.tick(0, 1)
-    Media(desk.page, desk.source, desk.media._recorder, desk.clock).digest()
+    Media(desk.page, desk.media._recorder, desk.clock).digest()
     assert not desk.media.recording
     assert desk.source.begun == 0
 
@@ -330,9 +347,107 @@ def test_the_report_counts_rows_and_repeated_pictures(desk: Desk) -> None:
     desk.tick(0, 1)
     desk.tick(1, 1)
     desk.clock.advance(1.0)
-    desk.media.pump(0.0)
+    desk.pump()
     report = desk.told(MediaReport)[-1]
     assert (report.rows, report.recording, report.repeated) == (2, "one", 2)
+
+
+# --- what two processes see ---------------------------------------------------------------------------------
+
+
+def test_a_tick_that_comes_before_the_observation_it_saw_was_read_is_a_row_of_that_one(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    drain = desk.page.rings["observations"].drain
+
+    def late() -> Any:
+        desk.page.rings["observations"].drain = drain  # type: ignore[method-assign]
+        yield from drain()
+        desk.source.waiting.append(desk.observation(2))
+        desk.reception.pump(0.0)
+        desk.tick(0, 2)
+
+    desk.page.rings["observations"].drain = late  # type: ignore[method-assign]
+    desk.media.digest()
+    (row,) = desk.journal.rows
+    assert row.lost == frozenset()
+    assert all((row.pictures[camera] == 2).all() for camera in CAMERAS)  # type: ignore[union-attr]
+
+
+def test_pictures_that_were_overwritten_before_they_were_recorded_are_lost_and_said_to_be(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.tick(0, 1)
+    desk.media.digest()
+    for sequence in range(2, PICTURE_SLOTS + 4):  # media does nothing meanwhile
+        desk.source.waiting.append(desk.observation(sequence))
+        desk.reception.pump(0.0)
+        desk.clock.advance(1 / RATE)
+        desk.tick(sequence - 1, sequence)
+    desk.media.digest()
+    lost = [row.lost == set(CAMERAS) for row in desk.journal.rows]
+    assert lost == [False, True, True, *[False] * PICTURE_SLOTS]
+    shown = [row.pictures["left"] for row in desk.journal.rows]
+    assert [None if seen is None else int(seen[0, 0, 0]) for seen in shown] == [
+        1,
+        None,
+        None,
+        *range(4, PICTURE_SLOTS + 4),
+    ]
+    assert [row.sequence for row in desk.journal.rows] == [*range(1, PICTURE_SLOTS + 4)]
+
+
+def test_what_media_had_no_room_for_is_lost_in_its_rows_and_said(
+    desk: Desk, caplog: pytest.LogCaptureFixture
+) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.tick(0, 1)
+    desk.media.digest()
+    push = desk.page.rings["observations"].push
+    desk.page.rings["observations"].push = lambda payload: False  # type: ignore[method-assign]
+    desk.receive(2, 3)
+    desk.page.rings["observations"].push = push  # type: ignore[method-assign]
+    desk.tick(1, 3)
+    desk.receive(4)
+    desk.tick(2, 4)
+    desk.media.digest()
+    assert [row.lost for row in desk.journal.rows] == [frozenset(), set(CAMERAS), frozenset()]
+    assert caplog.text.count("media does not read") == 1
+    assert desk.page.observation.read()["sequence"] == 4  # and control saw all of them
+
+
+def test_a_recording_goes_on_over_another_reception(desk: Desk) -> None:
+    desk.receive(1, 2)
+    desk.begin(run=0)
+    desk.tick(0, 2, run=0)
+    desk.media.digest()
+    desk.reception, desk.source.waiting = Reception(desk.page, desk.source, desk.clock), deque()
+    desk.receive(1)
+    assert desk.page.observation.read()["sequence"] == 3
+    desk.tick(1, 3, run=0)
+    desk.media.digest()
+    assert [row.sequence for row in desk.journal.rows] == [2, 3]
+    assert [row.lost for row in desk.journal.rows] == [frozenset(), frozenset()]
+
+
+def test_a_run_that_ends_before_its_source_began_is_not_opened_afterwards(desk: Desk) -> None:
+    desk.receive(1)
+    desk.post(BeginEpisode(1, {"uuid": "one"}))
+    desk.post(EndEpisode("interrupted", "reception died"))
+    desk.pump()
+    assert desk.told(EpisodeOpened) == []
+    assert desk.source.begun == desk.source.ended == 1
+    assert not desk.media.recording
+
+
+def test_a_restarted_media_lets_the_run_of_its_predecessor_end(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    ended = desk.source.ended
+    desk.media = Media(desk.page, desk.media._recorder, desk.clock)
+    desk.reception.pump(0.0)
+    assert desk.source.ended == ended + 1
 
 
 # --- an end that takes long --------------------------------------------------------------------------------
@@ -367,7 +482,7 @@ def slow(disk: SlowDisk) -> Desk:
     desk.begin()
     desk.tick(0, 1)
     desk.post(EndEpisode("finished", "over"))
-    desk.media.pump(0.0)
+    desk.pump()
     desk.told(Event)
     return desk
 
@@ -376,27 +491,27 @@ def test_while_an_episode_is_being_closed_media_receives_and_still_counts_it_as_
     slow: Desk, disk: SlowDisk
 ) -> None:
     slow.receive(*range(2, 12))
-    messages = [decode(payload) for payload in slow.page.rings["media_events"].drain()]
+    messages = slow.heard()
     assert slow.page.observation.read()["sequence"] == 11
     assert [m.recording for m in messages if isinstance(m, MediaReport)][-1] == "one"
     assert [m for m in messages if isinstance(m, EpisodeClosed)] == []
     disk.finish()
-    slow.media.digest()
+    slow.pump()
     (closed,) = slow.told(EpisodeClosed)
     assert (closed.uuid, closed.status, closed.rows) == ("one", "finished", 1)
     slow.clock.advance(1.0)
-    slow.media.digest()
+    slow.pump()
     assert slow.told(MediaReport)[-1].recording == ""
 
 
 def test_a_run_that_is_asked_for_meanwhile_begins_when_the_disk_is_done(slow: Desk, disk: SlowDisk) -> None:
     slow.post(BeginEpisode(2, {"uuid": "two"}))
     slow.post(Event("x", "of the second", 1.0))
-    slow.media.digest()
+    slow.pump()
     assert slow.told(EpisodeOpened) == []
     disk.finish()
-    slow.media.digest()
-    messages = [decode(payload) for payload in slow.page.rings["media_events"].drain()]
+    slow.pump()
+    messages = slow.heard()
     kept = [m for m in messages if isinstance(m, EpisodeClosed | EpisodeOpened)]
     assert [m.uuid for m in kept] == ["one", "two"]
     assert slow.journal.events[-1]["text"] == "of the second"
@@ -404,15 +519,15 @@ def test_a_run_that_is_asked_for_meanwhile_begins_when_the_disk_is_done(slow: De
 
 def test_a_run_is_refused_where_the_disk_takes_its_time(slow: Desk, disk: SlowDisk) -> None:
     slow.post(BeginEpisode(2, {"uuid": "two"}))
-    slow.media.digest()
+    slow.pump()
     slow.clock.advance(1.01)
-    slow.media.digest()
+    slow.pump()
     (opened,) = slow.told(EpisodeOpened)
     assert opened.run == 2
     assert "the last episode is still being written" in opened.error
     assert slow.source.begun == 1  # of the first run
     disk.finish()
-    slow.media.digest()
+    slow.pump()
     slow.begin(run=3, uuid="three")
     assert slow.told(EpisodeOpened)[-1].uuid == "three"
 
@@ -501,9 +616,9 @@ def test_at_the_end_of_the_process_what_waits_is_tried_once_more(
 
 def test_a_run_that_is_not_recorded_waits_for_no_disk_longer_than_that(slow: Desk) -> None:
     slow.post(BeginEpisode(2, None))
-    slow.media.digest()
+    slow.pump()
     slow.clock.advance(1.01)
-    slow.media.digest()
+    slow.pump()
     (opened,) = slow.told(EpisodeOpened)
     assert (opened.run, opened.error) == (2, "")
 
@@ -601,20 +716,20 @@ TRUTH = {"reset": "r", "milestones": {"placed": True}, "success": True}
 
 def test_the_truth_of_a_simulated_bench_is_reported_and_forgotten_with_its_node(desk: Desk) -> None:
     desk.source.waiting.append(desk.observation(1, truth=TRUTH))
-    desk.media.pump(0.0)
-    assert desk.told(MediaReport)[-1].truth == TRUTH
+    desk.pump()
+    assert desk.told(ReceptionReport)[-1].truth == TRUTH
     desk.clock.advance(1.0)
     desk.receive(2)  # another node, or the same without its bench
-    assert desk.told(MediaReport)[-1].truth == {}
+    assert desk.told(ReceptionReport)[-1].truth == {}
 
 
 def test_an_episode_ends_with_the_newest_truth(desk: Desk) -> None:
     desk.receive(1)
     desk.begin()
     desk.source.waiting.append(desk.observation(2, truth=TRUTH))
-    desk.media.pump(0.0)
+    desk.pump()
     desk.post(EndEpisode("finished", "stopped", {"reached": {"grasped": 1.5}}))
-    desk.media.pump(0.0)
+    desk.pump()
     said = [event for event in desk.told(Event) if event.kind == "truth"]
     assert [event.data for event in said] == [TRUTH | {"reached": {"grasped": 1.5}, "episode": "one"}]
     assert [event["data"] for event in desk.journal.events if event["kind"] == "truth"] == [said[0].data]
@@ -625,7 +740,7 @@ def test_without_truth_nothing_is_said_of_it(desk: Desk) -> None:
     desk.receive(1)
     desk.begin()
     desk.post(EndEpisode("finished", "stopped"))
-    desk.media.pump(0.0)
+    desk.pump()
     assert [event for event in desk.told(Event) if event.kind == "truth"] == []
 
 
@@ -633,28 +748,28 @@ def test_a_log_that_cannot_take_the_truth_ends_the_episode_once(desk: Desk) -> N
     desk.receive(1)
     desk.begin()
     desk.source.waiting.append(desk.observation(2, truth=TRUTH))
-    desk.media.pump(0.0)
+    desk.pump()
 
     desk.journal.failing = {"mark"}
     desk.post(EndEpisode("finished", "stopped"))
-    desk.media.pump(0.0)
+    desk.pump()
     closed = desk.told(EpisodeClosed)
     assert [(message.status, message.reason) for message in closed] == [("failed", "disk full while mark")]
 
 
 def test_drives_are_reported_and_their_changes_are_events_of_the_episode(desk: Desk) -> None:
     desk.receive(1)
-    assert desk.told(MediaReport)[-1].drives == {}
+    assert desk.told(ReceptionReport)[-1].drives == {}
     desk.begin()
     off = {"enabled": False, "faults": ["axis 2 is hot"]}
     for sequence in (2, 3):
         desk.source.waiting.append(desk.observation(sequence, drives=off))
         desk.clock.advance(1.0)
-        desk.media.pump(0.0)
-    messages = [decode(payload) for payload in desk.page.rings["media_events"].drain()]
+        desk.pump()
+    messages = desk.heard()
     events = [m for m in messages if isinstance(m, Event) and m.kind == "drives"]
     assert [(e.text, e.data) for e in events] == [("drives disabled; drive fault: axis 2 is hot", off)]
-    assert [m.drives for m in messages if isinstance(m, MediaReport)][-1] == off
+    assert [m.drives for m in messages if isinstance(m, ReceptionReport)][-1] == off
     assert [event["kind"] for event in desk.journal.events] == ["drives"]
 
 

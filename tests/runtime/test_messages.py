@@ -10,9 +10,11 @@ from runtime.errors import CodecError
 from runtime.messages import (
     Ack,
     BeginEpisode,
+    BeginRun,
     ChunkMerged,
     Command,
     EndEpisode,
+    EndRun,
     EpisodeClosed,
     EpisodeOpened,
     Event,
@@ -20,9 +22,12 @@ from runtime.messages import (
     MediaReport,
     Message,
     NodeRequest,
+    Observed,
     Order,
     PolicyAnswer,
     PostedChunk,
+    ReceptionReport,
+    RunBegun,
     TickDone,
     Tune,
     decode,
@@ -52,7 +57,12 @@ MESSAGES = [
     EndEpisode("finished", "stopped", {"control": {"ticks": 3}}),
     EpisodeOpened(7, "u", "/data/u", "disk full"),
     EpisodeClosed("u", "/data/u", "finished", "stopped", 240, ""),
-    MediaReport(3.5, {"joints": 30.0}, {"malformed": 2}, 12, "u", 1, {"reset": "r", "success": False}),
+    MediaReport(3.5, 12, "u", 1),
+    Observed(9, 1.5, {"joints": 1.25}, Q, {"left": 7}, eef=Q + 1, last=True, truth={"success": False}),
+    BeginRun(3),
+    RunBegun(3),
+    EndRun(),
+    ReceptionReport(3.5, {"joints": 30.0}, {"malformed": 2}, {"reset": "r"}, {"enabled": True, "faults": []}),
     Command("u", "run", {"a": [1, None]}, "anna", "page", 3, "boot", 12, 99.5),
     Ack("u", "done", "because", ["stop"], "boot", 12, {"qpos": Q}),
 ]
@@ -122,7 +132,7 @@ def test_a_word_that_is_not_among_those_expected_is_refused(content, field):
 
 
 def test_numbers_of_numpy_are_numbers():
-    report = MediaReport(np.float32(0.5), {}, {}, np.int64(3), "", np.int32(0))  # type: ignore[arg-type]
+    report = MediaReport(np.float32(0.5), np.int64(3), "", np.int32(0))  # type: ignore[arg-type]
     back = decode(encode(report))
     assert (back.time, back.rows, back.repeated) == (0.5, 3, 0)
 

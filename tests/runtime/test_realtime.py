@@ -17,11 +17,30 @@ _ASK = (
 )
 
 
+_ASK_BELOW = (
+    "from runtime import realtime; import gc, os, threading; "
+    "words = realtime.enter_below(20); found = []; "
+    "child = threading.Thread(target=lambda: found.append(os.sched_getscheduler(0))); child.start(); child.join(); "
+    "leaver = threading.Thread(target=lambda: (realtime.leave(), found.append(os.sched_getscheduler(0)))); "
+    "leaver.start(); leaver.join(); "
+    "got = os.sched_getscheduler(0); realtime.leave_all(); "
+    "print(words, got, *found, gc.isenabled(), os.sched_getscheduler(0), sep='|')"
+)
+
+
 def asked(*before: str) -> tuple[str, int, bool]:
     """What a process of its own gets: the words, the class by the kernel, whether gc runs."""
     done = subprocess.run([*before, sys.executable, "-c", _ASK], capture_output=True, text=True, check=True)
     words, policy, collects = done.stdout.rsplit(maxsplit=2)
     return words, int(policy), collects == "True"
+
+
+def test_who_comes_next_has_a_class_below_for_its_threads_too_but_for_those_that_leave_it() -> None:
+    done = subprocess.run([sys.executable, "-c", _ASK_BELOW], capture_output=True, text=True, check=True)
+    words, own, child, left, collects, at_last = done.stdout.strip().split("|")
+    assert int(own) == (os.SCHED_FIFO if words.startswith("FIFO 19") else os.SCHED_OTHER)
+    assert (child, int(left), collects) == (own, os.SCHED_OTHER, "True")
+    assert int(at_last) == os.SCHED_OTHER
 
 
 @pytest.fixture
@@ -50,6 +69,14 @@ def test_a_limit_below_the_wanted_priority_is_used(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(resource, "getrlimit", lambda kind: (10, 10))
     assert realtime._fifo(20) == "FIFO 10"
     assert tried == [20, 10]
+
+
+def test_who_comes_next_is_below_also_where_a_limit_holds_both(
+    monkeypatch: pytest.MonkeyPatch, tried: list[int]
+) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: (10, 10))
+    assert realtime._fifo(20, below=1) == "FIFO 9"
+    assert tried == [19, 9]
 
 
 def test_without_a_limit_there_is_no_real_time_class(

@@ -27,13 +27,14 @@ def failed(station: Station) -> str:
 
 def without_control(station: Station, seconds: float, beating: bool = True) -> None:
     """Time passes, and control, alive or not, does not tick."""
-    until = station.clock.now() + seconds
+    until, others = station.clock.now() + seconds, ("guard", "media", "reception")
     while station.clock.now() < until:
         now = station.clock.now()
-        for process in ("control", "guard", "media") if beating else ("guard", "media"):
+        for process in ("control", *others) if beating else others:
             station.page.beat(process, now)
         station._handle("lease_renew")
-        station.media.pump(0.0)
+        station.reception.pump(0.0)
+        station.media.digest()
         station.main.pump()
         station.clock.advance(1 / 30)
 

@@ -22,7 +22,7 @@ DOORS = {
     "preflight",
     "quality",
 }
-FAMILY = {"control", "main", "media", "guard", "headless"}
+FAMILY = {"control", "main", "reception", "media", "guard", "headless"}
 ROOF = FAMILY | {"lockstep", "served_lockstep", "supervisor", "ctl", "terminal", "channel", "__main__"}
 
 
@@ -170,7 +170,9 @@ def run(code):
     ).stdout
 
 
-@pytest.mark.parametrize("module", ["runtime.config", "runtime.control", "runtime.guard", "runtime.ctl"])
+@pytest.mark.parametrize(
+    "module", ["runtime.config", "runtime.control", "runtime.reception", "runtime.guard", "runtime.ctl"]
+)
 def test_what_control_and_the_terminal_import_is_free_of_codecs_and_tables(module):
     heavy = ["av", "pyarrow", "PIL", "websockets", "simplejpeg"]
     assert run(f"import sys, {module}; print([m for m in {heavy} if m in sys.modules])").strip() == "[]"

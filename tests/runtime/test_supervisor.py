@@ -24,7 +24,9 @@ def started(monkeypatch):
     real = subprocess.Popen
 
     class Started(real):
-        commands = dict.fromkeys(("guard", "media", "control", "main", "headless", "channel"), WAITS)
+        commands = dict.fromkeys(
+            ("guard", "reception", "media", "control", "main", "headless", "channel"), WAITS
+        )
 
         def __init__(self, arguments, **options):
             self.process = arguments[2].removeprefix("runtime.")
@@ -56,7 +58,7 @@ def test_the_end_of_what_drives_a_headless_run_ends_the_family(station, started)
     made, commands = started
     commands["headless"] = ["sh", "-c", "exit 3"]
     assert station.run(headless=True) == 3
-    assert [child.process for child in made] == ["guard", "media", "control", "main", "headless"]
+    assert [child.process for child in made] == ["guard", "reception", "media", "control", "main", "headless"]
     assert all_ended(made)
 
 
@@ -74,7 +76,7 @@ def test_a_control_channel_that_dies_does_not_end_the_family_and_ends_with_it(tm
     commands["channel"], commands["headless"] = DIES, ["sh", "-c", "sleep 0.3; exit 4"]
     assert Supervisor(plan(load(DEMO, sets))).run(headless=True) == 4
     names = [child.process for child in made]
-    assert names == ["guard", "media", "control", "main", "channel", "headless"]
+    assert names == ["guard", "reception", "media", "control", "main", "channel", "headless"]
     commands["channel"] = WAITS
     assert Supervisor(plan(load(DEMO, sets))).run(headless=True) == 4
     assert all_ended(made)

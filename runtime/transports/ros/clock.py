@@ -2,38 +2,38 @@
 
 from __future__ import annotations
 
-from runtime.clock import ClockMap
+from collections import defaultdict
 
-JUMP_S = 0.5  # a stamp that is further off than this from where its stream's clock should be is a jump
+from runtime.clock import ClockMap, Steps
 
 
 class RosClock:
     """One map for all streams of a robot, so that each stream's own delay stays visible in its age.
 
-    Every stream is watched for jumps by itself, because a camera may be late by more than joints are. After a jump
-    back nothing that was received before can be compared with what comes; the map starts anew.
+    Every stream is watched for steps by itself, because a camera may be late by more than joints are. After a step
+    nothing that was received before can be compared with what comes; the map starts anew.
     """
 
     def __init__(self) -> None:
-        self._map = _map()
-        self._newest: dict[str, tuple[float, float]] = {}  # by stream: stamp, arrival
-        self.backwards = 0
-        self.forwards = 0
+        self._map = ClockMap()
+        self._steps: defaultdict[str, Steps] = defaultdict(Steps)
+
+    @property
+    def backwards(self) -> int:
+        """How often the clock was set back."""
+        return self._map.restarts
+
+    @property
+    def forwards(self) -> int:
+        """How often it was set ahead."""
+        return self._map.leaps
 
     def see(self, stream: str, stamp: float, arrival: float) -> float:
-        """A stamp [s] in our clock, never later than its arrival; counts a jump as one of those it has seen."""
-        before = self._newest.get(stream)
-        if before is not None and stamp < before[0] - JUMP_S:
-            self.backwards += 1
-            self._map = _map()
-            self._newest.clear()
-        elif before is not None and stamp - before[0] > arrival - before[1] + JUMP_S:
-            self.forwards += 1
-        known = self._newest.get(stream)
-        if known is None or stamp > known[0]:
-            self._newest[stream] = (stamp, arrival)
-        return self._map.map(stamp, arrival)
-
-
-def _map() -> ClockMap:
-    return ClockMap(tolerance=float("inf"))  # jumps are noticed stream by stream
+        """A stamp [s] in our clock, never later than its arrival; counts a step as one of those it has seen."""
+        before = self._map.restarts + self._map.leaps
+        time = self._map.map(stamp, arrival, self._steps[stream])
+        if self._map.restarts + self._map.leaps > before:
+            for name, steps in self._steps.items():
+                if name != stream:
+                    steps.forget()
+        return time

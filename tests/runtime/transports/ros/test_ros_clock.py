@@ -51,6 +51,17 @@ def test_a_slow_camera_is_no_clock_that_goes_back() -> None:
     assert (clock.backwards, clock.forwards) == (0, 0)
 
 
+@pytest.mark.parametrize(("step", "counted"), [(-0.2, (1, 0)), (0.2, (0, 1))])
+def test_a_small_step_is_one_however_many_streams_show_it(step: float, counted: tuple[int, int]) -> None:
+    clock = RosClock()
+    for tick in range(90):
+        now, offset = 50 + tick / 30, WALL - 50 + (step if tick >= 60 else 0.0)
+        joints = clock.see("joints", now + offset, now + 0.002)
+        clock.see("camera", now + offset, now + 0.030)
+    assert joints == pytest.approx(now + 0.002)
+    assert (clock.backwards, clock.forwards) == counted
+
+
 def test_a_silence_is_no_leap() -> None:
     clock = RosClock()
     clock.see("joints", WALL, 50.0)

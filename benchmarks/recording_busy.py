@@ -1,0 +1,120 @@
+"""Recordings of a whole station beside busy loops: how old joints come into the shared page, and what is lost."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.busy_lab import PATIENT
+from benchmarks.recording_station import SIZE, PatientLab
+from runtime.client import Refused
+from runtime.recording.reader import Episode, open_episode
+
+_LOOK_S = 20.0  # less than what the ages are of
+_LOOP = "while True: pass"
+_NODE_PRIORITY = 30  # above ours
+# Patient with everything but old joints, which are what is measured.
+_JUDGED = ("safety.joint_age_s", "safety.refusals_to_hold")
+_SETTINGS = [one for one in PATIENT if not one.startswith(_JUDGED)]
+CASES = {"quiet": (False, "auto"), "busy": (True, "auto"), "busy_ordinary": (True, "off")}
+
+
+def record(folder: Path, seconds: float) -> dict[str, Any]:
+    """Record `seconds` on a quiet machine, beside a busy loop per core, and there without a real-time class."""
+    rows = []
+    for name, (busy, realtime) in CASES.items():
+        lab = PatientLab(folder / name)
+        lab.folder.mkdir(parents=True)
+        try:
+            lab.node(*SIZE).server()
+            lab.up(
+                *_SETTINGS,
+                f"run.duration_s={seconds + 600}",
+                "bus.preview_rate=15",
+                f'control.realtime="{realtime}"',
+            )
+            _put_first(lab.children["node"].pid)
+            lab.ready()
+            rows.append({"case": name, **_run(lab, seconds, busy)})
+        finally:
+            lab.close()
+    return {"rows": rows}
+
+
+def _run(lab: PatientLab, seconds: float, busy: bool) -> dict[str, Any]:
+    lab.client.command("run")
+    uuid = lab.client.wait(lambda status: status["recording"]["uuid"], lab.patience)["recording"]["uuid"]
+    with _loops(os.cpu_count() or 1 if busy else 0):
+        ages, held = _watch(lab, seconds)
+        status = lab.client.status()
+    lab.client.command("stop")
+    lab.reach("ready", "idle")
+    lab.client.wait(lambda status: status["episode"].get("uuid") == uuid, lab.patience)
+    episode = open_episode(lab.data / "episodes" / uuid)
+    return {
+        "seconds": seconds,
+        "scheduling": status["link"]["scheduling"],
+        "age_ms": {quantile: max(age[quantile] for age in ages) for quantile in ages[0]},
+        "holds": held,
+        **pictures(episode),
+    }
+
+
+def _watch(lab: PatientLab, seconds: float) -> tuple[list[dict[str, float]], list[str]]:
+    """The ages of joints as they came in, at times; why the robot was held, and goes on."""
+    end, look_at = time.monotonic() + seconds, time.monotonic() + _LOOK_S
+    ages: list[dict[str, float]] = []
+    held: list[str] = []
+    while (now := time.monotonic()) < end or not ages:
+        lab.client.renew()
+        status = lab.client.status(30.0)
+        if status["state"] != "running":
+            held.append(status["reason"])
+        if status["state"] == "holding":
+            with suppress(Refused):  # not yet: again with the next look
+                lab.client.command("resume")
+        if now >= min(look_at, end):
+            look_at = now + _LOOK_S
+            ages.append(status["link"]["age_ms"])
+        time.sleep(0.5)
+    return ages, held
+
+
+def pictures(episode: Episode) -> dict[str, int]:
+    """What was given and is not in the videos: flagged, and not (`silent`)."""
+    flagged = silent = 0
+    rows = episode.rows
+    for camera in episode.layout.cameras:
+        captured = rows.column(f"capture_time.{camera}").to_numpy()
+        repeated, lost = (rows.column(f"{what}.{camera}").to_numpy() for what in ("repeated", "lost"))
+        new = np.concatenate([[True], captured[1:] != captured[:-1]])
+        flagged += int(lost.sum())
+        silent += int((repeated & new & ~lost).sum())
+    return {"rows": len(rows), "lost": flagged, "silent": silent}
+
+
+def _put_first(process: int) -> None:
+    """The node stands for a machine of its own: it is not held up by ours, where that is permitted."""
+    with suppress(PermissionError):
+        for thread in Path(f"/proc/{process}/task").iterdir():
+            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(_NODE_PRIORITY))
+
+
+@contextmanager
+def _loops(count: int) -> Iterator[None]:
+    """So many processes that never wait."""
+    loops = [subprocess.Popen([sys.executable, "-c", _LOOP]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.wait()

@@ -1,0 +1,52 @@
+"""Observations from reception to media: numbers in a message, pictures in their slots until they are used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from runtime.messages import Observed
+from runtime.page import Page
+from runtime.types import Observation, UInt8
+
+_SAME = (
+    *("sequence", "arrived", "captured", "qpos", "qvel", "effort", "eef"),
+    *("reported_action", "reported_action_eef", "last", "truth"),
+)
+
+
+class SlotPictures(Mapping[str, UInt8]):
+    """Pictures by camera, copied out of their slots when they are asked for: one that was overwritten is a KeyError."""
+
+    def __init__(self, page: Page, numbers: Mapping[str, int]) -> None:
+        self._page = page
+        self._numbers = numbers
+
+    def __getitem__(self, camera: str) -> UInt8:
+        picture = self._page.pictures[camera].read(self._numbers[camera])
+        if picture is None:
+            raise KeyError(camera)
+        return picture
+
+    def __contains__(self, camera: object) -> bool:
+        """Whether there was one, overwritten or not."""
+        return camera in self._numbers
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._numbers)
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+
+def as_message(observation: Observation, numbers: Mapping[str, int]) -> Observed:
+    """What media is told of an observation whose pictures are in the slots of these numbers."""
+    told = {name: getattr(observation, name) for name in _SAME}
+    told["captured"] = dict(observation.captured)
+    return Observed(**told, pictures={camera: numbers[camera] for camera in observation.pictures})
+
+
+def as_observation(message: Observed, page: Page) -> Observation:
+    """The observation that a message tells of."""
+    return Observation(
+        **{name: getattr(message, name) for name in _SAME}, pictures=SlotPictures(page, message.pictures)
+    )

@@ -1,0 +1,174 @@
+"""The process that receives every observation and puts it where control, main and media find it."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+
+from runtime import heap, realtime
+from runtime.clock import Clock, MonotonicClock
+from runtime.errors import RuntimeFault
+from runtime.family import Plan, join
+from runtime.intake import Intake
+from runtime.messages import BeginRun, EndRun, Event, Message, ReceptionReport, RunBegun, decode, encode
+from runtime.page import Page
+from runtime.received import as_message
+from runtime.transports.base import Source
+from runtime.types import Observation
+
+log = logging.getLogger(__name__)
+_REPORT_PERIOD = 0.2
+_WAIT_S = 0.005  # for an observation, until media is heard again
+_RETRY_S = 1.0  # between two tries to connect
+_SHARE_S = 3.0
+
+
+class Share:
+    """The processor time that this process takes, over and over for `_SHARE_S` seconds."""
+
+    def __init__(self) -> None:
+        self._since: tuple[float, float] | None = None  # when, and what had been taken by then [s]
+
+    def too_much(self, now: float, taken: float) -> bool:
+        """Whether it was more than a core over the last whole stretch; `taken` since the start [s]."""
+        since = self._since or (now, taken)
+        if now - since[0] < _SHARE_S:
+            self._since = since
+            return False
+        self._since = now, taken
+        return taken - since[1] > now - since[0]
+
+
+class Reception:
+    """One `pump` takes what there is; lockstep calls it tick by tick."""
+
+    def __init__(self, page: Page, source: Source, clock: Clock, scheduling: str = "") -> None:
+        self._page = page
+        self._clock = clock
+        self._scheduling = scheduling
+        self._intake = Intake(page, source, clock, self._say, self._hand_on)
+        self._begun: RunBegun | None = None  # media is not told yet
+        self._next_report = 0.0
+        self._missed = 0  # observations that media had no room for
+        for _ in page.rings["source"].drain():
+            pass  # addressed to a predecessor that died
+
+    def pump(self, timeout: float) -> None:
+        """Obey media, take one observation if there is one within `timeout` seconds, report when it is time."""
+        self.hear()
+        self._intake.pump(timeout)
+        self._report_in_time()
+
+    def tend(self) -> None:
+        """The same without an observation: the source is not connected."""
+        self.hear()
+        self._report_in_time()
+
+    def give_way(self) -> None:
+        """No real-time class any more: what comes in would take the processors from the guard and from main."""
+        realtime.leave_all()
+        self._scheduling = "ordinary"
+        text = (
+            f"receiving took more than a processor core for {_SHARE_S:g} s and gives its real-time class up: "
+            "see what the robot's node and the cameras send; the class is back when the station is started anew"
+        )
+        self._say(Event("scheduling", text, self._clock.now()))
+
+    def _report_in_time(self) -> None:
+        if self._clock.now() >= self._next_report:
+            self.report()
+
+    def hear(self) -> bool:
+        """Let the source begin its run, or end it, as media says; whether a run has begun."""
+        for payload in self._page.rings["source"].drain():
+            message = decode(payload)
+            if isinstance(message, BeginRun):
+                self._intake.begin_run()
+                self._begun = RunBegun(message.run)
+            elif isinstance(message, EndRun):
+                self._intake.end_run()
+        if self._begun is None or not self._record(self._begun):
+            return False
+        self._begun = None
+        return True
+
+    def report(self) -> None:
+        """Tell main how it goes; done by itself five times a second."""
+        intake, now = self._intake, self._clock.now()
+        self._next_report = now + _REPORT_PERIOD
+        faults, rates = intake.faults(), intake.rates()
+        told = (intake.truth, intake.drives, intake.cameras, intake.age_ms(), self._scheduling)
+        self._tell(ReceptionReport(now, rates, faults, *told))
+
+    def _hand_on(self, observation: Observation, numbers: Mapping[str, int]) -> None:
+        """To media, before anybody else can see it: what a tick has seen is known there."""
+        if self._record(as_message(observation, numbers)):
+            self._missed = 0
+            return
+        self._missed += 1
+        if self._missed == 1:
+            log.warning("media does not read: rows miss what is observed now")
+
+    def _say(self, event: Event) -> None:
+        """An event of reception's own: to main, and into the episode."""
+        self._tell(event)
+        if not self._record(event):
+            log.warning("media does not read: %s is missing from the record", event.kind)
+
+    def _record(self, message: Message) -> bool:
+        return self._page.rings["observations"].push(encode(message))
+
+    def _tell(self, message: Message) -> None:
+        if not self._page.rings["reception_events"].push(encode(message)):
+            log.warning("main does not read: %s lost", type(message).__name__)
+
+
+def main() -> None:
+    """Receive until the supervisor is gone, and control with it."""
+    heap.keep()
+    member = join("reception")
+    page, clock = member.page, MonotonicClock()
+    page.beat("reception", clock.now())
+    scheduling = _scheduling(member.plan)  # before there are other threads, which are to have the same
+    log.info("receiving, scheduling %s", scheduling)
+    source = member.plan.source(clock)
+    reception = Reception(page, source, clock, scheduling)
+    connected, retry_at = False, 0.0
+    share = Share() if scheduling.startswith("FIFO") else None
+    while member.needed(clock.now()):
+        now = clock.now()
+        page.beat("reception", now)
+        if share is not None and share.too_much(now, time.process_time()):
+            reception.give_way()
+            share = None
+        if not connected and now >= retry_at:
+            connected, retry_at = _connected(source), now + _RETRY_S
+        if connected:
+            reception.pump(_WAIT_S)
+        else:
+            reception.tend()
+            clock.sleep_until(now + 0.1)
+    source.close()
+
+
+def _scheduling(plan: Plan) -> str:
+    """The class that this process got; it asks for one only where what it sees is a robot."""
+    settings = plan.deployment.control
+    if settings.realtime == "off" or not plan.capabilities.moves_robot:
+        return "ordinary"
+    return realtime.enter_below(settings.realtime_priority)
+
+
+def _connected(source: Source) -> bool:
+    """Whether it could be; says why it could not."""
+    try:
+        source.connect()
+    except RuntimeFault as error:
+        log.warning("%s", error)
+        return False
+    return True
+
+
+if __name__ == "__main__":
+    main()
