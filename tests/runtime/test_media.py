@@ -320,9 +320,9 @@ def test_a_recording_whose_end_was_never_told_is_closed_where_another_one_begins
     desk.receive(1)
     desk.begin(run=0)
     desk.tick(0, 1)
-    desk.media.pump(0.0)
+    desk.pump()
     desk.post(BeginEpisode(2, {"uuid": "two"}))
-    desk.media.pump(0.0)
+    desk.pump()
     messages = [decode(payload) for payload in desk.page.rings["media_events"].drain()]
     (closed,) = [m for m in messages if isinstance(m, EpisodeClosed)]
     assert (closed.uuid, closed.status, closed.rows) == ("one", "interrupted", 1)
@@ -553,7 +553,7 @@ def unclosed(desk: Desk) -> FullDisk:
     desk.begin()
     desk.tick(0, 1)
     desk.post(EndEpisode("finished", "over"))
-    desk.media.pump(0.0)
+    desk.pump()
     return full
 
 
