@@ -15,6 +15,7 @@ import numpy as np
 
 from runtime.commitment import Commitment
 from runtime.messages import ChunkMerged
+from runtime.mixture import Mixture
 from runtime.strategies.base import Arrival, Merged, Progress, StrategyParameters, join
 from runtime.timeline import Dims, Makers, Timeline
 from runtime.types import ActionChunk, Conditioning, Float64
@@ -78,7 +79,7 @@ class StepLoop:
         self._waiting = True  # for the first chunk: no starvation yet
         self._starved = False
         self._delays: deque[int] = deque(maxlen=50)
-        self._commitment = Commitment(rate)
+        self._commitment = Commitment(rate, Mixture(self._dims))
         self._kind = ""
         self._joining = False
         self.tune(strategy, config)
@@ -163,5 +164,13 @@ class StepLoop:
 def _as_told(merged: Merged) -> ChunkMerged:
     """What control would tell main of it."""
     return ChunkMerged(
-        merged.chunk_id, 1, merged.arrival_step, merged.delay, merged.targets, merged.mistimed, merged.dropped
+        merged.chunk_id,
+        1,
+        merged.arrival_step,
+        merged.delay,
+        merged.targets,
+        merged.mistimed,
+        merged.dropped,
+        overlap=merged.overlap,
+        shares=merged.shares,
     )

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from runtime.messages import ChunkMerged
-from runtime.types import ActionChunk, Conditioning, Float32
+from runtime.mixture import Mixture, Parts
+from runtime.timeline import HELD
+from runtime.types import ActionChunk, Conditioning, Float32, Float64
 
 _HAIR = 1e-9  # of a row: what rates divided by rates are off by
+Numbers = Float32 | Float64
+Shares = dict[int, float]  # by chunk: its weight in a step; they sum to 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,24 +25,42 @@ class _Answer:
     chunk: ActionChunk
     observation_step: int
     waited: bool
+    commands: Float64
 
 
 @dataclass(frozen=True, slots=True)
 class _Commitment:
-    """A chunk on the timeline: `rows` as the server gave them, row 0 for control step `anchor`."""
+    """A chunk on the timeline: `rows` as the server gave them, row 0 for control step `anchor`.
 
+    From control step `first` on it is the plan, but for the steps in `shares`, which others have a part in; None
+    where nobody knows which.
+    """
+
+    chunk: ActionChunk
     rows: Float32  # [T, W] in model space where the server returned that, else its actions
-    usable: int  # of these rows, those that there are actions for
+    commands: Float64  # [N, D] the joint rows that it became, row 0 for `anchor`
+    usable: int  # of its rows, those that there are actions for
     anchor: int
+    first: int
+    end: int  # the step after the last that is planned
+    shares: Mapping[int, Shares] | None
     pace: float  # rows per control step
     delay: int  # control steps from its observation to its arrival
     rebased: bool  # its rows are relative to an observation that is over
 
+    @property
+    def kind(self) -> tuple[object, ...]:
+        """What its numbers are."""
+        chunk = self.chunk
+        return chunk.space, chunk.mode, chunk.pose, chunk.actions.shape[1], self.rows.shape[1]
+
 
 class Commitment:
-    """Keeps the newest merged chunk as the server gave it, and says what of it is left for a new observation.
+    """Says what is planned for the steps from a new observation on, in the rows of the newest merged chunk.
 
-    Not the joint rows that the chunk became: those are solved, snapped and resampled, the policy never saw them.
+    These are as the server gave them, and not the joint rows that they became: those are solved, snapped and
+    resampled, the policy never saw them. Where control has blended chunks, rows of both are mixed by the same
+    weights; where it fades over from a target that no chunk says, or the blend is not known, nothing is said.
     The chunk's place is the one control gave it: its observation step, shifted where it was mistimed, or the
     step of its arrival where the robot waited for it. Source of the method: Black et al., Real-Time Execution
     of Action Chunking Flow Policies, arXiv 2506.07339. No clock, no thread: steps are what it counts in.
@@ -46,14 +68,14 @@ class Commitment:
     A reset is `clear`: `generation` rises, and an answer that was asked for in an earlier one never counts.
     """
 
-    def __init__(self, control_rate: float) -> None:
+    def __init__(self, control_rate: float, mixture: Mixture | None = None) -> None:
         self._control_rate = control_rate
+        self._mixture = Mixture() if mixture is None else mixture
         self.generation = 0  # what a request is asked in, see `answered`
         self.warning = ""  # of the newest `conditioning`, "" where it fits
         self.predicted_delay = 0  # rows, of the newest `conditioning`
         self._on_the_way: dict[int, _Answer] = {}
-        self._held: _Commitment | None = None
-        self._newest = -1
+        self._merged: dict[int, _Commitment] = {}  # by chunk, the newest last
 
     def clear(self) -> None:
         """The robot is committed to nothing, and no answer that is still out will change that."""
@@ -61,8 +83,7 @@ class Commitment:
         self.warning = ""
         self.predicted_delay = 0
         self._on_the_way.clear()
-        self._held = None
-        self._newest = -1
+        self._merged.clear()
 
     def answered(
         self,
@@ -71,27 +92,38 @@ class Commitment:
         observation_step: int,
         waited: bool = False,
         generation: int | None = None,
+        commands: Float64 | None = None,
     ) -> None:
         """The policy gave `chunk` for `observation_step`; it counts when control has merged it.
+
+        `commands` [N, D] are the joint rows at control rate that it became; its actions where they are that.
 
         `generation` is what it was when the request went out; without it the caller vouches that nothing was
         cleared since.
         """
         if generation is None or generation == self.generation:
-            self._on_the_way[chunk_id] = _Answer(chunk, observation_step, waited)
+            rows = chunk.actions.astype(np.float64) if commands is None else commands
+            self._on_the_way[chunk_id] = _Answer(chunk, observation_step, waited, rows)
 
     def merged(self, merged: ChunkMerged) -> None:
         """Control has put a chunk on the timeline, or dropped it: what was dropped commits nobody."""
         answer = self._on_the_way.pop(merged.chunk_id, None)
-        if answer is None or merged.dropped or merged.chunk_id < self._newest:
+        if answer is None or merged.dropped or merged.chunk_id < max(self._merged, default=-1):
             return
         chunk = answer.chunk
         rows = chunk.actions if chunk.model_actions is None else chunk.model_actions
-        self._newest = merged.chunk_id
-        self._held = _Commitment(
+        over = [number for number, held in self._merged.items() if held.end < answer.observation_step]
+        for number in over:  # no later request is about a step that it has made
+            del self._merged[number]
+        self._merged[merged.chunk_id] = _Commitment(
+            chunk=chunk,
             rows=rows,
+            commands=answer.commands,
             usable=min(len(rows), len(chunk.actions)),
             anchor=merged.arrival_step if answer.waited else answer.observation_step + merged.mistimed,
+            first=merged.arrival_step,
+            end=int(merged.targets.max(initial=merged.arrival_step - 1)) + 1,
+            shares=_shares(merged),
             pace=(chunk.rate or self._control_rate) / self._control_rate,
             delay=merged.delay,
             rebased=chunk.mode == "relative" and chunk.model_actions is None,
@@ -108,15 +140,15 @@ class Commitment:
 
         `delays` are recent measured ones in control steps (that of the chunk itself where there are none); their
         `quantile` is predicted, in rows rounded up. `execution_horizon` is in control steps, None is the whole
-        chunk. Sets `warning` where the answer is expected later than the rows last that may still be executed.
+        chunk. Sets `warning` where the answer is expected later than the rows last that may still be executed; no
+        more than these are said to be executed until then.
 
-        At a rate of its own a chunk has no row exactly at the observation: the nearest one is the first that is
-        left, so that a chain of chunks neither runs ahead nor falls behind.
+        At a rate of its own a chunk has no row exactly at the observation: what is left is resampled from there on.
         """
         self.warning, self.predicted_delay = "", 0
-        held = self._held
-        if held is None:
+        if not self._merged:
             return None
+        held = self._merged[max(self._merged)]
         if held.rebased:
             self.warning = (
                 "RTC: the policy's rows are relative to an observation that is over and it returned none of its own "
@@ -132,7 +164,96 @@ class Commitment:
             return None
         self.predicted_delay = _rows_of(delays or [held.delay], quantile, held.pace)
         self._judge(last - consumed, last)
-        return Conditioning(_from(held.rows, passed), consumed, self.predicted_delay, last)
+        steps = observation_step + np.arange(last - consumed) / held.pace
+        steps = steps[np.ceil(steps - _HAIR) < held.end]
+        previous = self._planned(held, steps, passed) if len(steps) else None
+        if previous is None:
+            return None
+        return Conditioning(previous, consumed, min(self.predicted_delay, len(steps)), last)
+
+    def _planned(self, held: _Commitment, steps: Float64, passed: int) -> Float32 | None:
+        """The rows of `held`, those for control `steps` as they are planned; None where that is not known.
+
+        `passed` is the row nearest to the first of these. Rows that are no absolute numbers do not mix.
+        """
+        if held.chunk.mode != "absolute":
+            return held.rows if passed >= 0 else None
+        made = [self._makers(at) for at in steps.tolist()]
+        known = [shares for shares in made if shares is not None and self._alike(held, shares)]
+        if len(known) < len(made):
+            return None
+        exact = abs((steps[0] - held.anchor) * held.pace - max(0, passed)) < _HAIR
+        alone = {max(self._merged): 1.0}
+        mixed = [place for place, shares in enumerate(known) if not exact or shares != alone]
+        if not mixed:
+            return held.rows
+        rows = held.rows.copy()
+        found = self._mixed(steps[mixed], [known[place] for place in mixed])
+        if found is None:
+            return None
+        rows[max(0, passed) + np.array(mixed)] = found
+        return rows
+
+    def _alike(self, held: _Commitment, shares: Shares) -> bool:
+        """Whether all these are chunks in the numbers of `held`."""
+        others = [self._merged.get(number) for number in shares]
+        return all(other is not None and other.kind == held.kind for other in others)
+
+    def _makers(self, at: float) -> Shares | None:
+        """What makes control step `at`, between steps what makes both; None where that is not known."""
+        before = math.floor(at + _HAIR)
+        part = at - before
+        if part < _HAIR:
+            return self._makers_of(before)
+        made: Shares = {}
+        for shares, weight in ((self._makers_of(before), 1.0 - part), (self._makers_of(before + 1), part)):
+            if shares is None:
+                return None
+            for chunk, share in shares.items():
+                made[chunk] = made.get(chunk, 0.0) + weight * share
+        return made
+
+    def _makers_of(self, step: int) -> Shares | None:
+        number = max((number for number, held in self._merged.items() if held.first <= step), default=HELD)
+        held = self._merged.get(number)
+        if held is None or held.shares is None or step >= held.end:
+            return None
+        return held.shares.get(step, {number: 1.0})
+
+    def _mixed(self, steps: Float64, made: Sequence[Shares]) -> Float64 | None:
+        """Rows for these control steps, of what makes each; None where the model's own rows cannot be mixed."""
+        like, mixture = self._merged[max(self._merged)].chunk, self._mixture
+        actions = self._parts(steps, made, lambda held: (held.chunk.actions, held.pace))
+        if like.space == "joint":
+            meant = mixture.joints(actions)
+        else:
+            commands = self._parts(steps, made, lambda held: (held.commands, 1.0))
+            meant = mixture.poses(mixture.joints(commands), actions.newest, like)
+        if like.model_actions is None:
+            return meant
+        if not mixture.agree(mixture.numbers(actions, like), meant, like):
+            return None
+        return mixture.numbers(self._parts(steps, made, lambda held: (held.rows, held.pace)), like)
+
+    def _parts(
+        self, steps: Float64, made: Sequence[Shares], table: Callable[[_Commitment], tuple[Numbers, float]]
+    ) -> Parts:
+        """What the rows for these steps are mixed of, out of a `table` of each chunk and its rows per step."""
+        numbers: list[Numbers] = []
+        weights: list[Float64] = []
+        newest = np.zeros(len(steps), np.int64)
+        for number in sorted({number for shares in made for number in shares}):
+            held = self._merged[number]
+            rows, pace = table(held)
+            share = np.array([shares.get(number, 0.0) for shares in made])
+            places = np.clip((steps - held.anchor) * pace, 0, len(rows) - 1)
+            below = np.floor(places + _HAIR).astype(np.int64)
+            part = np.clip(places - below, 0.0, 1.0)
+            newest[share > 0.0] = len(numbers)
+            numbers += [rows[below], rows[np.minimum(below + 1, len(rows) - 1)]]
+            weights += [share * (1.0 - part), share * part]
+        every = np.array(numbers, np.float64)
+        return Parts(every, np.array(weights), every[newest, np.arange(len(steps))])
 
     def _judge(self, left: int, last: int) -> None:
         """RTC needs rows to go on with until the answer arrives."""
@@ -150,8 +271,11 @@ def _rows_of(delays: Sequence[int], quantile: float, pace: float) -> int:
     return max(0, math.ceil(delay * pace - _HAIR))
 
 
-def _from(rows: Float32, passed: int) -> Float32:
-    """The rows; where they begin after the observation (the robot had waited), the first is repeated before them."""
-    if passed >= 0:
-        return rows
-    return np.concatenate([np.repeat(rows[:1], -passed, axis=0), rows])[: len(rows)]
+def _shares(merged: ChunkMerged) -> dict[int, Shares] | None:
+    """By step, of the steps that are not the chunk's alone; None where they were not told."""
+    if merged.shares is None:
+        return None
+    shares: dict[int, Shares] = {}
+    for step, chunk, weight in merged.shares.tolist():
+        shares.setdefault(int(step), {})[int(chunk)] = weight
+    return shares

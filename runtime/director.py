@@ -31,6 +31,7 @@ from runtime.messages import (
     ReceptionReport,
     decode,
 )
+from runtime.mixture import Mixture
 from runtime.operations import Operations, Parts
 from runtime.orders import Orders
 from runtime.page import Page
@@ -77,7 +78,13 @@ class Director:
         asking = Asking(plan.new_policy(clock), settings.task, spaces, sight, runner, clock)
         patience = Patience(settings.control.starvation_hold_s, settings.faults.patience_s)
         self.inference = Inference(
-            asking, strategy_of(plan), page, self._orders, clock, patience, Commitment(plan.rate)
+            asking,
+            strategy_of(plan),
+            page,
+            self._orders,
+            clock,
+            patience,
+            Commitment(plan.rate, Mixture(plan.dims, plan.robot)),
         )
         self.setup = SetUp(plan, self.inference, self._orders, page, clock, lambda: self.reception_report)
         self._watch = Watch(plan, page, self.lease, clock, self.people, lambda: self.reception_report)

@@ -171,6 +171,7 @@ class Follow(Behaviour):
             dropped=merged.dropped,
             strategy=self._strategy.kind,
             overlap=merged.overlap,
+            shares=merged.shares,
         )
 
     # --- nothing planned -----------------------------------------------------------------------------------

@@ -56,6 +56,7 @@ class PoseRows:
         self.dims = _dims(pose, robot, key)
         self._arms = [arm.name for arm in robot.arms]
         self._gripped = np.array([arm.gripper is not None for arm in robot.arms])
+        self._grippers = [arm.gripper_dim for arm in robot.arms]
         self._numbers = orientation_of(pose)
         self._turning = slice(3, 3 + len(self._numbers.fields))
         fields = ("x", "y", "z", *self._numbers.fields, *(("gripper",) if pose.gripper else ()))
@@ -70,6 +71,13 @@ class PoseRows:
     def width(self) -> int:
         """Numbers per row."""
         return len(self.names)
+
+    @property
+    def commanded(self) -> list[tuple[int, int]]:
+        """(place in a row, place in the robot's vector) of what is commanded as it stands there."""
+        grippers = enumerate(self._grippers if self.pose.gripper else [])
+        appended = enumerate(self.dims.tolist(), len(self._arms) * self._each)
+        return [((arm + 1) * self._each - 1, dim) for arm, dim in grippers if dim is not None] + [*appended]
 
     def encode(self, vectors: Float64, joints: Float64, previous: Float64 | None = None) -> Float64:
         """Rows float64 [T, width] of vectors [T, arms, 8] at the joints [T or 1, D], which place the frame.

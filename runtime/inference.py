@@ -321,7 +321,7 @@ class Inference:
         made = Made(self._orders.next_chunk(), answered.made.rows, answered)
         self._wanted = False
         self.tally.answered(answered.seconds, answered.age, answered.ik)
-        self._commitment.answered(made.number, chunk, step, answered.waited, self._generation)
+        self._commitment.answered(made.number, chunk, step, answered.waited, self._generation, made.rows)
         if self._mode == "preview":
             self.proposal = made
             nowhere = np.full(len(made.rows), -1, np.int64)

@@ -117,6 +117,7 @@ class ChunkMerged:
     dropped: str
     strategy: str = ""  # the kind that merged it
     overlap: int = 0  # steps from the arrival on that were blended with what was planned before
+    shares: Float64 | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
@@ -16,6 +17,7 @@ from runtime.types import Float64
 
 BlendShape = Literal["linear", "cosine", "exponential"]
 JOIN_WINDOW = 8  # steps over which a chunk takes over from what it does not continue
+_MOST_SHARES = 4096  # that are told of a chunk: they pass the ring to main
 
 
 class StrategyParameters(Section):
@@ -68,7 +70,8 @@ class Merged:
     `arrival_step` is the first tick not yet sent, `delay` = arrival_step - observation_step. `targets` int64 [H]
     is the step each row was planned for, -1 where it was dropped. `mistimed` is how many steps later than meant
     its rows are executed (k_max); negative where it arrived before the step it is for. `dropped` says why nothing
-    of the chunk was used, "" where something was.
+    of the chunk was used, "" where something was. `shares` [N, 3] are step, chunk id and weight of what makes steps
+    that are not the chunk's alone; None where `Merge.continues` is false, or there are too many.
     """
 
     chunk_id: int
@@ -80,14 +83,19 @@ class Merged:
     overlap: int = (
         0  # steps from arrival_step on that more than one chunk makes, or a chunk and a held target
     )
+    shares: Float64 | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Which rows of a chunk are used: [N, D], row 0 for step `merged.arrival_step`; none where it is dropped."""
+    """Which rows of a chunk are used: [N, D], row 0 for step `merged.arrival_step`; none where it is dropped.
+
+    `before` [D] is the row before them, None where there is none.
+    """
 
     rows: Float64
     merged: Merged
+    before: Float64 | None = None
 
     @property
     def first(self) -> int:
@@ -120,6 +128,7 @@ class Merge(ABC):
     """Lets a chunk join the timeline; a pure function of timeline, chunk and first free step."""
 
     waits: bool = False  # an empty timeline is this strategy's way of waiting, not starvation
+    continues: bool = False  # its chunks are continued (RTC): what makes each step is told
 
     @abstractmethod
     def place(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Placement:
@@ -169,8 +178,20 @@ def join(
     elif joining and planned is not None:
         _fade(timeline, free_step, *timeline.span(free_step), JOIN_WINDOW, dims)
     merge.lay(timeline, placed)
-    overlap = sum(len(makers) > 1 for makers in timeline.span(free_step)[1])
-    return replace(placed.merged, overlap=overlap)
+    made = timeline.span(free_step)[1]
+    shares = _shares(free_step, made, placed.merged.chunk_id) if merge.continues else None
+    return replace(placed.merged, overlap=sum(len(makers) > 1 for makers in made), shares=shares)
+
+
+def _shares(first: int, made: Sequence[Makers], chunk_id: int) -> Float64 | None:
+    alone = ((chunk_id, 1.0),)
+    told = [
+        (step, maker, weight)
+        for step, makers in enumerate(made, first)
+        if makers != alone
+        for maker, weight in makers
+    ]
+    return np.array(told, np.float64).reshape(-1, 3) if len(told) <= _MOST_SHARES else None
 
 
 def _fade(timeline: Timeline, step: int, rows: Float64, makers: list[Makers], count: int, dims: Dims) -> None:

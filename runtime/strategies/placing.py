@@ -25,7 +25,8 @@ def place(
     targets = np.full(len(arrival.rows), -1, np.int64)
     targets[stale:count] = free_step + np.arange(count - stale)
     merged = Merged(arrival.chunk_id, free_step, delay, targets, mistimed=due - stale)
-    return Placement(arrival.rows[stale:count], merged)
+    before = arrival.rows[stale - 1] if stale else None
+    return Placement(arrival.rows[stale:count], merged, before)
 
 
 def dropped(arrival: Arrival, free_step: int, why: str) -> Placement:

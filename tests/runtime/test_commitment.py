@@ -1,15 +1,26 @@
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import robots
 from runtime.commitment import Commitment
+from runtime.end_effectors import EndEffectors
+from runtime.formats import PoseRows
+from runtime.kinematics.forward import ChainForward
 from runtime.messages import ChunkMerged
+from runtime.mixture import Mixture
+from runtime.pose_format import OrientationName, PoseFormat
+from runtime.timeline import Dims
 from runtime.types import ActionChunk, Conditioning
 
 RATE = 30.0
+ALONE = np.zeros((0, 3))  # no step that another chunk has a part in
 
 
 def rows(count: int, width: int = 2, first: float = 0.0) -> np.ndarray:
@@ -20,17 +31,19 @@ def rows(count: int, width: int = 2, first: float = 0.0) -> np.ndarray:
 def merged(
     number: int, observation_step: int, delay: int, count: int = 50, mistimed: int = 0, dropped: str = ""
 ) -> ChunkMerged:
+    """As control tells of rows from `observation_step` on; what is stale is told as what is not."""
     targets = observation_step + mistimed + np.arange(count)
-    return ChunkMerged(number, 1, observation_step + delay, delay, targets, mistimed, dropped)
+    return ChunkMerged(number, 1, observation_step + delay, delay, targets, mistimed, dropped, shares=ALONE)
 
 
 def committed(
     chunk: ActionChunk | None = None, step: int = 100, delay: int = 3, waited: bool = False, mistimed: int = 0
 ) -> Commitment:
     """A commitment to one chunk that answers the observation of `step`."""
-    made = Commitment(RATE)
-    made.answered(1, chunk or ActionChunk(rows(50)), step, waited)
-    made.merged(merged(1, step, delay, mistimed=mistimed))
+    made, chunk = Commitment(RATE), chunk or ActionChunk(rows(50))
+    made.answered(1, chunk, step, waited)
+    count = int(len(chunk.actions) * RATE / (chunk.rate or RATE))
+    made.merged(merged(1, step + delay if waited else step, 0 if waited else delay, count, mistimed))
     return made
 
 
@@ -52,11 +65,12 @@ def test_nobody_is_committed_to_anything_before_a_chunk_was_merged() -> None:
     assert held.conditioning(104, [3], 0.9, None) is None
 
 
-@given(st.integers(0, 40), st.integers(0, 40), st.integers(1, 30))
+@given(st.integers(0, 40), st.integers(0, 40), st.integers(1, 90))
 def test_what_is_left_begins_with_the_row_for_the_observation_whatever_the_delay(
-    delay: int, later: int, count: int
+    delay: int, since: int, count: int
 ) -> None:
     """The bad design shifts by a constant, or counts from the arrival."""
+    later = delay + since
     held = committed(ActionChunk(rows(count)), delay=delay)
     found = held.conditioning(100 + later, [delay], 0.9, None)
     if later >= count:
@@ -76,10 +90,12 @@ def test_a_chunk_that_the_robot_waited_for_counts_from_its_arrival() -> None:
     assert asked(held, 170).left_over[0, 0] == 10
 
 
-@given(st.integers(0, 5))
-def test_before_its_first_row_the_robot_stands_where_that_row_begins(early: int) -> None:
-    found = asked(committed(delay=6, waited=True), 106 - early)
-    assert found.left_over[:, 0].tolist() == [0.0] * early + list(range(50 - early))
+@given(st.integers(1, 5), st.booleans())
+def test_of_a_step_before_its_first_one_nothing_is_said(early: int, waited: bool) -> None:
+    """The robot was told something else then, and no row says what."""
+    held = committed(delay=6, waited=waited)
+    assert held.conditioning(106 - early, [3], 0.9, None) is None
+    assert asked(held, 106).left_over[0, 0] == (0 if waited else 6)
 
 
 def test_the_newest_merged_chunk_counts_and_what_was_dropped_does_not() -> None:
@@ -116,15 +132,16 @@ def test_rows_relative_to_an_observation_that_is_over_are_not_handed_back() -> N
 # Rates
 
 
-@given(st.floats(3, 120), st.integers(0, 60), st.integers(0, 40))
-def test_at_another_rate_the_row_nearest_to_the_observation_is_the_first(
-    rate: float, later: int, delay: int
+@given(st.floats(3, 120), st.integers(0, 50), st.integers(0, 40))
+def test_at_another_rate_what_is_left_begins_exactly_at_the_observation(
+    rate: float, since: int, delay: int
 ) -> None:
     held = committed(ActionChunk(rows(400), rate=rate))
-    found = held.conditioning(100 + later, [delay], 0.9, None)
+    found = held.conditioning(103 + since, [delay], 0.9, None)
     assert found is not None
-    apart = found.consumed / rate - later / RATE
-    assert abs(apart) <= 0.5 / rate + 1e-6
+    assert abs(found.consumed / rate - (3 + since) / RATE) <= 0.5 / rate + 1e-6
+    passed = (3 + since) * rate / RATE + np.arange(found.predicted_delay)
+    np.testing.assert_allclose(found.left_over[: found.predicted_delay, 0], passed, rtol=1e-6, atol=1e-5)
     assert -1e-6 <= found.predicted_delay - delay * rate / RATE < 1 + 1e-6
 
 
@@ -144,7 +161,7 @@ def test_the_chunks_own_delay_is_predicted_where_no_other_was_measured() -> None
     assert asked(committed(delay=7), 110, []).predicted_delay == 7
 
 
-@given(st.integers(0, 60), st.integers(0, 49), st.one_of(st.none(), st.integers(1, 80)))
+@given(st.integers(0, 60), st.integers(3, 49), st.one_of(st.none(), st.integers(1, 80)))
 def test_it_warns_exactly_where_the_answer_comes_after_the_last_row_that_may_be_executed(
     delay: int, later: int, horizon: int | None
 ) -> None:
@@ -154,6 +171,7 @@ def test_it_warns_exactly_where_the_answer_comes_after_the_last_row_that_may_be_
     assert (found is None) == (later >= last)
     if found is not None:
         assert found.execution_horizon == last
+        assert found.predicted_delay == min(delay, last - later)
         assert bool(held.warning) == (delay > last - later)
 
 
@@ -224,3 +242,87 @@ def test_only_an_answer_asked_for_and_merged_since_the_last_reset_counts(
     assert (found is None) == (expected is None)
     if found is not None and expected is not None:
         assert found.left_over[0, 0] == pytest.approx(1000.0 * expected + 5)
+
+
+# What control has blended
+
+
+def blended(
+    first: ActionChunk, second: ActionChunk, shares: list[list[float]], **settings: Any
+) -> Commitment:
+    """A commitment to a chunk for step 100, and from 105 on to one for step 102, as far as `shares` do not say else."""
+    held = Commitment(RATE, Mixture(**settings))
+    held.answered(1, first, 100)
+    held.merged(merged(1, 100, 0, len(first.actions)))
+    held.answered(2, second, 102)
+    told = merged(2, 102, 3, len(second.actions))
+    held.merged(replace(told, shares=np.array(shares).reshape(-1, 3)))
+    return held
+
+
+HALF = [[105, 1, 1.0], [106, 1, 0.5], [106, 2, 0.5]]
+
+
+def test_rows_that_control_has_blended_are_given_back_as_they_became() -> None:
+    held = blended(ActionChunk(rows(50)), ActionChunk(rows(50, first=200)), HALF)
+    assert asked(held, 105).left_over[:4, 0].tolist() == [5.0, (6.0 + 204.0) / 2, 205.0, 206.0]
+    assert asked(held, 103).left_over[:4, 0].tolist() == [3.0, 4.0, 5.0, 105.0]  # also of the plan before
+
+
+def test_the_models_own_rows_are_mixed_by_the_same_weights() -> None:
+    first = ActionChunk(rows(50), model_actions=rows(50, 32, first=0.5))
+    second = ActionChunk(rows(50, first=200), model_actions=rows(50, 32, first=20))
+    held = blended(first, second, HALF, dims=Dims(switched=(1,)))
+    left = asked(held, 105).left_over
+    assert left[:3, 0].tolist() == [5.5, (6.5 + 24.0) / 2, 25.0]
+    assert left[:3, 1].tolist() == [5.5, 24.0, 25.0]  # a binary gripper does not lie in between
+    assert left.shape[1] == 32
+
+
+def test_angles_without_limits_mix_the_shorter_way_round_and_in_the_models_own_numbers_not_at_all() -> None:
+    first, second = (np.full((50, 2), angle, np.float32) for angle in (3.1, -3.1))
+    shares = [[105, 1, 0.5], [105, 2, 0.5]]
+    held = blended(ActionChunk(first), ActionChunk(second), shares, dims=Dims(wrapping=(0,)))
+    mixed = asked(held, 105).left_over[0]
+    np.testing.assert_allclose(mixed, [-np.pi, 0.0], atol=1e-6)
+    own = (ActionChunk(angles, model_actions=rows(50, 32)) for angles in (first, second))
+    held = blended(*own, shares, dims=Dims(wrapping=(0,)))
+    assert held.conditioning(105, [3], 0.9, None) is None
+    assert asked(held, 106).left_over[0, 0] == 4.0
+
+
+@pytest.mark.parametrize("orientation", ["wxyz", "euler", "rotation_vector", "6d"])
+def test_blended_poses_are_those_of_the_blended_joints(orientation: OrientationName) -> None:
+    robot, pose = robots.load("agilex_piper"), PoseFormat(orientation=orientation)
+    layout, ends = PoseRows(pose, robot), EndEffectors(robot, ChainForward(robot))
+    joints = [np.tile(robot.poses["ready"] + apart, (50, 1)) for apart in (0.0, 0.2)]
+
+    def chunk(at: np.ndarray) -> ActionChunk:
+        return ActionChunk(layout.encode(ends.vectors(at), at).astype(np.float32), "eef", pose=pose)
+
+    held = Commitment(RATE, Mixture(robot=robot))
+    for number, at in enumerate(joints, 1):
+        held.answered(number, chunk(at), 100, commands=at)
+        held.merged(
+            replace(merged(number, 100, number), shares=np.array([[105, 1, 0.5], [105, number, 0.5]]))
+        )
+    between = chunk((joints[0] + joints[1]) / 2)
+    np.testing.assert_allclose(asked(held, 105).left_over[0], between.actions[0], atol=1e-6)
+    np.testing.assert_array_equal(asked(held, 105).left_over[1:], chunk(joints[1]).actions[6:])
+
+
+@pytest.mark.parametrize("shares", [[[106, 0, 0.5], [106, 2, 0.5]], [[106, 7, 1.0]], None])
+def test_of_a_held_target_of_an_unknown_chunk_and_of_what_was_not_told_nothing_is_said(
+    shares: list[list[float]] | None,
+) -> None:
+    held = blended(ActionChunk(rows(50)), ActionChunk(rows(50)), shares or [])
+    if shares is None:
+        held.answered(3, ActionChunk(rows(50)), 104)
+        held.merged(replace(merged(3, 104, 2), shares=None))
+    assert held.conditioning(106, [3], 0.9, None) is None
+
+
+def test_answers_in_other_numbers_are_not_mixed() -> None:
+    held = blended(ActionChunk(rows(50)), ActionChunk(rows(50), model_actions=rows(50, 32)), HALF)
+    assert held.conditioning(105, [3], 0.9, None) is None
+    assert asked(held, 107).left_over[0, 0] == 5.0

@@ -653,7 +653,8 @@ def test_rtc_tells_the_policy_what_control_has_merged_less_what_is_consumed() ->
     desk = Desk(strategy=RTC).going()
     desk.inference.pump()
     assert desk.policy.conditionings == [None]
-    desk.inference.merged(ChunkMerged(1, 1, 8, 1, np.array([-1, 8, 9, 10]), 0, ""))
+    alone = np.zeros((0, 3))
+    desk.inference.merged(ChunkMerged(1, 1, 8, 1, np.array([-1, 8, 9, 10]), 0, "", shares=alone))
     desk.observe()
     desk.ticked(9)
     desk.inference.pump()

@@ -46,7 +46,9 @@ def talking(
 
 
 def placed(number: int, step: int, delay: int, count: int) -> ChunkMerged:
-    return ChunkMerged(number, 1, step + delay, delay, step + np.arange(count), 0, "")
+    return ChunkMerged(
+        number, 1, step + delay, delay, step + np.arange(count), 0, "", shares=np.zeros((0, 3))
+    )
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)

@@ -1,0 +1,372 @@
+"""RTC: what a request declares fixed is what control plans for these steps, whatever comes in between.
+
+A whole station on the virtual clock, a robot that is at once where it is told to be, and a policy that changes its
+mind with every answer and keeps the contract of real-time chunking, or does not. Answers are late by chance, are
+lost, and the run is halted, taken up again, tuned and started anew.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from contextlib import closing
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.strategy_station import KnownPlan, Obedient
+from robots import Robot
+from runtime import deployment, family
+from runtime.clock import Clock
+from runtime.end_effectors import EndEffectors
+from runtime.errors import PolicyLostError
+from runtime.kinematics.forward import ChainForward
+from runtime.lockstep import Around, Lockstep
+from runtime.policies.base import Policy, PolicyInfo
+from runtime.runner import LockstepRunner
+from runtime.timeline import difference
+from runtime.transitions import State
+from runtime.types import EEF_WIDTH, ActionChunk, Conditioning, Float64, Observation
+
+_TICKS = 240
+_HAIR = 1e-6  # of a step
+_ROUNDING = 2e-5  # [rad, m] of float32 there and back through the model's own numbers
+_POSES = 1e-3  # [m, and of a quaternion's numbers] of inverse kinematics
+_ROBOTS = ("agilex_piper", "ur5e", "r1_lite")
+_KINDS = ("rtc", "rtc", "rtc", "async", "naive", "ensemble", "sync")
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """What a seed stands for."""
+
+    robot: str
+    control_hz: float
+    action_hz: float | None  # None: the control rate
+    horizon: int
+    space: str
+    own: bool  # the server returns rows of the model's own space
+    keeps: bool  # the server keeps the contract
+    endless: bool  # one joint has no limits, and turns across half a turn
+    wander: float  # [rad] by which answers differ
+    delay: tuple[int, int]  # ticks, least and most
+    lost: float  # part of the answers
+    seen_every: int  # ticks per observation
+    strategy: dict[str, Any]
+
+
+def scenario(seed: int) -> Scenario:
+    """The scenario of this seed."""
+    random = np.random.default_rng(seed)
+    control = float(random.choice([20.0, 30.0, 50.0]))
+    least = int(random.integers(1, 6))
+    most = least + int(random.integers(0, 7))
+    horizon = int(random.integers(most + 3, 41))
+    strategy: dict[str, Any] = {"kind": "rtc", "blend_window": int(random.integers(1, 13))}
+    if random.random() < 0.1:
+        strategy["blend_window"] = "all"
+    if random.random() < 0.2:
+        strategy["k_max"] = int(random.integers(0, 8))
+    if random.random() < 0.3:
+        strategy["execution_horizon"] = int(random.integers(most + 2, horizon + 1))
+    if random.random() < 0.3:
+        strategy["inference_rate"] = float(random.choice([2.0, 5.0, 10.0]))
+    eef = random.random() < 0.15
+    if eef:  # what is asked for is to be reached: no jumps
+        strategy = {"kind": "rtc", "blend_window": int(random.integers(4, 13))}
+    rate = float(random.choice([10.0, 15.0, 24.0, 60.0])) if random.random() < 0.35 else None
+    return Scenario(
+        robot=str(random.choice(_ROBOTS[:2] if eef else _ROBOTS)),
+        control_hz=control,
+        action_hz=rate,
+        horizon=horizon if rate is None else math.ceil(horizon * rate / control) + 1,
+        space="eef" if eef else "joint",
+        own=not eef and random.random() < 0.5,
+        keeps=random.random() < 0.7,
+        endless=not eef and random.random() < 0.2,
+        wander=float(random.choice([0.01, 0.04] if eef else [0.01, 0.04, 0.15])),  # poses are to be reached
+        delay=(least, most),
+        lost=0.1 if random.random() < 0.3 else 0.0,
+        seen_every=int(random.choice([1, 1, 2])),
+        strategy=strategy,
+    )
+
+
+def once(seed: int) -> list[str]:
+    """Run the scenario of this seed on the virtual clock; each violation in a sentence, none where all is well."""
+    made, random = scenario(seed), np.random.default_rng([seed, 1])
+    with tempfile.TemporaryDirectory() as folder:
+        plan = _plan(Path(folder), made)
+        keeper = plan.made["policy"] = Keeper(made, plan, random)
+        planned = _run(plan, made, random)
+    return [f"seed {seed}: {text}" for text in _violations(made, keeper, planned)]
+
+
+class Late(LockstepRunner):
+    """Hands each result over after a number of ticks that is chance."""
+
+    def __init__(self, least: int, most: int, random: np.random.Generator) -> None:
+        super().__init__(least)
+        self._least, self._most, self._random = least, most, random
+
+    def submit(self, call: Any) -> Any:
+        """As in lockstep, with a delay of its own."""
+        self._delay = int(self._random.integers(self._least, self._most + 1))
+        return super().submit(call)
+
+
+class Seldom(Obedient):
+    """Stands at `position` in the beginning, and is seen every so many ticks."""
+
+    def __init__(self, robot: Robot, clock: Clock, position: Float64, every: int) -> None:
+        super().__init__(robot, clock)
+        self.position = position
+        self._every, self._looked = every, 0
+
+    def receive(self, timeout: float) -> Observation | None:
+        """Where it is, at its own rate."""
+        self._looked += 1
+        return super().receive(timeout) if self._looked % self._every == 0 else None
+
+
+@dataclass(frozen=True, slots=True)
+class SeldomPlan(KnownPlan):
+    """A plan whose robot is the one above."""
+
+    every: int
+
+    def _robot(self, config: object, robot: Robot, clock: Clock) -> Obedient:
+        stands = self.made["policy"].stands.copy()
+        found: Obedient = self.made.setdefault("robot", Seldom(self.robot, clock, stands, self.every))
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Declared:
+    """What a request said: rows [d, W] that are fixed, the first for control step `step`."""
+
+    step: int
+    rows: Float64
+
+
+class Keeper(Policy):
+    """Wanders about where it stands; continues what it is told, where it keeps the contract."""
+
+    def __init__(self, made: Scenario, plan: SeldomPlan, random: np.random.Generator) -> None:
+        self._made, self._random = made, random
+        self._robot = plan.robot
+        self._eef = EndEffectors(plan.robot, ChainForward(plan.robot))
+        self.stands = plan.robot.poses["ready"].astype(np.float64)
+        if made.endless:
+            self.stands[0] = np.pi - 0.02
+        self._scale = random.uniform(0.3, 3.0, plan.robot.dim)
+        self._shift = random.uniform(-1.0, 1.0, plan.robot.dim)
+        self._switched = [] if made.space == "eef" else list(plan.robot.binary_dims)
+        self.declared: list[Declared] = []
+
+    def connect(self) -> PolicyInfo:
+        """Nothing to reach."""
+        return PolicyInfo("keeper", horizon=self._made.horizon, rate=self._made.action_hz, supports_rtc=True)
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        """Its rows; PolicyLostError by chance."""
+        rows = self._wandering(observation)
+        if conditioning is not None:
+            fixed = conditioning.left_over[: conditioning.predicted_delay].astype(np.float64)
+            left = self._joints(conditioning.left_over.astype(np.float64))
+            self.declared.append(Declared(observation.step, self._joints(fixed)))
+            if self._made.keeps:
+                rows = self._continued(rows, left, len(fixed))
+        if self.declared and self._random.random() < self._made.lost:
+            raise PolicyLostError("the answer is lost on purpose")
+        own = self._model(rows).astype(np.float32) if self._made.own else None
+        actions = rows if own is None else self._joints(own.astype(np.float64))
+        return ActionChunk(
+            actions.astype(np.float32),
+            "eef" if self._made.space == "eef" else "joint",
+            rate=self._made.action_hz,
+            model_actions=own,
+        )
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def apart(self, row: Float64, at: float, planned: dict[int, Float64]) -> str:
+        """How a fixed row for control step `at` is not what was planned; "" where it is.
+
+        Between two steps it is compared with both, to within what the plan bends there.
+        """
+        before, part = math.floor(at + _HAIR), at - math.floor(at + _HAIR)
+        steps = [before, before + 1] if part > _HAIR else [before]
+        missing = [step for step in steps if step not in planned]
+        if missing:
+            return f"is for step {missing[0]}, for which nothing was planned"
+        rows = np.array([self._of(planned[step]) for step in steps])
+        meant = rows[0] + (part * self._difference(rows[-1], rows[0]) if len(rows) > 1 else 0.0)
+        off = np.abs(self._difference(row, meant))
+        allowed = np.full(len(off), _POSES if self._made.space == "eef" else _ROUNDING)
+        if len(rows) > 1:
+            allowed += self._bend(before, planned)
+        off[self._switched] = 0.0
+        worst = int(np.argmax(off - allowed))
+        if off[worst] <= allowed[worst]:
+            return ""
+        return f"is {off[worst]:.2e} off in number {worst}, allowed {allowed[worst]:.2e}"
+
+    def _bend(self, before: int, planned: dict[int, Float64]) -> Float64:
+        """How much the plan bends about that step: what is cut off corners between two steps."""
+        rows = [self._of(planned[step]) for step in range(before - 2, before + 4) if step in planned]
+        steps = [self._difference(later, sooner) for sooner, later in pairwise(rows)]
+        bends = [np.abs(later - sooner) for sooner, later in pairwise(steps)]
+        return np.max(bends, axis=0, initial=0.0) if bends else np.zeros(len(rows[0]))
+
+    def _of(self, joints: Float64) -> Float64:
+        """Planned joints in the numbers of rows."""
+        return self._eef.eef_of(joints).astype(np.float64) if self._made.space == "eef" else joints
+
+    def _difference(self, one: Float64, other: Float64) -> Float64:
+        if self._made.space == "eef":  # of quaternions the nearer sign
+            one, other = one.reshape(*one.shape[:-1], -1, EEF_WIDTH).copy(), other.reshape(-1, EEF_WIDTH)
+            turns = one[..., 3:7]
+            turns *= np.where((turns * other[..., 3:7]).sum(axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
+            return (one - other).reshape(-1)
+        return difference(one, other, (0,) if self._made.endless else ())
+
+    def _wandering(self, observation: Observation) -> Float64:
+        """A smooth path about where it stands, another one with every answer, on the branch that servers answer on."""
+        robot, random = self._robot, self._random
+        rate = self._made.action_hz or self._made.control_hz
+        seconds = observation.step / self._made.control_hz + np.arange(self._made.horizon) / rate
+        phases = random.uniform(0.0, 2.0 * np.pi, robot.dim)
+        joints = self.stands + self._made.wander * np.sin(2.0 * seconds[:, None] + phases)
+        joints[:, list(robot.gripper_dims)] = self.stands[list(robot.gripper_dims)]
+        if self._made.space == "eef":
+            return self._eef.eef_of(joints).astype(np.float64)
+        for dim in robot.binary_dims:
+            joints[:, dim] = random.choice([robot.lower[dim], robot.upper[dim]])
+        if self._made.endless:
+            joints[:, 0] = (joints[:, 0] + np.pi) % (2.0 * np.pi) - np.pi
+        return np.asarray(joints)
+
+    def _continued(self, rows: Float64, left: Float64, fixed: int) -> Float64:
+        """The rows with what is fixed in place of their own, and over to their own within 6 more."""
+        count = min(len(left), len(rows), fixed + 6)
+        weights = np.clip((fixed + 6 - np.arange(count)) / 7.0, 0.0, 1.0)
+        weights[:fixed] = 1.0
+        for place in range(count):
+            rows[place] += weights[place] * self._difference(left[place], rows[place])
+        rows[:fixed] = left[:fixed]
+        return rows
+
+    def _model(self, joints: Float64) -> Float64:
+        return (joints - self._shift) / self._scale
+
+    def _joints(self, rows: Float64) -> Float64:
+        return rows * self._scale + self._shift if self._made.own else rows
+
+
+def _plan(data: Path, made: Scenario) -> SeldomPlan:
+    tree: dict[str, Any] = {
+        "station": "prefix",
+        "robot": made.robot,
+        "data_dir": str(data),
+        "task": "wander",
+        "transport": {"kind": "dataset", "path": "-"},
+        "policy": {"kind": "mock"},
+        "strategy": made.strategy,
+        "control": {"rate": made.control_hz},
+        "setup": {"home": False},
+        "recording": {"enabled": False},
+        "faults": {"policy_lost": "slow", "patience_s": 1000.0},
+    }
+    planned = family.plan(deployment.resolve(tree, {}, "prefix"))
+    robot = planned.robot
+    if made.endless:
+        lower, upper = robot.lower.copy(), robot.upper.copy()
+        lower[0], upper[0] = -np.inf, np.inf
+        robot = replace(robot, lower=lower, upper=upper)
+    return SeldomPlan(planned.resolved, robot, {}, made.seen_every)
+
+
+@dataclass(slots=True)
+class Planned:
+    """By control step what was planned, before safety, where something was, and the steps in which no run was."""
+
+    rows: dict[int, Float64]
+    held: set[int]
+    arrived: dict[int, int]  # by the step of the observation: that from which on the answer is the plan
+    other: set[int]  # steps in which another strategy was in force
+    end: int
+
+
+def _run(plan: SeldomPlan, made: Scenario, random: np.random.Generator) -> Planned:
+    planned = Planned({}, set(), {}, set(), 0)
+    around = Around(runner=Late(*made.delay, random))
+    with closing(Lockstep(plan, around=around)) as station:
+        session = station.main.session
+        station.connect()
+        station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
+        station.command("setup")
+        station.until(lambda: session.state is not State.SETTING_UP, 60.0, "set-up")
+        station.command("run")
+        end = station.step + _TICKS
+
+        def over() -> bool:
+            status = station.page.control.read()
+            row, step = status["smoothed"].astype(np.float64), int(status["step"])
+            if np.isfinite(row).all():
+                planned.rows[step] = row
+            if session.state is not State.RUNNING:
+                planned.held.add(step + 1)
+            if not station.main.inference.continues:
+                planned.other.add(step + 1)
+            shown = station.main.inference.shown
+            if shown is not None and shown.state == "merged":
+                used = shown.targets[shown.targets >= 0]
+                planned.arrived.setdefault(shown.observation_step, int(used[0]))
+            return station.step >= end or random.random() < 0.02
+
+        while station.step < end:
+            station.until(over, 60.0, "the run")
+            _interfere(station, made, random)
+        planned.end = station.step - 1
+    return planned
+
+
+def _interfere(station: Lockstep, made: Scenario, random: np.random.Generator) -> None:
+    """What a person might do now."""
+    state = station.main.session.state
+    if state is State.READY:
+        station.command("run")
+    elif state is State.HOLDING:
+        station.command("resume" if random.random() < 0.7 else "stop")
+    elif state is State.RUNNING and random.random() < 0.3:
+        station.command("halt" if random.random() < 0.7 else "stop")
+    elif state is State.RUNNING:
+        kind = str(random.choice(_KINDS))
+        station.command("tune", strategy=made.strategy if kind == "rtc" else {"kind": kind})
+
+
+def _violations(made: Scenario, keeper: Keeper, planned: Planned) -> list[str]:
+    """Each fixed row that is not what was planned for its step, by more than its arithmetic."""
+    found: list[str] = []
+    pace = (made.action_hz or made.control_hz) / made.control_hz
+    binding = made.keeps and made.action_hz is None and "k_max" not in made.strategy
+    for declared in keeper.declared:
+        arrived = planned.arrived.get(declared.step, planned.end)
+        over = planned.end if binding and arrived not in planned.other else arrived
+        for place, row in enumerate(declared.rows):
+            at = declared.step + place / pace
+            steps = range(declared.step, math.ceil(at - _HAIR) + 1)
+            if steps[-1] >= over or any(step in planned.held for step in steps):
+                break  # the run was held meanwhile, or an answer is laid that need not continue
+            off = keeper.apart(row, at, planned.rows)
+            if off:
+                found.append(f"row {place} of the request about step {declared.step} ({made}) {off}")
+    return found

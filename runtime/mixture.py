@@ -1,0 +1,102 @@
+"""What several answers make together, in the numbers in which the policy gave its rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from runtime.end_effectors import EndEffectors
+from runtime.errors import PolicyError
+from runtime.formats import PoseRows
+from runtime.kinematics.forward import ChainForward
+from runtime.pose_format import CANONICAL
+from runtime.timeline import Dims, difference
+from runtime.types import ActionChunk, Float64
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+_ROUND = 0.02  # [rad] by which the model's own rows, mixed as numbers, may miss an angle or a turn
+
+
+class Parts(NamedTuple):
+    """What N rows are mixed of: numbers [P, N, W], weights [P, N] that sum to 1, and the newest of each [N, W]."""
+
+    rows: Float64
+    weights: Float64
+    newest: Float64
+
+
+class Mixture:
+    """Mixes rows as control mixes plans; `dims` say what of joint rows does not mix as numbers do.
+
+    Joints are mixed as they are; poses are those of the mixed joints, because it is joints that control mixes.
+    Binary grippers are those of the newest row, as the policy gave them.
+    """
+
+    def __init__(self, dims: Dims | None = None, robot: Robot | None = None) -> None:
+        self._dims = Dims() if dims is None else dims
+        self._robot = robot
+        self._layout: PoseRows | None = None  # a policy speaks one format
+
+    def joints(self, parts: Parts) -> Float64:
+        """Joint rows [N, D], angles without limits on the newest one's branch."""
+        return _mixed(parts, self._dims.switched, self._dims.wrapping)
+
+    def numbers(self, parts: Parts, like: ActionChunk) -> Float64:
+        """Rows [N, W] of which nobody but the model knows what they mean, in the order of the actions of `like`."""
+        return _mixed(parts, self._switched(like), ())
+
+    def poses(self, joints: Float64, newest: Float64, like: ActionChunk) -> Float64:
+        """The poses [N, W] of joints [N, D] in the format of `like`, each written as near to the newest as can be."""
+        layout = self._layout_of(like)
+        vectors = self._end_effectors.vectors(joints)
+        rows = (layout.encode(vectors[n : n + 1], joints[n : n + 1], newest[n]) for n in range(len(joints)))
+        made = np.concatenate(list(rows))
+        switched = self._switched(like)
+        made[:, switched] = newest[:, switched]
+        return made
+
+    def agree(self, straight: Float64, meant: Float64, like: ActionChunk) -> bool:
+        """Whether rows that were mixed as numbers are what is meant: they are not where an angle goes round."""
+        if like.space == "joint":
+            return bool(np.abs(straight - meant).max(initial=0.0) <= _ROUND)
+        try:
+            one, other = (self._layout_of(like).decode(rows)[0][..., 3:7] for rows in (straight, meant))
+        except PolicyError:  # they determine no orientation
+            return False
+        cosines = np.abs((one * other).sum(axis=-1))
+        return bool(2.0 * np.arccos(np.clip(cosines, 0.0, 1.0)).max(initial=0.0) <= _ROUND)
+
+    def _switched(self, like: ActionChunk) -> list[int]:
+        """The places of binary grippers in a row."""
+        if like.space == "joint":
+            return list(self._dims.switched)
+        binary = self._known.binary_dims
+        return [place for place, dim in self._layout_of(like).commanded if dim in binary]
+
+    def _layout_of(self, like: ActionChunk) -> PoseRows:
+        wanted = CANONICAL if like.pose is None else like.pose
+        if self._layout is None or self._layout.pose != wanted:
+            self._layout = PoseRows(wanted, self._known)
+        return self._layout
+
+    @cached_property
+    def _end_effectors(self) -> EndEffectors:
+        return EndEffectors(self._known, ChainForward(self._known))
+
+    @property
+    def _known(self) -> Robot:
+        assert self._robot is not None, "rows of poses need the robot whose they are"
+        return self._robot
+
+
+def _mixed(parts: Parts, switched: Sequence[int], wrapping: Sequence[int]) -> Float64:
+    """Written so that equal rows stay equal to the last bit."""
+    apart = difference(parts.rows, parts.newest, wrapping)
+    made: Float64 = parts.newest + (parts.weights[..., None] * apart).sum(axis=0)
+    made[:, list(switched)] = parts.newest[:, list(switched)]
+    return made
