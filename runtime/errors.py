@@ -61,6 +61,10 @@ class PolicyGone(PolicyLostError):
     """The server closed the connection; it may have restarted."""
 
 
+class UnsolicitedError(PolicyLostError):
+    """The server sent what nobody had asked for, so answers may be off by one; the connection is dropped."""
+
+
 class PortClosedError(PolicyLostError):
     """The policy server's machine answers, and nobody listens at the port."""
 

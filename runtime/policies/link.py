@@ -1,6 +1,7 @@
 """One websocket to a policy server: a first frame on connect, then strictly one request and one answer.
 
-Replies carry no id, so a connection whose answer did not come in time is dropped and never used again.
+Replies carry no id, so a connection whose answer did not come in time is dropped and never used again, and so is one
+on which something waits before a question is asked.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from runtime.errors import (
     RefusedError,
     ServerSaysError,
     TlsError,
+    UnsolicitedError,
     WrongProtocolError,
 )
 from runtime.policies.reach import Dial, Place, reached
@@ -29,6 +31,8 @@ from runtime.policies.watchdog import Watchdog
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
+ANSWER_LIMIT = 64 * 1024 * 1024  # bytes of a message, metadata too; a chunk of 50 rows is some kilobytes
+_TOO_BIG = 1009  # the close code for it
 _CLOSE_TIMEOUT = 0.5  # seconds for the closing handshake; a server busy with inference does not answer it
 
 
@@ -89,6 +93,7 @@ class WebsocketLink:
             raise PolicyError(f"there is no connection to {self._url}; connect first")
         deadline = time.monotonic() + seconds
         with self._dropping_on_error():
+            self._require_silence(connection)
             self._send(connection, request, seconds)
             return self._receive(connection, deadline, "an answer", seconds)
 
@@ -102,6 +107,7 @@ class WebsocketLink:
             raise PolicyError(f"there is no connection to {self._url}; connect first")
         deadline = time.monotonic() + seconds
         with self._dropping_on_error():
+            self._require_silence(connection)
             self._send(connection, request, seconds)
             answer = self._frame(connection, deadline, "an acknowledgement", seconds)
             return None if answer == text else self._binary(answer)
@@ -165,7 +171,7 @@ class WebsocketLink:
                     sock=wire,
                     additional_headers=self._headers,
                     compression=None,
-                    max_size=None,
+                    max_size=ANSWER_LIMIT,
                     # A server that computes on its event loop answers no pings.
                     ping_interval=None,
                     proxy=None,
@@ -236,6 +242,22 @@ class WebsocketLink:
                     ) from error
                 raise self._gone(error) from error
 
+    def _require_silence(self, connection: ClientConnection) -> None:
+        """Whatever waits before a question is asked answers none, and would be taken for what answers this one."""
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            waiting = connection.recv(timeout=0)
+        except TimeoutError:
+            return
+        except ConnectionClosed as error:
+            raise self._gone(error) from error
+        raise UnsolicitedError(
+            f"{self._url} sent a message of {len(self._binary(waiting))} bytes that nobody had asked for: an answer "
+            "came twice, by the server or by what stands before it, and the last one may have been another question's; "
+            "the connection is dropped"
+        )
+
     def _cut(self) -> None:
         if self._connection is not None:
             _end(self._connection.socket)
@@ -263,6 +285,12 @@ class WebsocketLink:
     def _gone(self, error: Exception) -> PolicyError:
         if self._aborted:
             return PolicyError(f"the connection to {self._url} was closed from our side")
+        sent = getattr(error, "sent", None)
+        if sent is not None and sent.code == _TOO_BIG:
+            return WrongProtocolError(
+                f"{self._url} sent a message that is too large ({sent.reason}): it is no policy's answer, or pictures "
+                "are among it; the connection is dropped"
+            )
         return PolicyGone(
             f"the policy server at {self._url} closed the connection ({error}): see that it runs"
         )

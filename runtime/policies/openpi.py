@@ -6,6 +6,7 @@ configuration, so that the ALOHA, DROID and LIBERO layouts are settings and not 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,11 +15,12 @@ from pydantic import Field
 
 from runtime import codecs
 from runtime.clock import Clock
-from runtime.errors import ConfigurationError, PolicyError, WrongProtocolError
+from runtime.errors import CodecError, ConfigurationError, PolicyError, WrongProtocolError
 from runtime.policies.agreement import Declared, agreed
 from runtime.policies.answers import AnswerSettings
 from runtime.policies.base import PolicyInfo
 from runtime.policies.grip import Convention, Grip
+from runtime.policies.link import ANSWER_LIMIT
 from runtime.policies.request import RequestLayout, RequestSettings, poses_of
 from runtime.policies.rows import action_rows
 from runtime.policies.rtc.async_rtc import AsyncRtc, Schedule
@@ -32,6 +34,7 @@ from runtime.types import ActionChunk, Conditioning, Float32, Observation
 if TYPE_CHECKING:
     from robots import Robot
 
+_SOONER = 0.95  # of what a server says that its inference took: clocks differ by less
 
 # Metadata keys by which servers of other protocols are known, and the kind that is theirs.
 _MARKS = {
@@ -57,7 +60,7 @@ class Config(ServerSettings, RequestSettings, AnswerSettings):
     """With openpi_rtc: what its parts are called, and how many rows the server takes off the chunk before."""
     rtc_rows: Rows = "aligned"
     """With openpi_rtc and kai0: "aligned" sends the chunk before so that the server continues from the first row that
-    the robot has not consumed; "whole" as it was answered, as these dialects' own clients do, which is right only
+    the robot has not consumed; "whole" from its first row on, as these dialects' own clients do, which is right only
     where the robot has consumed what the server assumes."""
     prefix_attention_schedule: Schedule = "exp"
     """With async_rtc: how the weight of the rows before falls after the predicted delay."""
@@ -139,6 +142,15 @@ class OpenpiPolicy(WebsocketPolicy):
         except PolicyError:
             self._link.drop()  # after an error the server closes, after another's answer all would be another's
             raise
+
+    def _doubt(self, request: bytes, answer: bytes, took: float) -> str:
+        """Also where it came sooner than the server says that it took: then it was under way before the question."""
+        with contextlib.suppress(CodecError):  # `infer` says so
+            reply = codecs.unpack(answer, ANSWER_LIMIT)
+            said = _timing(reply).get("server.infer_ms", 0.0) if isinstance(reply, dict) else 0.0
+            if took < _SOONER * said:
+                return "the answer came sooner than the server says that its inference took"
+        return super()._doubt(request, answer, took)
 
     def _chunk(self, reply: Mapping[str, Any], round_trip: float) -> ActionChunk:
         if "actions" not in reply:

@@ -117,6 +117,7 @@ class RoboarenaPolicy(WebsocketPolicy):
             return
         request = codecs.pack(self._ending | {"endpoint": "reset"})
         answer = self._link.acknowledged(request, self._config.reset_deadline, ACKNOWLEDGED)
+        self._last = None  # no answer of before can follow
         if answer is not None:
             self._require_acknowledged(self._value(answer, "an acknowledgement"))
         self._ending = None

@@ -13,6 +13,9 @@ NAMES = {
     "close_mid_reply": "answers :N requests, then ends the connection within an answer",
     "die": "answers :N requests, then the process ends",
     "late_reply": "answers the second request :S seconds late (3), all others in time",
+    "doubled": "answers the request number :N (0) twice at once",
+    "doubled_late": "answers the request number :N (0) once more when the next one comes, before that",
+    "too_large": "answers with a message of more than 64 MiB",
     "wrong_dim": "rows are one number short",
     "nan": "one number is NaN, at row 3, column 2",
     "empty": "no rows at all",
@@ -43,6 +46,7 @@ NAMES = {
     "other_rate": "lerobot: rows at twice the rate",
     "no_name": "lerobot: has its classes where version 0.3 had them",
 }
+TOO_LARGE = 64 * 1024 * 1024 + 1  # bytes
 
 
 @dataclass(frozen=True, slots=True)

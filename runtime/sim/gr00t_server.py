@@ -16,7 +16,7 @@ import zmq
 
 from runtime.errors import SetupError
 from runtime.sim import gr00t_wire as wire
-from runtime.sim.faults import NONE, Fault
+from runtime.sim.faults import NONE, TOO_LARGE, Fault
 from runtime.sim.script import Answer, Script, Waving
 from runtime.types import Float32, Float64, UInt8
 
@@ -147,6 +147,8 @@ class Gr00tServer:
             return None
         if fault.name == "late_reply" and number == 1:
             self._ended.wait(fault.number(_LATE))
+        if fault.name == "too_large":
+            return [bytes(TOO_LARGE)]
         frames = {"error_bytes": [b"ERROR"], "malformed": [b"\x93\xc1"], "two_frames": [b"\x80", b"\x80"]}
         return frames.get(fault.name, _RIGHT)
 

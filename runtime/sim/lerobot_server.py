@@ -16,7 +16,7 @@ import numpy as np
 
 from runtime.errors import SetupError
 from runtime.sim import lerobot_wire as wire
-from runtime.sim.faults import NONE, Fault
+from runtime.sim.faults import NONE, TOO_LARGE, Fault
 from runtime.sim.script import Answer, Script, Waving
 from runtime.types import Float32
 
@@ -176,6 +176,8 @@ class LerobotServer:
             self._ended.wait()
         if fault.name == "late_reply" and number == 1:
             self._ended.wait(fault.number(_LATE))
+        if fault.name == "too_large":
+            return bytes(TOO_LARGE)
         if fault.name == "malformed":
             return b"\x80\x04]\x93."
         if fault.name == "foreign_name":

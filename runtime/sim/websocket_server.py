@@ -19,7 +19,7 @@ from websockets.frames import Frame, Opcode
 from websockets.sync.server import Server, ServerConnection, serve
 
 from runtime.errors import SetupError
-from runtime.sim.faults import Fault
+from runtime.sim.faults import TOO_LARGE, Fault
 from runtime.types import Float32
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ class WebsocketServer(ABC):
         self._idle = idle  # s after which a silent client is left
         self._device = threading.Lock()
         self._asked = 0
+        self._before: Frames = b""  # the newest answer
         self._server: Server | None = None
         self._thread: threading.Thread | None = None
 
@@ -152,7 +153,14 @@ class WebsocketServer(ABC):
             return False
         if fault.name == "late_reply" and number == 1:
             time.sleep(fault.number(_LATE))
+        if fault.name == "too_large":
+            reply = bytes(TOO_LARGE)
+        if fault.name == "doubled_late" and number == fault.number(0) + 1:
+            connection.send(self._before)
         connection.send(reply)
+        if fault.name == "doubled" and number == fault.number(0):
+            connection.send(reply)
+        self._before = reply
         return True
 
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from benchmarks import soak
-from benchmarks.fuzzing import boxes, encoders
+from benchmarks.fuzzing import answers, boxes, encoders, rtc_prefix
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -16,6 +16,32 @@ def test_faulty_encoders_never_move_a_robot_beyond_its_limits_or_away_from_where
 @pytest.mark.parametrize("seed", range(75))
 def test_no_command_has_an_end_effector_outside_its_box(seed):
     assert boxes.once(seed) == []
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_what_a_request_declares_fixed_is_what_control_plans_for_these_steps(seed):
+    assert rtc_prefix.once(seed) == []
+
+
+def test_a_plan_that_is_another_one_than_was_declared_is_noticed(monkeypatch):
+    """As before: the rows of the newest answer as it was given, whatever control has blended."""
+    monkeypatch.setattr("runtime.commitment._shares", lambda merged: {})
+    found = [text for seed in range(4) for text in rtc_prefix.once(seed)]
+    assert any("off in number" in text for text in found)
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_an_answer_that_comes_twice_answers_no_other_question(seed):
+    assert answers.once(seed) == []
+
+
+def test_answers_that_are_off_by_one_are_noticed(monkeypatch):
+    """As before: what comes next is the answer."""
+    monkeypatch.setattr("runtime.policies.link.WebsocketLink._require_silence", lambda *given: None)
+    monkeypatch.setattr("runtime.policies.websocket.WebsocketPolicy._doubt", lambda *given: "")
+    monkeypatch.setattr("runtime.policies.openpi.OpenpiPolicy._doubt", lambda *given: "")
+    found = [text for seed in range(8) for text in answers.once(seed)]
+    assert any("has an answer that begins" in text for text in found)
 
 
 def test_a_soak_goes_through_all_fuzzers_and_names_what_they_find():
@@ -34,7 +60,7 @@ def test_a_soak_goes_through_all_fuzzers_and_names_what_they_find():
 
 
 def test_every_fuzzer_is_part_of_a_soak():
-    assert {"boxes", "encoders"} <= set(soak.fuzzers())
+    assert {"answers", "boxes", "encoders", "rtc_prefix"} <= set(soak.fuzzers())
 
 
 def test_what_leaks_and_grows_is_seen():

@@ -11,7 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runtime.errors import ContradictionError, PolicyError, PolicyGone, PolicyLostError, PolicyTimeout
+from runtime.errors import (
+    ContradictionError,
+    PolicyError,
+    PolicyGone,
+    PolicyLostError,
+    PolicyTimeout,
+    UnsolicitedError,
+)
 from runtime.sim import faults
 from runtime.sim.faults import Fault
 from runtime.types import Conditioning
@@ -39,6 +46,8 @@ WEBSOCKET: Faults = {
     "object_array": (PolicyError, "refused"),
     "exception": (PolicyError, "CUDA out of memory"),
     "late_reply:0.8": (PolicyTimeout, "the connection is dropped"),
+    "doubled": (UnsolicitedError, "that nobody had asked for"),
+    "too_large": (PolicyError, "67108865 bytes exceeds limit of 67108864 bytes"),
 }
 GR00T: Faults = {
     "mute_on_connect": (PolicyLostError, "did not send an answer to get_modality_config within"),
@@ -60,6 +69,7 @@ GR00T: Faults = {
     "two_frames": (PolicyError, "2 frames; expected one"),
     "missing_key": (PolicyError, r"no action 'left_arm'; it has (action\.)?right_arm"),
     "uneven": (PolicyError, "different numbers of rows: left_arm 49, right_arm 50"),
+    "too_large": (PolicyGone, "sends no more than 67108864 bytes"),
 }
 FAULTS: dict[str, Faults] = {
     "openpi": WEBSOCKET,
@@ -95,13 +105,18 @@ FAULTS: dict[str, Faults] = {
         "other_rate": (PolicyError, "rows are at 60 Hz"),
         "load_fails": (PolicyError, "not a folder with a config.json"),
         "no_name": (PolicyError, "policy.server_version"),
+        "too_large": (PolicyError, r"too large for GetActions: .*larger than max .* vs\. 8388608"),
     },
 }
 # Faults that a protocol cannot have, or that are none there; each with the reason.
+_REP = "a REP socket answers once; two answers by what stands before it: tests/runtime/policies/groot"
 NONE: dict[str, dict[str, str]] = {
     "starvla": {"exception": "its server tells errors of a model as a map: refused"},
-    "gr00t-n1.5": {"two_batches": "its answers have no batch axis"},
+    "gr00t-n1.5": {"two_batches": "its answers have no batch axis", "doubled": _REP},
+    "gr00t-n1.6": {"doubled": _REP},
+    "gr00t-n1.7": {"doubled": _REP},
     "lerobot": {
+        "doubled": "a call has one answer, and each row the step that it is for",
         "bad_array_dialect": "tensors are pickles of torch",
         "object_array": "tensors are pickles of torch",
         "two_batches": "each step has one row",
@@ -109,7 +124,7 @@ NONE: dict[str, dict[str, str]] = {
 }
 EVERYWHERE = {
     *("mute_on_connect", "mute_on_infer", "close_mid_reply", "late_reply", "wrong_dim", "nan", "empty"),
-    *("bad_array_dialect", "object_array", "exception", "two_batches"),
+    *("bad_array_dialect", "object_array", "exception", "two_batches", "doubled", "too_large"),
 }
 
 pytestmark = pytest.mark.usefixtures("no_thread_is_left")
@@ -188,6 +203,21 @@ def test_a_late_answer_is_never_paired_with_the_next_request(name: str) -> None:
             with contextlib.suppress(PolicyLostError):  # the server may still be at what nobody waits for
                 assert served.begins_at(policy, value)
                 answered += 1
+
+
+@pytest.mark.parametrize("fault", ["doubled:2", "doubled_late:2", "doubled:3", "doubled_late:3"])
+@pytest.mark.parametrize("name", WEBSOCKETS)
+def test_a_doubled_answer_is_never_paired_with_another_question(name: str, fault: str) -> None:
+    """It costs at most one question; before, all later answers were off by one for good."""
+    served = protocol(name)
+    failed = 0
+    with served.served(Fault(*fault.split(":"))) as policy:
+        for number in range(8):
+            try:
+                assert served.begins_at(policy, 0.1 + 0.1 * number)
+            except PolicyError:
+                failed += 1
+    assert failed <= 1
 
 
 @on_every_protocol

@@ -58,6 +58,7 @@ class ReqLink:
         for option, value in (
             (zmq.LINGER, 0),
             (zmq.MAXMSGSIZE, self._limit),
+            (zmq.REQ_CORRELATE, 1),  # a REP socket gives the request's number back; another's is thrown away
             (zmq.RECONNECT_IVL, -1),  # after a lost connection the request is lost, and so is the socket
         ):
             made.setsockopt(option, value)
@@ -82,7 +83,7 @@ class ReqLink:
                 raise PolicyGone(
                     f"the policy server at {self._url} closed the connection since the last request: see that it runs"
                 ) from error
-            while not wire.poll(_SPELL_MS):
+            while (frames := _received(wire)) is None:
                 self._require_not_aborted()
                 if time.monotonic() >= deadline:
                     raise PolicyTimeout(
@@ -93,7 +94,6 @@ class ReqLink:
                         f"the policy server at {self._url} closed the connection before {what}: see that it runs, and "
                         f"that it sends no more than {self._limit} bytes"
                     )
-            frames = wire.recv_multipart(zmq.NOBLOCK)
             if len(frames) != 1:
                 raise WrongProtocolError(
                     f"{self._url} sent a message of {len(frames)} frames; expected one: it is no GR00T server"
@@ -197,3 +197,11 @@ class ReqLink:
         except BaseException:
             self.drop()
             raise
+
+
+def _received(wire: zmq.Socket[bytes]) -> list[bytes] | None:
+    """The frames of an answer, None where none comes within a spell: what answers another request is thrown away."""
+    try:
+        return wire.recv_multipart(zmq.NOBLOCK) if wire.poll(_SPELL_MS) else None
+    except zmq.Again:
+        return None

@@ -349,3 +349,39 @@ def test_after_an_error_the_same_connection_goes_on() -> None:
         server._behaviour = Gr00tBehaviour()
         policy.infer(observation())
         assert policy._link._socket is link
+
+
+@pytest.mark.parametrize("when", ["at once", "with the next"])
+def test_an_answer_that_comes_twice_is_thrown_away(when: str) -> None:
+    """What stands before the server sends each answer once more; a REP socket gives the request's number back."""
+    server, ended = Gr00tServer(ROBOT, Gr00tBehaviour(horizon=20)), threading.Event()
+    wire: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.ROUTER)
+    port = wire.bind_to_random_port("tcp://127.0.0.1")
+
+    def repeat() -> None:
+        before: list[bytes] = []
+        while not ended.is_set():
+            if not wire.poll(20):
+                continue
+            *envelope, payload = wire.recv_multipart()
+            if before and when == "with the next":
+                wire.send_multipart(before)
+            answer = server._replies(payload)
+            assert answer is not None
+            before = [*envelope, *answer]
+            wire.send_multipart(before)
+            if when == "at once":
+                wire.send_multipart(before)
+
+    thread = threading.Thread(target=repeat)
+    thread.start()
+    try:
+        with policy_at(f"tcp://127.0.0.1:{port}") as policy:
+            for value in (0.1, 0.2, 0.3, 0.4):
+                first = policy.infer(observation(value)).actions[0]
+                near = np.clip(value, ROBOT.lower, ROBOT.upper)
+                assert np.abs(first - near).max() < 0.05
+    finally:
+        ended.set()
+        thread.join()
+        wire.close(linger=0)

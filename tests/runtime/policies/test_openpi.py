@@ -26,13 +26,14 @@ from runtime.errors import (
     PolicyLostError,
     PolicyTimeout,
     UnreachableError,
+    UnsolicitedError,
     WrongProtocolError,
 )
 from runtime.policies import openpi
 from runtime.policies.link import WebsocketLink, headline
 from runtime.policies.openpi import Config, OpenpiPolicy
 from runtime.pose_format import PoseFormat
-from runtime.sim.faults import NONE, Fault
+from runtime.sim.faults import NONE, TOO_LARGE, Fault
 from runtime.sim.in_poses import InPoses
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.script import Waving
@@ -993,3 +994,86 @@ def test_an_inference_while_reset_is_called_comes_back_with_its_own_answer() -> 
         assert row_zero_starts_at(policy.infer(observation(0.4)), 0.4)
         timer.join()
         assert row_zero_starts_at(policy.infer(observation(0.1)), 0.1)
+
+
+# Answers and questions
+
+
+def rows_of(value: float, **figures: Any) -> dict[str, Any]:
+    return {"actions": np.full((5, ROBOT.dim), value, np.float32), **figures}
+
+
+def test_a_policy_that_always_answers_the_same_is_asked_twice_once_and_then_believed() -> None:
+    asked: list[Any] = []
+    with stub(replying(rows_of(0.5), seen=asked)) as url, policy_at(url) as policy:
+        for number in range(4):
+            assert policy.infer(observation(0.1 * number)).actions[0, 0] == 0.5
+    assert len(asked) == 5
+
+
+def test_the_same_question_may_have_the_same_answer() -> None:
+    asked: list[Any] = []
+    with stub(replying(rows_of(0.5), seen=asked)) as url, policy_at(url) as policy:
+        for _ in range(3):
+            policy.infer(observation())
+    assert len(asked) == 3
+
+
+def test_an_answer_that_came_sooner_than_it_took_is_another_questions() -> None:
+    """A server, or a proxy, that computes an answer twice: the second differs from the first in its figures."""
+    conversations: list[int] = []
+
+    def converse(connection: ServerConnection) -> None:
+        conversations.append(0)
+        connection.send(codecs.pack({}))
+        for request in connection:
+            conversations[-1] += 1
+            value = codecs.unpack(request)["state"][0]
+            late = len(conversations) == 1 and conversations[-1] == 2
+            took = {"server_timing": {"infer_ms": 1e6 if late else 0.0}}
+            connection.send(codecs.pack(rows_of(0.0 if late else value, **took)))
+
+    with stub(converse) as url, policy_at(url) as policy:
+        found = [policy.infer(observation(value)).actions[0, 0] for value in (0.1, 0.2, 0.3)]
+    np.testing.assert_allclose(found, [0.1, 0.2, 0.3])
+    assert conversations == [2, 2]
+
+
+def test_figures_that_are_no_durations_are_believed_no_more() -> None:
+    asked: list[Any] = []
+    with (
+        stub(replying(rows_of(0.5, server_timing={"infer_ms": 1e6}), seen=asked)) as url,
+        policy_at(url) as policy,
+    ):
+        for _ in range(3):
+            policy.infer(observation())
+    assert len(asked) == 4
+
+
+@pytest.mark.parametrize("copy", [codecs.pack({}), codecs.pack(rows_of(0.5))])
+def test_what_waits_before_the_first_question_answers_none(copy: bytes) -> None:
+    def converse(connection: ServerConnection) -> None:
+        connection.send(codecs.pack({}))
+        connection.send(copy)
+        for _ in connection:
+            connection.send(codecs.pack(rows_of(0.1)))
+
+    with stub(converse) as url, policy_at(url) as policy:
+        policy.connect()
+        told: list[PolicyError] = []
+        for _ in range(2):  # it may come a moment after the metadata
+            try:
+                policy.infer(observation())
+            except PolicyError as error:
+                told.append(error)
+    assert isinstance(told[-1], UnsolicitedError)
+    assert "that nobody had asked for" in str(told[-1])
+
+
+def test_metadata_have_a_bound_too() -> None:
+    with (
+        stub(lambda connection: connection.send(bytes(TOO_LARGE))) as url,
+        policy_at(url) as policy,
+        pytest.raises(WrongProtocolError, match="67108865 bytes exceeds limit of 67108864 bytes"),
+    ):
+        policy.connect()

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+import itertools
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,17 @@ def served(**arena: Any) -> Iterator[tuple[RoboarenaServer, str]]:
 
 def reply_to(message: Any) -> object:
     return "reset successful" if message["endpoint"] == "reset" else {"actions": ROWS}
+
+
+def changing() -> Callable[[Any], object]:
+    """As `reply_to`, with other rows each time: the same bytes to another question would be doubted."""
+    count = itertools.count()
+
+    def reply(message: Any) -> object:
+        found = reply_to(message)
+        return found if isinstance(found, str) else {"actions": ROWS + np.float32(next(count))}
+
+    return reply
 
 
 def request_of(
@@ -133,7 +145,7 @@ def test_four_frames_per_view_are_the_recorded_request() -> None:
     asked: list[bytes] = []
     metadata = SIX | {"n_external_cameras": 2, "image_resolution": None}
     with (
-        serving(answering(metadata, reply_to, asked)) as url,
+        serving(answering(metadata, changing(), asked)) as url,
         policy_at(url, cameras=three, cartesian_position="zeros", frames=4) as policy,
     ):
         for frame in range(4):
@@ -149,7 +161,7 @@ def test_four_frames_per_view_are_the_recorded_request() -> None:
 def test_moments_before_a_request_are_shown_from_the_second_on_although_nobody_asked_then() -> None:
     asked: list[bytes] = []
     with (
-        serving(answering(SIX | {"image_resolution": None}, reply_to, asked)) as url,
+        serving(answering(SIX | {"image_resolution": None}, changing(), asked)) as url,
         policy_at(url, frame_steps=[23, 16, 8, 0]) as policy,
     ):
         assert policy.glances_s == pytest.approx(1 / 15)

@@ -1,0 +1,116 @@
+"""Policy servers that answer twice, by chance: no answer is taken for that to another question."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+import robots
+from robots import Robot
+from runtime.clock import MonotonicClock
+from runtime.errors import PolicyError
+from runtime.plugins import variants
+from runtime.policies.base import Policy
+from runtime.sim.openpi_server import Behaviour, OpenpiServer
+from runtime.sim.roboarena_server import Arena, RoboarenaServer
+from runtime.sim.starvla_server import Star, StarvlaServer
+from runtime.sim.websocket_server import Frames, WebsocketServer
+from runtime.types import Observation
+
+_QUESTIONS = 12
+_SIZE = (24, 32)  # of pictures
+_NEAR = 0.05  # [rad] of where it was seen, within which a gesture begins
+_ARENA = {"cameras": {"cam_high": "first", "cam_left_wrist": "wrist"}, "cartesian_position": "zeros"}
+_ROBOT = robots.load("dual_franka", ["left_arm"])
+_VIEWS = [camera.key for camera in _ROBOT.cameras]
+
+
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """A client's kind and settings, and the server that it is for."""
+
+    kind: str
+    server: Callable[[], WebsocketServer]
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+_PROTOCOLS = (
+    Protocol("openpi", lambda: OpenpiServer(_ROBOT, Behaviour())),
+    Protocol("openpi", lambda: OpenpiServer(_ROBOT, Behaviour(rtc="async_rtc")), {"rtc": "async_rtc"}),
+    Protocol("roboarena", lambda: RoboarenaServer(_ROBOT, Arena(resolution=_SIZE)), _ARENA),
+    Protocol(
+        "roboarena",
+        lambda: RoboarenaServer(_ROBOT, Arena(variant="vllm", reply="dict", resolution=_SIZE)),
+        _ARENA,
+    ),
+    Protocol(
+        "starvla", lambda: StarvlaServer(_ROBOT, Star(size=_SIZE)), {"cameras": _VIEWS, "ping_every": None}
+    ),
+)
+
+
+def once(seed: int) -> list[str]:
+    """Ask the server of this seed some questions; each wrong answer in a sentence, none where all is well."""
+    random = np.random.default_rng(seed)
+    chosen = _PROTOCOLS[int(random.integers(len(_PROTOCOLS)))]
+    values = random.permutation(np.linspace(0.1, 1.3, _QUESTIONS))
+    server = chosen.server()
+    doubled = _doubling(server, random)
+    with closing(server):
+        url = str(server.start()["url"])
+        module = variants("runtime.policies")[chosen.kind]
+        config = module.Config(url=url, connect_deadline=10.0, inference_deadline=10.0, **chosen.settings)
+        with closing(module.build(config, _ROBOT, MonotonicClock(), 30.0)) as policy:
+            found = _asked(policy, values)
+    wrong = [text for text in found if not text.startswith("error")]
+    failed = len(found) - len(wrong)
+    if failed > doubled():
+        wrong.append(f"{failed} questions failed for {doubled()} doubled answers: {found}")
+    return [f"seed {seed}: {chosen.kind}: {text}" for text in wrong]
+
+
+def _asked(policy: Policy, values: np.ndarray[Any, Any]) -> list[str]:
+    """What was wrong, question by question."""
+    found: list[str] = []
+    for value in values.tolist():
+        near = np.clip(value, _ROBOT.lower, _ROBOT.upper)
+        try:
+            begins = policy.infer(_seen(_ROBOT, value)).actions[0]
+        except PolicyError as error:
+            found.append(f"error: {error}")
+            continue
+        off = float(np.abs(begins - near).max())
+        if off >= _NEAR:
+            found.append(f"the question about {value:.2f} has an answer that begins {off:.2f} away")
+    return found
+
+
+def _doubling(server: WebsocketServer, random: np.random.Generator) -> Callable[[], int]:
+    """Have the server send answers once more, at once or when the next question comes; how many it has."""
+    send, before, count = server._send, dict[Any, Frames](), 0
+
+    def sending(connection: Any, reply: Frames, number: int) -> bool:
+        nonlocal count
+        last = before.get(connection)
+        if last is not None and random.random() < 0.2:
+            connection.send(last)
+            count += 1
+        went = send(connection, reply, number)
+        if random.random() < 0.2:
+            connection.send(reply)
+            count += 1
+        before.clear()
+        before[connection] = reply
+        return went
+
+    server._send = sending  # type: ignore[method-assign]
+    return lambda: count
+
+
+def _seen(robot: Robot, value: float) -> Observation:
+    pictures = {camera.key: np.zeros((*_SIZE, 3), np.uint8) for camera in robot.cameras}
+    return Observation(1, 0.0, {}, np.full(robot.dim, value, np.float32), pictures, prompt="pick")
