@@ -34,7 +34,7 @@ from runtime.types import EEF_WIDTH, ActionChunk, Conditioning, Float64, Observa
 _TICKS = 240
 _HAIR = 1e-6  # of a step
 _ROUNDING = 2e-5  # [rad, m] of float32 there and back through the model's own numbers
-_POSES = 1e-3  # [m, and of a quaternion's numbers] of inverse kinematics
+_POSES = 2e-3  # [m, and of a quaternion's numbers] of inverse kinematics
 _ROBOTS = ("agilex_piper", "ur5e", "r1_lite")
 _KINDS = ("rtc", "rtc", "rtc", "async", "naive", "ensemble", "sync")
 
@@ -212,7 +212,7 @@ class Keeper(Policy):
         off = np.abs(self._difference(row, meant))
         allowed = np.full(len(off), _POSES if self._made.space == "eef" else _ROUNDING)
         if len(rows) > 1:
-            allowed += self._bend(before, planned)
+            allowed += 2.0 * self._bend(before, planned)
         off[self._switched] = 0.0
         worst = int(np.argmax(off - allowed))
         if off[worst] <= allowed[worst]:

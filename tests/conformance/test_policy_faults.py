@@ -17,7 +17,6 @@ from runtime.errors import (
     PolicyGone,
     PolicyLostError,
     PolicyTimeout,
-    UnsolicitedError,
 )
 from runtime.sim import faults
 from runtime.sim.faults import Fault
@@ -46,7 +45,6 @@ WEBSOCKET: Faults = {
     "object_array": (PolicyError, "refused"),
     "exception": (PolicyError, "CUDA out of memory"),
     "late_reply:0.8": (PolicyTimeout, "the connection is dropped"),
-    "doubled": (UnsolicitedError, "that nobody had asked for"),
     "too_large": (PolicyError, "67108865 bytes exceeds limit of 67108864 bytes"),
 }
 GR00T: Faults = {
@@ -109,14 +107,10 @@ FAULTS: dict[str, Faults] = {
     },
 }
 # Faults that a protocol cannot have, or that are none there; each with the reason.
-_REP = "a REP socket answers once; two answers by what stands before it: tests/runtime/policies/groot"
 NONE: dict[str, dict[str, str]] = {
     "starvla": {"exception": "its server tells errors of a model as a map: refused"},
-    "gr00t-n1.5": {"two_batches": "its answers have no batch axis", "doubled": _REP},
-    "gr00t-n1.6": {"doubled": _REP},
-    "gr00t-n1.7": {"doubled": _REP},
+    "gr00t-n1.5": {"two_batches": "its answers have no batch axis"},
     "lerobot": {
-        "doubled": "a call has one answer, and each row the step that it is for",
         "bad_array_dialect": "tensors are pickles of torch",
         "object_array": "tensors are pickles of torch",
         "two_batches": "each step has one row",
@@ -124,7 +118,7 @@ NONE: dict[str, dict[str, str]] = {
 }
 EVERYWHERE = {
     *("mute_on_connect", "mute_on_infer", "close_mid_reply", "late_reply", "wrong_dim", "nan", "empty"),
-    *("bad_array_dialect", "object_array", "exception", "two_batches", "doubled", "too_large"),
+    *("bad_array_dialect", "object_array", "exception", "two_batches", "too_large"),
 }
 
 pytestmark = pytest.mark.usefixtures("no_thread_is_left")
@@ -208,7 +202,10 @@ def test_a_late_answer_is_never_paired_with_the_next_request(name: str) -> None:
 @pytest.mark.parametrize("fault", ["doubled:2", "doubled_late:2", "doubled:3", "doubled_late:3"])
 @pytest.mark.parametrize("name", WEBSOCKETS)
 def test_a_doubled_answer_is_never_paired_with_another_question(name: str, fault: str) -> None:
-    """It costs at most one question; before, all later answers were off by one for good."""
+    """It costs at most one question; before, all later answers were off by one for good.
+
+    A REP socket and a call of gRPC have one answer; one that a proxy repeats to GR00T: test_gr00t.py.
+    """
     served = protocol(name)
     failed = 0
     with served.served(Fault(*fault.split(":"))) as policy:

@@ -1050,24 +1050,32 @@ def test_figures_that_are_no_durations_are_believed_no_more() -> None:
     assert len(asked) == 4
 
 
-@pytest.mark.parametrize("copy", [codecs.pack({}), codecs.pack(rows_of(0.5))])
-def test_what_waits_before_the_first_question_answers_none(copy: bytes) -> None:
+@pytest.mark.parametrize("after", ["metadata", "answer"])
+def test_what_waits_before_a_question_answers_none(after: str) -> None:
+    """The copy has reached the client when that answers a ping."""
+    there = threading.Event()
+
+    def repeat(connection: ServerConnection, message: bytes, what: str) -> None:
+        connection.send(message)
+        if what == after and not there.is_set():
+            connection.send(message)
+            connection.ping().wait()
+            there.set()
+
     def converse(connection: ServerConnection) -> None:
-        connection.send(codecs.pack({}))
-        connection.send(copy)
-        for _ in connection:
-            connection.send(codecs.pack(rows_of(0.1)))
+        repeat(connection, codecs.pack({}), "metadata")
+        for request in connection:
+            value = codecs.unpack(request)["state"][0]
+            repeat(connection, codecs.pack(rows_of(value)), "answer")
 
     with stub(converse) as url, policy_at(url) as policy:
         policy.connect()
-        told: list[PolicyError] = []
-        for _ in range(2):  # it may come a moment after the metadata
-            try:
-                policy.infer(observation())
-            except PolicyError as error:
-                told.append(error)
-    assert isinstance(told[-1], UnsolicitedError)
-    assert "that nobody had asked for" in str(told[-1])
+        if after == "answer":
+            policy.infer(observation(0.1))
+        assert there.wait(10)
+        with pytest.raises(UnsolicitedError, match="bytes that nobody had asked for"):
+            policy.infer(observation(0.2))
+        assert policy.infer(observation(0.3)).actions[0, 0] == np.float32(0.3)
 
 
 def test_metadata_have_a_bound_too() -> None:
