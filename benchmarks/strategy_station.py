@@ -184,19 +184,24 @@ def _answer(start: Float64, case: Case) -> Answering:
     return lambda step, given: known(step, given).astype(np.float32).astype(np.float64)
 
 
-def _plan(data: Path, case: Case) -> KnownPlan:
-    tree: dict[str, Any] = {
+def lockstep_deployment(data: Path, robot: str, strategy: dict[str, Any], rate: float) -> dict[str, Any]:
+    """The tables of a station on the virtual clock whose robot and policy are given to it; nothing is recorded."""
+    return {
         "station": "strategies",
-        "robot": "agilex_piper",
+        "robot": robot,
         "data_dir": str(data),
         "task": "follow the reference",
         "transport": {"kind": "dataset", "path": "-"},
         "policy": {"kind": "mock"},
-        "strategy": case.section,
-        "control": {"rate": case.control_hz},
+        "strategy": strategy,
+        "control": {"rate": rate},
         "setup": {"home": False},
         "recording": {"enabled": False},
-        "lockstep": {"delay_ticks": case.delay},
     }
+
+
+def _plan(data: Path, case: Case) -> KnownPlan:
+    tree = lockstep_deployment(data, "agilex_piper", case.section, case.control_hz)
+    tree["lockstep"] = {"delay_ticks": case.delay}
     made = family.plan(deployment.resolve(tree, {}, "strategies"))
     return KnownPlan(made.resolved, made.robot, {})

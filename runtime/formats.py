@@ -82,19 +82,28 @@ class PoseRows:
     def encode(self, vectors: Float64, joints: Float64, previous: Float64 | None = None) -> Float64:
         """Rows float64 [T, width] of vectors [T, arms, 8] at the joints [T or 1, D], which place the frame.
 
-        Each row is as near to the one before as its orientations can be written, the first to `previous` [width].
+        Each row is as near to the one before as its orientations can be written, the first to `previous` [width]; to
+        its own one of `previous` [T, width] where there are as many.
         Raises PolicyError for a quaternion without direction.
         """
         upright = self.upright(vectors)
         turned = self.frame.express(upright, joints)
-        before = None if previous is None else self._poses_of(previous[None])[0, :, self._turning]
         poses = np.empty((len(vectors), len(self._arms), self._each))
         poses[..., _POSITION] = turned[..., _POSITION]
-        poses[..., self._turning] = self._numbers.encode(turned[..., _QUATERNION], before)
+        poses[..., self._turning] = self._turned(turned[..., _QUATERNION], previous)
         if self.pose.gripper:
             poses[..., -1] = np.where(self._gripped, turned[..., _GRIPPER], 0.0)
         appended = np.broadcast_to(joints, (len(vectors), joints.shape[-1]))[:, self.dims]
         return np.concatenate([poses.reshape(len(vectors), -1), appended], axis=1)
+
+    def _turned(self, quaternions: Float64, previous: Float64 | None) -> Float64:
+        if previous is None:
+            return self._numbers.encode(quaternions)
+        before = self._poses_of(np.atleast_2d(previous))[..., self._turning]
+        if previous.ndim == 1:
+            return self._numbers.encode(quaternions, before[0])
+        each = self._numbers.encode(quaternions.reshape(1, -1, 4), before.reshape(-1, before.shape[-1]))
+        return each.reshape(before.shape)
 
     def decode(self, rows: Float64, whose: str = "the policy answered with") -> tuple[Float64, Float64]:
         """Vectors [T, arms, 8] in the declared frame and the joints [T, n] that follow them, of rows [T, width].

@@ -53,9 +53,7 @@ class Mixture:
     def poses(self, joints: Float64, newest: Float64, like: ActionChunk) -> Float64:
         """The poses [N, W] of joints [N, D] in the format of `like`, each written as near to the newest as can be."""
         layout = self._layout_of(like)
-        vectors = self._end_effectors.vectors(joints)
-        rows = (layout.encode(vectors[n : n + 1], joints[n : n + 1], newest[n]) for n in range(len(joints)))
-        made = np.concatenate(list(rows))
+        made = layout.encode(self._end_effectors.vectors(joints), joints, newest)
         switched = self._switched(like)
         made[:, switched] = newest[:, switched]
         return made

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.strategy_station import KnownPlan, Obedient
+from benchmarks.strategy_station import KnownPlan, Obedient, lockstep_deployment
 from robots import Robot
 from runtime import deployment, family
 from runtime.clock import Clock
@@ -272,19 +272,8 @@ class Keeper(Policy):
 
 
 def _plan(data: Path, made: Scenario) -> SeldomPlan:
-    tree: dict[str, Any] = {
-        "station": "prefix",
-        "robot": made.robot,
-        "data_dir": str(data),
-        "task": "wander",
-        "transport": {"kind": "dataset", "path": "-"},
-        "policy": {"kind": "mock"},
-        "strategy": made.strategy,
-        "control": {"rate": made.control_hz},
-        "setup": {"home": False},
-        "recording": {"enabled": False},
-        "faults": {"policy_lost": "slow", "patience_s": 1000.0},
-    }
+    tree = lockstep_deployment(data, made.robot, made.strategy, made.control_hz)
+    tree["faults"] = {"policy_lost": "slow", "patience_s": 1000.0}
     planned = family.plan(deployment.resolve(tree, {}, "prefix"))
     robot = planned.robot
     if made.endless:
