@@ -34,7 +34,7 @@ from runtime.types import EEF_WIDTH, ActionChunk, Conditioning, Float64, Observa
 _TICKS = 240
 _HAIR = 1e-6  # of a step
 _ROUNDING = 2e-5  # [rad, m] of float32 there and back through the model's own numbers
-_POSES = 2e-3  # [m, and of a quaternion's numbers] of inverse kinematics
+_POSES = 1e-3  # [m, and of a quaternion's numbers] that inverse kinematics meets poses to
 _ROBOTS = ("agilex_piper", "ur5e", "r1_lite")
 _KINDS = ("rtc", "rtc", "rtc", "async", "naive", "ensemble", "sync")
 
@@ -197,10 +197,11 @@ class Keeper(Policy):
     def close(self) -> None:
         """Nothing to release."""
 
-    def apart(self, row: Float64, at: float, planned: dict[int, Float64]) -> str:
+    def apart(self, row: Float64, at: float, planned: dict[int, Float64], missed: float) -> str:
         """How a fixed row for control step `at` is not what was planned; "" where it is.
 
-        Between two steps it is compared with both, to within what the plan bends there.
+        Between two steps it is compared with both, to within what the plan bends there; poses to within what inverse
+        kinematics has `missed`.
         """
         before, part = math.floor(at + _HAIR), at - math.floor(at + _HAIR)
         steps = [before, before + 1] if part > _HAIR else [before]
@@ -210,7 +211,7 @@ class Keeper(Policy):
         rows = np.array([self._of(planned[step]) for step in steps])
         meant = rows[0] + (part * self._difference(rows[-1], rows[0]) if len(rows) > 1 else 0.0)
         off = np.abs(self._difference(row, meant))
-        allowed = np.full(len(off), _POSES if self._made.space == "eef" else _ROUNDING)
+        allowed = np.full(len(off), _POSES + missed if self._made.space == "eef" else _ROUNDING)
         if len(rows) > 1:
             allowed += 2.0 * self._bend(before, planned)
         off[self._switched] = 0.0
@@ -291,11 +292,16 @@ class Planned:
     held: set[int]
     arrived: dict[int, int]  # by the step of the observation: that from which on the answer is the plan
     other: set[int]  # steps in which another strategy was in force
+    missed: dict[int, float]  # by the step of the observation: what poses are missed by at most [m, rad]
     end: int
+
+    def missed_before(self, step: int, horizon: int) -> float:
+        """What the answers that may make this step and those after it have missed at most."""
+        return max((off for at, off in self.missed.items() if step - 2 * horizon <= at <= step), default=0.0)
 
 
 def _run(plan: SeldomPlan, made: Scenario, random: np.random.Generator) -> Planned:
-    planned = Planned({}, set(), {}, set(), 0)
+    planned = Planned({}, set(), {}, set(), {}, 0)
     around = Around(runner=Late(*made.delay, random))
     with closing(Lockstep(plan, around=around)) as station:
         session = station.main.session
@@ -312,12 +318,14 @@ def _run(plan: SeldomPlan, made: Scenario, random: np.random.Generator) -> Plann
             if np.isfinite(row).all():
                 planned.rows[step] = row
             if session.state is not State.RUNNING:
-                planned.held.add(step + 1)
+                planned.held |= {step, step + 1}  # in the former an answer may be laid that is told no more
             if not station.main.inference.continues:
                 planned.other.add(step + 1)
             shown = station.main.inference.shown
             if shown is not None and shown.state == "merged":
                 used = shown.targets[shown.targets >= 0]
+                worst = shown.ik.get("worst_mm", 0.0) / 1e3, math.radians(shown.ik.get("worst_deg", 0.0))
+                planned.missed[shown.observation_step] = max(worst)
                 planned.arrived.setdefault(shown.observation_step, int(used[0]))
             return station.step >= end or random.random() < 0.02
 
@@ -355,7 +363,7 @@ def _violations(made: Scenario, keeper: Keeper, planned: Planned) -> list[str]:
             steps = range(declared.step, math.ceil(at - _HAIR) + 1)
             if steps[-1] >= over or any(step in planned.held for step in steps):
                 break  # the run was held meanwhile, or an answer is laid that need not continue
-            off = keeper.apart(row, at, planned.rows)
+            off = keeper.apart(row, at, planned.rows, planned.missed_before(declared.step, made.horizon))
             if off:
                 found.append(f"row {place} of the request about step {declared.step} ({made}) {off}")
     return found
