@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -86,6 +87,7 @@ class Plausibility:
         self._needed = CONSISTENT_S  # how long samples have to agree
         self._contradicted = float("-inf")  # when they last did not
         self._captured = float("-inf")
+        self._joints: Float64 = np.zeros(0)
         self._judged: float | None = None
         self._unseen = 0.0  # how long there has been no sample; a stall of our own counts little [s]
         self._doubt = ""
@@ -99,8 +101,9 @@ class Plausibility:
         self._judged = now
         if not seen.measured:
             return seen
-        if seen.joints_captured != self._captured:
-            self._captured = seen.joints_captured
+        # A stamp may stay: joints of several messages are as old as the oldest of them.
+        if seen.joints_captured != self._captured or not np.array_equal(seen.joints, self._joints):
+            self._captured, self._joints = seen.joints_captured, seen.joints
             self._doubt = self._take(_Sample(seen.joints, seen.joints_captured, now), commanded)
         return replace(seen, doubt=self._doubt) if self._doubt else seen
 
@@ -123,6 +126,15 @@ class Plausibility:
         """For how long the joints were missing before those that are believed now came [s]; 0 the second time."""
         missing, self._missing = (0.0 if self._chain is None else self._missing), 0.0
         return missing
+
+    def middle(self, joints: Float64) -> Float64:
+        """The middle of the newest three believed samples, number by number: a spike among them does not count.
+
+        Angles that wrap are counted in the turn of `joints` [D].
+        """
+        newest = [] if self._chain is None else islice(reversed(self._chain.samples), _CONSISTENT)
+        lately = [joints + difference(sample.joints, joints, self._wrapping) for sample in newest]
+        return np.asarray(np.median(lately, axis=0)) if lately else joints
 
     def _take(self, sample: _Sample, commanded: Float64 | None) -> str:
         unseen, self._unseen = self._unseen, 0.0

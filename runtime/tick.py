@@ -298,6 +298,7 @@ class Tick:
             actuator.engage(measured)
             stopped.see(actuator.commanded.copy())
         elif stopped.follows:
+            measured = self._plausibility.middle(measured)
             if not stopped.seen:
                 actuator.step_to(measured, "e-stop, towards where the robot is", stopped.rest)
             # An object in the gripper keeps it open: its command stays, or it would let go.

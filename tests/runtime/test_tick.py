@@ -64,11 +64,9 @@ def test_the_e_stop_sends_the_measured_position_and_refuses_everything_else(benc
     following(bench)
     bench.run(5)
     bench.page.set_estop(EStop.LATCHED)
-    bench.measured = np.array([0.07, 0.03])
-    bench.observe()
-    bench.feed = False
+    bench.measured = bench.moved_by_hand = np.array([0.07, 0.03])
     bench.say("motion", goal=np.array([1.0, 1.0]))
-    bench.run(3)
+    bench.run(6)
     assert np.allclose(bench.sink.sent[-1], [0.07, 0.03], atol=1e-4)
     assert bench.page.control.read()["estop_obeyed"]
     assert bench.said("estopped")
@@ -451,6 +449,17 @@ def test_an_arm_that_sags_a_little_is_held_at_its_target(bench):
     bench.moved_by_hand = held.astype(float) - 0.05
     bench.run(60)
     assert (bench.sink.sent[-1] == held).all()
+
+
+@pytest.mark.parametrize("ticks", range(20))
+def test_a_spike_that_a_joint_could_have_moved_does_not_move_an_arm_under_e_stop(bench, ticks):
+    following(bench, wave(60, speed=0.0))
+    bench.run(5)
+    bench.page.set_estop(EStop.LATCHED)
+    bench.run(ticks)
+    bench.measured = np.array([0.3, 0.0])
+    bench.run(30)
+    assert np.abs(bench.sent).max() <= 1e-6
 
 
 def test_an_arm_under_e_stop_does_not_sink_under_its_own_measurement(bench):
