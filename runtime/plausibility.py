@@ -23,6 +23,7 @@ _LONGEST_S = 0.05  # without a sample, after which no longer way is believed at 
 _STALL_S = 0.1  # between two looks of ours: it says nothing about the joints
 _BEYOND = 0.1  # [rad] that an arm may rest beyond its limits
 _FROZEN_S, _FROZEN_RAD = 1.0, 0.05
+_LATENCY_S = 0.3  # a robot that stood may take this long to move after its command did
 _TURNS = 3  # times that the last digits of an encoder which is never still went there and back
 _STILL = 5  # samples that are equal, of one that is
 _SAME = 0.02  # [rad] within which two joints have exchanged their values
@@ -309,6 +310,7 @@ class _Frozen:
         self._last: Float64 = np.full(dim, np.nan)
         self._since: Float64 = np.zeros(dim)  # when each number was first read
         self._range: Float64 = np.zeros((2, dim))  # of the command since then
+        self._moved: Float64 = np.zeros(dim)  # when that was last within what says nothing
 
     def __call__(self, joints: Float64, captured: float, commanded: Float64 | None) -> str:
         if commanded is None:
@@ -320,7 +322,9 @@ class _Frozen:
         low, high = self._range
         np.copyto(low, np.where(fresh, commanded, np.minimum(low, commanded)))
         np.copyto(high, np.where(fresh, commanded, np.maximum(high, commanded)))
-        frozen = self._limits.places & (captured - self._since >= _FROZEN_S) & (high - low > _FROZEN_RAD)
+        self._moved[high - low <= _FROZEN_RAD] = captured
+        late = (captured - self._since >= _FROZEN_S) & (captured - self._moved >= _LATENCY_S)
+        frozen = self._limits.places & late
         if not frozen.any():
             return ""
         worst = int(np.where(frozen, high - low, 0.0).argmax())

@@ -225,6 +225,15 @@ def test_a_blocked_joint_that_is_noisy_is_not_frozen_and_neither_is_a_gripper_or
         assert watcher.see([noisy, -0.4, 0.05], [0.8 + 0.01 * tick, -0.4, 0.1 * (tick % 2)]) == ""
 
 
+def test_a_joint_that_stood_for_long_and_follows_late_is_not_frozen():
+    watcher = stood()
+    for tick in range(60):
+        assert watcher.see(STANDS, STANDS) == ""
+    for tick in range(30):
+        late = 0.8 + 0.05 * max(tick - 6, 0)  # 0.2 s behind its command
+        assert watcher.see([late, -0.4, 0.05], [0.8 + 0.05 * tick, -0.4, 0.05]) == ""
+
+
 def test_a_frozen_joint_may_be_tried_again():
     watcher = stood()
     for tick in range(40):
