@@ -155,7 +155,7 @@ class Plausibility:
 
     def _goes_on(self, chain: _Chain, sample: _Sample) -> bool:
         """Whether the sample follows what is believed, rather than what contradicts it."""
-        if self._faster(chain.newest, sample).any() or self._zeros(chain.newest.joints, sample.joints):
+        if self._faster(chain.newest, sample).any() or self._dies(chain, sample):
             return False
         other = self._other
         return other is None or self._way(chain.newest, sample) <= self._way(other.newest, sample)
@@ -224,7 +224,7 @@ class Plausibility:
         before = self._chain.newest
         if exchanged := self._exchanged(before, sample):
             return f"{exchanged} read each other's values: are they swapped?"
-        if dead := self._zeros(before.joints, sample.joints):
+        if dead := self._dies(self._chain, sample):
             return f"{dead}: is an encoder dead?"
         return ""
 
@@ -250,6 +250,18 @@ class Plausibility:
             return ""
         worst = int(still.argmax())
         return f"{self._limits.names[worst]} jumped to {joints[-1, worst]:.3f} rad and reads exactly that: is it stuck?"
+
+    def _dies(self, chain: _Chain, sample: _Sample) -> str:
+        """The joints that jump to exactly 0, and neither come by it on their way nor go back to it."""
+        newest = chain.newest
+        if not (zeros := self._zeros(newest.joints, sample.joints)) or len(chain.samples) < _CONSISTENT:
+            return zeros
+        before, oldest = chain.samples[-2], chain.samples[-3]
+        speed = (newest.joints - before.joints) / max(newest.captured - before.captured, _EPSILON)
+        way = -newest.joints / max(sample.captured - newest.captured, _EPSILON)
+        passes = (speed * way > 0.0) & (np.abs(speed) >= 0.5 * np.abs(way))
+        returns = (before.joints == 0.0) | (oldest.joints == 0.0)
+        return self._zeros(np.where(passes | returns, 0.0, newest.joints), sample.joints)
 
     def _zeros(self, before: Float64, after: Float64) -> str:
         """The joints that read exactly 0 and were elsewhere before."""

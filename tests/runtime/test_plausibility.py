@@ -61,9 +61,9 @@ def watcher():
     return Watcher()
 
 
-def stood():
+def stood(joints=STANDS):
     watcher = Watcher()
-    watcher.stand()
+    watcher.stand(joints=joints)
     return watcher
 
 
@@ -105,6 +105,24 @@ def test_zeros_of_a_dead_encoder_are_never_believed_however_long_they_last():
         assert watcher.see([0.0, -0.4, 0.05]) == "hip read exactly 0 rad after 0.800: is an encoder dead?"
     assert watcher.judge.apart(STANDS, 0.1) is False
     assert watcher.see(STANDS) == ""
+
+
+def test_a_fast_joint_may_pass_exactly_0_on_its_way():
+    watcher = stood([0.7, -0.4, 0.05])
+    assert {watcher.see([hip, -0.4, 0.05]) for hip in (0.6, 0.48, 0.34, 0.17, 0.0, -0.15, -0.3)} == {""}
+
+
+def test_a_joint_that_stands_at_exactly_0_is_believed_there_after_a_spike():
+    watcher = stood(np.zeros(3))
+    assert watcher.see([0.25, 0.0, 0.0]) == ""  # as far as it could have moved
+    assert set(watcher.stand(5, np.zeros(3))) == {""}
+
+
+@pytest.mark.parametrize("step", [0.03, 0.0, -0.01, -0.1])
+def test_a_joint_that_dies_is_noticed_also_while_it_moves(step):
+    watcher = stood([0.3 - step, -0.4, 0.05])
+    watcher.see([0.3, -0.4, 0.05])
+    assert watcher.see([0.0, -0.4, 0.05]).endswith("is an encoder dead?")
 
 
 def test_swapped_joints_are_never_believed_however_long_they_last():
