@@ -28,6 +28,7 @@ _TURNS = 3  # times that the last digits of an encoder which is never still went
 _STILL = 5  # samples that are equal, of one that is
 _SAME = 0.02  # [rad] within which two joints have exchanged their values
 _LONGEST_DOUBT_S = 2.0
+_KEPT = 512  # samples: as many that agree are enough, however short their time at a high rate
 _QUIET_S = 1.0  # without a contradiction, after which the next one is a first one
 _EPSILON = 1e-6  # stamps are sums of floats
 
@@ -42,7 +43,7 @@ class _Chain:
     """Samples each of which can follow the one before; the newest of them."""
 
     def __init__(self, first: _Sample, never: str = "") -> None:
-        self.samples = deque([first], maxlen=512)
+        self.samples = deque([first], maxlen=_KEPT)
         self.never = never  # why it is not believed, however long it lasts
 
     @property
@@ -55,7 +56,7 @@ class _Chain:
         for sample in reversed(self.samples):
             enough.append(sample)
             spans = self.newest.captured - sample.captured >= needed - _EPSILON
-            if spans and len(enough) >= _CONSISTENT:
+            if (spans and len(enough) >= _CONSISTENT) or len(enough) == _KEPT:
                 return enough
         return []
 

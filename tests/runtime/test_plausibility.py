@@ -171,6 +171,17 @@ def test_what_contradicted_itself_again_and_again_has_to_agree_for_longer():
     assert sum(map(bool, watcher.stand(6, STANDS))) == 3
 
 
+def test_what_contradicted_itself_is_believed_again_at_any_rate():
+    watcher = stood()
+    for _ in range(8):
+        watcher.see([-0.5, 0.3, 0.05])
+        watcher.see(STANDS)
+    for _ in range(1500):
+        watcher.now += 0.001 - PERIOD  # 1 kHz
+        assert watcher.see(STANDS) == ""
+    assert watcher.judge.settled
+
+
 def test_an_arm_that_is_moved_as_fast_as_it_can_is_believed_all_the_way():
     watcher = Watcher()
     watcher.stand(5, [-1.5, 0.0, 0.05])
@@ -204,7 +215,10 @@ def test_a_repeated_sample_is_not_judged_again():
 def test_joints_that_change_under_an_old_stamp_are_judged_as_well():
     # Joints that come in several messages are as old as the oldest of them.
     watcher = stood()
-    assert watcher.see([0.0, -0.4, 0.05], stamp=False) == "hip read exactly 0 rad after 0.800: is an encoder dead?"
+    assert (
+        watcher.see([0.0, -0.4, 0.05], stamp=False)
+        == "hip read exactly 0 rad after 0.800: is an encoder dead?"
+    )
     assert watcher.see([5.0, -0.4, 0.05], stamp=False).startswith("hip reads 5.000 rad, beyond its limits")
     assert watcher.see(STANDS, stamp=False) == ""
 
@@ -245,7 +259,7 @@ def test_a_blocked_joint_that_is_noisy_is_not_frozen_and_neither_is_a_gripper_or
 
 def test_a_joint_that_stood_for_long_and_follows_late_is_not_frozen():
     watcher = stood()
-    for tick in range(60):
+    for _ in range(60):
         assert watcher.see(STANDS, STANDS) == ""
     for tick in range(30):
         late = 0.8 + 0.05 * max(tick - 6, 0)  # 0.2 s behind its command
