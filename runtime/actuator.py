@@ -98,9 +98,9 @@ class Actuator(ABC):
         """
         limits = self._settings.limits
         measured = limits.standing(np.where(limits.grippers & self.engaged, self.commanded, measured))
-        if self._settings.guarded:
-            measured = np.clip(measured, limits.lower, limits.upper)
-        self.commanded = measured
+        inside = np.clip(measured, limits.lower, limits.upper) if self._settings.guarded else measured
+        self._note_step(measured, inside, "taken over inside its limits")
+        self.commanded = inside
         self.rest_here()
         self.engaged = True
 
@@ -115,7 +115,10 @@ class Actuator(ABC):
         """
         before = self.commanded
         self.engage(before + np.clip(measured - before, -np.asarray(farthest), farthest))
-        apart = np.where(self._settings.limits.places, np.abs(self.commanded - before), 0.0)
+        self._note_step(before, self.commanded, why)
+
+    def _note_step(self, before: Float64, after: Float64, why: str) -> None:
+        apart = np.where(self._settings.limits.places, np.abs(after - before), 0.0)
         if apart.any():
             worst = int(apart.argmax())
             self._stepped = (f"{why}: {self._settings.limits.names[worst]} stepped {apart[worst]:.3f} rad",)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
+import numpy as np
+
 from runtime.motion import Brake, Motion
 from runtime.recording.base import ControlSource
 from runtime.safety import Path
@@ -112,23 +114,36 @@ class Move(Behaviour):
 class EStopped(Behaviour):
     """Sends where the robot was measured, or the last command where that is not known.
 
-    It goes along with the measurement for `_FOLLOWS_S`, while the arm comes to rest, and then keeps it: an arm
-    that is sent its own measurement for ever sinks under its weight. `position` float64 [D], None before the
-    robot was ever measured: nothing is sent then. `rest` [D]: the distance within which it could come to rest.
+    It goes along with the measurement for `_FOLLOWS_S`, while the arm comes to rest, no farther from where it was first
+    seen than that takes, and then keeps it: an arm that is sent its own measurement sinks under its weight.
+    `position` float64 [D], None before the robot was ever measured: nothing is sent then. `rest` [D]: the distance
+    within which it could come to rest.
     """
 
     name = "estop"
     _FOLLOWS_S = 0.5
+    _SLACK = 0.05  # [rad] beyond the distance to rest: what a command is ahead of a robot that follows it
 
     def __init__(self, position: Float64 | None, rest: Float64) -> None:
         self.position = position
         self.rest = rest
-        self.seen = False  # since it was pressed
+        self._first: Float64 | None = None  # where it was seen first since it was pressed
         self._time = 0.0
 
+    @property
+    def seen(self) -> bool:
+        """Whether the robot was seen since it was pressed."""
+        return self._first is not None
+
     def see(self, position: Float64) -> None:
-        """Where the robot is."""
-        self.position, self.seen = position, True
+        """Where the robot is while it comes to rest."""
+        self._first = position if self._first is None else self._first
+        farthest = self.rest + self._SLACK
+        self.position = np.clip(position, self._first - farthest, self._first + farthest)
+
+    def stay(self, position: Float64) -> None:
+        """Where it is held from now on."""
+        self._first = self.position = position
 
     @property
     def follows(self) -> bool:

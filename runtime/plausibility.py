@@ -175,7 +175,7 @@ class Plausibility:
                 self._contradict(sample.seen)
             self._other = other = _Chain(sample, self._never(sample))
         if not other.never and not (stuck := self._stuck(other)) and other.lately(self._needed):
-            self.dead = "" if self._before is None else self._zeros(self._before, sample.joints)
+            self.dead = "" if self._before is None else self._zeros(self._before, other.samples[0].joints)
             self._chain, self._other, self._before = other, None, None
             return ""
         return other.never or stuck or self._jump(sample)
@@ -327,7 +327,7 @@ class _Frozen:
 
     def __call__(self, joints: Float64, captured: float, commanded: Float64 | None) -> str:
         if commanded is None:
-            self._last[:] = np.nan
+            self._last = np.full(len(joints), np.nan)
             return ""
         fresh = joints != self._last
         self._last = joints

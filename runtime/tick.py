@@ -296,7 +296,7 @@ class Tick:
             return
         if not actuator.engaged:
             actuator.engage(measured)
-            stopped.see(actuator.commanded.copy())
+            stopped.stay(actuator.commanded.copy())
         elif stopped.follows:
             measured = self._plausibility.middle(measured)
             if not stopped.seen:
@@ -344,7 +344,7 @@ class Tick:
         away = self._displacement.distance(self._actuator, where)
         self._actuator.step_to(where, "held where the robot is")
         if isinstance(behaviour, EStopped):
-            behaviour.see(self._actuator.commanded.copy())
+            behaviour.stay(self._actuator.commanded.copy())
             return
         self._tell_displaced(
             f"the robot is {away:.2f} rad from where it was told to hold: holding where it is"

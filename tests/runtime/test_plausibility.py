@@ -266,6 +266,13 @@ def test_a_joint_that_stood_for_long_and_follows_late_is_not_frozen():
         assert watcher.see([late, -0.4, 0.05], [0.8 + 0.05 * tick, -0.4, 0.05]) == ""
 
 
+def test_what_was_seen_is_never_written_to():
+    watcher = stood()
+    watcher.see(STANDS, STANDS)
+    watcher.see(STANDS)
+    assert watcher.judge.middle(np.zeros(3)) == pytest.approx(STANDS)
+
+
 def test_a_frozen_joint_may_be_tried_again():
     watcher = stood()
     for tick in range(40):

@@ -462,6 +462,43 @@ def test_a_spike_that_a_joint_could_have_moved_does_not_move_an_arm_under_e_stop
     assert np.abs(bench.sent).max() <= 1e-6
 
 
+@pytest.mark.parametrize("sags", [0.02, 0.05, 0.1])
+def test_an_arm_that_reads_below_its_command_is_not_led_away_by_the_e_stop(bench, sags):
+    bench.say("motion", goal=np.zeros(2))
+    bench.run(10)
+    bench.page.set_estop(EStop.LATCHED)
+    for _ in range(40):
+        bench.moved_by_hand = bench.sent[-1] - sags
+        bench.run()
+    assert np.abs(bench.sent).max() <= sags + 0.05 + 1e-6
+
+
+def test_a_robot_that_rests_outside_its_limits_is_taken_over_inside_them_and_the_record_says_so():
+    bench = Bench()
+    bench.measured = np.array([2.05, 0.0])
+    bench.say("motion", goal=np.array([1.9, 0.0]))
+    bench.run(2)
+    notes = [note for record in bench.records() for note in record.notes]
+    assert notes[0] == "taken over inside its limits: a stepped 0.050 rad"
+    assert bench.sent.max() <= 2.0
+
+
+def test_a_node_that_comes_back_at_0_and_is_pulled_at_first_is_left_alone(bench):
+    bench.say("motion", goal=np.full(2, 0.6))
+    bench.run(60)
+    bench.feed = False
+    bench.run(20)
+    bench.feed = True
+    for part in (0.0, 0.02, 0.06, 0.1, 0.14, 0.18):
+        bench.measured = bench.moved_by_hand = np.full(2, part)
+        bench.run()
+    assert "read exactly 0 rad after 0.600" in bench.said("displaced")[0].text
+    told = len(bench.sink.sent)
+    bench.run(10)
+    assert len(bench.sink.sent) == told
+    assert bench.behaviour == "silent"
+
+
 def test_an_arm_under_e_stop_does_not_sink_under_its_own_measurement(bench):
     following(bench)
     bench.run(5)
