@@ -20,7 +20,6 @@ from django.conf import settings
 from django.contrib.auth import get_user_model
 from django.db import DataError, Error, IntegrityError, connection
 
-from evaweb.errors import EvaError
 from evaweb.stations.models import Command, Station
 from runtime.recording.files import RecordingError, write_whole
 
@@ -35,7 +34,7 @@ _PLAIN = ("kind", "args", "holder", "epoch", "boot", "sequence", "status", "reas
 class Unwritten:
     """Those that wait, and the thread that goes on trying to have them written by `write`.
 
-    `write` raises a database's Error where it has to be tried again; EvaError, IntegrityError or DataError where
+    `write` raises a database's Error where it has to be tried again; IntegrityError, DataError or any other where
     that is no use: the log then has the command, and its file stays as UUID.refused.
     """
 
@@ -71,14 +70,20 @@ class Unwritten:
         self._news.set()
 
     def attempt(self) -> bool:
-        """Write what waits; whether some has to wait on."""
-        try:
-            for name, content in self._waiting():
-                self._attempt(name, content)
-        except Error as error:
-            log.info("the database does not take what was commanded yet: %s", error)
-            return True
-        return False
+        """Write what waits; whether some has to wait on. A file that the disk does not give keeps no other waiting."""
+        waits = False
+        for name in self._waiting():
+            try:
+                self._attempt(name)
+            except FileNotFoundError:
+                continue  # another process has written it
+            except OSError as error:
+                log.info("%s waits for the disk: %s", name, error)
+                waits = True
+            except Error as error:
+                log.info("the database does not take what was commanded yet: %s", error)
+                return True
+        return waits
 
     def _run(self) -> None:
         while True:
@@ -89,19 +94,18 @@ class Unwritten:
                 time.sleep(_AGAIN_S)
             connection.close()
 
-    def _waiting(self) -> Iterator[tuple[str, bytes]]:
-        for path in sorted(_folder().glob("*.json")):
-            try:
-                yield path.stem, path.read_bytes()
-            except FileNotFoundError:
-                continue  # another process has written it
-        yield from list(self._kept.items())
+    def _waiting(self) -> Iterator[str]:
+        yield from (path.stem for path in sorted(_folder().glob("*.json")) if path.is_file())
+        yield from list(self._kept)
 
-    def _attempt(self, name: str, content: bytes) -> None:
+    def _attempt(self, name: str) -> None:
+        content = self._kept.get(name) or _path(name).read_bytes()
         try:
             self._write(_row(json.loads(content)))
-        except (IntegrityError, DataError, EvaError, ValueError, KeyError) as refused:
-            log.error("a command is not in the database: %r; it was %r", refused, content)
+        except Exception as refused:  # a file may hold anything: this thread must see the next one
+            if isinstance(refused, Error) and not isinstance(refused, IntegrityError | DataError):
+                raise
+            log.error("a command is not in the database: %r; it was %.9999r", refused, content)
             if _path(name).exists():
                 _path(name).replace(_path(name).with_suffix(".refused"))
         _path(name).unlink(missing_ok=True)

@@ -161,3 +161,46 @@ def test_what_the_database_refuses_for_good_keeps_nothing_else_waiting(halted, f
     assert {path.suffix for path in folder.iterdir()} == {".refused"}
     assert f"{refused.uuid}.refused" in {path.name for path in folder.iterdir()}
     assert "station 'gone' does not exist" in caplog.text
+
+
+@pytest.mark.usefixtures("asleep")
+@pytest.mark.parametrize(
+    "spoiled",
+    [b"[]", b"null", b'{"uuid": 5}', b"\xff\xfe\x00", b"[" * 200_000, b'{"user": "", "issued_at": 5}'],
+    ids=lambda spoiled: repr(spoiled[:12]),
+)
+def test_a_file_that_holds_something_else_keeps_nothing_else_waiting(halted, folder, spoiled):
+    one, row = Unwritten(commands._written), halted()
+    one.keep(row)
+    (folder / "0.json").write_bytes(spoiled)
+    assert one.attempt() is False
+    assert Command.objects.get().uuid == row.uuid
+    assert [path.name for path in folder.iterdir()] == ["0.refused"]
+
+
+@pytest.mark.usefixtures("asleep")
+def test_a_number_that_no_database_has_keeps_nothing_else_waiting(halted, folder):
+    one, refused, row = Unwritten(commands._written), halted(), halted()
+    refused.epoch = 1 << 70
+    for each in (refused, row):
+        one.keep(each)
+    assert one.attempt() is False
+    assert Command.objects.get().uuid == row.uuid
+    assert [path.name for path in folder.iterdir()] == [f"{refused.uuid}.refused"]
+
+
+@pytest.mark.usefixtures("asleep")
+def test_a_file_that_the_disk_does_not_give_is_tried_again_and_the_others_are_written(
+    halted, folder, monkeypatch
+):
+    one, rows = Unwritten(commands._written), sorted((halted() for _ in range(3)), key=lambda row: row.uuid)
+    for row in rows:
+        one.keep(row)
+    (folder / "0.json").mkdir()
+    path = unwritten._path
+    with monkeypatch.context() as patch:
+        patch.setattr(unwritten, "_path", lambda name: folder if name == str(rows[0].uuid) else path(name))
+        assert one.attempt() is True
+    assert set(Command.objects.values_list("uuid", flat=True)) == {row.uuid for row in rows[1:]}
+    assert one.attempt() is False
+    assert Command.objects.count() == 3
