@@ -63,27 +63,32 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _scrub(paths: Sequence[Path], as_json: bool) -> int:
-    """Every episode of `paths`; one that cannot be looked at does not keep the others."""
-    damaged = unknown = False
+    """Every episode of `paths`; one that cannot be looked at, or marked, does not keep the others."""
+    codes = {0}
     for path in paths:
         try:
-            for folder in episodes_in(path):
-                damaged |= _scrubbed(folder, as_json)
+            codes |= {_scrubbed(folder, as_json) for folder in episodes_in(path)}
         except RecordingError as error:
-            unknown = True
+            codes.add(2)
             print(error, file=sys.stderr)
-    return 1 if damaged else 2 if unknown else 0
+    return min(codes - {0}, default=0)
 
 
-def _scrubbed(folder: Path, as_json: bool) -> bool:
-    """Tell and mark; whether it is damaged."""
-    verdict = verify(folder)
-    print(
-        json.dumps(verdict.document()) if as_json else f"{folder}: {verdict.state}: {verdict.text}",
-        flush=True,
-    )
-    keep(verdict)
-    return verdict.state == "damaged"
+def _scrubbed(folder: Path, as_json: bool) -> int:
+    """Tell and mark; the exit code that it comes to."""
+    damaged = False
+    try:
+        verdict = verify(folder)
+        damaged = verdict.state == "damaged"
+        print(
+            json.dumps(verdict.document()) if as_json else f"{folder}: {verdict.state}: {verdict.text}",
+            flush=True,
+        )
+        keep(verdict)
+    except RecordingError as error:
+        print(error, file=sys.stderr)
+        return 1 if damaged else 2
+    return int(damaged)
 
 
 def _repair(path: Path) -> int:

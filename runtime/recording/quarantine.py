@@ -25,7 +25,7 @@ def keep(verdict: Verdict) -> None:
     if verdict.state != "damaged":
         _remove(path)
     elif marked(folder.parents[1], folder.name) != (damage := verdict.document()["damage"]):
-        path.parent.mkdir(parents=True, exist_ok=True)
+        _make(path.parent)
         told = {"uuid": folder.name, "found": time.time(), "damage": damage}
         write_whole(path, document(told, "the mark", indent=1))
 
@@ -41,6 +41,13 @@ def marked(data: Path, uuid: str) -> list[dict[str, Any]]:
 
 def _file(data: Path, uuid: str) -> Path:
     return data / FOLDER / f"{uuid}.json"
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise disk_fault("creating", folder, error) from error
 
 
 def _remove(path: Path) -> None:

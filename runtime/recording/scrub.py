@@ -152,6 +152,8 @@ def _damage(path: Path, digest: FileDigest, manifest: Mapping[str, object]) -> D
             return _located(path.name, file, digest, _rate(path.name, manifest))
     except FileNotFoundError:
         return Damage(path.name, "is absent")
+    except IsADirectoryError:
+        return Damage(path.name, "is a folder")
     except OSError as error:
         if error.errno == errno.EIO:  # of the disk itself; any other is ours to mend
             return Damage(path.name, "cannot be read: the disk fails")

@@ -306,6 +306,30 @@ def test_one_that_cannot_be_scrubbed_keeps_none_of_the_others(
     assert main(["scrub", str(tmp_path / "empty")]) == 2
 
 
+def test_one_that_is_closed_to_us_or_cannot_be_marked_keeps_none_of_the_others(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, first = folder.parents[1], folder.with_name("0")
+    shutil.copytree(folder, first)
+    (first / "outcome.json").unlink()
+    (first / "outcome.json").mkdir()
+    (folder / "raw.arrow").unlink()
+    code, told = scrubbed(data, capsys)
+    assert (code, [(one["episode"], one["state"]) for one in told]) == (
+        1,
+        [("0", "damaged"), (folder.name, "damaged")],
+    )
+    shutil.rmtree(data / "quarantine")
+    (data / "quarantine").write_text("not a folder")
+    code, told = scrubbed(data, capsys)
+    assert (code, [one["episode"] for one in told]) == (1, ["0", folder.name])
+    assert main(["scrub", str(data)]) == 1
+    assert capsys.readouterr().err.count("disk error while creating") == 2
+    shutil.rmtree(first)
+    (folder / "raw.arrow").mkdir()
+    assert verify(folder).text == "raw.arrow is a folder"
+
+
 def test_a_recording_that_lies_elsewhere_is_scrubbed_and_marked_nowhere(folder: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "stick" / folder.name
     shutil.copytree(folder, elsewhere)
