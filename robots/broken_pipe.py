@@ -1,4 +1,6 @@
-"""A terminal that reads on no more (`... | head -1`) ends a command without a traceback; here, below all programs."""
+"""A terminal that reads on no more (`... | head -1`), or a disk that is full (`... > FILE`), ends a command without a
+traceback; here, below all programs.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +8,12 @@ import io
 import os
 import select
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import ParamSpec, TextIO
 
 UNREAD = 141  # exit code, that of a shell for an end by SIGPIPE
+UNWRITTEN = 74  # exit code, EX_IOERR of sysexits.h
 
 Given = ParamSpec("Given")
 
@@ -18,7 +21,8 @@ Given = ParamSpec("Given")
 def unread_ends(main: Callable[Given, int]) -> Callable[Given, int]:
     """`main`, with the exit code 141 where standard output or error is a pipe that nobody reads any more.
 
-    A BrokenPipeError of anything else stays one.
+    Where the disk does not take standard output it is 74, and standard error says so. An OSError of anything else
+    stays one.
     """
 
     @wraps(main)
@@ -34,6 +38,11 @@ def unread_ends(main: Callable[Given, int]) -> Callable[Given, int]:
             if not _silenced():
                 raise
             return UNREAD
+        except OSError as error:
+            if not _refused(error):
+                raise
+            print(f"standard output cannot be written: {error.strerror}", file=sys.stderr)
+            return UNWRITTEN
         return code
 
     return run
@@ -43,16 +52,31 @@ def _flush() -> None:
     print(end="", flush=True)  # also where there is no standard output
 
 
+def _refused(error: OSError) -> bool:
+    """Whether it was standard output that raised it: what could not be written waits in it, and goes nowhere now."""
+    try:
+        _flush()
+    except OSError as again:
+        if again.errno == error.errno:
+            _to_nowhere([_descriptor(sys.stdout)])
+            return True
+    return False
+
+
 def _silenced() -> bool:
     """Whether one of our streams has no reader; what waits to be written there goes nowhere from now on."""
     unread = [
         number for number in map(_descriptor, (sys.stdout, sys.stderr)) if number >= 0 and _unread(number)
     ]
+    _to_nowhere(unread)
+    return bool(unread)
+
+
+def _to_nowhere(descriptors: Sequence[int]) -> None:
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    for number in unread:
+    for number in descriptors:
         os.dup2(nowhere, number)
     os.close(nowhere)
-    return bool(unread)
 
 
 def _descriptor(stream: TextIO) -> int:

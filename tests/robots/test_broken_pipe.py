@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import subprocess
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from robots.broken_pipe import UNREAD, unread_ends
+from robots.broken_pipe import UNREAD, UNWRITTEN, unread_ends
 from tests.runtime.datasets.small import record
 
 ROOT = Path(__file__).parents[2]
@@ -109,6 +110,30 @@ def test_a_process_whose_output_nobody_reads_says_nothing_at_its_end(words: list
     )
     os.close(written)
     assert (ended.returncode, ended.stderr) == (UNREAD, "")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["-m", "robots", "list"], ["-m", "robots", "--help"], ["manage.py", "help"], ["manage.py", "check"]],
+    ids=lambda words: " ".join(words),
+)
+def test_a_full_disk_behind_standard_output_is_said_in_a_sentence(words: list[str]) -> None:
+    with open("/dev/full", "w") as full:
+        ended = subprocess.run(
+            [sys.executable, *words], cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    said = "standard output cannot be written: No space left on device\n"
+    assert (ended.returncode, ended.stderr) == (UNWRITTEN, said)
+
+
+def test_the_full_disk_of_anything_else_is_an_error() -> None:
+    @unread_ends
+    def main() -> int:
+        print("said before")
+        raise OSError(errno.ENOSPC, "No space left on device", "/data/episodes")
+
+    with pytest.raises(OSError, match="/data/episodes"):
+        main()
 
 
 def test_the_break_of_any_other_pipe_is_an_error() -> None:
