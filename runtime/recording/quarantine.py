@@ -31,12 +31,29 @@ def keep(verdict: Verdict) -> None:
 
 
 def marked(data: Path, uuid: str) -> list[dict[str, Any]]:
-    """What is wrong with an episode, a table per file as in Verdict.document; [] where nothing was found."""
+    """What is wrong with an episode, a table per file as in Verdict.document; [] where nothing was found.
+
+    A mark that is none is nothing found: the next scrub makes it anew.
+    """
     try:
         damage = read_document(_file(data, uuid)).get("damage")
     except RecordingError:
         return []
-    return damage if isinstance(damage, list) else []
+    return damage if isinstance(damage, list) and all(map(_is_told, damage)) else []
+
+
+def _is_told(one: object) -> bool:
+    """Whether it is a table of Verdict.document."""
+    if not isinstance(one, dict) or one.keys() != {"file", "what", "rows", "times", "text"}:
+        return False
+    words = all(isinstance(one[name], str) for name in ("file", "what", "text"))
+    return words and _are_spans(one["rows"], int) and _are_spans(one["times"], float)
+
+
+def _are_spans(value: object, kind: type) -> bool:
+    """Whether it is a list of first and last."""
+    spans = value if isinstance(value, list) else [None]
+    return all(isinstance(span, list) and [type(end) for end in span] == [kind, kind] for span in spans)
 
 
 def _file(data: Path, uuid: str) -> Path:

@@ -306,6 +306,29 @@ def test_one_that_cannot_be_scrubbed_keeps_none_of_the_others(
     assert main(["scrub", str(tmp_path / "empty")]) == 2
 
 
+def test_a_mark_that_is_damaged_itself_is_nothing_found_until_the_next_scrub(folder: Path) -> None:
+    data, uuid = folder.parents[1], folder.name
+    (folder / "raw.arrow").write_bytes(a_bit_off(folder / "raw.arrow"))
+    keep(verify(folder))
+    told = marked(data, uuid)
+    assert told
+    assert told == verify(folder).document()["damage"]
+    mark = data / f"quarantine/{uuid}.json"
+    fields = [told[0] | {name: None} for name in told[0]]
+    for spoiled in (
+        [5],
+        [None],
+        ["text"],
+        [{"file": "raw.arrow"}],
+        [told[0] | {"rows": [[1]]}],
+        *([one] for one in fields),
+    ):
+        mark.write_text(json.dumps({"damage": spoiled}), "utf-8")
+        assert marked(data, uuid) == []
+    keep(verify(folder))
+    assert marked(data, uuid) == told
+
+
 def test_one_that_is_closed_to_us_or_cannot_be_marked_keeps_none_of_the_others(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
