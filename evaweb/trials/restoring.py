@@ -74,8 +74,11 @@ def _never_ran(trial: Trial) -> str:
 
 
 def _judgements(kept: Kept) -> list[KeptScore | KeptVoid]:
+    """What its lines say; of a score that was given once more, as the database did not take it, the last."""
     read = (kept_line(line, number) for number, line in enumerate(kept.lines, start=1))
-    return [line for line in read if line is not None]
+    lines = [line for line in read if line is not None]
+    last = {line.uuid: line for line in lines if isinstance(line, KeptScore)}
+    return [line for line in lines if isinstance(line, KeptVoid) or line is last[line.uuid]]
 
 
 def _facts(kept: Kept, lines: Sequence[KeptScore | KeptVoid]) -> KeptTrial | None:

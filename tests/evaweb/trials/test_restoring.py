@@ -9,6 +9,7 @@ from uuid import uuid4
 
 import pytest
 from django.contrib.auth.models import User
+from django.db import OperationalError
 
 from evaweb.api.trials import TrialDetail
 from evaweb.episodes import reconcile as reconciling
@@ -201,6 +202,24 @@ def test_trials_scores_and_statistics_of_a_lost_database_come_back(judged):
     assert "smoke" in found[0]["reason"]
     assert found[0]["started_at"] < found[0]["ended_at"]
     assert counted() == counts
+
+
+def test_a_score_that_the_database_took_at_the_second_time_comes_back_once(lab, monkeypatch):
+    trial, uuid = lab.run(), uuid4()
+
+    def away(score, *given, **named):
+        raise OperationalError("disk I/O error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Score, "save", away)
+        with pytest.raises(OperationalError):
+            lab.score(trial, True, True, True, uuid=uuid, note="first")
+    lab.score(trial, True, True, True, uuid=uuid, note="again")
+    assert journal.path_of(trial.episode_id).read_text().count(str(uuid)) == 2
+    lose(*RECORDS)
+    assert reconcile().problems == ()
+    assert list(Score.objects.values_list("uuid", "note")) == [(uuid, "again")]
+    assert Trial.objects.get().verdict.uuid == uuid
 
 
 def test_a_second_time_changes_nothing(judged):
