@@ -23,6 +23,7 @@ NOT_OF_A_TERMINAL = {
     "runtime.guard",
     "runtime.main",
     "runtime.media",
+    "runtime.reception",
     "runtime.policies.tunnel.bound",
     "runtime.transports.ros.rospy_node.__main__",
     "benchmarks.first_chunk",
