@@ -34,7 +34,7 @@ from runtime.types import EEF_WIDTH, ActionChunk, Conditioning, Float64, Observa
 _TICKS = 240
 _HAIR = 1e-6  # of a step
 _ROUNDING = 2e-5  # [rad, m] of float32 there and back through the model's own numbers
-_POSES = 1e-3  # [m, and of a quaternion's numbers] that inverse kinematics meets poses to
+_POSES = 2e-3  # [m, and of a quaternion's numbers] that inverse kinematics meets poses to
 _ROBOTS = ("agilex_piper", "ur5e", "r1_lite")
 _KINDS = ("rtc", "rtc", "rtc", "async", "naive", "ensemble", "sync")
 
@@ -357,7 +357,8 @@ def _violations(made: Scenario, keeper: Keeper, planned: Planned) -> list[str]:
     binding = made.keeps and made.action_hz is None and "k_max" not in made.strategy
     for declared in keeper.declared:
         arrived = planned.arrived.get(declared.step, planned.end)
-        over = planned.end if binding and arrived not in planned.other else arrived
+        foreign = min((step for step in planned.other if step >= declared.step), default=planned.end)
+        over = min(foreign, planned.end) if binding else arrived
         for place, row in enumerate(declared.rows):
             at = declared.step + place / pace
             steps = range(declared.step, math.ceil(at - _HAIR) + 1)
