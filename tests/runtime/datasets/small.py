@@ -30,7 +30,10 @@ POSES = tuple(
 
 def robot(cameras: tuple[str, ...] = CAMERAS, dim: int = len(JOINTS)) -> Any:
     """As much of a robot description as a dataset needs."""
-    arms = tuple(SimpleNamespace(name=f"{side}_arm", gripper=None, chain=True) for side in ("left", "right"))
+    arms = tuple(
+        SimpleNamespace(name=f"{side}_arm", gripper=None, gripper_dim=None, chain=True)
+        for side in ("left", "right")
+    )
     return SimpleNamespace(
         name="small",
         dim=dim,
