@@ -130,13 +130,16 @@ def _run(
     trials = []
     for number, slot in enumerate(slots):
         station, operator = block_of[slot.block]
-        episode = _episode(station, begin + timedelta(seconds=100 * number), round(chance.uniform(6, 60), 3))
+        episode = closed_episode(
+            station, begin + timedelta(seconds=100 * number), round(chance.uniform(6, 60), 3)
+        )
         trials.append(_trial(plan, slot, episode, operator))
     Episode.objects.bulk_create([trial.episode for trial in trials], batch_size=_BATCH)
     return list(Trial.objects.bulk_create(trials, batch_size=_BATCH))
 
 
-def _episode(station: Any, started: datetime, seconds: float) -> Any:
+def closed_episode(station: Any, started: datetime, seconds: float) -> Any:
+    """A recording of 30 rows a second that is closed; not saved."""
     from evaweb.episodes.models import Episode
 
     return Episode(
