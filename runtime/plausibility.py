@@ -73,9 +73,9 @@ class Plausibility:
     A sample is believed where no joint is beyond its limits or has moved faster than it can since the last believed
     one. Samples that contradict that one, and agree with each other for CONSISTENT_S, take its place, later where
     they contradict each other again and again; a joint that jumped to exactly 0, and joints that exchanged their
-    values, never do. A joint that reads the same number for
-    `_FROZEN_S` while its command moves is frozen. Grippers and speeds are not judged. Nothing can be said of the first
-    samples but that they agree with each other, nor of those after UNSEEN_S without any.
+    values, never do. A joint that reads the same number for `_FROZEN_S` while its command moves is frozen. Grippers and
+    speeds are not judged. Nothing can be said of the first samples but that they agree with each other, nor of those
+    after UNSEEN_S without any.
     """
 
     def __init__(self, limits: Limits, dims: Dims) -> None:
