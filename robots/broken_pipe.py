@@ -15,6 +15,8 @@ from typing import ParamSpec, TextIO
 UNREAD = 141  # exit code, that of a shell for an end by SIGPIPE
 UNWRITTEN = 74  # exit code, EX_IOERR of sysexits.h
 
+_STREAMS = (0, 1, 2)  # standard input, output and error
+
 Given = ParamSpec("Given")
 
 
@@ -22,11 +24,12 @@ def unread_ends(main: Callable[Given, int]) -> Callable[Given, int]:
     """`main`, with the exit code 141 where standard output or error is a pipe that nobody reads any more.
 
     Where the disk does not take standard output it is 74, and standard error says so. An OSError of anything else
-    stays one.
+    stays one. A stream that was closed (`>&-`) goes nowhere, and the code is that of the command.
     """
 
     @wraps(main)
     def run(*given: Given.args, **named: Given.kwargs) -> int:
+        _open_closed()
         try:
             try:
                 code = main(*given, **named)
@@ -48,8 +51,20 @@ def unread_ends(main: Callable[Given, int]) -> Callable[Given, int]:
     return run
 
 
+def _open_closed() -> None:
+    """Let closed streams go nowhere, here and in children: else the next file that is opened takes their number."""
+    number = os.open(os.devnull, os.O_RDWR)
+    while number <= _STREAMS[-1]:
+        os.set_inheritable(number, True)
+        number = os.open(os.devnull, os.O_RDWR)
+    os.close(number)
+    sys.stdin = sys.stdin or os.fdopen(os.open(os.devnull, os.O_RDONLY))
+    sys.stdout = sys.stdout or os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
+    sys.stderr = sys.stderr or os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
+
+
 def _flush() -> None:
-    print(end="", flush=True)  # also where there is no standard output
+    print(end="", flush=True)
 
 
 def _refused(error: OSError) -> bool:

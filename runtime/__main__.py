@@ -12,14 +12,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from robots.broken_pipe import unread_ends
-from runtime import deployment, headless, lockstep, log
-from runtime.clock import MonotonicClock
-from runtime.deployment import Resolved
-from runtime.errors import ConfigurationError, RuntimeFault
-from runtime.family import Lifeline, Plan, plan
-from runtime.rerun import data_folder, rerun
-from runtime.supervisor import Supervisor
-from runtime.transitions import State
+from runtime.clients import headless
+from runtime.config import loader as deployment
+from runtime.config.loader import Resolved
+from runtime.core import environment
+from runtime.core import logs as log
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import ConfigurationError, RuntimeFault
+from runtime.ipc.lifeline import Lifeline
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.lockstep import lockstep
+from runtime.processes.supervisor.supervisor import Supervisor
+from runtime.station.rerun import data_folder, rerun
+from runtime.station.spec import StationSpec, plan
 
 
 @unread_ends
@@ -91,7 +96,7 @@ def _resolved(given: argparse.Namespace) -> Resolved:
     return found.resolved
 
 
-def _require_encoder(made: Plan) -> None:
+def _require_encoder(made: StationSpec) -> None:
     """The encoder of the recording is missed here, not by the first run; ConfigurationError."""
     from runtime.recording import trial
 
@@ -99,7 +104,7 @@ def _require_encoder(made: Plan) -> None:
         trial.require(made.deployment.recording)
 
 
-def _check(made: Plan) -> int:
+def _check(made: StationSpec) -> int:
     print(json.dumps(dict(made.resolved.tree), indent=1))
     print(f"hash {made.resolved.digest}")
     robot = made.robot
@@ -108,7 +113,7 @@ def _check(made: Plan) -> int:
     return 0
 
 
-def run_in_lockstep(made: Plan) -> int:
+def run_in_lockstep(made: StationSpec) -> int:
     """Run, print how it went, export it, publish what ended well; returns the exit code."""
     done = lockstep.run(made)
     episode = done.episode
@@ -132,4 +137,5 @@ def run_in_lockstep(made: Plan) -> int:
 
 
 if __name__ == "__main__":
+    environment.shed()
     sys.exit(main())

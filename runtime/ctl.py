@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from robots.broken_pipe import unread_ends
-from runtime.client import Refused, StationClient
-from runtime.errors import RuntimeFault, TransportError
-from runtime.terminal import aims, watching
-from runtime.terminal.arguments import arguments
-from runtime.terminal.attendance import LASTING, attend
-from runtime.terminal.figures import line, report, tuning
-from runtime.terminal.settling import settle
-from runtime.terminal.syntax import parse
+from runtime.clients.client import Refused, StationClient
+from runtime.clients.terminal import aims, watching
+from runtime.clients.terminal.arguments import arguments
+from runtime.clients.terminal.attendance import LASTING, attend
+from runtime.clients.terminal.figures import line, report, tuning
+from runtime.clients.terminal.settling import settle
+from runtime.clients.terminal.syntax import parse
+from runtime.core.errors import RuntimeFault, TransportError
 
 DONE, FAILED, UNKNOWN, INTERRUPTED = 0, 1, 3, 130  # exit codes; 2 is argparse's, 141 that of broken_pipe
 _RELEASE_S = 2.0

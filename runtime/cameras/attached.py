@@ -8,10 +8,10 @@ from types import MappingProxyType
 from typing import Any
 
 from runtime.cameras.base import Camera, Condition, Health
-from runtime.clock import Clock
-from runtime.messages import Event
+from runtime.core.clock import Clock
+from runtime.core.types import Observation
+from runtime.ipc.messages import Event
 from runtime.transports.base import Source
-from runtime.types import Observation
 
 
 class Attached(Source):

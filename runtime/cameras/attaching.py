@@ -10,9 +10,9 @@ from runtime.cameras.base import Address, Camera, CameraSettings
 from runtime.cameras.file import Config as FileConfig
 from runtime.cameras.live import LiveCamera
 from runtime.cameras.playing import FileCamera
-from runtime.clock import Clock, VirtualClock
-from runtime.errors import ConfigurationError, SetupError
-from runtime.plugins import variants
+from runtime.core.clock import Clock, VirtualClock
+from runtime.core.errors import ConfigurationError, SetupError
+from runtime.core.plugins import variants
 from runtime.transports.base import Source
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from runtime.errors import ConfigurationError, TransportError
-from runtime.section import Section
-from runtime.types import UInt8
+from runtime.core.errors import ConfigurationError, TransportError
+from runtime.core.settings import Settings
+from runtime.core.types import UInt8
 
 LARGEST = 1920 * 1080 * 3  # bytes of a picture as it is handed on
 
@@ -24,7 +24,7 @@ class CameraError(TransportError):
     """A camera cannot be opened, is lost, or its pictures are unusable; says what was found there."""
 
 
-class CameraSettings(Section):
+class CameraSettings(Settings):
     """What is done with the pictures of any camera, in this order: colours, crop, rotate, flip, size."""
 
     colours: Literal["rgb", "bgr"] = "rgb"

@@ -11,7 +11,7 @@ import numpy as np
 
 from runtime.cameras.base import Address, CameraError
 from runtime.cameras.finding import found
-from runtime.types import UInt8
+from runtime.core.types import UInt8
 
 _THERE_S = 0.003  # a packet that comes within was there before it was asked for
 _AT_ONCE = 2

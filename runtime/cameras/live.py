@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import threading
 
-from runtime import realtime
-from runtime.back_off import BackOff
 from runtime.cameras.base import Address, Camera, CameraError, CameraSettings, Condition, Health, Shot
 from runtime.cameras.feed import Feed
 from runtime.cameras.shaping import Shaping
 from runtime.cameras.stamps import StreamTime
-from runtime.clock import Clock
+from runtime.core import realtime
+from runtime.core.backoff import BackOff
+from runtime.core.clock import Clock
 
 log = logging.getLogger(__name__)
 SETTLE_S = 0.3  # after opening: what was buffered until then is older than it looks

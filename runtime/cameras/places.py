@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from urllib.parse import quote, urlsplit, urlunsplit
 
-from runtime.errors import ConfigurationError
+from runtime.core.environment import secret
+from runtime.core.errors import ConfigurationError
 
 
 def checked(key: str, url: str, schemes: tuple[str, ...]) -> str:
@@ -32,9 +32,6 @@ def with_password(url: str, user: str | None, variable: str | None) -> str:
         return url
     name = quote(user, safe="")
     if variable is not None:
-        password = os.environ.get(variable)
-        if not password:
-            raise ConfigurationError(f"password_env names {variable}, which is not set in the environment")
-        name += ":" + quote(password, safe="")
+        name += ":" + quote(secret("password_env", variable), safe="")
     parts = urlsplit(url)
     return urlunsplit(parts._replace(netloc=f"{name}@{parts.netloc}"))

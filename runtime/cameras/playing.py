@@ -7,12 +7,12 @@ import math
 import threading
 from collections.abc import Callable
 
-from runtime import realtime
 from runtime.cameras import file
 from runtime.cameras.base import Camera, CameraError, Condition, Health, Shot
 from runtime.cameras.feed import Feed, Frame
 from runtime.cameras.shaping import Shaping
-from runtime.clock import Clock
+from runtime.core import realtime
+from runtime.core.clock import Clock
 
 log = logging.getLogger(__name__)
 _EARLY_S = 1e-6  # due times are sums of floats

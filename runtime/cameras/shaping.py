@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from runtime.cameras.base import LARGEST, CameraError, CameraSettings
-from runtime.types import UInt8
+from runtime.core.types import UInt8
 
 
 class Shaping:

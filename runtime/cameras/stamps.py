@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from runtime.clock import ClockMap
+from runtime.core.clock import ClockMap
 
 
 class StreamTime:

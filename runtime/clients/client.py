@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import getpass
+import os
 import socket
 import time
 import uuid
@@ -12,9 +12,12 @@ from typing import Any
 
 import zmq
 
-from runtime.bus import CommandClient, Endpoints, Subscriber
-from runtime.errors import RuntimeFault, TransportError
-from runtime.messages import Ack, Command
+from runtime.core.errors import RuntimeFault, TransportError
+from runtime.ipc.bus import CommandClient, Endpoints, Subscriber
+from runtime.ipc.endpoints import account
+from runtime.ipc.estop_client import urgent
+from runtime.ipc.estop_requests import kept
+from runtime.ipc.messages import Ack, Command
 
 RENEW_S = 1.0
 
@@ -31,7 +34,7 @@ class StationClient:
     """
 
     def __init__(self, station_dir: Path, holder: str = "") -> None:
-        self.holder = holder or f"terminal:{getpass.getuser()}@{socket.gethostname()}"
+        self.holder = holder or f"terminal:{account(os.getuid())}@{socket.gethostname()}"
         self._endpoints = Endpoints(station_dir)
         self._context: zmq.Context[Any] = zmq.Context.instance()
         self._commands: CommandClient | None = None
@@ -61,7 +64,10 @@ class StationClient:
 
     def ask(self, kind: str, arguments: Mapping[str, Any]) -> Ack:
         """`query` with arguments of any name."""
-        return _accepted(self._send(Command(str(uuid.uuid4()), kind, arguments, user=self.holder), 2.0))
+        return _accepted(self._send(self._question(kind, arguments), 2.0))
+
+    def _question(self, kind: str, arguments: Mapping[str, Any]) -> Command:
+        return Command(str(uuid.uuid4()), kind, arguments, user=self.holder, holder=self.holder)
 
     def claim(self, epoch: int = 0) -> None:
         """Take the lease where it is free (or ours); raises Refused with who holds it."""
@@ -98,12 +104,8 @@ class StationClient:
     def estop(self, why: str) -> Ack:
         """Press the software e-stop at the guard, which needs neither lease nor main."""
         try:
-            client = CommandClient(self._context, self._endpoints.read("guard")["estop"])
-            try:
-                command = Command(str(uuid.uuid4()), "estop", {"why": why}, user=self.holder)
-                return client.request(command, 2.0)
-            finally:
-                client.close()
+            command = self._question("estop", {"why": kept(why)})
+            return urgent(self._context, self._endpoints, ("guard", "estop"), command, 2.0)
         except TransportError as error:
             raise TransportError(f"USE THE HARDWARE STOP: {error}") from None
 
@@ -152,7 +154,8 @@ class StationClient:
         endpoint = self._endpoints.read("main")["commands"]
         if self._commands is None or endpoint != self._endpoint:
             self.close()
-            self._commands, self._endpoint = CommandClient(self._context, endpoint), endpoint
+            owner = self._endpoints.owner
+            self._commands, self._endpoint = CommandClient(self._context, endpoint, owner=owner), endpoint
         return self._commands.request(command, timeout)
 
     def close(self) -> None:

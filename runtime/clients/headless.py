@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import sys
@@ -11,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from robots.broken_pipe import unread_ends
-from runtime.client import StationClient
-from runtime.errors import RuntimeFault, SetupError
-from runtime.family import Plan, join
-from runtime.terminal.figures import figure, line
+from runtime.clients.client import StationClient
+from runtime.clients.terminal.figures import figure, line
+from runtime.core import logs as log
+from runtime.core.errors import RuntimeFault, SetupError
+from runtime.station.spec import StationSpec, planned
 
 _START_S = 30.0
 _SETUP_S = 240.0
@@ -29,7 +31,7 @@ _SILENT = frozenset(
 RESULT_NAME = "headless.json"
 
 
-def drive(plan: Plan, client: StationClient) -> dict[str, Any]:
+def drive(plan: StationSpec, client: StationClient) -> dict[str, Any]:
     """One run from start to published dataset; returns what came of it. Raises RuntimeFault with the reason."""
     check(plan)
     attended = Attended(client)
@@ -52,7 +54,7 @@ def drive(plan: Plan, client: StationClient) -> dict[str, Any]:
     return result
 
 
-def check(plan: Plan) -> None:
+def check(plan: StationSpec) -> None:
     """Raise SetupError for a mode that needs a person."""
     mode, station = plan.deployment.run.mode, plan.deployment.station
     if mode not in MODES:
@@ -170,7 +172,7 @@ def _of_episode(path: Path) -> dict[str, Any]:
     }
 
 
-def _keep(plan: Plan, episode: Path, well: bool) -> dict[str, Any]:
+def _keep(plan: StationSpec, episode: Path, well: bool) -> dict[str, Any]:
     """Export the streams of any run; publish what ended well and moved a robot. Raises RuntimeFault."""
     from runtime.recording.export import export
 
@@ -180,7 +182,7 @@ def _keep(plan: Plan, episode: Path, well: bool) -> dict[str, Any]:
     return result
 
 
-def _publish(plan: Plan, episode: Path) -> dict[str, Any]:
+def _publish(plan: StationSpec, episode: Path) -> dict[str, Any]:
     from runtime.datasets.published import publish
 
     dataset = plan.deployment.data / str(plan.deployment.publish.dataset)
@@ -221,11 +223,16 @@ def summary(result: dict[str, Any]) -> list[str]:
 @unread_ends
 def main() -> int:
     """Drive, print, leave the result in the station's folder; exit code 0 where all went well."""
-    member = join("headless")
-    station_dir = member.plan.deployment.station_dir
-    client = StationClient(station_dir, holder=f"headless:{member.boot}")
+    parser = argparse.ArgumentParser(prog="runtime.clients.headless", description="started by the supervisor")
+    parser.add_argument("--resolved", required=True)
+    parser.add_argument("--boot", required=True)
+    given = parser.parse_args()
+    log.start("headless")
+    plan = planned(given.resolved)
+    station_dir = plan.deployment.station_dir
+    client = StationClient(station_dir, holder=f"headless:{given.boot}")
     try:
-        result = drive(member.plan, client)
+        result = drive(plan, client)
     except RuntimeFault as fault:
         print(f"error: {fault}", file=sys.stderr)
         (station_dir / RESULT_NAME).write_text(json.dumps({"error": str(fault)}), "utf-8")

@@ -6,24 +6,24 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from runtime.errors import ConfigurationError
-from runtime.plugins import union
-from runtime.section import Section
+from runtime.core.errors import ConfigurationError
+from runtime.core.plugins import union
+from runtime.core.settings import Settings
 
 if TYPE_CHECKING:
 
-    class LeaderConfig(Section):
+    class LeaderConfig(Settings):
         """Any leader's section."""
 
         kind: str
 else:
-    LeaderConfig = union("runtime.leaders")
+    LeaderConfig = union("runtime.teleoperators")
 
 Measured = Literal["qvel", "effort", "eef"]
 Column = Literal["qvel", "effort", "eef", "eef_action"]
 
 
-class CollectionSettings(Section):
+class CollectionSettings(Settings):
     """Collecting demonstrations: a person drives the robot, and what must be recorded of it."""
 
     source: Literal["relay", "node"]

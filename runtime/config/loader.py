@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
@@ -14,9 +13,10 @@ from urllib.parse import urlsplit
 
 from pydantic import ValidationError
 
-from runtime.config import Deployment
-from runtime.errors import ConfigurationError
-from runtime.explanation import Key, explanation
+from runtime.config.schema import Deployment
+from runtime.core import bounded_documents as bounded
+from runtime.core.errors import ConfigurationError
+from runtime.core.explanation import Key, explanation
 
 __all__ = [
     "ConfigurationError",
@@ -112,15 +112,15 @@ def _read(path: Path, chain: tuple[Path, ...]) -> tuple[dict[str, Any], dict[Key
     if path in chain:
         raise ConfigurationError(f"{path}: extends itself by way of {' -> '.join(map(str, chain))}")
     try:
-        own = tomllib.loads(path.read_text("utf-8"))
+        own = bounded.toml_file(path, str(path))
     except OSError as error:
         near = ", ".join(sorted(p.name for p in path.parent.glob("*.toml"))) or "none"
         by = f"which {chain[-1]} extends " if chain else ""
         raise ConfigurationError(
             f"{path}: {by}cannot be read ({error.strerror}); deployment files there: {near}"
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path}: is not valid TOML: {error}") from None
+    except bounded.Unreadable as error:
+        raise ConfigurationError(str(error)) from None
     parent = own.pop("extends", None)
     if parent is None:
         return own, {key: str(path) for key in _keys(own)}
@@ -161,8 +161,8 @@ def _assignment(text: str) -> tuple[Key, Any]:
     if not separator or not name.strip():
         raise ConfigurationError(f"--set {text}: must be key=value, for example control.rate=30")
     try:
-        value = tomllib.loads(f"value = {raw}")["value"]
-    except tomllib.TOMLDecodeError:
+        value = bounded.toml(f"value = {raw}", f"--set {name}")["value"]
+    except bounded.Unreadable:
         value = raw  # a bare word is a string, so that quotes need no escaping in a shell
     return tuple(name.strip().split(".")), value
 

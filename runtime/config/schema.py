@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from runtime.collection import CollectionSettings
-from runtime.errors import ConfigurationError
+from runtime.config.collection import CollectionSettings
+from runtime.core.errors import ConfigurationError
+from runtime.core.plugins import union, variants
+from runtime.core.pose_format import PoseFormat
+from runtime.core.settings import Settings
+from runtime.core.types import Space
+from runtime.ipc.messages import PolicyMode
 from runtime.kinematics.base import KinematicsSettings
-from runtime.messages import PolicyMode
-from runtime.plugins import union, variants
-from runtime.pose_format import PoseFormat
 from runtime.recording.settings import RecordingSettings
-from runtime.safety import SafetySettings
-from runtime.section import Section
+from runtime.safety.filter import SafetySettings
 from runtime.strategies.base import StrategyParameters
-from runtime.types import Space
 
 if TYPE_CHECKING:
 
-    class Variant(Section):
+    class Variant(Settings):
         """What all variants have in common."""
 
         kind: str
@@ -48,13 +49,15 @@ else:
     KinematicsConfig = union("runtime.kinematics")
 
 
-def _loopback(host: str) -> str:
-    if host not in ("127.0.0.1", "localhost"):
-        raise ValueError("must be 127.0.0.1 or localhost: the bus has no keys of its own yet")
-    return host
+# Addresses and ports of the bus, from before its sockets had names in a folder.
+GONE_FROM_BUS = ("host", "command_port", "state_port", "camera_port", "estop_port")
+_NO_PORTS = (
+    "the bus has no ports any more, but Unix sockets that this account alone can reach, in $XDG_RUNTIME_DIR/eva-web "
+    "(docs/security.md): leave it out"
+)
 
 
-class ControlSettings(Section):
+class ControlSettings(Settings):
     """The control loop."""
 
     rate: float | None = Field(default=None, gt=0, le=1000)
@@ -72,7 +75,7 @@ class ControlSettings(Section):
     """Time without any planned action after which `running` becomes `holding` [s]."""
 
 
-class SetupSettings(Section):
+class SetupSettings(Settings):
     """What `setup` does."""
 
     home: bool = True
@@ -85,7 +88,7 @@ class SetupSettings(Section):
     """How long to wait for a complete first observation [s]."""
 
 
-class RunSettings(Section):
+class RunSettings(Settings):
     """A run."""
 
     duration_s: float | None = Field(default=None, gt=0)
@@ -101,7 +104,7 @@ class RunSettings(Section):
 Answer = Literal["hold", "slow", "stop"]
 
 
-class FaultSettings(Section):
+class FaultSettings(Settings):
     """What a run does when its policy fails: "hold" at once; "slow": go on with what is planned, then decelerate,
     hold, and go on by itself if it comes back in time; "stop": end the run."""
 
@@ -131,7 +134,7 @@ class RecordingChoice(RecordingSettings):
     without."""
 
 
-class PublishSettings(Section):
+class PublishSettings(Settings):
     """The LeRobot dataset that finished episodes go to."""
 
     dataset: str | None = None
@@ -140,7 +143,7 @@ class PublishSettings(Section):
     """Version of the format of a new dataset, v2.1 where it is not given; one that is there keeps its own."""
 
 
-class PublicationSettings(Section):
+class PublicationSettings(Settings):
     """What the robot is told: joints, or poses beside them where the transport takes such a command."""
 
     space: Space = "joint"
@@ -149,33 +152,23 @@ class PublicationSettings(Section):
     """How these poses are written."""
 
 
-class LeaseSettings(Section):
+class LeaseSettings(Settings):
     """Who may command, and for how long."""
 
     ttl_s: float = Field(default=5.0, gt=0)
     """Time after which a lease that is not renewed ends and the robot holds [s]."""
 
 
-class BusSettings(Section):
-    """Sockets that the web, the terminal and scripts talk to."""
+class BusSettings(Settings):
+    """What the station publishes for those who watch."""
 
-    host: Annotated[str, AfterValidator(_loopback)] = "127.0.0.1"
-    """Address to listen on: 127.0.0.1 or localhost."""
-    command_port: int = Field(default=0, ge=0, le=65535)
-    """Where commands are taken; 0 for a free port, which clients find in the station's folder."""
-    state_port: int = Field(default=0, ge=0, le=65535)
-    """Where snapshots, joints and events are published; 0 for a free port."""
-    camera_port: int = Field(default=0, ge=0, le=65535)
-    """Where previews are published; 0 for a free port."""
-    estop_port: int = Field(default=0, ge=0, le=65535)
-    """Where the guard takes the e-stop; 0 for a free port."""
     preview_rate: float = Field(default=15.0, ge=0, le=60)
     """JPEG previews per second and camera [Hz]; 0 for none."""
     preview_height: int = Field(default=240, ge=60, le=1080)
     """Height of a preview [pixels]."""
 
 
-class ControlChannelSettings(Section):
+class ControlChannelSettings(Settings):
     """JSON commands over ZMQ for existing scripts, on this machine alone: docs/control-channel.md."""
 
     enabled: bool = False
@@ -186,19 +179,32 @@ class ControlChannelSettings(Section):
     """Who the scripts command for, in lease and events; user and machine where it is not given."""
     silence_s: float = Field(default=10.0, gt=0, le=3600)
     """Silence of a script after which its lease ends and the robot holds [s]."""
-    scripts: Literal["apart", "together"] = "apart"
-    """"apart": each connection (or name that a script gives itself) is a holder of its own; "together": all that
-    give no name are one, and whatever any of them says keeps their lease."""
+    scripts: Literal["apart", "together"] = "together"
+    """"together": all scripts that give themselves no name are one holder, also with a connection for every message;
+    "apart": each connection is one."""
 
 
-class LockstepSettings(Section):
+class SecuritySettings(Settings):
+    """What a table that comes over the web, as a checkpoint's does, may name of the station's own."""
+
+    variables: list[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*\*?$")]] = Field(
+        default=["EVA_POLICY_*"]
+    )
+    """Environment variables with keys of policy servers; * at the end stands for anything. Those that [policy] itself
+    names are allowed in any case."""
+    files: list[Annotated[str, Field(pattern=r"^(/|~/)")]] = Field(default_factory=list)
+    """Keys and configurations of ssh, and recordings, or folders of them, outside of ssh/ in the station's folder and
+    of the data folder. Those that [policy] itself names are allowed in any case."""
+
+
+class LockstepSettings(Settings):
     """One process on a virtual clock."""
 
     delay_ticks: int = Field(default=0, ge=0)
     """Ticks between an observation and the arrival of its chunk."""
 
 
-class GripperSettings(Section):
+class GripperSettings(Settings):
     """What a deployment says otherwise of one gripper than the robot's description."""
 
     binary: bool | None = None
@@ -213,8 +219,11 @@ class GripperSettings(Section):
     """Its number when closed."""
 
 
-class Deployment(Section):
+class Deployment(Settings):
     """One station: a robot, a way to it, a policy, and how they are brought together."""
+
+    GONE: ClassVar[Mapping[str, str]] = {f"bus.{key}": _NO_PORTS for key in GONE_FROM_BUS}
+    """Keys that there were, and what is in their place."""
 
     station: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")
     """Name of the station, and of its folder in the data folder."""
@@ -254,6 +263,7 @@ class Deployment(Section):
     lease: LeaseSettings = LeaseSettings()
     bus: BusSettings = BusSettings()
     control_channel: ControlChannelSettings = ControlChannelSettings()
+    security: SecuritySettings = SecuritySettings()
     lockstep: LockstepSettings = LockstepSettings()
 
     @model_validator(mode="after")
@@ -273,6 +283,11 @@ class Deployment(Section):
     def station_dir(self) -> Path:
         """Folder of the station's latch, command journal and endpoints."""
         return self.data / "stations" / self.station
+
+    @property
+    def ssh_dir(self) -> Path:
+        """Folder of what checkpoints name for ssh: keys, known hosts, configurations."""
+        return self.station_dir / "ssh"
 
     @property
     def episodes_dir(self) -> Path:

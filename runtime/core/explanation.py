@@ -45,6 +45,8 @@ def _sentence(
         near = difflib.get_close_matches(key[-1], allowed, 1)
         hint = f" (did you mean {near[0]}?)" if near else ""
         given = "" if _SECRET.search(key[-1]) else f" = {error['input']!r:.200}"
+        if (instead := getattr(root, "GONE", {}).get(name)) is not None:
+            return f"{where}: {name}{given}: {instead}"
         return f"{where}: {name}{given}: unknown key{hint}; allowed here: {', '.join(allowed)}"
     if kind == "missing":
         return f"{where}: {name} is missing and has no default"

@@ -16,7 +16,7 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped]
 import numpy as np
 
-from runtime.errors import CodecError
+from runtime.core.errors import CodecError
 
 DEFAULT_LIMIT = 256 * 1024 * 1024  # bytes of one message; a peer that sends more is not one of ours
 _REFUSED_KINDS = frozenset("VOc")  # structures, Python objects, complex numbers

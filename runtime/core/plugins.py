@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from runtime.errors import ConfigurationError
+from runtime.core.errors import ConfigurationError
 
 
 @functools.cache

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from runtime.errors import ConfigurationError
-from runtime.section import Section
+from runtime.core.errors import ConfigurationError
+from runtime.core.settings import Settings
 
 _ORDERS = (
     r"^(xyz|xzy|yxz|yzx|zxy|zyx|xyx|xzx|yxy|yzy|zxz|zyz|XYZ|XZY|YXZ|YZX|ZXY|ZYX|XYX|XZX|YXY|YZY|ZXZ|ZYZ)$"
@@ -15,7 +15,7 @@ _ORDERS = (
 OrientationName = Literal["wxyz", "xyzw", "euler", "rotation_vector", "6d"]
 
 
-class PoseFormat(Section):
+class PoseFormat(Settings):
     """How the pose of an end effector is written: per arm x, y, z [m], an orientation, and its gripper."""
 
     orientation: OrientationName = "wxyz"

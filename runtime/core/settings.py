@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import BaseModel, ConfigDict
 
 
-class Section(BaseModel):
+class Settings(BaseModel):
     """A frozen table of a deployment file, in which nothing is coerced.
 
     Unknown keys, wrong types, NaN and infinity are errors.

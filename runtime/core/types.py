@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from runtime.pose_format import PoseFormat
+    from runtime.core.pose_format import PoseFormat
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -20,6 +20,7 @@ UInt8 = NDArray[np.uint8]
 Space = Literal["joint", "eef"]
 ActionMode = Literal["absolute", "relative", "delta"]
 RelativeFrame = Literal["base", "tool"]
+Result = Literal["success", "partial", "fail"]  # of an episode, as its operator judged it
 EEF_WIDTH = 8  # x, y, z [m], quaternion w, x, y, z, gripper: one arm's end-effector vector
 
 _EMPTY: Mapping[str, object] = MappingProxyType({})

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from robots.broken_pipe import unread_ends
+from runtime.core.errors import RecordingError, RuntimeFault
 from runtime.datasets import layout, operations
 from runtime.datasets.assemble import Assembled
 from runtime.datasets.consistency import examine
 from runtime.datasets.hub import push
 from runtime.datasets.published import publish
-from runtime.errors import RecordingError, RuntimeFault
 
 
 @unread_ends

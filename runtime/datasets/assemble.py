@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.catalog import Catalog, info_of, own_line
 from runtime.datasets.columns import column_statistics
@@ -26,7 +27,6 @@ from runtime.datasets.rows import numbers, write_table
 from runtime.datasets.sides import FOLDER, side_file, side_files
 from runtime.datasets.staging import Draft
 from runtime.datasets.stats import Statistic, picture_statistic, video_statistic
-from runtime.errors import RecordingError
 from runtime.recording.files import disk_fault
 
 if TYPE_CHECKING:

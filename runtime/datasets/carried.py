@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robots import EEF_FIELDS
+from runtime.core.errors import RecordingError
+from runtime.core.types import Float32
 from runtime.datasets.mapping import ColumnMapping
 from runtime.datasets.reader import Dataset
-from runtime.errors import RecordingError
-from runtime.types import Float32
 
 
 class _Kind(NamedTuple):

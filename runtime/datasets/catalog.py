@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from runtime.core.errors import RecordingError
 from runtime.datasets import layout, parquet_lists
 from runtime.datasets.entries import (
     EpisodeEntry,
@@ -20,7 +21,6 @@ from runtime.datasets.entries import (
 from runtime.datasets.features import Features, differences, plain_rate
 from runtime.datasets.layout import Line
 from runtime.datasets.stats import Statistic, aggregate
-from runtime.errors import RecordingError
 
 
 @dataclass(frozen=True, slots=True)

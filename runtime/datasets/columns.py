@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.core.errors import RecordingError
 from runtime.datasets.features import INDEX_COLUMNS, Feature, Features, arrow_schema, scalar, stored, vector
 from runtime.datasets.journal import RecordedJournal
 from runtime.datasets.stats import Statistic, column_statistic
-from runtime.errors import RecordingError
 
 if TYPE_CHECKING:
     import pyarrow as pa

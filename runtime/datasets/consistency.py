@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from runtime.core.errors import RecordingError
 from runtime.datasets import layout, parquet_lists
 from runtime.datasets.entries import EpisodeEntry, Span, committed, entry, statistic_lines, task_lines
 from runtime.datasets.features import INDEX_COLUMNS, arrow_type, stored
 from runtime.datasets.pictures import Pictures, Stretch
 from runtime.datasets.rows import numbers, read_rows
 from runtime.datasets.sides import strays
-from runtime.errors import RecordingError
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from runtime.core.errors import RecordingError
 from runtime.datasets.entries import Span
 from runtime.datasets.pictures import Pictures, Stretch
 from runtime.datasets.remux import copied_stream
-from runtime.errors import RecordingError
 
 if TYPE_CHECKING:
     import av

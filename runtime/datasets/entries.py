@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from runtime.core.errors import RecordingError
 from runtime.datasets import layout, parquet_lists
 from runtime.datasets.layout import Info, Line
-from runtime.errors import RecordingError
 
 
 @dataclass(frozen=True, slots=True)

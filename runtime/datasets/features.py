@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 
 if TYPE_CHECKING:
     import pyarrow as pa

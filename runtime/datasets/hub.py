@@ -6,11 +6,11 @@ import re
 from importlib import import_module
 from pathlib import Path
 
+from runtime.core.errors import RecordingError
 from runtime.datasets.assemble import Tell, silent
 from runtime.datasets.consistency import check
 from runtime.datasets.layout import read_info
 from runtime.datasets.staging import LOCK
-from runtime.errors import RecordingError
 
 _REPLACED = ("data", "videos", "images", "meta", "eva")  # there, what is not here any more goes
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}", re.ASCII)

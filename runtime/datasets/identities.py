@@ -9,17 +9,17 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from uuid import NAMESPACE_URL, uuid5
+from uuid import NAMESPACE_URL, UUID, uuid5
 
 import numpy as np
 import pyarrow as pa
 
+from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.catalog import Catalog
 from runtime.datasets.operations import convert
 from runtime.datasets.reader import Dataset, open_dataset
 from runtime.datasets.staging import locked
-from runtime.errors import RecordingError
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import disk_fault, sync_folder, write_whole
 
@@ -123,7 +123,15 @@ def _require_same(dataset: Path, target: Path) -> None:
 
 def _told(root: Path) -> list[dict[str, Any]]:
     lines = layout.read_lines(root / layout.EVA_EPISODES)
-    strange = next((line for line in lines if not ("uuid" in line and "episode_index" in line)), None)
+    strange = next((line for line in lines if not _names_episode(line)), None)
     if strange is not None:
         raise RecordingError(f"{root / layout.EVA_EPISODES} has a line of no episode: {strange!r:.120}")
     return lines
+
+
+def _names_episode(line: Mapping[str, Any]) -> bool:
+    """Whether it names an episode by a uuid: that becomes a folder, and whoever made the dataset has written it."""
+    try:
+        return "episode_index" in line and str(UUID(line["uuid"])) == line["uuid"]
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return False

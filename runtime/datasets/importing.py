@@ -17,19 +17,19 @@ from typing import Any
 import numpy as np
 
 import robots
+from runtime.core.errors import RecordingError
+from runtime.core.types import Float32
 from runtime.datasets import layout
 from runtime.datasets.carried import Carried, carried, names_of
 from runtime.datasets.identities import uuids_of
 from runtime.datasets.mapping import ColumnMapping, video_key
 from runtime.datasets.pictures import PictureSequence
 from runtime.datasets.reader import Dataset, RecordedEpisode
-from runtime.errors import RecordingError
 from runtime.recording.base import IMPORTED, ExecutedTick, Outcome, Row
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.files import disk_fault, sync_folder
 from runtime.recording.scrub import require_sound
 from runtime.recording.settings import RecordingSettings
-from runtime.types import Float32
 
 STATES = ("observation.state", "observation.qpos")  # measured joints, the first that there is
 ACTION = "action"

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
+from runtime.core.types import Float32
 from runtime.recording.reader import Episode, open_episode
-from runtime.types import Float32
 
 
 @dataclass(frozen=True, slots=True, eq=False)

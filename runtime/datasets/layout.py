@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 
 V20, V21, V30 = "v2.0", "v2.1", "v3.0"
 READABLE_VERSIONS = (V20, V21, V30)

@@ -6,10 +6,10 @@ from typing import Any
 
 from pydantic import Field, field_validator
 
-from runtime.section import Section
+from runtime.core.settings import Settings
 
 
-class ColumnMapping(Section):
+class ColumnMapping(Settings):
     """Column names of one dataset. An empty string says that the dataset has no such column."""
 
     state: str = "observation.state"

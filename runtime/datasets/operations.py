@@ -11,13 +11,13 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
+from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.assemble import Assembled, Part, Source, Tell, assemble, silent
 from runtime.datasets.consistency import check
 from runtime.datasets.entries import episode_lines
 from runtime.datasets.renaming import Names
 from runtime.datasets.staging import LOCK, locked, recover, remove_drafts
-from runtime.errors import RecordingError
 from runtime.recording.files import disk_fault
 
 

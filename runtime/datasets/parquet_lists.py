@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.layout import Line
-from runtime.errors import RecordingError
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from runtime.errors import RecordingError
-from runtime.types import UInt8
+from runtime.core.errors import RecordingError
+from runtime.core.types import UInt8
 
 if TYPE_CHECKING:
     import av

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from runtime.core.errors import RecordingError
 from runtime.datasets import features as declared
 from runtime.datasets import layout
 from runtime.datasets.catalog import Catalog
@@ -26,11 +27,10 @@ from runtime.datasets.rows import write_table
 from runtime.datasets.sides import STREAMS, read_sides, side_file
 from runtime.datasets.staging import Staging, locked, recover, require_empty
 from runtime.datasets.stats import Statistic, video_statistic
-from runtime.errors import RecordingError
 from runtime.recording.base import IMPORTED
 from runtime.recording.export import exported
 from runtime.recording.labels import newest
-from runtime.recording.scrub import UNSEALED, require_sound
+from runtime.recording.scrub import require_sound
 
 if TYPE_CHECKING:
     import numpy as np
@@ -94,7 +94,7 @@ def publish(
             )
         beside = {STREAMS: exported(journal.folder), **given}
         done = _publish(journal, catalog, success, version or layout.DEFAULT_VERSION, beside)
-    return replace(done, remark=UNSEALED if verdict.state == "unsealed" else "")
+    return replace(done, remark=verdict.text if verdict.state == "unsealed" else "")
 
 
 def never_published(manifest: Mapping[str, object]) -> str:

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from runtime.core.errors import RecordingError
+from runtime.core.types import Float32, Float64
 from runtime.datasets import layout
 from runtime.datasets.entries import EpisodeEntry, Span, entry, episode_lines, task_lines
 from runtime.datasets.mapping import ColumnMapping, video_key
 from runtime.datasets.pictures import Pictures, PictureSequence, StoredPictures, Stretch
 from runtime.datasets.rows import read_rows
-from runtime.errors import RecordingError
-from runtime.types import Float32, Float64
 
 if TYPE_CHECKING:
     import pyarrow as pa

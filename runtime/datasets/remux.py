@@ -8,7 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 
 if TYPE_CHECKING:
     import av

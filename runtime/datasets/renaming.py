@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
+from runtime.core.errors import RecordingError
 from runtime.datasets.features import INDEX_COLUMNS
-from runtime.errors import RecordingError
 
 Value = TypeVar("Value")
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from uuid import UUID
 
+from runtime.core.errors import RecordingError
 from runtime.datasets.catalog import Catalog
 from runtime.datasets.layout import read_lines
 from runtime.datasets.staging import locked, recover
-from runtime.errors import RecordingError
 from runtime.recording.files import write_whole
 
 FOLDER = (

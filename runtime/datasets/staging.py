@@ -15,9 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
+from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.catalog import Catalog
-from runtime.errors import RecordingError
 from runtime.recording.files import disk_fault, read_document, sync_folder, write_whole
 
 FOLDER = ".publishing"  # hidden: readers that take every file below data/ do not look here

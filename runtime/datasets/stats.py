@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.core.errors import RecordingError
+from runtime.core.types import UInt8
 from runtime.datasets.pictures import PictureSequence
-from runtime.errors import RecordingError
-from runtime.types import UInt8
 
 # min, max, mean, std and the quantiles: lists of the feature's shape; count: [n]
 Statistic = dict[str, list[Any]]

@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, JsonValue, ValidationError
 
-from runtime.errors import RuntimeFault
-from runtime.explanation import explanation
-from runtime.messages import Mode
-from runtime.recording.labels import Result
-from runtime.section import Section
+from runtime.core.errors import RuntimeFault
+from runtime.core.explanation import explanation
+from runtime.core.settings import Settings
+from runtime.core.types import Result
+from runtime.ipc.messages import Mode
 
 LARGEST = 64 * 1024  # characters of JSON that a command may carry into a manifest
 _HIGHEST_SEED = 2**53 - 1  # beyond it a browser counts no more
@@ -29,25 +29,25 @@ Map = Annotated[dict[str, JsonValue], AfterValidator(_small)]
 Label = Annotated[str, Field(max_length=200)]
 
 
-class Nothing(Section):
+class Nothing(Settings):
     """For commands that are one word."""
 
 
-class Checkpoint(Section):
+class Checkpoint(Settings):
     """Which checkpoint is behind the policy, as the one who asks knows it."""
 
     id: Annotated[str, Field(min_length=1, max_length=200)] | int
     name: Label = ""
 
 
-class Positions(Section):
+class Positions(Settings):
     """Where things are wanted on the bench, in the world: x, y [m], yaw [degrees]; what is absent lies anywhere."""
 
     block: list[float] | None = Field(default=None, min_length=3, max_length=3)
     plate: list[float] | None = Field(default=None, min_length=2, max_length=2)
 
 
-class BenchRequest(Section):
+class BenchRequest(Settings):
     """How a simulated bench is to be laid out; `id` names this reset, one is made up where none is given."""
 
     id: Annotated[str, Field(min_length=1, max_length=200)] | None = None
@@ -55,14 +55,14 @@ class BenchRequest(Section):
     positions: Positions | None = None
 
 
-class LeastTimes(Section):
+class LeastTimes(Settings):
     """How long the stages of a set-up that wait for the policy last at least [s], whoever it is."""
 
     connect_s: float = Field(default=0.0, ge=0, le=3600)
     warm_up_s: float = Field(default=0.0, ge=0, le=3600)
 
 
-class SetUpRequest(Section):
+class SetUpRequest(Settings):
     """`setup`: what differs from the deployment this time; what is absent is the deployment's own.
 
     `policy` is merged into the deployment's own [policy] as a file over what it extends: a table of another
@@ -86,7 +86,7 @@ class SetUpRequest(Section):
         return {key: value for key, value in wanted.items() if value is not None}
 
 
-class PreflightRequest(Section):
+class PreflightRequest(Settings):
     """`preflight`: which policy is asked without the robot; what is absent is the deployment's own.
 
     `policy` as in a set-up; `id` names the report; it ends after `deadline_s` [s] at the latest, without it after what
@@ -112,26 +112,26 @@ class PreflightRequest(Section):
         return f"the checkpoint {named}" if named else "the deployment's policy"
 
 
-class PreflightReportRequest(Section):
+class PreflightReportRequest(Settings):
     """`preflight_report`: how the preflight of that `id` went."""
 
     id: Annotated[str, Field(min_length=1, max_length=200)]
 
 
-class PolicyServerRequest(Section):
+class PolicyServerRequest(Settings):
     """`policy_server`: which server the policy in force has, or the deployment's with this `policy` on top."""
 
     policy: Map | None = None
 
 
-class CollectSession(Section):
+class CollectSession(Settings):
     """The session that a collected episode is one of, and the dataset that it is meant for."""
 
     uuid: Annotated[str, Field(pattern=r"^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$")]
     dataset: Annotated[str, Field(max_length=200)] = ""
 
 
-class RunRequest(Section):
+class RunRequest(Settings):
     """`run`: `trial` is the asker's own and goes into the manifest as it is; `duration_s` ends this run [s].
 
     Where operator, duration, mode or sim_state are absent, the deployment's own hold. `task` and `session` are for the
@@ -147,13 +147,13 @@ class RunRequest(Section):
     session: CollectSession | None = None
 
 
-class DiscardRequest(Section):
+class DiscardRequest(Settings):
     """`discard`: mark an episode as one that is never published; absent: the open one, which ends, or the newest."""
 
     episode: Annotated[str, Field(max_length=100)] | None = None
 
 
-class LabelRequest(Section):
+class LabelRequest(Settings):
     """`label`: how an episode went; absent: the open one, or the newest."""
 
     episode: Annotated[str, Field(max_length=100)] | None = None
@@ -161,7 +161,7 @@ class LabelRequest(Section):
     note: Annotated[str, Field(max_length=2000)] = ""
 
 
-class TuneRequest(Section):
+class TuneRequest(Settings):
     """`tune`: another strategy or other parameters of it, another instruction; what is absent stays as it is.
 
     `strategy` is merged into the one in force, whose parameters another `kind` keeps.
@@ -174,7 +174,7 @@ class TuneRequest(Section):
 Triple = Annotated[list[Annotated[float, Field(ge=-10, le=10)]], Field(min_length=3, max_length=3)]
 
 
-class Jog(Section):
+class Jog(Settings):
     """A step of one arm's end effector: `translation` [m], `rotation` roll, pitch, yaw [rad] about fixed axes.
 
     Both along the axes of the arm's "base" frame, or of the end effector itself ("tool").
@@ -186,7 +186,7 @@ class Jog(Section):
     rotation: Triple = Field(default_factory=lambda: [0.0, 0.0, 0.0])
 
 
-class AimRequest(Section):
+class AimRequest(Settings):
     """`aim`: where the robot would go, moving nothing.
 
     `joints` [D] are a target, or what a jog starts from (the commanded ones where absent); `pose` is a named pose.
@@ -197,7 +197,7 @@ class AimRequest(Section):
     jog: Jog | None = None
 
 
-class MoveRequest(Section):
+class MoveRequest(Settings):
     """`move`: go to `joints` [D] or to a named `pose` on a limited path.
 
     `speed` is the part of the speed of motions of ours that may be used.
@@ -208,14 +208,37 @@ class MoveRequest(Section):
     speed: float = Field(default=1.0, ge=0.01, le=1)
 
 
-class GripperRequest(Section):
+class GripperRequest(Settings):
     """`gripper`: open or close one; lock one where it is, or give it back. `arm` absent: all of them."""
 
     arm: str | None = None
     action: Literal["open", "close", "lock", "unlock"]
 
 
-Request = TypeVar("Request", bound=Section)
+# What each command takes. None: whatever comes with it is not looked at, because a stop is not refused for a word.
+ARGUMENTS: dict[str, type[Settings] | None] = {
+    "setup": SetUpRequest,
+    "run": RunRequest,
+    "stop": None,
+    "halt": None,
+    "resume": Nothing,
+    "home": Nothing,
+    "release": Nothing,
+    "record_start": Nothing,
+    "record_stop": Nothing,
+    "tune": TuneRequest,
+    "step": Nothing,
+    "commit": Nothing,
+    "cancel": Nothing,
+    "move": MoveRequest,
+    "gripper": GripperRequest,
+    "approach": Nothing,
+    "arm": Nothing,
+    "disarm": Nothing,
+    "label": LabelRequest,
+    "discard": DiscardRequest,
+}
+Request = TypeVar("Request", bound=Settings)
 
 
 def read(kind: str, model: type[Request], arguments: Mapping[str, Any]) -> Request:

@@ -14,9 +14,12 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.codecs import pack, unpack
-from runtime.errors import CodecError
-from runtime.types import Float32, Float64, UInt8
+from runtime.core.errors import CodecError
+from runtime.core.msgpack_arrays import pack, unpack
+from runtime.core.types import Float32, Float64, UInt8
+
+# Kinds of events that control gives and main reads: whether anybody listens to commands.
+UNHEARD, HEARD = "commands_unheard", "commands_heard"
 
 # --- main -> control ---------------------------------------------------------------------------------------
 
@@ -215,7 +218,7 @@ class MediaReport:
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """An observation as in runtime.types.Observation, its pictures by their numbers in the slots of the page."""
+    """An observation as in runtime.core.types.Observation, its pictures by their numbers in the slots of the page."""
 
     sequence: int
     arrived: float
@@ -270,7 +273,7 @@ class ReceptionReport:
     age_ms: Mapping[str, float] = field(
         default_factory=dict
     )  # of joints when they came into the page: p50, p99, max of the newest
-    scheduling: str = ""  # the class of the process, as by runtime.realtime
+    scheduling: str = ""  # the class of the process, as by runtime.core.realtime
 
 
 # --- clients <-> runtime -----------------------------------------------------------------------------------
@@ -281,7 +284,9 @@ class Command:
     """A discrete request of a person or a program.
 
     `boot` and `sequence` are those of the snapshot it was decided by; `valid_until` is in the runtime's own
-    clock, as counted on from that snapshot. `holder` and `epoch` say under which lease it is given.
+    clock, as counted on from that snapshot. `holder` and `epoch` say under which lease it is given. `user` and `role`
+    are what the sender says, and are believed where runtime.ipc.identity has verified them; `vouched` names arguments
+    that an administrator wrote.
     """
 
     uuid: str
@@ -293,6 +298,8 @@ class Command:
     boot: str = ""
     sequence: int = 0
     valid_until: float = float("inf")
+    role: str = ""
+    vouched: list[str] = field(default_factory=list)
 
 
 AckStatus = Literal["accepted", "refused", "done", "failed"]

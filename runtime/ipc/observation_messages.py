@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from runtime.messages import Observed
-from runtime.page import Page
-from runtime.types import Observation, UInt8
+from runtime.core.types import Observation, UInt8
+from runtime.ipc.messages import Observed
+from runtime.ipc.shared_state import SharedState
 
 _SAME = (
     *("sequence", "arrived", "captured", "qpos", "qvel", "effort", "eef"),
@@ -17,7 +17,7 @@ _SAME = (
 class SlotPictures(Mapping[str, UInt8]):
     """Pictures by camera, copied out of their slots when they are asked for: one that was overwritten is a KeyError."""
 
-    def __init__(self, page: Page, numbers: Mapping[str, int]) -> None:
+    def __init__(self, page: SharedState, numbers: Mapping[str, int]) -> None:
         self._page = page
         self._numbers = numbers
 
@@ -45,7 +45,7 @@ def as_message(observation: Observation, numbers: Mapping[str, int]) -> Observed
     return Observed(**told, pictures={camera: numbers[camera] for camera in observation.pictures})
 
 
-def as_observation(message: Observed, page: Page) -> Observation:
+def as_observation(message: Observed, page: SharedState) -> Observation:
     """The observation that a message tells of."""
     return Observation(
         **{name: getattr(message, name) for name in _SAME}, pictures=SlotPictures(page, message.pictures)

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runtime.page import Page
-from runtime.types import Float32, Float64
+from runtime.core.types import Float32, Float64
+from runtime.ipc.shared_state import SharedState
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class LatestObservation:
     """What is known of the robot: joints [D], and when each part of it was captured on our monotonic clock [s]."""
 
     sequence: int  # 0 before the first observation
@@ -31,27 +31,27 @@ class Seen:
         return {camera: now - captured for camera, captured in self.pictures_captured}
 
 
-class Eyes:
+class ObservationReader:
     """Reads the page; an observation that is still the newest is not read again."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: SharedState) -> None:
         self._page = page
         self._version = -1
-        self._seen: Seen
+        self._seen: LatestObservation
 
-    def look(self) -> Seen:
+    def look(self) -> LatestObservation:
         """The newest observation."""
         version = self._page.observation.version
         if version != self._version:
             self._seen, self._version = self._read(), version
         return self._seen
 
-    def _read(self) -> Seen:
+    def _read(self) -> LatestObservation:
         record = self._page.observation.read()
         qpos = record["qpos"].copy()
         sequence = int(record["sequence"])
         captured = record["picture_captured"].tolist()
-        return Seen(
+        return LatestObservation(
             sequence=sequence,
             qpos=qpos,
             joints=qpos.astype(np.float64),

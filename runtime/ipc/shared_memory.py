@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.errors import RuntimeFault
+from runtime.core.errors import RuntimeFault
 
 _LENGTH_CRC = struct.Struct("<II")
 _ALIGN = 64  # one cache line, so that two writers never share one

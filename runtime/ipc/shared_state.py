@@ -13,9 +13,9 @@ from enum import IntEnum
 
 import numpy as np
 
-from runtime import memory
-from runtime.memory import Record, Ring, aligned
-from runtime.types import Observation, UInt8
+from runtime.core.types import Observation, UInt8
+from runtime.ipc import shared_memory as memory
+from runtime.ipc.shared_memory import Record, Ring, aligned
 
 _LINE = 64
 PICTURE_SLOTS = 12  # 0.4 s of a camera at 30 Hz: for so long may media be late
@@ -28,6 +28,7 @@ RING_BYTES = {
     "control_events": 1 << 19,  # control -> main
     "reception_events": 1 << 19,  # reception -> main
     "media_events": 1 << 19,  # media -> main
+    "presses": 1 << 14,  # main -> guard: presses of the e-stop that came to main
 }
 DOUBT_BYTES = 200
 PROCESSES = ("control", "main", "reception", "media", "guard")
@@ -42,7 +43,7 @@ class EStop(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class PageLayout:
+class SharedStateLayout:
     """The sizes everything in the page follows from; equal in all of the family."""
 
     dim: int
@@ -115,10 +116,10 @@ class PageLayout:
         )
 
 
-class Page:
+class SharedState:
     """The shared memory of one station's family, or of a lockstep run in one process."""
 
-    def __init__(self, layout: PageLayout, shared: mmap.mmap) -> None:
+    def __init__(self, layout: SharedStateLayout, shared: mmap.mmap) -> None:
         self.layout = layout
         self._shared = shared
         offset = 0
@@ -144,25 +145,25 @@ class Page:
             offset += PictureSlots.size(layout.picture_bytes)
 
     @classmethod
-    def size(cls, layout: PageLayout) -> int:
+    def size(cls, layout: SharedStateLayout) -> int:
         """Bytes of the shared file; pictures are sparse, so only what is used takes memory."""
         pictures = len(layout.cameras) * PictureSlots.size(layout.picture_bytes)
         return cls._size_of_numbers(layout) + pictures
 
     @staticmethod
-    def _size_of_numbers(layout: PageLayout) -> int:
+    def _size_of_numbers(layout: SharedStateLayout) -> int:
         fixed = _LINE * (len(PROCESSES) + 1)
         fixed += Record.size(layout.observation_dtype()) + Record.size(layout.control_dtype())
         return fixed + sum(Ring.size(capacity) for capacity in RING_BYTES.values())
 
     @classmethod
-    def create(cls, layout: PageLayout) -> tuple[Page, int]:
+    def create(cls, layout: SharedStateLayout) -> tuple[SharedState, int]:
         """A new page and the descriptor that children inherit to attach to it."""
         descriptor = memory.create(cls.size(layout))
         return cls(layout, memory.attach(descriptor)), descriptor
 
     @classmethod
-    def attach(cls, layout: PageLayout, descriptor: int, pictures: bool = True) -> Page:
+    def attach(cls, layout: SharedStateLayout, descriptor: int, pictures: bool = True) -> SharedState:
         """The page behind an inherited descriptor; without `pictures` for who locks its memory (control)."""
         return cls(layout, memory.attach(descriptor, 0 if pictures else cls._size_of_numbers(layout)))
 
@@ -206,7 +207,7 @@ class Page:
         return EStop(self._shared[self._estop])
 
     def set_estop(self, state: EStop) -> None:
-        """Written by the guard alone."""
+        """Lowered by the guard alone; main raises it for a press that came to main's socket."""
         self._shared[self._estop] = int(state)
 
     def publish_observation(self, observation: Observation, pictures: Mapping[str, int]) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import robots
 from robots.broken_pipe import unread_ends
-from runtime.errors import RuntimeFault
+from runtime.core.errors import RuntimeFault
 from runtime.kinematics import compiled
 
 

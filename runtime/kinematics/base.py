@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from runtime.errors import RuntimeFault
-from runtime.section import Section
-from runtime.types import Float64
+from runtime.core.errors import RuntimeFault
+from runtime.core.settings import Settings
+from runtime.core.types import Float64
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -32,7 +32,7 @@ class IkFlag(IntFlag):
     NEAR_SINGULAR = 8  # some direction of the end effector can hardly be moved in
 
 
-class KinematicsSettings(Section):
+class KinematicsSettings(Settings):
     """What every backend lets a deployment choose."""
 
     position_weight: Positive = 50.0

@@ -11,11 +11,11 @@ import numpy as np
 from pydantic import Field
 
 from robots import Chain, Group, Robot
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
+from runtime.core.types import Float64
 from runtime.kinematics.base import IkResult, Kinematics, KinematicsError, KinematicsSettings
-from runtime.kinematics.replanning import missed, postures, replanned
-from runtime.kinematics.tables import Records, Way, chains_of
-from runtime.types import Float64
+from runtime.kinematics.replanning import CRAMPED, ROOMIER, missed, postures, replanned
+from runtime.kinematics.tables import POSED, Record, Records, Way, chains_of
 
 _WRONG = {  # by what runtime.kinematics.kernels.chunks says
     1: "a target, the seed or the anchor holds a number that is not finite",
@@ -138,15 +138,27 @@ class CompiledKinematics(Kinematics):
     def _replan(
         self, found: IkResult, targets: Float64, seed: Float64, dt: float, held: Float64, row: int
     ) -> None:
-        """Puts another plan into `found` for arms that meet the pose they begin with and miss a later one."""
+        """Puts another plan into `found` for arms that meet the first pose, and miss a later one or end cramped.
+
+        The next chunk may go on towards a limit that this one ends by, and nothing else is known of it.
+        """
         begin = row if row >= 0 else 1
-        for index in missed(found, begin):
-            arm = self._arms[index : index + 1]
-            dims = arm["dims"][0, : arm["joints"][0]]
+        if begin >= len(targets):
+            return
+        late = missed(found, begin)
+        for index, arm in enumerate(self._arms):
+            room = partial(_room, arm)
+            spare = room(found.q[-1])
+            cramped = spare < CRAMPED and found.reached[begin:, index].all()
+            if index not in late and not cramped:
+                continue
+            least = spare + ROOMIER if cramped else -np.inf
+            dims = arm["dims"][: arm["joints"]]
             start = seed.copy()
             start[dims] = (held if row >= 0 else found.q[0])[dims]
             poses = np.ascontiguousarray(targets[begin:, index : index + 1])
-            plan = replanned(partial(self._sweep, arm), poses, start, dt, dims, self._postures[index])
+            sweep = partial(self._sweep, self._arms[index : index + 1])
+            plan = replanned(sweep, poses, start, dt, dims, self._postures[index], room, least)
             if plan is not None:
                 found.q[begin:, dims] = plan.q[:, dims]
                 found.position_error[begin:, index] = plan.position_error[:, 0]
@@ -229,6 +241,20 @@ def _arms_of(robot: Robot, own: Sequence[tuple[Group, Chain]], velocity_scale: f
         arm["below"][:count] = np.minimum(_ROOM, home - robot.lower[dims])
         arm["above"][:count] = np.minimum(_ROOM, robot.upper[dims] - home)
     return arms
+
+
+def _room(arm: Record, q: Float64) -> float:
+    """How far the joint nearest to a limit is from it in joints [D], as a part of what is kept; inf without a choice.
+
+    Sides to which home itself is nearer do not count: there is no more room to go to.
+    """
+    count = arm["joints"]
+    if count <= POSED:
+        return np.inf
+    at = q[arm["dims"][:count]]
+    rooms = np.concatenate([at - arm["lower"][:count], arm["upper"][:count] - at])
+    kept = np.concatenate([arm["below"][:count], arm["above"][:count]])
+    return float(rooms[kept >= _ROOM].min(initial=np.inf) / _ROOM)
 
 
 def _carrying(group: Group) -> Way:

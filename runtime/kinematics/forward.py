@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from robots import Robot
+from runtime.core.types import Float64
 from runtime.kinematics.base import Forward, KinematicsError
-from runtime.types import Float64
 
 
 class ChainForward(Forward):

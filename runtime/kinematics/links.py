@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robots import Body
+from runtime.core.types import Float32
 from runtime.kinematics.base import KinematicsError
-from runtime.types import Float32
 
 if TYPE_CHECKING:
     from runtime.kinematics.kernels.bodies import Parts

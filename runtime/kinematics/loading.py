@@ -6,9 +6,9 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from threading import Lock
 
-from runtime.errors import RuntimeFault, SetupError
+from runtime.core.errors import RuntimeFault, SetupError
+from runtime.core.types import Float64
 from runtime.kinematics.base import Forward, IkResult, Kinematics
-from runtime.types import Float64
 
 Make = Callable[[], Kinematics]
 

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from robots import Group, Robot
 from robots.rotations import rotation_vector, transform_of
+from runtime.core.types import Float64
 from runtime.kinematics.base import IkFlag, IkResult, KinematicsSettings
-from runtime.types import Float64
 
 _RESTS = 1e-6  # rad (m) within which a joint rests on a bound
 

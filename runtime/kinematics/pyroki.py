@@ -16,11 +16,11 @@ import numpy as np
 
 from robots import Group, Robot
 from robots.rotations import quaternion_of_matrix, transform_of
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
+from runtime.core.types import Float64
 from runtime.kinematics import compiled
 from runtime.kinematics.base import IkResult, Kinematics, KinematicsSettings
 from runtime.kinematics.measuring import measured
-from runtime.types import Float64
 
 _BUCKET = 64  # rows: chunks are filled up to a multiple, so that few lengths are compiled
 _BOX_WEIGHT = 100.0  # per rad beyond the box; what is left beyond it is cut off

@@ -1,4 +1,4 @@
-"""Another plan for a chunk of which poses are missed, found from its end."""
+"""Another plan for a chunk of which poses are missed, or that ends cramped, found from its end."""
 
 from __future__ import annotations
 
@@ -8,17 +8,25 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.core.types import Float64
 from runtime.kinematics.base import IkResult
-from runtime.types import Float64
 
 _SAME = 0.01  # rad (m) within which two ends are one
 _HOPELESS = 4  # postures without a solution after which the last pose is taken to have none
 _FOLLOWED = 12  # ends at most that are followed back
 _ENDLESS = np.pi  # rad to either side in which joints without limits are tried
 
+CRAMPED = 0.3  # of the room that joints with a choice keep; what ends with less may have none left for the next chunk
+ROOMIER = 0.1  # of it that another posture must have more
+
 Sweep = Callable[
     ..., IkResult
 ]  # poses [T, 1, 7], seed [D], dt, anchor [D], anchor_row, guide [T, D]: frame by frame
+
+
+Room = Callable[
+    [Float64], float
+]  # joints [D]: how far the one nearest to a limit is from it, where it has a choice
 
 
 def postures(home: Float64, lower: Float64, upper: Float64, count: int) -> Float64:
@@ -37,18 +45,28 @@ def missed(result: IkResult, begin: int) -> NDArray[np.intp]:
 
 
 def replanned(
-    sweep: Sweep, poses: Float64, start: Float64, dt: float, dims: NDArray[np.intp], starts: Float64
+    sweep: Sweep,
+    poses: Float64,
+    start: Float64,
+    dt: float,
+    dims: NDArray[np.intp],
+    starts: Float64,
+    room: Room,
+    least: float = -np.inf,
 ) -> IkResult | None:
     """A plan for poses [T, 1, 7] of the arm at `dims`, from `start` [D] on, that misses none; None if none is found.
+
+    At its end the joints [D] have more than the `least` room.
 
     Frames that are solved one after the other may take a branch, or a posture, that ends before the poses do. So the
     last pose is solved from `starts` [S, n], each solution is followed back to the first pose, and what that gives
     guides a plan forwards: it comes as close to its guide as half of the velocities let it, the nearest end first.
     """
-    for end in islice(_ends(sweep, poses[-1:], start, dims, starts), _FOLLOWED):
+    ends = (end for end in _ends(sweep, poses[-1:], start, dims, starts) if room(end) > least)
+    for end in islice(ends, _FOLLOWED):
         back = sweep(np.ascontiguousarray(poses[::-1]), end, dt, end, 0)
         plan = sweep(poses, start, dt, start, 0, np.ascontiguousarray(back.q[::-1]))
-        if plan.reached.all():
+        if plan.reached.all() and room(plan.q[-1]) > least:
             return plan
     return None
 

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robots import Chain
-from runtime.types import Float64
+from runtime.core.types import Float64
 
 Record = Any  # one element of an array of the types below: fields by name, lengths known to the compiler
 Records = NDArray[np.void]
+POSED = 6  # numbers that a pose holds: joints beyond them are free
 
 
 def chain_type(moving: int) -> np.dtype[np.void]:

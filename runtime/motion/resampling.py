@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robots.rotations import slerp
-from runtime.types import Float64
+from runtime.core.types import Float64
 
 
 def length(count: int, rate: float, wanted_rate: float) -> int:

@@ -7,22 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runtime.types import Float64
+from runtime.core.types import Float64
 
-Makers = tuple[tuple[int, float], ...]  # (chunk id, weight), the weights of a step sum to 1
+Contributions = tuple[tuple[int, float], ...]  # (chunk id, weight), the weights of a step sum to 1
 HELD = 0  # the chunk id of a held target
 _TURN = 2.0 * np.pi
 
 
 @dataclass(frozen=True, slots=True)
-class Dims:
+class DimensionKinds:
     """Dimensions that do not blend as numbers do."""
 
     switched: tuple[int, ...] = ()  # binary grippers: they switch where the new chunk switches
     wrapping: tuple[int, ...] = ()  # angles without limits: blended on the circle
 
 
-_PLAIN = Dims()
+_PLAIN = DimensionKinds()
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +30,11 @@ class Planned:
     """The action meant for one step: float64 [D], and the chunks it was made from."""
 
     action: Float64
-    makers: Makers
+    makers: Contributions
 
 
 @dataclass(frozen=True, slots=True)
-class Laid:
+class PlacedChunk:
     """A chunk as it was placed: float64 [N, D], row 0 for step `first`."""
 
     chunk_id: int
@@ -53,9 +53,9 @@ class Fade:
 
     first: int
     rows: Float64
-    makers: tuple[Makers, ...]
+    makers: tuple[Contributions, ...]
     weights: Float64
-    dims: Dims
+    dims: DimensionKinds
 
     def over(self, step: int, plan: Planned) -> Planned:
         """`plan` for `step`, as far as it has taken over by then."""
@@ -85,8 +85,8 @@ class Timeline:
         """Forget everything."""
         self.first = 0
         self.rows: Float64 = np.empty((0, self._dim))
-        self.makers: list[Makers] = []
-        self.laid: tuple[Laid, ...] = ()
+        self.makers: list[Contributions] = []
+        self.laid: tuple[PlacedChunk, ...] = ()
         self.fade: Fade | None = None
 
     def at(self, step: int) -> Planned | None:
@@ -101,14 +101,14 @@ class Timeline:
         """How many steps are planned from `step` on."""
         return max(0, self.first + len(self.rows) - max(step, self.first))
 
-    def plan(self, step: int) -> tuple[Float64, list[Makers]]:
+    def plan(self, step: int) -> tuple[Float64, list[Contributions]]:
         """The strategy's plan from `step` on: rows [N, D] and makers; nothing if the plan starts later."""
         index = step - self.first
         if index < 0:
             return self.rows[:0], []
         return self.rows[index:], self.makers[index:]
 
-    def span(self, step: int) -> tuple[Float64, list[Makers]]:
+    def span(self, step: int) -> tuple[Float64, list[Contributions]]:
         """What is to be executed from `step` on: rows [N, D] and their makers."""
         rows, makers = self.plan(step)
         if self.fade is None:
@@ -120,7 +120,7 @@ class Timeline:
         return rows, makers
 
     def replace(
-        self, step: int, rows: Float64, makers: Sequence[Makers], laid: tuple[Laid, ...] = ()
+        self, step: int, rows: Float64, makers: Sequence[Contributions], laid: tuple[PlacedChunk, ...] = ()
     ) -> None:
         """Let `rows` be the whole plan from `step` on; what was planned before `step` is over."""
         self.first = step
@@ -136,12 +136,12 @@ class Timeline:
         self.fade = fade
 
 
-def single(chunk_id: int, count: int) -> list[Makers]:
+def single(chunk_id: int, count: int) -> list[Contributions]:
     """The makers of `count` rows that come from one chunk alone."""
     return [((chunk_id, 1.0),)] * count
 
 
-def mixed(old: Makers, new: Makers, weight: float) -> Makers:
+def mixed(old: Contributions, new: Contributions, weight: float) -> Contributions:
     """The makers of one step that is `weight` of `old` and the rest of `new`."""
     shares: dict[int, float] = {}
     for makers, part in ((old, weight), (new, 1.0 - weight)):
@@ -190,7 +190,7 @@ def fading(count: int, shape: str = "linear") -> Float64:
 
 
 def overlap_blend(
-    old: Float64, new: Float64, window: int | None, dims: Dims = _PLAIN, shape: str = "linear"
+    old: Float64, new: Float64, window: int | None, dims: DimensionKinds = _PLAIN, shape: str = "linear"
 ) -> tuple[Float64, Float64]:
     """`new` with its first rows blended over from `old`, and the weight of `old` in each blended row.
 

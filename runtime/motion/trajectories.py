@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-from runtime.types import Float64
+from runtime.core.types import Float64
 
 
 class Motion(ABC):

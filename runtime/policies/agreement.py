@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from runtime.errors import ActionSpaceError, ContradictionError
+from runtime.core.errors import ActionSpaceError, ContradictionError
+from runtime.core.pose_format import PoseFormat
+from runtime.core.types import ActionMode, RelativeFrame, Space
 from runtime.policies.request import RequestSettings
-from runtime.pose_format import PoseFormat
-from runtime.types import ActionMode, RelativeFrame, Space
 
 _SPACES: dict[str, Space] = {"joint": "joint", "qpos": "joint", "eef": "eef"}
 _MODES = ("absolute", "relative", "delta")

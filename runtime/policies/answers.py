@@ -6,14 +6,14 @@ from typing import Annotated
 
 from pydantic import Field
 
-from runtime.pose_format import PoseFormat
-from runtime.section import Section
-from runtime.types import ActionMode, RelativeFrame, Space
+from runtime.core.pose_format import PoseFormat
+from runtime.core.settings import Settings
+from runtime.core.types import ActionMode, RelativeFrame, Space
 
 Rate = Annotated[float, Field(ge=1, le=1000)]
 
 
-class AnswerSettings(Section):
+class AnswerSettings(Settings):
     """Space, format, mode and rate of the rows of an answer."""
 
     action_space: Space = "joint"

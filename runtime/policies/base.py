@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+from runtime.core.types import ActionChunk, Conditioning, Observation, Space
 from runtime.policies.reach import Dial
-from runtime.types import ActionChunk, Conditioning, Observation, Space
 
 
 @dataclass(frozen=True, slots=True)

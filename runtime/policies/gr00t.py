@@ -1,14 +1,13 @@
 """GR00T's policy servers N1.5, N1.6 and N1.7: one request, one answer over a ZMQ REQ socket.
 
 The server is asked first what its model is shown and answers (its modality configuration); requests are built of
-that by maps that the deployment declares. Arrays are sent in the form that every version reads (NPY); its
-`kill` endpoint is never used. Source: Isaac-GR00T's PolicyServer and PolicyClient.
+that by maps that the deployment declares, and arrays are sent in the form that it reads. Its `kill` endpoint is never
+used. Source: Isaac-GR00T's PolicyServer and PolicyClient; for servers without a modality configuration StarVLA's.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import threading
 import time
@@ -17,15 +16,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
-from runtime.clock import Clock
-from runtime.errors import (
+from runtime.core.clock import Clock
+from runtime.core.environment import secret
+from runtime.core.errors import (
     CodecError,
-    ConfigurationError,
     PolicyError,
     RefusedError,
     ServerSaysError,
     WrongProtocolError,
 )
+from runtime.core.machine_names import Variable
+from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.groot import arrays
 from runtime.policies.groot.link import ReqLink
@@ -33,7 +34,6 @@ from runtime.policies.groot.modality import modalities
 from runtime.policies.groot.request import Gr00tRequest, RequestSettings
 from runtime.policies.link import headline
 from runtime.policies.tunnel.settings import TunnelSettings
-from runtime.types import ActionChunk, Conditioning, Observation
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -63,7 +63,7 @@ class Config(RequestSettings):
     """Where the server listens."""
     tunnel: TunnelSettings | None = None
     """The SSH tunnel through which the server is reached; url is then as seen from the tunnel's far end."""
-    api_token_env: str | None = None
+    api_token_env: Variable | None = None
     """Environment variable with the server's API token; the token itself would end up in every manifest."""
     connect_deadline: Positive = 5.0
     """For the connection and the server's modality configuration [s]; for a reset too."""
@@ -99,6 +99,8 @@ class Gr00tPolicy(Policy):
         self._turning = threading.Lock()  # between open and closed: held for a moment
         self._closed = False
         self._warm = False
+        self._mnp = False  # how arrays are written
+        self._guessed = False  # of a server that does not say how it reads them
         self._asked = False  # since the last reset
 
     def connect(self) -> PolicyInfo:
@@ -125,7 +127,7 @@ class Gr00tPolicy(Policy):
             seconds = self._config.inference_deadline if self._warm else self._config.first_inference_deadline
             self._warm = self._asked = True
             started = time.monotonic()
-            reply = self._call("get_action", seconds, data)
+            reply = self._act(data, seconds)
             round_trip = 1e3 * (time.monotonic() - started)
             rows = self._request.rows(reply)
         return self._config.chunk(rows, {"round_trip_ms": round_trip})
@@ -169,6 +171,7 @@ class Gr00tPolicy(Policy):
         try:
             wanted = modalities(self._call("get_modality_config", left))
             self._request.agree(wanted)
+            self._mnp, self._guessed = bool(wanted.reads_mnp), wanted.reads_mnp is None
         except PolicyError:
             self._link.drop()
             raise
@@ -180,12 +183,28 @@ class Gr00tPolicy(Policy):
             metadata={"modality": wanted.plain()},
         )
 
+    def _act(self, data: Mapping[str, Any], seconds: float) -> Any:
+        """The answer to get_action; to a server that does not say how it reads arrays once in the other form too."""
+        until = time.monotonic() + seconds
+        guessed, self._guessed = self._guessed, False
+        try:
+            return self._call("get_action", seconds, data)
+        except ServerSaysError as error:
+            if not guessed:
+                raise
+            self._mnp = not self._mnp
+            try:
+                return self._call("get_action", max(0.1, until - time.monotonic()), data)
+            except ServerSaysError:
+                self._mnp = not self._mnp
+                raise error from None
+
     def _call(self, endpoint: str, seconds: float, data: Mapping[str, Any] | None = None) -> Any:
         """The result of an endpoint; PolicyError for the server's own error, after which it goes on serving."""
         message: dict[str, Any] = {"endpoint": endpoint}
         message |= {} if data is None else {"data": data}
         message |= {} if self._token is None else {"api_token": self._token}
-        reply = self._link.exchange(arrays.pack(message), seconds, f"an answer to {endpoint}")
+        reply = self._link.exchange(arrays.pack(message, self._mnp), seconds, f"an answer to {endpoint}")
         if reply == b"ERROR":
             raise ServerSaysError(
                 f"{self._config.url} answers {endpoint} with ERROR: see the server's own output"
@@ -226,18 +245,13 @@ class Gr00tPolicy(Policy):
                     f"{allowed}"
                 )
         if "must be a numpy array" in text:
+            form, mark = ("MNP", "has") if self._mnp else ("NPY", "lacks")
             return (
-                f"{said}\nIt does not read arrays in NPY, which every GR00T server does: it is another server"
+                f"{said}\nIt does not read arrays in {form}, although its modality configuration {mark} N1.7's mark: "
+                "it is no version of GR00T's server that is known here"
             )
         return said
 
 
 def _token(config: Config) -> str | None:
-    if config.api_token_env is None:
-        return None
-    token = os.environ.get(config.api_token_env)
-    if not token:
-        raise ConfigurationError(
-            f"policy.api_token_env names {config.api_token_env}, which is not set in the environment"
-        )
-    return token
+    return None if config.api_token_env is None else secret("policy.api_token_env", config.api_token_env)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from runtime.formats import PoseRows
-from runtime.types import EEF_WIDTH, Float32, Float64, Observation
+from runtime.core.types import EEF_WIDTH, Float32, Float64, Observation
+from runtime.spaces.pose_rows import PoseRows
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping
 from urllib.parse import urlsplit
 
-from runtime.errors import PolicyLostError, PolicyTimeout, RefusedError, TlsError, WrongProtocolError
+from runtime.core.errors import PolicyLostError, PolicyTimeout, RefusedError, TlsError, WrongProtocolError
 from runtime.policies.reach import Dial, reached
 
 _STATUS = re.compile(rb"HTTP/1\.[01] ([0-9]{3})([^\r\n]*)\r?\n")

@@ -16,8 +16,8 @@ from urllib.parse import urlsplit
 
 from pydantic import Field
 
-from runtime.clock import Clock
-from runtime.errors import (
+from runtime.core.clock import Clock
+from runtime.core.errors import (
     CodecError,
     ConfigurationError,
     PolicyError,
@@ -26,13 +26,13 @@ from runtime.errors import (
     ServerSaysError,
     WrongProtocolError,
 )
+from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.async_inference import messages
 from runtime.policies.async_inference.link import Channel
 from runtime.policies.async_inference.pickles import MODULES, TimedAction, read_actions
 from runtime.policies.async_inference.request import AsyncRequest, RequestSettings
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.tunnel.settings import TunnelSettings
-from runtime.types import ActionChunk, Conditioning, Observation
 
 if TYPE_CHECKING:
     from robots import Robot

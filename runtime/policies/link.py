@@ -10,11 +10,12 @@ import contextlib
 import json
 import socket
 import ssl
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from runtime.errors import (
+from runtime.core.errors import (
     PolicyError,
     PolicyGone,
     PolicyLostError,
@@ -33,7 +34,16 @@ if TYPE_CHECKING:
 
 ANSWER_LIMIT = 64 * 1024 * 1024  # bytes of a message, metadata too; a chunk of 50 rows is some kilobytes
 _TOO_BIG = 1009  # the close code for it
+LEAVING = "websocket-leave"  # threads that say goodbye to a server
 _CLOSE_TIMEOUT = 0.5  # seconds for the closing handshake; a server busy with inference does not answer it
+
+
+def await_left(seconds: float) -> None:
+    """Wait until all servers that are being left have been told, at most so long: for a process that is to end."""
+    until = time.monotonic() + seconds
+    for thread in threading.enumerate():
+        if thread.name == LEAVING:
+            thread.join(max(0.0, until - time.monotonic()))
 
 
 class WebsocketLink:
@@ -126,6 +136,14 @@ class WebsocketLink:
     def _require_not_aborted(self) -> None:
         if self._aborted:
             raise PolicyError(f"the connection to {self._url} was closed from our side")
+
+    def leave(self) -> None:
+        """End the connection with a close frame, without which servers print a traceback; waits for nothing."""
+        self._watchdog.end()
+        connection, self._connection = self._connection, None
+        held = self._stack.pop_all()
+        if connection is not None:
+            threading.Thread(target=held.close, name=LEAVING).start()
 
     def drop(self) -> None:
         """End the connection without waiting for the server's consent; safe to call twice."""

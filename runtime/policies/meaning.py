@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Literal
 
+from runtime.core.pose_format import PoseFormat
+from runtime.core.types import ActionChunk, Float32, Space
 from runtime.policies.answers import AnswerSettings
 from runtime.policies.pictures import Resize
 from runtime.policies.request import RequestLayout, RequestSettings, Size, poses_of
-from runtime.pose_format import PoseFormat
-from runtime.types import ActionChunk, Float32, Space
 
 if TYPE_CHECKING:
     from robots import Robot

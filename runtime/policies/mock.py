@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import Field
 
-from runtime.clock import Clock
-from runtime.errors import PolicyError
+from runtime.core.clock import Clock
+from runtime.core.errors import PolicyError
+from runtime.core.settings import Settings
+from runtime.core.types import ActionChunk, Conditioning, Float64, Observation
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.section import Section
-from runtime.types import ActionChunk, Conditioning, Float64, Observation
 
 if TYPE_CHECKING:
     from robots import Robot
 
 
-class Config(Section):
+class Config(Settings):
     """Motion made up on this machine, to try everything but a policy."""
 
     kind: Literal["mock"] = "mock"

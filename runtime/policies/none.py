@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from runtime.clock import Clock
-from runtime.errors import PolicyError
+from runtime.core.clock import Clock
+from runtime.core.errors import PolicyError
+from runtime.core.settings import Settings
+from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.section import Section
-from runtime.types import ActionChunk, Conditioning, Observation
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _NONE = "this deployment has no [policy]: it is set up to collect (setup with collect = true), or given one"
 
 
-class Config(Section):
+class Config(Settings):
     """No policy; what a deployment with a [collection] has where it names none."""
 
     kind: Literal["none"] = "none"

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from runtime import codecs
-from runtime.clock import Clock
-from runtime.errors import CodecError, ConfigurationError, PolicyError, WrongProtocolError
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import Clock
+from runtime.core.errors import CodecError, ConfigurationError, PolicyError, WrongProtocolError
+from runtime.core.types import ActionChunk, Conditioning, Float32, Observation
 from runtime.policies.agreement import Declared, agreed
 from runtime.policies.answers import AnswerSettings
 from runtime.policies.base import PolicyInfo
@@ -29,7 +30,6 @@ from runtime.policies.rtc.kai0 import Kai0
 from runtime.policies.rtc.openpi_rtc import EnvelopeKeys, OpenpiRtc, Rows
 from runtime.policies.rtc.prev_action import PrevAction
 from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
-from runtime.types import ActionChunk, Conditioning, Float32, Observation
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -140,7 +140,7 @@ class OpenpiPolicy(WebsocketPolicy):
         try:
             return self._dialect.result(reply)
         except PolicyError:
-            self._link.drop()  # after an error the server closes, after another's answer all would be another's
+            self._link.leave()  # after an error the server closes, after another's answer all would be another's
             raise
 
     def _doubt(self, request: bytes, answer: bytes, took: float) -> str:

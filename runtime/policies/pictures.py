@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from runtime.types import UInt8
+from runtime.core.types import UInt8
 
 Resize = Literal["pad", "stretch"]
 Layout = Literal["chw", "hwc"]

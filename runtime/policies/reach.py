@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from runtime.errors import PortClosedError, UnreachableError
+from runtime.core.errors import PortClosedError, UnreachableError
 
 Address = tuple[Any, ...]
 Place = tuple[str, int]  # host and port

@@ -11,25 +11,26 @@ import numpy as np
 from pydantic import Field
 
 import robots
-from runtime.clock import Clock
+from runtime.core.clock import Clock
+from runtime.core.errors import PolicyError, RecordingError
+from runtime.core.machine_names import Recording
+from runtime.core.pose_format import PoseFormat
+from runtime.core.settings import Settings
+from runtime.core.types import ActionChunk, Conditioning, Float32, Observation, Space
 from runtime.datasets.mapping import ColumnMapping
-from runtime.errors import PolicyError, RecordingError
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.request import poses_of
-from runtime.pose_format import PoseFormat
 from runtime.recording.base import IMPORTED
-from runtime.section import Section
-from runtime.types import ActionChunk, Conditioning, Float32, Observation, Space
 
 if TYPE_CHECKING:
     from robots import Robot
 
 
-class Config(Section):
+class Config(Settings):
     """Replays the actions of one episode: of a LeRobot dataset, v2.0, v2.1 or v3.0, or of a recording of ours."""
 
     kind: Literal["replay"] = "replay"
-    path: str
+    path: Recording
     """Folder of the dataset, or of a recorded episode."""
     episode: int = Field(default=0, ge=0)
     """Index of the episode in the dataset."""

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from runtime.errors import ConfigurationError, PolicyError
-from runtime.formats import PoseRows
+from runtime.core.errors import ConfigurationError, PolicyError
+from runtime.core.pose_format import PoseFormat, refuse_format
+from runtime.core.settings import Settings
+from runtime.core.types import EEF_WIDTH, Float32, Observation, Space
 from runtime.policies.pictures import Layout, Resize, fitted, laid_out
-from runtime.pose_format import PoseFormat, refuse_format
-from runtime.section import Section
-from runtime.types import EEF_WIDTH, Float32, Observation, Space
+from runtime.spaces.pose_rows import PoseRows
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -22,7 +22,7 @@ Size = Annotated[list[Pixels], Field(min_length=2, max_length=2)]
 Dims = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
 
 
-class RequestSettings(Section):
+class RequestSettings(Settings):
     """How a policy server wants observations: the keys of its request, and what goes under them."""
 
     observation_space: Space = "joint"

@@ -11,15 +11,15 @@ import uuid
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
-from runtime import codecs
-from runtime.clock import Clock
-from runtime.errors import ContradictionError, PolicyError, ServerSaysError, WrongProtocolError
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import Clock
+from runtime.core.errors import ContradictionError, PolicyError, ServerSaysError, WrongProtocolError
+from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.arena.actions import Meant, MeantSettings
 from runtime.policies.arena.request import Shown, ShownSettings
 from runtime.policies.arena.wants import Wants, wanted
 from runtime.policies.base import PolicyInfo
 from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
-from runtime.types import ActionChunk, Conditioning, Observation
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -124,7 +124,7 @@ class RoboarenaPolicy(WebsocketPolicy):
 
     def _reopen(self) -> None:
         if self._link.was_left:
-            self._link.drop()
+            self._link.leave()
         self._require_open()
 
     def _session_field(self) -> dict[str, str]:
@@ -152,7 +152,7 @@ class RoboarenaPolicy(WebsocketPolicy):
     def _require_acknowledged(self, reply: Any) -> None:
         _require_no_error(reply)
         if not isinstance(reply, Mapping) or reply.get("status") != ACKNOWLEDGED:
-            self._link.drop()  # whatever this answers, it is no reset
+            self._link.leave()  # whatever this answers, it is no reset
             raise WrongProtocolError(
                 f"{self._config.url} answered a reset with {_short(reply)}; expected the text or the status "
                 f"{ACKNOWLEDGED!r}"

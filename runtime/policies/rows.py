@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.errors import NotFiniteError, ShapeError
-from runtime.types import Float32
+from runtime.core.errors import NotFiniteError, ShapeError
+from runtime.core.types import Float32
 
 
 def action_rows(name: str, given: object, width: int | None = None) -> Float32:

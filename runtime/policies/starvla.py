@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from runtime import codecs
-from runtime.clock import Clock
-from runtime.errors import (
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import Clock
+from runtime.core.errors import (
     ActionSpaceError,
     ConfigurationError,
     ContradictionError,
@@ -25,6 +25,7 @@ from runtime.errors import (
     ServerSaysError,
     WrongProtocolError,
 )
+from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.base import PolicyInfo
 from runtime.policies.link import headline
 from runtime.policies.meaning import MeaningSettings
@@ -32,13 +33,15 @@ from runtime.policies.request import RequestLayout, Size
 from runtime.policies.rows import action_rows
 from runtime.policies.statistics import Statistics
 from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
-from runtime.types import ActionChunk, Conditioning, Observation
 
 if TYPE_CHECKING:
     from robots import Robot
 
 log = logging.getLogger(__name__)
-_ENVIRONMENT = "starvla_policy_server"
+_ENVIRONMENTS = (
+    "starvla_policy_server",
+    "simpler_env",
+)  # the second until May 2026, with nothing else beside it
 
 
 class Config(ServerSettings, MeaningSettings):
@@ -114,7 +117,7 @@ class StarvlaPolicy(WebsocketPolicy):
             raise PolicyError("the StarVLA protocol has no real-time chunking; choose another strategy")
         with self._lock:
             if self._link.was_left:
-                self._link.drop()
+                self._link.leave()
             self._require_open()
             envelope = self._envelope("infer") | {"payload": self.payload(observation)}
             answer, round_trip = self._exchange(codecs.pack(envelope))
@@ -145,11 +148,11 @@ class StarvlaPolicy(WebsocketPolicy):
 
     def _greeted(self, metadata: dict[str, Any]) -> PolicyInfo:
         said = metadata.get("env")
-        if said != _ENVIRONMENT and "available_unnorm_keys" not in metadata and "ckpt_path" not in metadata:
+        if said not in _ENVIRONMENTS and not {"available_unnorm_keys", "ckpt_path"} & set(metadata):
             found = ", ".join(map(str, metadata)) or "nothing"
             raise WrongProtocolError(
-                f"the server's metadata have env = {said!r} and {found}; expected env = {_ENVIRONMENT!r}: it is no "
-                "StarVLA server; correct policy.kind or policy.url"
+                f"the server's metadata have env = {said!r} and {found}; expected env = {_ENVIRONMENTS[0]!r} or "
+                f"{_ENVIRONMENTS[1]!r}: it is no StarVLA server; correct policy.kind or policy.url"
             )
         self._unnorm_key = _unnorm_key(metadata, self._config.unnorm_key)
         self._layout = self._layout_for(self._agreed_size(metadata.get("training_obs_image_size")))
@@ -193,7 +196,7 @@ class StarvlaPolicy(WebsocketPolicy):
                     self._ping(self._config.inference_deadline)
             except PolicyError as error:
                 log.warning("the policy server did not answer a ping, the connection is dropped: %s", error)
-                self._link.drop()
+                self._link.leave()
             finally:
                 self._lock.release()
 
@@ -201,7 +204,7 @@ class StarvlaPolicy(WebsocketPolicy):
         """An answer to this very request that is no error; any other is followed by another connection."""
         asked, found = envelope["request_id"], reply.get("request_id")
         if found != asked:
-            self._link.drop()
+            self._link.leave()
             raise WrongProtocolError(
                 f"the answer has request_id {found!r}, asked was {asked!r}: it is another request's, or no StarVLA "
                 "server answers here"

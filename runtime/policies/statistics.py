@@ -7,14 +7,14 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, model_validator
 
-from runtime.errors import ConfigurationError
-from runtime.section import Section
-from runtime.types import Float32
+from runtime.core.errors import ConfigurationError
+from runtime.core.settings import Settings
+from runtime.core.types import Float32
 
 Numbers = Annotated[list[float], Field(min_length=1)]
 
 
-class Statistics(Section):
+class Statistics(Settings):
     """What -1 and 1 stand for, per number of a row: the minimum and maximum, or quantiles, of the training data."""
 
     low: Numbers

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import threading
 import time
 from abc import abstractmethod
@@ -11,13 +10,15 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from runtime import codecs
-from runtime.errors import CodecError, ConfigurationError, PolicyError, WrongProtocolError
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.environment import secret
+from runtime.core.errors import CodecError, PolicyError, WrongProtocolError
+from runtime.core.machine_names import Variable
+from runtime.core.settings import Settings
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.health import require_healthy
 from runtime.policies.link import ANSWER_LIMIT, WebsocketLink
 from runtime.policies.tunnel.settings import TunnelSettings
-from runtime.section import Section
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -25,12 +26,12 @@ log = logging.getLogger(__name__)
 _REPEATED = "the answer is byte for byte the one before, to another question"
 
 
-class ServerSettings(Section):
+class ServerSettings(Settings):
     """Where a policy server on a websocket listens, and how long it may take."""
 
     url: Annotated[str, Field(pattern=r"^wss?://.+")] = "ws://127.0.0.1:8000"
     """Where the server listens: ws or wss, with a path where it has one."""
-    api_key_env: str | None = None
+    api_key_env: Variable | None = None
     """Environment variable with the API key; the key itself would end up in every recording's manifest."""
     health_path: Annotated[str, Field(pattern=r"^/")] | None = None
     """Where the same port answers an HTTP GET with 200 while the server is well (openpi: "/healthz"); it is asked
@@ -75,19 +76,24 @@ class WebsocketPolicy(Policy):
         with self._lock:
             self._warm, self._last = False, None
             self._excused.clear()
-            self._link.drop()
+            self._link.leave()
             with self._turning:
                 self._closed = False
                 self._link = self._new_link()
             return self._open()
 
     def close(self) -> None:
-        """Cut the connection and return at once; a call that waits in another thread raises PolicyError.
+        """Leave the server and return at once; a call that waits in another thread is cut off and raises PolicyError.
 
-        What is left of the connection is dropped by whoever uses it, now or at the next `connect`.
+        What is left of such a connection is dropped by whoever uses it, now or at the next `connect`.
         """
         with self._turning:
             self._closed = True
+            if self._lock.acquire(blocking=False):
+                try:
+                    self._link.leave()
+                finally:
+                    self._lock.release()
             self._link.abort()
 
     def _new_link(self) -> WebsocketLink:
@@ -109,7 +115,7 @@ class WebsocketPolicy(Policy):
         try:
             return self._greeted(metadata)
         except PolicyError:
-            self._link.drop()
+            self._link.leave()
             raise
 
     def _exchange(self, request: bytes) -> tuple[bytes, float]:
@@ -125,7 +131,7 @@ class WebsocketPolicy(Policy):
         doubted, doubt = answer, self._doubt(request, answer, took)
         if doubt and doubt not in self._excused:
             log.warning("%s: %s: it is asked again over another connection", self._server.url, doubt)
-            self._link.drop()
+            self._link.leave()
             self._require_open()
             answer, took = self._asked_once(request, max(1e-3, seconds - (time.monotonic() - started)))
             if answer == doubted or self._doubt(request, answer, took) == doubt:
@@ -149,7 +155,7 @@ class WebsocketPolicy(Policy):
     def _unpacked(self, payload: bytes, what: str) -> dict[str, Any]:
         message = self._value(payload, what)
         if not isinstance(message, dict):
-            self._link.drop()
+            self._link.leave()
             raise WrongProtocolError(
                 f"{self._server.url} sent {what} that is a {type(message).__name__}; expected a map"
             )
@@ -159,7 +165,7 @@ class WebsocketPolicy(Policy):
         try:
             return codecs.unpack(payload, ANSWER_LIMIT)
         except CodecError as error:
-            self._link.drop()
+            self._link.leave()
             raise WrongProtocolError(
                 f"{self._server.url} sent {what} that is not the {self.PROTOCOL} protocol: {error}"
             ) from error
@@ -169,9 +175,4 @@ def headers(server: ServerSettings) -> dict[str, str]:
     """The request headers; ConfigurationError where the key that is named is not in the environment."""
     if server.api_key_env is None:
         return {}
-    key = os.environ.get(server.api_key_env)
-    if not key:
-        raise ConfigurationError(
-            f"policy.api_key_env names {server.api_key_env}, which is not set in the environment"
-        )
-    return {"Authorization": f"Api-Key {key}"}
+    return {"Authorization": f"Api-Key {secret('policy.api_key_env', server.api_key_env)}"}

@@ -16,16 +16,23 @@ from pathlib import Path
 from typing import Any
 
 from robots.broken_pipe import unread_ends
-from runtime import deployment, log
-from runtime.deployment import Resolved
-from runtime.errors import ConfigurationError, RuntimeFault
-from runtime.family import Lifeline, plan
-from runtime.preflight.course import Course, patience
+from runtime.config import loader as deployment
+from runtime.config.loader import Resolved
+from runtime.core import environment
+from runtime.core import logs as log
+from runtime.core.errors import ConfigurationError, RuntimeFault
+from runtime.ipc.lifeline import Lifeline
+from runtime.policies.link import await_left
+from runtime.preflight.course import Course
 from runtime.preflight.report import Report
 from runtime.preflight.verdict import Stage, Verdict
+from runtime.station.permissions import require_named
+from runtime.station.preflight_child import patience
+from runtime.station.spec import plan
 
 _LOOK_S = 0.2
 _LONGEST_S = 3600.0
+_GOODBYE_S = 1.0
 _BACKGROUND_NICE = 5  # stations of the same machine come first
 
 
@@ -69,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--json", action="store_true", help="say it as JSON")
     parser.add_argument(
-        "--given", action="store_true", help="for a parent process: see runtime.preflight.child"
+        "--given", action="store_true", help="for a parent process: see runtime.station.preflight_child"
     )
     return parser
 
@@ -93,19 +100,23 @@ def _for_a_parent() -> int:
     threading.Thread(target=_end_with_parent, name="lifeline", daemon=True).start()
     report = preflight(lambda: _asked_for(asked), asked.get("deadline_s"))
     print(json.dumps(report.plain()), flush=True)
+    await_left(_GOODBYE_S)
     os._exit(exit_code(report))  # a policy's own threads are not waited for
 
 
 def _asked_for(asked: Mapping[str, Any]) -> Resolved:
-    if "tree" in asked:
+    changes = asked.get("changes", {})
+    if "tree" in asked:  # the station has seen to who may ask for what
         base = deployment.resolve(asked["tree"], {}, "the station's deployment")
-    elif "deployment" in asked:
-        base = deployment.load(Path(asked["deployment"]))
-    else:
+        return deployment.changed(base, changes, "the checkpoint")
+    if "deployment" not in asked:
         raise ConfigurationError(
             f"preflight: given {', '.join(asked) or 'nothing'}; needed: tree or deployment"
         )
-    return deployment.changed(base, asked.get("changes", {}), "the checkpoint")
+    base = deployment.load(Path(asked["deployment"]))
+    resolved = deployment.changed(base, changes, "the checkpoint")
+    require_named(base.deployment, resolved.deployment)
+    return resolved
 
 
 def _line() -> bytes:
@@ -127,4 +138,5 @@ def _end_with_parent() -> None:
 
 
 if __name__ == "__main__":
+    environment.shed()
     sys.exit(main())

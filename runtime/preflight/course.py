@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 
-from runtime.asking import Answered, Asking
-from runtime.clock import Clock, MonotonicClock
-from runtime.config import Deployment
-from runtime.errors import RuntimeFault
-from runtime.family import Plan
+from runtime.core.clock import Clock, MonotonicClock
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.kinematics.base import Kinematics
 from runtime.kinematics.forward import ChainForward
 from runtime.kinematics.loading import Loading
@@ -20,13 +18,13 @@ from runtime.policies.base import Policy, PolicyInfo
 from runtime.preflight.report import Call, Chunk, Report
 from runtime.preflight.subject import Subject
 from runtime.preflight.verdict import Stage, Verdict, stage_of, verdict_of
+from runtime.processes.coordinator.inference.requests import PolicyRequests, PolicyResponse
+from runtime.processes.coordinator.inference.worker import LockstepRunner
+from runtime.processes.coordinator.session.tuning import strategy_of
+from runtime.processes.coordinator.setup.sequence import check_info, first_action
 from runtime.recording import trial
-from runtime.runner import LockstepRunner
-from runtime.setup import check_info, first_action
-from runtime.tuning import strategy_of
-from runtime.types import ActionChunk, Conditioning, Observation
+from runtime.station.spec import StationSpec
 
-_ROOM_S = 10.0  # beside the deadlines of the policy's own calls: kinematics, a slow machine
 _TOLERANCE = 1e-6
 _LOOK_S = 0.2
 Result = TypeVar("Result")
@@ -80,12 +78,12 @@ class Timed(Policy):
 class Course:
     """One preflight of one plan; `run` once. It has no transport: no action can go anywhere."""
 
-    def __init__(self, plan: Plan, clock: Clock | None = None) -> None:
+    def __init__(self, plan: StationSpec, clock: Clock | None = None) -> None:
         self._plan = plan
         self._clock = clock or MonotonicClock()
         self._begun = self._clock.now()
         self._policy: Timed | None = None
-        self._answered: Answered | None = None
+        self._answered: PolicyResponse | None = None
         self._notes: list[str] = []
         self._loading: float | None = None  # since when the compiler of kinematics has been at work
         self._loaded = 0.0  # how long it was [s]
@@ -145,7 +143,7 @@ class Course:
         check_info(info, plan, strategy.query.continues)
         kinematics = Loading(ChainForward(plan.robot), self._kinematics, runner.aside)
         spaces, subject = plan.spaces(kinematics), Subject(plan, self._clock)
-        asking = Asking(policy, plan.deployment.task, spaces, subject, runner, self._clock)
+        asking = PolicyRequests(policy, plan.deployment.task, spaces, subject, runner, self._clock)
         for _ in range(2):  # the first resets before it asks
             answered = self._answered = asking.ask(k_max=strategy.parameters.k_max).result()
         asking.note(answered)
@@ -214,7 +212,7 @@ class Course:
         """Of the last answer [ms]."""
         return [call.ms for call in self._policy.calls if call.name == "infer"][-1] if self._policy else 0.0
 
-    def _chunk(self, answered: Answered) -> Chunk:
+    def _chunk(self, answered: PolicyResponse) -> Chunk:
         plan, chunk, made = self._plan, answered.chunk, answered.made
         first = first_action(made.meant, np.asarray(answered.observation.qpos, np.float64), plan)
         beyond = (plan.limits.outside(made.rows) > _TOLERANCE).any(axis=1)
@@ -254,15 +252,3 @@ class Course:
                 "stand and wait"
             )
         return made
-
-
-def patience(settings: Deployment) -> float:
-    """How long a preflight may take where nobody says so [s]: what the policy's own deadlines come to."""
-    policy = settings.policy.model_dump()
-    return _ROOM_S + _deadlines(policy) + float(policy.get("inference_deadline", 0.0))  # it is asked twice
-
-
-def _deadlines(table: Mapping[str, Any]) -> float:
-    """The sum of all deadlines in a table and in those within it, such as that of a tunnel."""
-    own = [float(value) for key, value in table.items() if key.endswith("_deadline") and value is not None]
-    return sum(own) + sum(_deadlines(value) for value in table.values() if isinstance(value, Mapping))

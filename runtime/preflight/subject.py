@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from runtime.clock import Clock
-from runtime.family import Plan
-from runtime.types import Float64, Observation, UInt8
+from runtime.core.clock import Clock
+from runtime.core.types import Float64, Observation, UInt8
+from runtime.station.spec import StationSpec
 
 _HEIGHT, _WIDTH = 480, 640  # of cameras for which the deployment says no size
 _GREY, _GRAIN = 128, 12  # noise: what a camera sees in the dark is never all the same
@@ -20,7 +20,7 @@ class Subject:
 
     simulated = False
 
-    def __init__(self, plan: Plan, clock: Clock) -> None:
+    def __init__(self, plan: StationSpec, clock: Clock) -> None:
         self._plan = plan
         self._clock = clock
         self._begun = clock.now()
@@ -49,7 +49,7 @@ class Subject:
         return None
 
 
-def pictures(plan: Plan) -> dict[str, UInt8]:
+def pictures(plan: StationSpec) -> dict[str, UInt8]:
     """Grey noise [H, W, 3] for each camera of the deployment, in the size that it says, the same on every call."""
     noise = np.random.default_rng(0)
     made: dict[str, UInt8] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from runtime.errors import (
+from runtime.core.errors import (
     ActionSpaceError,
     ConfigurationError,
     ContradictionError,

@@ -9,9 +9,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from robots.broken_pipe import unread_ends
+from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.reader import open_dataset
-from runtime.errors import RecordingError
 from runtime.quality.inspection import inspect, inspect_dataset
 from runtime.quality.report import Report
 from runtime.quality.settings import QualitySettings, read_settings

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.core.types import Float32, Float64
 from runtime.quality.luma import Film
 from runtime.quality.report import Severity
-from runtime.types import Float32, Float64
 
 Bools = NDArray[np.bool_]
 

@@ -11,15 +11,15 @@ import pyarrow.dataset as pads
 
 import robots
 from robots import RobotError
+from runtime.core.errors import RecordingError
+from runtime.core.types import EEF_WIDTH, Float64
 from runtime.datasets import layout
 from runtime.datasets.mapping import ColumnMapping, video_key
 from runtime.datasets.pictures import Stretch
 from runtime.datasets.reader import Dataset
-from runtime.errors import RecordingError
 from runtime.quality.block import BLOCK_ROWS, Block, Bools, Joints, Numbers, Source, Vector
 from runtime.quality.joints import known_joints, unknown_joints
 from runtime.quality.luma import Film, StoredFilm, VideoFilm
-from runtime.types import EEF_WIDTH, Float64
 
 STATES = ("observation.state", "observation.qpos")  # the first that there is
 ACTION = "action"

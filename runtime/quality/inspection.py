@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from runtime.core.errors import RecordingError
 from runtime.datasets.reader import Dataset, open_dataset
-from runtime.errors import RecordingError
 from runtime.quality.block import Source
 from runtime.quality.datasets import DatasetSource
 from runtime.quality.journals import JournalSource

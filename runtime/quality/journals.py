@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from robots import RobotError
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.quality.block import BLOCK_ROWS, Block, Bools, Joints, Numbers, Source, Vector, VideoEnd
 from runtime.quality.joints import known_joints, unknown_joints
 from runtime.quality.luma import Film, VideoFilm

@@ -10,9 +10,9 @@ from typing import Any, Protocol
 import av
 import numpy as np
 
+from runtime.core.errors import RecordingError
+from runtime.core.types import Float32
 from runtime.datasets.pictures import PictureSequence, Stretch
-from runtime.errors import RecordingError
-from runtime.types import Float32
 
 # Where the first plane is brightness, 8 bits a pixel; others are converted, which costs twice the time.
 _PLANAR = frozenset({"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray"})

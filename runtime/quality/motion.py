@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from runtime.core.types import Float32, Float64
 from runtime.quality.block import Block, Bools, Joints, Source
 from runtime.quality.report import Flag, Flags, Run, Runs, span
 from runtime.quality.settings import QualitySettings
-from runtime.types import Float32, Float64
 
 
 class Motion:

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
+from runtime.core.types import Float32, Float64
 from runtime.quality.block import Bools, Source
 from runtime.quality.losses import Losses
 from runtime.quality.luma import Film, Shot
 from runtime.quality.report import Flag, Flags, Run, Runs, Severity, span
 from runtime.quality.settings import QualitySettings
-from runtime.types import Float32, Float64
 
 CHANGED = 10.0  # times `same`: a difference that only motion makes
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 from pydantic import Field, ValidationError
 
-from runtime.errors import RecordingError
-from runtime.section import Section
+from runtime.core import bounded_documents as bounded
+from runtime.core.errors import RecordingError
+from runtime.core.settings import Settings
 
 
-class QualitySettings(Section):
+class QualitySettings(Settings):
     """The bounds of the checks; an episode's own `[collection]` goes before `max_skew_s` and `min_length_s`."""
 
     # --- time ---
@@ -85,10 +85,12 @@ class QualitySettings(Section):
 def read_settings(path: Path) -> QualitySettings:
     """The bounds in a TOML file with keys of QualitySettings; RecordingError names file, key, given and allowed."""
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = bounded.toml_file(path, str(path))
     except FileNotFoundError:
         raise RecordingError(f"there is no file {path} with settings") from None
-    except (OSError, ValueError) as error:
+    except bounded.Unreadable as error:
+        raise RecordingError(str(error)) from error
+    except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error}") from error
     try:
         return QualitySettings.model_validate(content)

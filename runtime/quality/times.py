@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from runtime.core.types import Float64
 from runtime.quality.block import Block, Source
 from runtime.quality.report import Flag, Flags, Run, Runs, Severity, span
 from runtime.quality.settings import QualitySettings
-from runtime.types import Float64
 
 JOINTS = ("joints", "eef")  # streams that are no cameras
 

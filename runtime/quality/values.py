@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from runtime.core.types import EEF_WIDTH, Float32
 from runtime.quality.block import Block, Joints, Numbers, Source, Vector
 from runtime.quality.report import Flag, Flags, Run, Runs, Severity, listed, span
 from runtime.quality.settings import QualitySettings
-from runtime.types import EEF_WIDTH, Float32
 
 MOVING = ("state", "action")
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from robots.broken_pipe import unread_ends
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.export import export
 from runtime.recording.quarantine import keep
 from runtime.recording.reader import Episode, open_episode
@@ -101,7 +101,8 @@ def _repair(path: Path) -> int:
 
 def _line(report: Report) -> str:
     figures = f"{report.frames} rows, {report.rows_cut} cut, {report.torn_bytes} torn bytes"
-    return f"{report.path}: {report.verdict}: {report.problem or figures}"
+    said = "; ".join(filter(None, (figures if report.verdict == "repaired" else "", report.problem)))
+    return f"{report.path}: {report.verdict}: {said or figures}"
 
 
 def _show(path: Path) -> int:

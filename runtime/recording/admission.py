@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
+from runtime.core.types import Float32, UInt8
 from runtime.recording.base import ExecutedTick, RawChunk, Row
 from runtime.recording.layout import Layout
-from runtime.types import Float32, UInt8
 
 _NONE: Mapping[str, UInt8 | None] = MappingProxyType({})
 

@@ -7,7 +7,7 @@ import threading
 from collections import deque
 from typing import NamedTuple
 
-from runtime.types import UInt8
+from runtime.core.types import UInt8
 
 RUN = 4  # repeats that wait together from here on are coded once and copied
 _GUESS_S = 0.03  # of the first frame, on a machine of which nothing is known; rows may come in a burst then

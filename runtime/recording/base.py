@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.types import Float32, Space, UInt8
+from runtime.core.types import Float32, Space, UInt8
 
 ControlSource = Literal["none", "hold", "motion", "policy", "teleop", "estop", "sim", "unknown"]
 Status = Literal["finished", "interrupted", "failed"]
@@ -20,7 +20,7 @@ Status = Literal["finished", "interrupted", "failed"]
 class Row:
     """Row `index` of the dataset grid: the observation assembled and the action sent at one control tick.
 
-    Vectors as in runtime.types.Observation. `captured` holds capture times per stream on our monotonic clock.
+    Vectors as in runtime.core.types.Observation. `captured` holds capture times per stream on our monotonic clock.
     `pictures` has one entry per recorded camera, RGB uint8; None repeats the previous picture (flagged).
     """
 

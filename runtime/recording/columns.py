@@ -10,9 +10,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from runtime.core.types import Float32
 from runtime.recording.base import ExecutedTick, RawChunk, Row
 from runtime.recording.layout import Layout
-from runtime.types import Float32
 
 
 class RecordedRow(NamedTuple):

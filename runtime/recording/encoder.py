@@ -10,14 +10,14 @@ from pathlib import Path
 
 import av
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
+from runtime.core.types import UInt8
 from runtime.recording.backlog import Picture, PictureQueue, codings
 from runtime.recording.digests import rows_of_piece
 from runtime.recording.files import AppendFile, DiskFullError
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.spread import Spread
 from runtime.recording.video import FragmentedVideo
-from runtime.types import UInt8
 
 
 class CameraEncoder:

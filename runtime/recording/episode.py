@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.admission import admit_chunk, admit_row, admit_tick
 from runtime.recording.base import VIDEO_LOST, ExecutedTick, Journal, Loss, Outcome, RawChunk, Record, Row
 from runtime.recording.columns import RecordedRow
@@ -29,7 +29,7 @@ from runtime.recording.files import (
 )
 from runtime.recording.fragments import count_frames
 from runtime.recording.layout import Layout
-from runtime.recording.sealing import MANIFEST, OUTCOME, digest_of, digests_of, sealed
+from runtime.recording.sealing import MANIFEST, digest_of, digests_of, sealed, write_outcome
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.summary import summarise
 from runtime.recording.tables import read_table, rows_schema
@@ -244,8 +244,7 @@ class _Recording:
         try:
             if full is None:
                 self._look_at_losses()
-                conclusion = sealed(self._conclusion(outcome), self._digests(stuck))
-                write_whole(self.folder / OUTCOME, conclusion)
+                write_outcome(self.folder, sealed(self._conclusion(outcome), self._digests(stuck)))
         except DiskFullError as error:
             full = error
         finally:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
-import os
 import unicodedata
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +14,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from runtime.errors import RecordingError
-from runtime.recording.files import disk_fault, document, read_document, write_whole
+from runtime.core.errors import RecordingError
+from runtime.recording.files import alone_in, disk_fault, document, read_document, write_whole
 from runtime.recording.layout import Layout
 from runtime.recording.scrub import require_sound
 from runtime.recording.sealing import read_outcome, told
@@ -91,7 +88,7 @@ def export(folder: Path, root: Path) -> Path:
     if not (folder / "outcome.json").exists():
         raise RecordingError(f"{folder} has no outcome.json: it is being recorded, or wants repair")
     path = place(manifest, root)
-    with _alone(path.parent):
+    with alone_in(path.parent):
         if not is_exported(folder, path):
             require_sound(folder, _FILES)
             write_whole(path, _content(_read(folder, manifest)))
@@ -134,21 +131,6 @@ def slug(text: object, empty: str = "unknown") -> str:
         return name
     mark = hashlib.sha256(words.encode(errors="surrogatepass")).hexdigest()[:8]
     return f"{name}-{mark}" if name else mark
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Nobody else writes into `folder` meanwhile; the kernel lets go however we end."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    except OSError as error:
-        raise disk_fault("creating", folder, error) from error
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def _read(folder: Path, manifest: Mapping[str, object]) -> _Run:

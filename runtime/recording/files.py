@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import math
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.digests import Digest, FileDigest
 
 _FULL = {errno.ENOSPC: "disk full", errno.EDQUOT: "disk quota used up"}
@@ -117,18 +120,62 @@ def require_room(folder: Path, wanted: int) -> None:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Put `data` at `path` so that there is the old file or all of the new one, also after a power cut."""
+    """Put `data` at `path` so that there is the old file or all of the new one, also after a power cut.
+
+    Any number of processes may do so at once: the last one's stays.
+    """
     draft = path.with_name(f".{path.name}.draft")
     try:
-        with open(draft, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(draft, path)
+        with _drafted(draft) as file:
+            try:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+                os.replace(draft, path)
+            except OSError:
+                draft.unlink(missing_ok=True)
+                raise
         sync_folder(path.parent)
     except OSError as error:
-        draft.unlink(missing_ok=True)
         raise disk_fault("writing", path, error) from error
+
+
+@contextmanager
+def _drafted(draft: Path) -> Iterator[BinaryIO]:
+    """The draft, empty and ours alone; what a kill left of one is taken over."""
+    while True:
+        with open(draft, "ab") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if _lies_at(file, draft):
+                file.truncate(0)
+                yield file
+                return
+
+
+def _lies_at(file: BinaryIO, path: Path) -> bool:
+    """Whether that is still its name: another writer may have put it in place."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
+    except FileNotFoundError:
+        return False
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Nobody else who asks for it works in `folder` meanwhile; it is made where it is not there.
+
+    The kernel lets go however we end. Raises RecordingError.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise disk_fault("creating", folder, error) from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def sync_folder(folder: Path) -> None:

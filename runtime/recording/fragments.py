@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 
 import av
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 
 _HEADER = struct.Struct(">I4s")
 _LONG = struct.Struct(">Q")

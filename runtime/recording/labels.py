@@ -7,11 +7,11 @@ import os
 import uuid
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
+from runtime.core.types import Result
 
-Result = Literal["success", "partial", "fail"]
 FOLDER = "labels"
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 
 VECTOR_STREAMS = ("qvel", "effort", "eef", "eef_action")
 FORMAT = 1

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 
+from runtime.core.types import UInt8
 from runtime.recording.codecs import PIXELS
-from runtime.types import UInt8
 
 # What cv2.transform adds up of red, green, blue and 1. It has a fast way for three rows; the first is not needed.
 _COLOURS = np.array(

@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import Any
 
-from runtime.errors import RecordingError
-from runtime.recording.files import disk_fault, document, read_document, sync_folder, write_whole
-from runtime.recording.scrub import Verdict
-
-FOLDER = "quarantine"
+from runtime.recording.files import alone_in, disk_fault, document, sync_folder, write_whole
+from runtime.recording.marks import data_of, mark_file, mark_of
+from runtime.recording.scrub import verify
+from runtime.recording.verdict import Verdict
 
 
 def keep(verdict: Verdict) -> None:
     """Make the mark of an episode in DATA/episodes say what was found; one that is whole again loses it.
 
-    Of an episode that lies elsewhere nothing is kept. RecordingError where the disk does not take it.
+    It stays where the recording is whole by another seal than when it was marked, or has none any more: then nobody can
+    say that its damage is mended. Of an episode that lies elsewhere nothing is kept. RecordingError where the disk does
+    not take it.
     """
-    folder = verdict.path.absolute()
-    if folder.parent.name != "episodes" or verdict.state == "open":
+    data = data_of(verdict.path)
+    if data is None or verdict.state == "open":
         return
-    path = _file(folder.parents[1], folder.name)
-    if verdict.state != "damaged":
-        _remove(path)
-    elif marked(folder.parents[1], folder.name) != (damage := verdict.document()["damage"]):
-        _make(path.parent)
-        told = {"uuid": folder.name, "found": time.time(), "damage": damage}
-        write_whole(path, document(told, "the mark", indent=1))
+    if verdict.state == "damaged":
+        _mark(data, verdict)
+    elif mark_file(data, verdict.path.name).exists():
+        _take_back(data, verdict)
 
 
 def marked(data: Path, uuid: str) -> list[dict[str, Any]]:
@@ -35,41 +34,32 @@ def marked(data: Path, uuid: str) -> list[dict[str, Any]]:
 
     A mark that is none is nothing found: the next scrub makes it anew.
     """
-    try:
-        damage = read_document(_file(data, uuid)).get("damage")
-    except RecordingError:
-        return []
-    return damage if isinstance(damage, list) and all(map(_is_told, damage)) else []
+    mark = mark_of(data, uuid)
+    return mark.damage if mark else []
 
 
-def _is_told(one: object) -> bool:
-    """Whether it is a table of Verdict.document."""
-    if not isinstance(one, dict) or one.keys() != {"file", "what", "rows", "times", "text"}:
-        return False
-    words = all(isinstance(one[name], str) for name in ("file", "what", "text"))
-    return words and _are_spans(one["rows"], int) and _are_spans(one["times"], float)
+def _mark(data: Path, verdict: Verdict) -> None:
+    path, damage = mark_file(data, verdict.path.name), verdict.document()["damage"]
+    with alone_in(path.parent):
+        known = mark_of(data, verdict.path.name)
+        seal = (known.seal if known else None) or verdict.seal  # the first one: that of what was recorded
+        if known is None or (known.damage, known.seal) != (damage, seal):
+            told = {"uuid": verdict.path.name, "found": time.time(), "seal": seal, "damage": damage}
+            write_whole(path, document(told, "the mark", indent=1))
 
 
-def _are_spans(value: object, kind: type) -> bool:
-    """Whether it is a list of first and last."""
-    spans = value if isinstance(value, list) else [None]
-    return all(isinstance(span, list) and [type(end) for end in span] == [kind, kind] for span in spans)
-
-
-def _file(data: Path, uuid: str) -> Path:
-    return data / FOLDER / f"{uuid}.json"
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise disk_fault("creating", folder, error) from error
+def _take_back(data: Path, verdict: Verdict) -> None:
+    """Only after another look: somebody else may have found damage since the one that `verdict` is of."""
+    path = mark_file(data, verdict.path.name)
+    with alone_in(path.parent):
+        mark = mark_of(data, verdict.path.name)
+        if mark and mark.resolved(verify(verdict.path)):
+            _remove(path)
 
 
 def _remove(path: Path) -> None:
     try:
-        path.unlink()
+        os.unlink(path)
         sync_folder(path.parent)
     except FileNotFoundError:
         return

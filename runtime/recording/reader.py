@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.files import read_document
 from runtime.recording.layout import Layout
 from runtime.recording.sealing import OUTCOME, read_outcome, told

@@ -5,37 +5,53 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.base import VIDEO_LOST
 from runtime.recording.episode import lock
-from runtime.recording.files import disk_fault, read_document, sync_folder, write_whole
+from runtime.recording.export import place
+from runtime.recording.files import disk_fault, document, read_document, sync_folder, write_whole
 from runtime.recording.fragments import count_frames, whole_bytes
 from runtime.recording.layout import Layout
+from runtime.recording.marks import data_of
 from runtime.recording.reader import read_events
 from runtime.recording.scrub import verify
-from runtime.recording.sealing import MANIFEST, OUTCOME, digests_of, read_outcome, sealed
+from runtime.recording.sealing import (
+    MANIFEST,
+    OUTCOME,
+    SEAL,
+    SECOND,
+    digests_of,
+    read_outcome,
+    sealed,
+    write_outcome,
+)
 from runtime.recording.summary import summarise
 from runtime.recording.tables import SCHEMAS, read_table, write_table
+from runtime.recording.verdict import Verdict
 
 REASON = "the recorder ended without closing the episode"
 UNCUT = "rows.uncut.arrow"  # the rows as they were found, where any had to go
+PLAN = ".repair.json"  # how the episode was found, as long as its repair is under way
+UNPROVABLE = "its outcome is lost, and with it whether its files are as they were recorded"
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
     """What a repair found and did.
 
-    "complete": had an outcome, nothing done. "damaged": had one too, and `problem` is what is not as it was recorded,
-    which nobody can mend. "repaired": has one now. "recording": is being written right
-    now, nothing done. "unreadable": no manifest to go by, nothing done. "failed": `problem` stopped it.
+    "complete": had an outcome, nothing done. "restored": has its outcome back from its copy; `problem` is what had
+    become of it. "damaged": had one, and `problem` is what is not as it was recorded; nothing done, nobody can mend it.
+    "repaired": has one now; `problem` is what nobody can say any more of one that had been closed before. "recording":
+    is being written right now, nothing done. "unreadable": no manifest to go by, nothing done. "failed": `problem`
+    stopped it.
     """
 
     path: Path
-    verdict: Literal["complete", "damaged", "repaired", "recording", "unreadable", "failed"]
+    verdict: Literal["complete", "restored", "damaged", "repaired", "recording", "unreadable", "failed"]
     problem: str = ""
     frames: int = 0  # rows that have a frame in every video
     rows_cut: int = 0  # whole rows without a frame in every video
@@ -47,6 +63,9 @@ class Report:
 
 def repair(path: Path) -> Report:
     """Complete the episode in folder `path` where it has no outcome; running it again changes nothing.
+
+    One that had an outcome gets that back from its copy, where its files are as that says, and is left alone where they
+    are not, or where it is marked as damaged: what was changed is never sealed as what was recorded.
 
     Rows without a frame in every video are cut, but for cameras whose video had ended before; the table as found stays
     beside as rows.uncut.arrow. Videos are never re-encoded: only a torn fragment at their end is cut. RecordingError
@@ -81,70 +100,135 @@ def _attempt(folder: Path) -> Report:
 def _judge(path: Path) -> Report:
     try:
         layout = Layout.of(read_document(path / MANIFEST))
-        if (path / OUTCOME).exists():
-            return _closed(path)
+        found = verify(path)
+        if found.state != "open" or (path / SECOND).exists():
+            return _closed(path, found)
     except RecordingError as error:
         return Report(path, "unreadable", str(error))
     return _complete(path, layout)
 
 
-def _closed(path: Path) -> Report:
-    found = verify(path)
+def _closed(path: Path, found: Verdict) -> Report:
+    """Nothing is mended but the outcome, from its copy, or that copy, where all other files are as they say."""
+    restored = ""
+    if found.state in ("open", "damaged") and (whole := _whole_outcome(path, found)):
+        write_outcome(path, whole)
+        restored, found = found.text, verify(path)
     if found.state == "damaged":
         return Report(path, "damaged", found.text)
+    (path / PLAN).unlink(missing_ok=True)
     frames = read_outcome(path).get("frames")
-    return Report(path, "complete", frames=frames if isinstance(frames, int) else 0)
+    verdict: Literal["restored", "complete"] = "restored" if restored else "complete"
+    return Report(path, verdict, restored, frames=frames if isinstance(frames, int) else 0)
+
+
+def _whole_outcome(path: Path, found: Verdict) -> bytes | None:
+    """The one of its two files that is as it was sealed, where nothing but the other one is damaged; None else."""
+    if {one.file for one in found.damage} - {OUTCOME, SECOND}:
+        return None
+    whole = {}
+    for name in (OUTCOME, SECOND):
+        try:
+            if SEAL in read_outcome(path, name):
+                whole[name] = (path / name).read_bytes()
+        except RecordingError:
+            continue
+    return next(iter(whole.values())) if len(whole) == 1 else None
 
 
 def _complete(path: Path, layout: Layout) -> Report:
-    ended = max(file.stat().st_mtime for file in path.iterdir())
-    videos, torn_video = _mend_videos(path, layout)
-    torn_lines, lost = _mend_events(path)
+    found = _found(path, layout)
+    videos = _mend_videos(path, layout)
+    lost = _mend_events(path)
     going = [frames for camera, frames in videos.items() if camera not in lost]
-    frames, cut, torn_tables = _mend_tables(path, layout, going)
-    report = Report(path, "repaired", "", frames, cut, videos, torn_video + torn_tables, torn_lines, lost)
-    write_whole(path / OUTCOME, sealed(_outcome(report, layout, ended), digests_of(path, layout)))
+    frames = _mend_tables(path, layout, going)
+    cut = found.rows - frames
+    report = Report(
+        path, "repaired", found.unproven, frames, cut, videos, found.torn_bytes, found.torn_lines, lost
+    )
+    write_outcome(path, sealed(_outcome(report, layout, found.ended), digests_of(path, layout)))
+    (path / PLAN).unlink()
     return report
 
 
-def _mend_videos(path: Path, layout: Layout) -> tuple[dict[str, int], int]:
-    """Frames per camera, and the torn bytes cut from the ends."""
-    frames, torn = {}, 0
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """The episode as it lay there before anything was mended, for who goes on where a repair was killed."""
+
+    ended: float  # when it was last written [Unix s]
+    rows: int
+    torn_bytes: int
+    torn_lines: int
+    unproven: str  # what nobody can say of it any more
+
+
+def _found(path: Path, layout: Layout) -> _Found:
+    """As an earlier attempt wrote it down, else measured and written down now."""
+    plan = path / PLAN
+    if plan.exists():
+        try:
+            return _Found(**read_document(plan))  # type: ignore[arg-type]
+        except TypeError as error:
+            raise RecordingError(f"{plan} is none of repair's: {error}. Remove it") from error
+    found = _measured(path, layout)
+    write_whole(plan, document(asdict(found), "the plan of a repair"))
+    return found
+
+
+def _measured(path: Path, layout: Layout) -> _Found:
+    ended = max(file.stat().st_mtime for file in path.iterdir() if not file.name.startswith("."))  # no drafts
+    tables = [read_table(path / f"{name}.arrow", schema(layout)) for name, schema in SCHEMAS.items()]
+    torn = sum(_torn(path / f"{camera}.mp4") for camera in layout.cameras)
+    torn += sum(table.torn_bytes for table in tables)
+    rows = tables[list(SCHEMAS).index("rows")].table.num_rows
+    closed = all(table.closed for table in tables)
+    return _Found(ended, rows, torn, read_events(path / "events.jsonl").torn, _unproven(path, closed))
+
+
+def _unproven(path: Path, closed: bool) -> str:
+    """What nobody can say any more of an episode that was closed once, "" where nothing tells that it was."""
+    data = data_of(path)
+    table = place(read_document(path / MANIFEST), data) if data else None
+    if table is not None and table.exists():
+        return f"{UNPROVABLE}: it was closed, for {table} was made of it"
+    return f"{UNPROVABLE}: all its tables were ended, which is done when it is closed" if closed else ""
+
+
+def _torn(video: Path) -> int:
+    """Bytes behind the last whole fragment."""
+    end = whole_bytes(video) if video.exists() else 0
+    return video.stat().st_size - end if end else 0
+
+
+def _mend_videos(path: Path, layout: Layout) -> dict[str, int]:
+    """Frames per camera."""
+    frames = {}
     for camera in layout.cameras:
         video = path / f"{camera}.mp4"
-        torn += _cut_fragment(video)
+        if torn := _torn(video):
+            with open(video, "r+b") as file:
+                file.truncate(video.stat().st_size - torn)
+                os.fsync(file.fileno())
         frames[camera] = count_frames(video) if video.exists() else 0
-    return frames, torn
+    return frames
 
 
-def _cut_fragment(video: Path) -> int:
-    if not video.exists() or (end := whole_bytes(video)) == 0:
-        return 0
-    torn = video.stat().st_size - end
-    if torn:
-        with open(video, "r+b") as file:
-            file.truncate(end)
-            os.fsync(file.fileno())
-    return torn
-
-
-def _mend_tables(path: Path, layout: Layout, videos: Sequence[int]) -> tuple[int, int, int]:
-    """Common number of rows and frames in videos of so many, whole rows cut, torn bytes cut."""
-    torn = frames = cut = 0
+def _mend_tables(path: Path, layout: Layout, videos: Sequence[int]) -> int:
+    """Common number of rows and frames in videos of so many."""
+    frames = 0
     for name, schema in SCHEMAS.items():
         file = path / f"{name}.arrow"
         read = read_table(file, schema(layout))
         table = read.table
-        torn += read.torn_bytes
         if name == "rows":
             frames = min([table.num_rows, *videos])
-            cut = table.num_rows - frames
             table = table.slice(0, frames)
-        if name == "rows" and cut:
+        cut = read.table.num_rows - table.num_rows
+        if cut:
             _keep_uncut(path)
         if cut or not read.closed:
             write_table(file, table)
-    return frames, cut, torn
+    return frames
 
 
 def _keep_uncut(path: Path) -> None:
@@ -153,14 +237,14 @@ def _keep_uncut(path: Path) -> None:
         sync_folder(path)
 
 
-def _mend_events(path: Path) -> tuple[int, dict[str, str]]:
-    """Torn lines, and the cameras whose video had ended, with what was said of it."""
+def _mend_events(path: Path) -> dict[str, str]:
+    """The cameras whose video had ended, with what was said of it."""
     log = path / "events.jsonl"
     events = read_events(log)
     if events.torn or not log.exists():
         write_whole(log, b"".join(line + b"\n" for line in events.lines))
     said = [json.loads(line) for line in events.lines]
-    return events.torn, {
+    return {
         str(event["data"]["camera"]): str(event["text"]) for event in said if event.get("kind") == VIDEO_LOST
     }
 
@@ -169,7 +253,8 @@ def _outcome(report: Report, layout: Layout, ended: float) -> dict[str, object]:
     summary = summarise(report.path / "rows.arrow", layout, report.frames)
     return {
         "status": "interrupted",
-        "reason": f"{REASON}; {report.frames} rows kept, {report.rows_cut} without a frame cut",
+        "reason": f"{REASON}; {report.frames} rows kept, {report.rows_cut} without a frame cut"
+        + (f"; {report.problem}" if report.problem else ""),
         "ended_wall": ended,
         **summary.fields(),
         "rows": report.frames,
@@ -181,5 +266,6 @@ def _outcome(report: Report, layout: Layout, ended: float) -> dict[str, object]:
             "rows_cut": report.rows_cut,
             "torn_bytes": report.torn_bytes,
             "torn_lines": report.torn_lines,
+            **({"unproven": report.problem} if report.problem else {}),
         },
     }

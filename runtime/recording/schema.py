@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from runtime.errors import RecordingError
-from runtime.types import Observation
+from runtime.core.errors import RecordingError
+from runtime.core.types import Observation
 
 
 @dataclass(frozen=True, slots=True)

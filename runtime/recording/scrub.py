@@ -6,122 +6,93 @@ import errno
 import hashlib
 import os
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.digests import FileDigest
 from runtime.recording.files import disk_fault, read_document
-from runtime.recording.reader import open_episode
-from runtime.recording.sealing import DIGESTS, MANIFEST, OUTCOME, read_outcome
-
-UNSEALED = (
-    "it is from before recordings had digests: nobody can say whether its files are as they were written"
-)
-
-State = Literal["sound", "damaged", "unsealed", "open"]
-
-
-@dataclass(frozen=True, slots=True)
-class Damage:
-    """What is wrong with one file of an episode, and in which rows; of events.jsonl in which lines."""
-
-    file: str
-    what: str
-    rows: tuple[tuple[int, int], ...] = ()  # first and last, both included
-    times: tuple[
-        tuple[float, float], ...
-    ] = ()  # of these rows [s since the episode began], where that is known
-
-    @property
-    def text(self) -> str:
-        """For a person."""
-        unit = "lines" if self.file.endswith(".jsonl") else "rows"
-        spans = [f"{first} to {last}" for first, last in self.rows]
-        times = [f"{first:.2f} to {last:.2f}" for first, last in self.times]
-        where = f", {unit} {', '.join(spans)}" if spans else ""
-        return f"{self.file} {self.what}{where}" + (f" ({', '.join(times)} s)" if times else "")
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """Of one episode. "unsealed": it has no digests. "open": it is being recorded, or wants repair."""
-
-    path: Path
-    state: State
-    damage: tuple[Damage, ...] = ()
-    bytes: int = 0  # that were read
-
-    @property
-    def text(self) -> str:
-        """For a person."""
-        said = {
-            "sound": "every file is as it was recorded",
-            "unsealed": UNSEALED,
-            "open": "it has no outcome: it is being recorded, or wants repair",
-            "damaged": "; ".join(one.text for one in self.damage),
-        }
-        return said[self.state]
-
-    def document(self) -> dict[str, Any]:
-        """As JSON."""
-        damage = [
-            {
-                "file": one.file,
-                "what": one.what,
-                "rows": [list(span) for span in one.rows],
-                "times": [list(span) for span in one.times],
-                "text": one.text,
-            }
-            for one in self.damage
-        ]
-        return {"episode": self.path.name, "state": self.state, "bytes": self.bytes, "damage": damage}
-
-
-class DamagedError(RecordingError):
-    """A recording is not what was recorded."""
-
-    def __init__(self, verdict: Verdict) -> None:
-        self.verdict = verdict
-        super().__init__(
-            f"{verdict.path} is damaged: {verdict.text}. It is left as it is and never published; bring its files "
-            "back from a copy"
-        )
+from runtime.recording.marks import standing
+from runtime.recording.readable import unreadable
+from runtime.recording.sealing import COPY, DIGESTS, MANIFEST, OUTCOME, SEAL, SECOND, read_outcome
+from runtime.recording.verdict import Damage, DamagedError, State, Verdict
 
 
 def verify(folder: Path, files: Collection[str] = ()) -> Verdict:
     """Read the files of the episode in `folder`, all or `files`; RecordingError where it is none, or closed to us."""
     if not (folder / OUTCOME).exists():
-        if not (folder / MANIFEST).exists():
-            raise RecordingError(f"{folder} is no episode: there is no {MANIFEST} in it")
-        return Verdict(folder, "open")
+        return _without_outcome(folder)
     try:
         outcome = read_outcome(folder)
     except RecordingError as error:
-        return Verdict(folder, "damaged", (Damage(OUTCOME, f"is damaged: {error}"),))
+        return _by_second(folder, Damage(OUTCOME, f"is damaged: {error}"))
+    if DIGESTS in outcome:
+        return _compared(folder, outcome, files)
+    if (folder / SECOND).exists():
+        return _by_second(folder, Damage(OUTCOME, f"has lost its digests: there is {SECOND}"))
+    damage = () if files else unreadable(folder)
+    return Verdict(folder, "damaged" if damage else "unsealed", damage)
+
+
+def _without_outcome(folder: Path) -> Verdict:
+    """Open, as far as anything here tells."""
+    if (folder / SECOND).exists():
+        found = _by_second(folder, Damage(OUTCOME, "is absent, and was there"))
+        if found.seal and len(found.damage) == 1:
+            why = f"it has no outcome, and a whole copy of it, {SECOND}: repair brings it back"
+            return Verdict(folder, "open", bytes=found.bytes, seal=found.seal, why=why)
+        return found
+    damage = standing(Verdict(folder, "open"))
+    if not damage and not (folder / MANIFEST).exists():
+        raise RecordingError(f"{folder} is no episode: there is no {MANIFEST} in it")
+    return Verdict(folder, "damaged" if damage else "open", damage)
+
+
+def _by_second(folder: Path, lost: Damage) -> Verdict:
+    """That of an episode whose outcome is `lost`, and what the copy of that says of the other files."""
+    if not (folder / SECOND).exists():
+        return Verdict(folder, "damaged", (lost,))
+    try:
+        outcome = read_outcome(folder, SECOND)
+    except RecordingError as error:
+        return Verdict(folder, "damaged", (lost, Damage(SECOND, f"is damaged: {error}")))
     if DIGESTS not in outcome:
-        return Verdict(folder, "unsealed") if files else _unsealed(folder)
+        return Verdict(folder, "damaged", (lost, Damage(SECOND, "is no copy of an outcome")))
+    found = _compared(folder, outcome, (), second=False)
+    return Verdict(folder, "damaged", (lost, *found.damage), found.bytes, found.seal)
+
+
+def _compared(
+    folder: Path, outcome: Mapping[str, Any], files: Collection[str], second: bool = True
+) -> Verdict:
+    """All files, or `files`, against their digests; all files include, if `second`, the copy of the outcome."""
     manifest = _manifest(folder)
     digests = {name: told for name, told in outcome[DIGESTS].items() if not files or name in files}
     found = [_damage(folder / name, digest, manifest) for name, digest in digests.items()]
+    found += [_second(folder)] if second and not files and COPY in outcome else []
     damage = tuple(one for one in found if one is not None)
     size = sum(digest["bytes"] for digest in digests.values())
-    return Verdict(folder, "damaged" if damage else "sound", damage, size)
+    repair = outcome.get("repair")
+    why = str(repair.get("unproven", "")) if isinstance(repair, Mapping) else ""
+    state: State = "damaged" if damage else "unsealed" if why else "sound"
+    return Verdict(folder, state, damage, size, str(outcome[SEAL]), repair is not None, why)
 
 
-def _unsealed(folder: Path) -> Verdict:
-    """Without digests only what cannot be read at all is known to be damaged."""
+def _second(folder: Path) -> Damage | None:
     try:
-        open_episode(folder)
-    except RecordingError as error:
-        return Verdict(folder, "damaged", (Damage(OUTCOME, f"has no digests, and {error}"),))
-    return Verdict(folder, "unsealed")
+        same = (folder / SECOND).read_bytes() == (folder / OUTCOME).read_bytes()
+    except OSError as error:
+        return Damage(SECOND, f"cannot be read: {error.strerror}")
+    return None if same else Damage(SECOND, f"is not the copy of {OUTCOME} that it was")
 
 
 def require_sound(folder: Path, files: Collection[str] = ()) -> Verdict:
-    """As `verify`; DamagedError where a file is not what was recorded."""
+    """As `verify`; DamagedError where a file is not what was recorded, or was found not to be and nothing says that
+    this is mended.
+    """
     verdict = verify(folder, files)
+    if verdict.state in ("sound", "unsealed") and (damage := standing(verdict)):
+        verdict = Verdict(folder, "damaged", damage, verdict.bytes, verdict.seal)
     if verdict.state == "damaged":
         raise DamagedError(verdict)
     return verdict
@@ -141,7 +112,7 @@ def episodes_in(path: Path) -> list[Path]:
 
 
 def _is_episode(folder: Path) -> bool:
-    return any((folder / name).is_file() for name in (MANIFEST, OUTCOME))
+    return any((folder / name).is_file() for name in (MANIFEST, OUTCOME, SECOND))
 
 
 def _damage(path: Path, digest: FileDigest, manifest: Mapping[str, object]) -> Damage | None:

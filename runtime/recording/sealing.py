@@ -9,15 +9,18 @@ from typing import Any
 
 import pyarrow as pa
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.digests import Digest, FileDigest, rows_of_piece
-from runtime.recording.files import document, read_document
+from runtime.recording.files import document, read_document, write_whole
 from runtime.recording.fragments import fragments
 from runtime.recording.layout import Layout
 from runtime.recording.tables import SCHEMAS
 
 MANIFEST, OUTCOME = "manifest.json", "outcome.json"
-DIGESTS, SEAL = "digests", "seal"  # keys of the outcome
+SECOND = (
+    "sealed.json"  # the outcome once more, byte by byte: what tells a lost one from none, and brings it back
+)
+DIGESTS, SEAL, COPY = "digests", "seal", "copy"  # keys of the outcome
 _UNSEALED = b"0" * hashlib.sha256().digest_size * 2
 
 
@@ -44,18 +47,24 @@ def _counts(path: Path, layout: Layout) -> bool:
 
 def sealed(outcome: Mapping[str, object], digests: Mapping[str, FileDigest]) -> bytes:
     """outcome.json: with the digests of the files, and last that of itself, taken with zeros in its place."""
-    whole = {**outcome, DIGESTS: digests, SEAL: _UNSEALED.decode()}
+    whole = {**outcome, COPY: SECOND, DIGESTS: digests, SEAL: _UNSEALED.decode()}
     text = document(whole, "the outcome", indent=1)
     before, _, after = text.rpartition(_UNSEALED)
     return before + hashlib.sha256(text).hexdigest().encode() + after
 
 
-def read_outcome(folder: Path) -> dict[str, Any]:
+def write_outcome(folder: Path, text: bytes) -> None:
+    """Put the sealed outcome at its two places; with outcome.json, which comes last, the episode is closed."""
+    for name in (SECOND, OUTCOME):
+        write_whole(folder / name, text)
+
+
+def read_outcome(folder: Path, name: str = OUTCOME) -> dict[str, Any]:
     """The outcome of an episode; RecordingError where it is absent, torn, or not as it was sealed.
 
-    One from before there were digests has none, and no seal.
+    One from before there were digests has none, and no seal. `name` is that of either of its files.
     """
-    path = folder / OUTCOME
+    path = folder / name
     outcome = read_document(path)
     if DIGESTS not in outcome and SEAL not in outcome:
         return outcome
@@ -69,7 +78,7 @@ def read_outcome(folder: Path) -> dict[str, Any]:
 
 def told(outcome: Mapping[str, object]) -> dict[str, object]:
     """An outcome without its digests, for who copies it to where they mean nothing."""
-    return {name: value for name, value in outcome.items() if name not in (DIGESTS, SEAL)}
+    return {name: value for name, value in outcome.items() if name not in (COPY, DIGESTS, SEAL)}
 
 
 def _parts(path: Path) -> Iterator[tuple[bytes, int]]:

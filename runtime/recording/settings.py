@@ -7,15 +7,15 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from runtime.errors import ConfigurationError
+from runtime.core.errors import ConfigurationError
+from runtime.core.settings import Settings
 from runtime.recording.codecs import CODECS, CodecName
-from runtime.section import Section
 
 Height = Annotated[int, Field(ge=32, le=4320, multiple_of=2)]
 _GOP_SECONDS, _GOP = 0.5, 15
 
 
-class RecordingSettings(Section):
+class RecordingSettings(Settings):
     """The `recording` table of a deployment file."""
 
     codec: CodecName = "libx264"

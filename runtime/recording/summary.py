@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.columns import spread
 from runtime.recording.layout import Layout
 

@@ -9,7 +9,7 @@ import av
 import numpy as np
 from av.video.frame import PictureType
 
-from runtime.errors import ConfigurationError
+from runtime.core.errors import ConfigurationError
 from runtime.recording.codecs import CODECS, PIXELS, options, set_up
 from runtime.recording.ordinary import ordinary_threads
 from runtime.recording.settings import RecordingSettings

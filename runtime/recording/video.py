@@ -12,6 +12,7 @@ import numpy as np
 from av.video.frame import PictureType
 from av.video.reformatter import ColorRange, Colorspace
 
+from runtime.core.types import UInt8
 from runtime.recording import codecs
 from runtime.recording.backlog import RUN
 from runtime.recording.files import AppendFile
@@ -19,7 +20,6 @@ from runtime.recording.fragments import frames_in
 from runtime.recording.ordinary import ordinary_threads
 from runtime.recording.planes import planes
 from runtime.recording.settings import RecordingSettings
-from runtime.types import UInt8
 
 FRAGMENT_SECONDS = 0.2  # what a kill can take
 _FRAGMENTS = "frag_keyframe+empty_moov+default_base_moof"

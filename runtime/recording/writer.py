@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.digests import FileDigest
 from runtime.recording.files import AppendFile, DiskFullError, require_room, sync_folder
 from runtime.recording.layout import Layout

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from robots import Robot
 from robots.clearance import Clearance
-from runtime.types import Float64
+from runtime.core.types import Float64
 
 _NEARER = 1e-6  # [m] that is rounding
 

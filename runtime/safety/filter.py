@@ -8,11 +8,11 @@ from typing import Literal
 
 import numpy as np
 
-from runtime.collision import Collision, Collisions
-from runtime.limits import Limits
-from runtime.motion import Brake
-from runtime.safety_settings import SafetySettings, WorkspaceBox
-from runtime.types import Float64
+from runtime.core.types import Float64
+from runtime.motion.trajectories import Brake
+from runtime.safety.collision import Collision, Collisions
+from runtime.safety.limits import Limits
+from runtime.safety.settings import SafetySettings, WorkspaceBox
 
 __all__ = [
     "Limits",
@@ -121,7 +121,7 @@ class SafetyFilter:
         return self._warned(self._changed(action, reachable, notes) if notes else Verdict(reachable), path)
 
     def _refusal(self, action: Float64, state: RobotState, path: Path) -> str:
-        blind = self._blind(state)
+        blind = self.blind(state)
         if path == "motion":  # of ours: needs no pictures
             return blind or self._place(action, state, path) or self._runs_away(action, state)
         return (
@@ -132,7 +132,8 @@ class SafetyFilter:
             or self._jumps(action, state)
         )
 
-    def _blind(self, state: RobotState) -> str:
+    def blind(self, state: RobotState) -> str:
+        """Why nobody knows where the robot is, "" where that is known."""
         allowed = self._settings.joint_age_s
         if state.doubt or state.joint_age <= allowed:
             return state.doubt

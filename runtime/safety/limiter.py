@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runtime.limits import Limits
-from runtime.safety_settings import SafetySettings
-from runtime.types import Float64
+from runtime.core.types import Float64
+from runtime.safety.limits import Limits
+from runtime.safety.settings import SafetySettings
 
 _MARGIN = 1.05  # rounding, and ticks that are not alike, are no excess
 _TOLERANCE = 1e-6  # [rad, or what a gripper's travel is worth]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runtime.types import Float64
+from runtime.core.types import Float64
 
 # At the default 60 rad/s2 a gripper then covers its travel from rest to rest in 0.1 s, as real ones do.
 GRIPPER_TRAVEL = 6.7

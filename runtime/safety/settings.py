@@ -7,10 +7,10 @@ from typing import Literal
 from pydantic import Field
 
 from robots.clearance import MARGIN
-from runtime.section import Section
+from runtime.core.settings import Settings
 
 
-class WorkspaceBox(Section):
+class WorkspaceBox(Settings):
     """A box in an arm's declared frame that its end effector must stay in [m]."""
 
     lower: list[float] = Field(min_length=3, max_length=3)
@@ -19,7 +19,7 @@ class WorkspaceBox(Section):
     """Corner with the largest x, y and z."""
 
 
-class SafetySettings(Section):
+class SafetySettings(Settings):
     """Limits on every action; the defaults come from what a real demonstration reaches."""
 
     report_only: bool = False

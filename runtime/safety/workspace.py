@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robots import Robot
-from runtime.safety import WorkspaceBox
-from runtime.types import Float64
+from runtime.core.types import Float64
+from runtime.safety.filter import WorkspaceBox
 
 
 class Workspace:

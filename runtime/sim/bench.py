@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.errors import RuntimeFault
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Float64
 from runtime.sim.eyes import Eye, wrist_eye
 from runtime.sim.limbs import limbs
-from runtime.types import Float64
 
 if TYPE_CHECKING:
     from robots import Camera, Group, Robot

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from runtime.core.types import Float64
 from runtime.sim.bench import BlockState
-from runtime.types import Float64
 
 GRAVITY = 9.81  # m/s^2
 _LEVELLING = 0.03  # s, the time constant with which a block that touches down on an edge drops on its face

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-from runtime.types import UInt8
+from runtime.core.types import UInt8
 
 _TRICKLE_S = 0.02
 FAULTS = {

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.clock import Clock, MonotonicClock
-from runtime.errors import SetupError
+from runtime.core.clock import Clock, MonotonicClock
+from runtime.core.errors import SetupError
+from runtime.core.types import Float32, Float64, UInt8
 from runtime.sim.bench import Belt, Bench
 from runtime.sim.pick_place import ScriptError
 from runtime.sim.postures import Postures
 from runtime.sim.script import Answer, Script
 from runtime.sim.sight import Overhead
-from runtime.types import Float32, Float64, UInt8
 
 if TYPE_CHECKING:
     from robots import Group, Robot

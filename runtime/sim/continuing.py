@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from runtime.types import Float32, Float64
+from runtime.core.types import Float32, Float64
 
 if TYPE_CHECKING:
     from robots import Robot

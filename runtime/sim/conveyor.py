@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from runtime.core.types import Float64
 from runtime.sim.bench import Belt, Bench, BenchError, Layout
 from runtime.sim.course import Course, course_of
 from runtime.sim.tabletop import Reset, Tabletop
-from runtime.types import Float64
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from runtime.core.types import Float64
 from runtime.sim.bench import Belt, BenchError
-from runtime.types import Float64
 
 SPEED = (0.06, 0.10)  # m/s, of a stroke
 SHORTEST = 0.10  # m, of a stroke

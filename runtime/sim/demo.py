@@ -13,9 +13,9 @@ from types import FrameType
 from typing import Any
 
 from robots.broken_pipe import unread_ends
-from runtime import deployment
-from runtime.errors import RuntimeFault, SetupError
-from runtime.headless import RESULT_NAME
+from runtime.clients.headless import RESULT_NAME
+from runtime.config import loader as deployment
+from runtime.core.errors import RuntimeFault, SetupError
 
 _DEPLOYMENT = Path(__file__).parents[2] / "deployments" / "demo.toml"
 _READY_S = 30.0

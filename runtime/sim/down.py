@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runtime.types import Float64
+from runtime.core.types import Float64
 
 _STRIDE, _SWING = 0.04, 0.25  # m and rad between two points of a way, at most
 

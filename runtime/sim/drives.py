@@ -15,7 +15,7 @@ from typing import Any
 import zmq
 
 from robots.broken_pipe import unread_ends
-from runtime import codecs
+from runtime.core import msgpack_arrays as codecs
 from runtime.transports.node_messages import DRIVE_FAULT_LENGTH, DRIVE_FAULTS_LIMIT
 
 WORDS = ("drives_disable", "drives_enable", "drives_fault")

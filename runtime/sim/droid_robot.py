@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
+from runtime.core.types import Float32, Float64, UInt8
 from runtime.sim.bench import camera_arm
-from runtime.types import Float32, Float64, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot

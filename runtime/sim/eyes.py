@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robots import scene_of
+from runtime.core.types import Float64
 from runtime.sim.limbs import limbs
-from runtime.types import Float64
 
 if TYPE_CHECKING:
     from robots import Robot, RobotScene

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import numpy as np
 
-from runtime import codecs
-from runtime.clock import ClockMap
-from runtime.errors import CodecError
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import ClockMap
+from runtime.core.errors import CodecError
+from runtime.core.types import Float64
 from runtime.sim import drives
 from runtime.sim.tabletop import Reset
-from runtime.types import Float64
 
 if TYPE_CHECKING:
     from robots import Robot

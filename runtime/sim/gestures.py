@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.types import Float32, Float64
+from runtime.core.types import Float32, Float64
 
 if TYPE_CHECKING:
     from robots import Robot

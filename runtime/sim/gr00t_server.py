@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import zmq
 
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
+from runtime.core.types import Float32, Float64, UInt8
 from runtime.sim import gr00t_wire as wire
 from runtime.sim.faults import NONE, TOO_LARGE, Fault
 from runtime.sim.script import Answer, Script, Waving
-from runtime.types import Float32, Float64, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot
 
-Version = Literal["n1.5", "n1.6", "n1.7"]
+Version = Literal["n1.5", "n1.6", "n1.7", "n1.7-early", "starvla"]
 
 _LATE = 3.0  # s
 _SPELL_MS = 20
@@ -36,6 +36,8 @@ class Gr00tBehaviour:
     """How the server answers: rows per chunk, their rate [Hz], time of an inference [s], what goes wrong.
 
     `flat` is what --use-sim-policy-wrapper makes of N1.6 and N1.7. `seen` are the steps of which it wants pictures.
+    "n1.7-early" is N1.7's early access, which reads MNP alone; "starvla" StarVLA's server of this protocol, which has
+    no modality configurations.
     """
 
     version: Version = "n1.6"
@@ -119,7 +121,7 @@ class Gr00tServer:
         """The frames that answer; None where the connection is to end without."""
         fault = self._behaviour.fault
         try:
-            message = wire.unpacked(payload)
+            message = wire.unpacked(payload, self._behaviour.version != "n1.7-early", self._modern)
             endpoint, reply = str(message.get("endpoint", "get_action")), self._result(message)
         except Exception as error:  # a policy's errors are told to the client, as GR00T does it
             self.failures.append(str(error))
@@ -131,7 +133,12 @@ class Gr00tServer:
             spoilt = self._spoilt_frames()
             if spoilt is not _RIGHT:
                 return spoilt
-        return [wire.packed(reply, self._behaviour.version == "n1.7", fault.name == "bad_array_dialect")]
+        return [wire.packed(reply, self._modern, fault.name == "bad_array_dialect")]
+
+    @property
+    def _modern(self) -> bool:
+        """Whether it knows MNP, which it then answers in."""
+        return self._behaviour.version.startswith("n1.7")
 
     def _spoilt_frames(self) -> list[bytes] | None:
         """What the fault sends in place of an answer; `_RIGHT` where the answer itself is right."""
@@ -165,12 +172,22 @@ class Gr00tServer:
         if endpoint == "ping":
             return {"status": "ok", "message": "Server is running"}
         if endpoint == "get_modality_config":
-            return self._modalities()
+            return self._contract() if behaviour.version == "starvla" else self._modalities()
         if endpoint == "reset":
             self._answer = None
-            return {}
+            return {"ok": True} if behaviour.version == "starvla" else {}
         self.requests = [*self.requests[-99:], dict(message)]
         return self._action(message["data"])
+
+    def _contract(self) -> dict[str, object]:
+        """What StarVLA's says: keys with their prefix, and how many numbers each has; nothing of pictures."""
+        groups: dict[str, object] = {group.name: len(group.joints) for group in self._robot.groups}
+        actions = {"poses": self._script.metadata["action_dim"]} if self._in_poses else groups
+        said: dict[str, object] = {"unnorm_key": "stand_in"}
+        for name, widths in (("state", groups), ("action", actions)):
+            prefixed = {f"{name}.{key}": width for key, width in widths.items()}
+            said |= {f"{name}_keys": list(prefixed), f"{name}_key_dims": prefixed}
+        return said
 
     def _modalities(self) -> dict[str, object]:
         cameras = [camera.key for camera in self._robot.cameras]

@@ -41,17 +41,17 @@ def packed(value: object, modern: bool, foreign: bool = False) -> bytes:
     return made
 
 
-def unpacked(payload: bytes) -> Any:
-    """The value of one message, with arrays of both forms."""
-    return msgpack.unpackb(payload, object_hook=_read)
+def unpacked(payload: bytes, npy: bool = True, mnp: bool = True) -> Any:
+    """The value of one message, with arrays of the forms that the server reads; others stay maps, as with GR00T's."""
 
+    def read(fields: dict[Any, Any]) -> object:
+        if npy and "__ndarray_class__" in fields:
+            return np.load(io.BytesIO(fields["as_npy"]), allow_pickle=False)
+        if mnp and fields.get(b"nd") is True and fields[b"kind"] == b"":
+            return np.ndarray(fields[b"shape"], fields[b"type"], buffer=fields[b"data"])
+        return fields
 
-def _read(fields: dict[Any, Any]) -> object:
-    if "__ndarray_class__" in fields:
-        return np.load(io.BytesIO(fields["as_npy"]), allow_pickle=False)
-    if fields.get(b"nd") is True and fields[b"kind"] == b"":
-        return np.ndarray(fields[b"shape"], fields[b"type"], buffer=fields[b"data"])
-    return fields
+    return msgpack.unpackb(payload, object_hook=read)
 
 
 def _file(array: np.ndarray[Any, Any], pickled: bool = False) -> dict[str, object]:

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from runtime.core.types import Float64
 from runtime.sim.block import Block
 from runtime.sim.hands import FINGER_RADIUS, Hand
-from runtime.types import Float64
 
 TILT = math.radians(25.0)  # beyond which an arm does not come from above: the block slips
 TURN = math.radians(30.0)  # between jaws and block, beyond which the jaws meet its corners: it slips

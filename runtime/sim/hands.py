@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from runtime.core.types import Float64
 from runtime.sim.bench import BenchError
 from runtime.sim.limbs import limbs
-from runtime.types import Float64
 
 if TYPE_CHECKING:
     from robots import Gripper, Group, Robot

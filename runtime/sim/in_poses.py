@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import ValidationError
 
-from runtime.errors import RuntimeFault, SetupError
-from runtime.formats import PoseRows
-from runtime.pose_format import PoseFormat
+from runtime.core.errors import RuntimeFault, SetupError
+from runtime.core.pose_format import PoseFormat
+from runtime.core.types import EEF_WIDTH, Float32, Float64, UInt8
 from runtime.sim.script import Answer, Script
-from runtime.types import EEF_WIDTH, Float32, Float64, UInt8
+from runtime.spaces.pose_rows import PoseRows
 
 if TYPE_CHECKING:
     from robots import Group, Robot

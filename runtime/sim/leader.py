@@ -2,7 +2,7 @@
 
 It listens to a simulated execution node and publishes, over ZMQ, where the tabletop's own script would have the
 robot a moment later: as somebody does who looks at the bench and moves a leader arm. What it says is what
-`runtime.leaders.zmq` reads.
+`runtime.teleoperators.zmq` reads.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ import numpy as np
 import zmq
 
 from robots.broken_pipe import unread_ends
-from runtime import codecs
-from runtime.clock import Clock, MonotonicClock
-from runtime.errors import RuntimeFault
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import Clock, MonotonicClock
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Float64
 from runtime.sim import standin
 from runtime.sim.node import positive, run, start_pose
 from runtime.sim.pick_place import PickPlace, Skill
@@ -27,11 +28,10 @@ from runtime.sim.script import Script, Waving
 from runtime.sim.sockets import address, bound
 from runtime.transports import zmq as node
 from runtime.transports.node_source import NodeSource
-from runtime.types import Float64
 
 if TYPE_CHECKING:
     from robots import Robot
-    from runtime.types import Observation
+    from runtime.core.types import Observation
 
 _ASKS_S = 0.2  # the script is asked anew; between that it goes on along its rows
 _HORIZON_S = 1.0

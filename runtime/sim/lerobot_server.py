@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import grpc
 import numpy as np
 
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
+from runtime.core.types import Float32
 from runtime.sim import lerobot_wire as wire
 from runtime.sim.faults import NONE, TOO_LARGE, Fault
 from runtime.sim.script import Answer, Script, Waving
-from runtime.types import Float32
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-from runtime.types import Float32
+from runtime.core.types import Float32
 
 HELPERS = "lerobot.async_inference.helpers"
 _MAGIC = 0x1950A86A20F9469CFC6C

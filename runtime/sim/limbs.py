@@ -12,8 +12,8 @@ import numpy as np
 from robots import Body, Chain, urdf
 from robots.copies import copy_of
 from robots.rotations import transform_of
-from runtime.errors import SetupError
-from runtime.types import Float64
+from runtime.core.errors import SetupError
+from runtime.core.types import Float64
 
 if TYPE_CHECKING:
     from robots import Group, Robot

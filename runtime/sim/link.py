@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from runtime import codecs
-from runtime.clock import Clock
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import Clock
+from runtime.core.types import Observation, RobotCommand, UInt8
 from runtime.sim.node import Node
 from runtime.transports.base import Sink, Source
 from runtime.transports.node_messages import MESSAGE_LIMIT, NodeMessages
-from runtime.types import Observation, RobotCommand, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot

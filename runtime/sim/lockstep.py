@@ -20,16 +20,19 @@ from typing import Any
 import robots
 from robots import Robot
 from robots.broken_pipe import unread_ends
-from runtime import deployment, family, log
-from runtime.clock import Clock, VirtualClock
-from runtime.errors import RuntimeFault, SetupError
-from runtime.family import Plan
-from runtime.served_lockstep import ServedLockstep
+from runtime.config import loader as deployment
+from runtime.core import environment
+from runtime.core import logs as log
+from runtime.core.clock import Clock, VirtualClock
+from runtime.core.errors import RuntimeFault, SetupError
+from runtime.processes.lockstep.server import ServedLockstep
 from runtime.sim import serve, standin, surroundings
 from runtime.sim.link import Link
 from runtime.sim.node import Node
 from runtime.sim.node import parser as node_parser
 from runtime.sim.surroundings import Surroundings
+from runtime.station import spec as family
+from runtime.station.spec import StationSpec
 from runtime.transports import zmq
 
 REST_S = 1.0  # of success, after which nothing more is to be seen
@@ -38,7 +41,7 @@ _PATIENT = ["policy.connect_deadline=60.0", "policy.inference_deadline=60.0"]
 
 
 @dataclass(frozen=True, slots=True)
-class BenchPlan(Plan):
+class BenchPlan(StationSpec):
     """A plan whose transport is a simulated node in this process."""
 
     link: Link
@@ -68,7 +71,7 @@ class Rested:
         return f"the simulated bench has said success for {REST_S:g} s" if rested else ""
 
 
-def planned(made: Plan, clock: Clock, around: Surroundings, options: argparse.Namespace) -> BenchPlan:
+def planned(made: StationSpec, clock: Clock, around: Surroundings, options: argparse.Namespace) -> BenchPlan:
     """The plan of a deployment, with a node in this process; SetupError where it declares none."""
     transport = made.deployment.transport
     if not made.capabilities.resets_bench or transport.kind != "zmq":
@@ -134,4 +137,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    environment.shed()
     sys.exit(main())

@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from robots.broken_pipe import unread_ends
-from runtime import codecs
-from runtime.clock import Clock, MonotonicClock
-from runtime.errors import RuntimeFault, SetupError
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import Clock, MonotonicClock
+from runtime.core.errors import RuntimeFault, SetupError
+from runtime.core.types import Float64, UInt8
 from runtime.sim import standin, surroundings
 from runtime.sim.bench import BenchError
 from runtime.sim.drives import Drives
@@ -29,7 +30,6 @@ from runtime.sim.gestures import Gesture
 from runtime.sim.plant import Plant, poses
 from runtime.sim.sockets import Sockets
 from runtime.sim.tabletop import Reset
-from runtime.types import Float64, UInt8
 
 if TYPE_CHECKING:
     from threading import Event

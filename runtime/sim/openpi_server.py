@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from runtime.core.types import UInt8
 from runtime.sim.arrays import packed, unpacked
 from runtime.sim.continuing import ModelSpace, continued
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.rtc_wires import WIRES, Asked, Name
 from runtime.sim.script import Answer, Script, Waving
 from runtime.sim.websocket_server import Answering, Frames, WebsocketServer, spoilt
-from runtime.types import UInt8
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.clock import Clock, MonotonicClock
-from runtime.errors import RuntimeFault
+from runtime.core.clock import Clock, MonotonicClock
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Float32, Float64, UInt8
 from runtime.sim.bench import Bench
 from runtime.sim.hands import Opening
 from runtime.sim.postures import gripper_dim, jaws
 from runtime.sim.routes import Planner, Route, Slip
 from runtime.sim.script import Answer, Script
 from runtime.sim.sight import Overhead, Sight
-from runtime.types import Float32, Float64, UInt8
 
 if TYPE_CHECKING:
     from robots import Group, Robot

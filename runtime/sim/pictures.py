@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.types import Float64, UInt8
+from runtime.core.types import Float64, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.types import EEF_WIDTH, Float32, Float64
+from runtime.core.types import EEF_WIDTH, Float32, Float64
 
 if TYPE_CHECKING:
     from robots import Group, Robot

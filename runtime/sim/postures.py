@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robots.rotations import quaternion_of_matrix
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
+from runtime.core.types import Float64
 from runtime.kinematics.compiled import CompiledKinematics
 from runtime.sim.bench import Bench
 from runtime.sim.down import Down, Place
 from runtime.sim.limbs import limbs
-from runtime.types import Float64
 
 if TYPE_CHECKING:
     from robots import Gripper, Group, Robot

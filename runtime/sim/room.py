@@ -9,7 +9,7 @@ import numpy as np
 
 from robots.clearance import MARGIN, Clearance
 from robots.description import TABLE
-from runtime.types import Float64
+from runtime.core.types import Float64
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
 
 _PACKAGES = (
     "catkin", "catkin_pkg", "defusedxml", "genmsg", "genpy", "geometry_msgs", "pyparsing", "roscpp", "rosgraph",

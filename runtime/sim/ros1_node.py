@@ -20,12 +20,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robots.broken_pipe import unread_ends
-from runtime.clock import Clock, MonotonicClock
-from runtime.errors import RuntimeFault, SetupError
+from runtime.core.clock import Clock, MonotonicClock
+from runtime.core.errors import RuntimeFault, SetupError
+from runtime.core.types import UInt8
 from runtime.sim import ros1_modules, ros_robot, standin
 from runtime.sim.node import run
 from runtime.sim.ros_robot import RosRobot, Told
-from runtime.types import UInt8
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -7,7 +7,7 @@ import os
 import socket
 from collections.abc import Iterator
 
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
 
 _DOMAINS = range(1, 100)  # beyond, ports reach into those that the system gives to anybody
 _FIRST, _EACH = 7400, 250  # RTPS 2.5, section 9.6.2

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 import numpy as np
 
 from robots.description import RosGroupTable
-from runtime.clock import Clock
-from runtime.errors import SetupError
+from runtime.core.clock import Clock
+from runtime.core.errors import SetupError
+from runtime.core.types import UInt8
 from runtime.sim import standin, surroundings
 from runtime.sim.node import LONGEST_STEP, positive, start_pose
 from runtime.sim.plant import Plant, poses
-from runtime.types import UInt8
 
 if TYPE_CHECKING:
     from robots import Group, Robot

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from runtime.core.types import Float64
 from runtime.sim.bench import Bench
 from runtime.sim.down import Place
 from runtime.sim.hands import Opening
 from runtime.sim.postures import CLEAR, TILTS, Postures, closed, gripper_dim, jaws, opened
 from runtime.sim.room import room_of
-from runtime.types import Float64
 
 if TYPE_CHECKING:
     from robots import Group, Robot

@@ -6,8 +6,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
+from runtime.core.types import Float32, Float64, UInt8
 from runtime.sim.gestures import Gesture
-from runtime.types import Float32, Float64, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot

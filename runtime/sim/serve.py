@@ -10,13 +10,13 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 from robots.broken_pipe import unread_ends
-from runtime.errors import RuntimeFault, SetupError
+from runtime.core.errors import RuntimeFault, SetupError
 from runtime.sim import faults, standin
 from runtime.sim.script import Script, Waving
 
 if TYPE_CHECKING:
     from robots import Robot
-    from runtime.clock import Clock
+    from runtime.core.clock import Clock
     from runtime.sim.rtc_wires import Name
 
 
@@ -85,7 +85,12 @@ def parser() -> argparse.ArgumentParser:
     arena.add_argument("--no-session", action="store_true", help="it wants no session id")
     arena.add_argument("--idle", type=float, metavar="S", help="leaves a silent client; vllm after 30 s")
     groot = line.add_argument_group("gr00t")
-    groot.add_argument("--version", choices=["n1.5", "n1.6", "n1.7"], default="n1.6", help="of the server")
+    groot.add_argument(
+        "--version",
+        choices=["n1.5", "n1.6", "n1.7", "n1.7-early", "starvla"],
+        default="n1.6",
+        help="of the server; starvla: StarVLA's server of this protocol",
+    )
     groot.add_argument(
         "--use-sim-policy-wrapper",
         action="store_true",

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.core.types import Float64, UInt8
 from runtime.sim import bench
 from runtime.sim.bench import Bench, BenchError, PinholeCamera
-from runtime.types import Float64, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -6,7 +6,7 @@ import contextlib
 
 import zmq
 
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
 from runtime.transports.zmq import is_loopback
 
 _QUEUED_FRAMES = 4

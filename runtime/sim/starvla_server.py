@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from runtime.core.types import Float32, UInt8
 from runtime.sim.arrays import packed, unpacked
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.script import Answer, Script, Waving
 from runtime.sim.websocket_server import Answering, Frames, WebsocketServer, spoilt
-from runtime.types import Float32, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 class Star:
     """How the server is: `views` are the robot's cameras in the order of the request, all where None.
 
-    `size` is what it says that it was trained with, `batched` whether answers are [1, T, D].
+    `size` is what it says that it was trained with, `batched` whether answers are [1, T, D]. `old`: as servers were
+    until May 2026, which say next to nothing of themselves and leave statistics to the client.
     """
 
     horizon: int = 16
@@ -34,6 +35,7 @@ class Star:
     size: tuple[int, int] | None = (224, 224)
     batched: bool = True
     keys: tuple[str, ...] = ("stand_in",)
+    old: bool = False
 
 
 class StarvlaServer(WebsocketServer):
@@ -52,8 +54,10 @@ class StarvlaServer(WebsocketServer):
         self.high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
 
     def greeting(self) -> Frames | None:
-        """What the newest server says."""
+        """What a server of its age says."""
         star = self._star
+        if star.old:
+            return packed({"env": "simpler_env"})
         return packed(
             {
                 "env": "starvla_policy_server",
@@ -102,7 +106,11 @@ class StarvlaServer(WebsocketServer):
         started = time.monotonic()
         self.seen.append(payload)
         (example,) = payload["examples"]
-        if len(self._star.keys) > 1 and payload.get("unnorm_key") not in self._star.keys:
+        if (
+            not self._star.old
+            and len(self._star.keys) > 1
+            and payload.get("unnorm_key") not in self._star.keys
+        ):
             raise KeyError(f"unnorm_key {payload.get('unnorm_key')!r}; available: {self._star.keys}")
         pictures = self._pictures(example["image"])
         state = np.asarray(example["state"], np.float64)
@@ -124,12 +132,14 @@ class StarvlaServer(WebsocketServer):
 
     def _data(self, rows: Float32) -> dict[str, Any]:
         fault = self._star.fault
-        if fault.name == "normalized":
-            share = 2 * (rows - self.low) / (self.high - self.low) - 1
-            return {"normalized_actions": share.astype(np.float32)[None]}
-        made = spoilt(fault, rows.astype(np.float64) if fault.name == "none" else rows)
-        plain = isinstance(made, np.ndarray) and made.ndim == 2 and fault.name == "none"
-        return {"actions": made[None] if plain and self._star.batched else made}
+        normalized = self._star.old or fault.name == "normalized"
+        if normalized:
+            rows = (2 * (rows - self.low) / (self.high - self.low) - 1).astype(np.float32)
+        well = fault.name in ("none", "normalized")
+        made = spoilt(fault, rows if normalized or not well else rows.astype(np.float64))
+        plain = isinstance(made, np.ndarray) and made.ndim == 2 and well
+        name = "normalized_actions" if normalized else "actions"
+        return {name: made[None] if plain and self._star.batched else made}
 
 
 def _binary(request: str | bytes) -> bytes:

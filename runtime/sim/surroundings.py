@@ -6,12 +6,12 @@ import argparse
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
+from runtime.core.types import Float64, UInt8
 from runtime.sim.conveyor import Conveyor
 from runtime.sim.pictures import Scene
 from runtime.sim.plant import Plant
 from runtime.sim.tabletop import Reset, Tabletop
-from runtime.types import Float64, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from runtime.core.types import Float64
 from runtime.sim.bench import Bench, BenchState, Layout, on_table, yaw_of
 from runtime.sim.block import Block
 from runtime.sim.grasp import RELEASE, push, squeeze
 from runtime.sim.hands import Hand, Jaws
 from runtime.sim.layout import layout_of
 from runtime.sim.plant import Plant
-from runtime.types import Float64
 
 if TYPE_CHECKING:
     from robots import Robot

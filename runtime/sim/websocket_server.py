@@ -18,9 +18,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import Frame, Opcode
 from websockets.sync.server import Server, ServerConnection, serve
 
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
+from runtime.core.types import Float32
 from runtime.sim.faults import TOO_LARGE, Fault
-from runtime.types import Float32
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response

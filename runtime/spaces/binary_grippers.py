@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from robots import Robot
-from runtime.limits import Limits
-from runtime.types import Float64
+from runtime.core.types import Float64
+from runtime.safety.limits import Limits
 
 DWELL_S = 0.2  # between two switches of one gripper
 _SAME = 1e-3  # of its travel
@@ -34,15 +34,16 @@ class Switch:
         """On which side of the threshold `number` is."""
         return number >= self.threshold if self.open > self.close else number <= self.threshold
 
-    def snapped(self, wanted: Float64, before: float) -> Float64:
-        """`wanted` [H], one after the other, as `open` and `close`; `before` is what it was told to be until then."""
-        upwards = np.sign(self.open - self.close)
-        beyond = upwards * (wanted - self.threshold)
+    def told(self, wanted: float, before: float) -> float:
+        """`wanted` as `open` or `close`; `before` is what it was told to be until then."""
+        beyond = (wanted - self.threshold) * (1.0 if self.open > self.close else -1.0)
         half = 0.5 * self.hysteresis * _ROUNDING
-        decided = np.concatenate([[True], (beyond >= half) | (beyond <= -half)])
-        opened = np.concatenate([[self.is_open(before)], beyond >= half])
-        newest = np.maximum.accumulate(np.where(decided, np.arange(len(decided)), 0))
-        return np.where(opened[newest][1:], self.open, self.close)
+        opens = beyond >= half or (beyond > -half and self.is_open(before))
+        return self.open if opens else self.close
+
+    def snapped(self, wanted: Float64, before: float) -> Float64:
+        """The same of `wanted` [H], one after the other."""
+        return np.array([before := self.told(number, before) for number in wanted.tolist()], np.float64)
 
 
 def switches(robot: Robot) -> tuple[Switch, ...]:
@@ -55,6 +56,19 @@ def switches(robot: Robot) -> tuple[Switch, ...]:
         width = gripper.hysteresis * abs(gripper.open - gripper.close)
         made.append(Switch(dim, gripper.open, gripper.close, gripper.threshold, width))
     return tuple(made)
+
+
+def open_or_closed(switches: tuple[Switch, ...], action: Float64, commanded: Float64) -> Float64:
+    """`action` [D] with every binary gripper open or closed, after it was `commanded` [D]; what is no number stays."""
+    if action.shape != commanded.shape:
+        return action
+    numbers = [switch for switch in switches if np.isfinite(action[switch.dim])]
+    ends = {one.dim: one.told(action[one.dim], commanded[one.dim]) for one in numbers}
+    if all(action[dim] == end for dim, end in ends.items()):
+        return action
+    action = action.copy()
+    action[list(ends)] = list(ends.values())
+    return action
 
 
 class Dwell:

@@ -10,15 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from robots import Robot
 from robots.rotations import quaternion_of_matrix, transform_of
-from runtime.end_effectors import EndEffectors
-from runtime.errors import NotFiniteError, SetupError, ShapeError
-from runtime.formats import PoseRows, continuous
+from runtime.core.errors import NotFiniteError, SetupError, ShapeError
+from runtime.core.pose_format import CANONICAL, PoseFormat
+from runtime.core.types import EEF_WIDTH, ActionChunk, Float64, Observation
 from runtime.kinematics.base import IkResult, Kinematics
-from runtime.pose_format import CANONICAL, PoseFormat
-from runtime.poses import absolute
-from runtime.resampling import length, resample
-from runtime.switching import switches
-from runtime.types import EEF_WIDTH, ActionChunk, Float64, Observation
+from runtime.motion.resampling import length, resample
+from runtime.spaces.binary_grippers import switches
+from runtime.spaces.end_effectors import EndEffectors
+from runtime.spaces.pose_rows import PoseRows, continuous
+from runtime.spaces.relative_poses import absolute
 
 _GRIPPER = EEF_WIDTH - 1
 _SAME_PLACE, _SAME_TURN = 0.02, 5.0  # [m, degrees] within which a measured pose is that of the described link
@@ -59,7 +59,7 @@ class CommandRows:
         return self.rows[0] if self.first is None else self.first
 
 
-class Spaces(EndEffectors):
+class ActionSpaces(EndEffectors):
     """One robot's action spaces: joint rows [H, D], and rows of poses that become joints by kinematics.
 
     An arm's vector is x, y, z [m], unit quaternion w, x, y, z, gripper, in the arm's declared frame, whatever the

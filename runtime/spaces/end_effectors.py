@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robots import Robot
+from runtime.core.types import EEF_WIDTH, Float32, Float64
 from runtime.kinematics.base import Forward
-from runtime.orientations import continuous_signs
-from runtime.types import EEF_WIDTH, Float32, Float64
+from runtime.spaces.orientations import continuous_signs
 
 _GRIPPER = EEF_WIDTH - 1
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from robots import Body, RobotError, urdf
 from robots.rotations import quaternion_of_matrix, quaternion_product, transform_of
-from runtime.errors import ConfigurationError
-from runtime.types import Float64
+from runtime.core.errors import ConfigurationError
+from runtime.core.types import Float64
 
 if TYPE_CHECKING:
     from robots import Group, Robot

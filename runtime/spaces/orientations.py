@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robots.rotations import matrix_of_quaternion, quaternion_of_matrix, quaternion_product
-from runtime.types import Float64
+from runtime.core.types import Float64
 
 Bools = NDArray[np.bool_]
 _WHOLE = 2.0 * np.pi

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.errors import ConfigurationError, PolicyError
-from runtime.frames import Frame
-from runtime.orientations import (
+from runtime.core.errors import ConfigurationError, PolicyError
+from runtime.core.pose_format import PoseFormat
+from runtime.core.types import EEF_WIDTH, Float64
+from runtime.spaces.frames import Frame
+from runtime.spaces.orientations import (
     EulerAngles,
     Orientation,
     QuaternionNumbers,
@@ -21,8 +23,6 @@ from runtime.orientations import (
     SixNumbers,
     continuous_signs,
 )
-from runtime.pose_format import PoseFormat
-from runtime.types import EEF_WIDTH, Float64
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from runtime.end_effectors import EndEffectors
-from runtime.formats import PoseRows
-from runtime.types import Float32, Float64
+from runtime.core.types import Float32, Float64
+from runtime.spaces.end_effectors import EndEffectors
+from runtime.spaces.pose_rows import PoseRows
 
 
-class Publication:
+class PosePublisher:
     """Called with every joint command [D] that is sent: float32 [W], each row continuing the one before."""
 
     def __init__(self, rows: PoseRows, end_effectors: EndEffectors) -> None:

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from robots.rotations import matrix_of_quaternion, quaternion_product
-from runtime.orientations import continuous_signs
-from runtime.types import ActionMode, Float64, RelativeFrame
+from runtime.core.types import ActionMode, Float64, RelativeFrame
+from runtime.spaces.orientations import continuous_signs
 
 _POSITION, _QUATERNION = slice(0, 3), slice(3, 7)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -12,11 +13,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from runtime.deployment import Resolved, changed
-from runtime.errors import RuntimeFault
-from runtime.preflight.course import patience
-from runtime.requests import PreflightRequest
+from runtime.config.loader import Resolved, changed
+from runtime.config.schema import Deployment
+from runtime.core.environment import without_secrets
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.command_arguments import PreflightRequest
 
+_ROOM_S = 10.0  # beside the deadlines of the policy's own calls: kinematics, a slow machine
 _GRACE_S = 180.0  # beyond the deadline, for a process that may have kinematics to compile
 _KEPT = 20  # reports, of which the oldest is forgotten first
 Spawn = Callable[[], "subprocess.Popen[bytes]"]
@@ -128,6 +131,7 @@ def _spawn() -> subprocess.Popen[bytes]:
         [sys.executable, "-m", "runtime.preflight", "--given"],
         stdin=subprocess.PIPE,  # its end is ours
         stdout=subprocess.PIPE,
+        env=without_secrets(os.environ),  # a worker's has the web's
     )
 
 
@@ -182,3 +186,15 @@ def _report(said: bytes) -> dict[str, Any]:
     except ValueError:
         return {}
     return dict(found) if isinstance(found, Mapping) else {}
+
+
+def patience(settings: Deployment) -> float:
+    """How long a preflight may take where nobody says so [s]: what the policy's own deadlines come to."""
+    policy = settings.policy.model_dump()
+    return _ROOM_S + _deadlines(policy) + float(policy.get("inference_deadline", 0.0))  # it is asked twice
+
+
+def _deadlines(table: Mapping[str, Any]) -> float:
+    """The sum of all deadlines in a table and in those within it, such as that of a tunnel."""
+    own = [float(value) for key, value in table.items() if key.endswith("_deadline") and value is not None]
+    return sum(own) + sum(_deadlines(value) for value in table.values() if isinstance(value, Mapping))

@@ -11,11 +11,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from runtime.deployment import Resolved, assigned, digest_of
-from runtime.errors import ConfigurationError, RecordingError
+from runtime.config.loader import Resolved, assigned, digest_of
+from runtime.config.schema import GONE_FROM_BUS
+from runtime.core.errors import ConfigurationError, RecordingError
+from runtime.core.git_revision import revision
 from runtime.recording.files import read_document
-from runtime.revision import revision
-from runtime.run import installed_versions
+from runtime.station.run import installed_versions
 
 _LISTED = 8  # runs, or keys, that a sentence names
 _SHORT = 12  # characters of a hash
@@ -95,6 +96,8 @@ def _wanted(tree: dict[str, Any], manifest: Mapping[str, Any], data: Path) -> di
         for key in ("mode", "sim_state", "duration_s"):
             if key in manifest and key in run:
                 run[key] = manifest[key]
+    for key in GONE_FROM_BUS:  # says nothing of what was done
+        tree.get("bus", {}).pop(key, None)
     if data_folder(tree.get("data_dir")) != data:
         tree["data_dir"] = str(data)
     return tree

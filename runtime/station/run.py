@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any
 
-from runtime.family import Plan
-from runtime.messages import Mode
+from runtime.core.git_revision import revision
+from runtime.ipc.messages import Mode
 from runtime.policies.base import PolicyInfo
-from runtime.revision import revision
+from runtime.station.spec import StationSpec
 
 _COUNTS = ("ticks", "missed", "records_lost")
 _PACKAGES = ("eva-web", "numpy", "pyarrow", "av", "pyzmq", "msgpack")
@@ -91,7 +91,7 @@ class Run:
 class Provenance:
     """What every manifest says of the station as it was last set up; `plan` is the one in force since then."""
 
-    plan: Plan
+    plan: StationSpec
     boot: str
     checkpoint: Mapping[str, Any] = field(
         default_factory=dict

@@ -1,12 +1,9 @@
-"""What every process of a family starts from: the deployment, its robot, the page, a lifeline, a log."""
+"""A deployment with its robot: what is known of a station before anything is connected."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import logging
-import os
-import select
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
@@ -15,36 +12,33 @@ import numpy as np
 
 import robots
 from robots import Robot
-from runtime import collection, deployment, log
 from runtime.cameras.attaching import attached, check
-from runtime.clock import Clock
-from runtime.config import Deployment
-from runtime.deployment import Resolved
-from runtime.end_effectors import EndEffectors
-from runtime.errors import ConfigurationError, RuntimeFault, SetupError
-from runtime.formats import PoseRows
+from runtime.config import collection
+from runtime.config import loader as deployment
+from runtime.config.loader import Resolved
+from runtime.config.schema import Deployment
+from runtime.core.clock import Clock
+from runtime.core.errors import ConfigurationError, RuntimeFault, SetupError
+from runtime.core.plugins import variants
+from runtime.core.pose_format import refuse_format
+from runtime.ipc.shared_state import SharedStateLayout
 from runtime.kinematics.base import Kinematics
 from runtime.kinematics.forward import ChainForward
-from runtime.leaders.base import Leader
-from runtime.leaders.relay import NodeLed, Relay
-from runtime.page import Page, PageLayout
-from runtime.plugins import variants
+from runtime.motion.timeline import DimensionKinds
 from runtime.policies.base import Policy
 from runtime.policies.tunnel.policy import through_tunnel
-from runtime.pose_format import refuse_format
-from runtime.publication import Publication
-from runtime.safety import Limits
-from runtime.spaces import Spaces
-from runtime.timeline import Dims
+from runtime.safety.filter import Limits
+from runtime.spaces.conversion import ActionSpaces
+from runtime.spaces.end_effectors import EndEffectors
+from runtime.spaces.pose_rows import PoseRows
+from runtime.spaces.published_poses import PosePublisher
+from runtime.teleoperators.base import Leader
+from runtime.teleoperators.relay import NodeLed, Relay
 from runtime.transports.base import Capabilities, Source
-
-_OUTLIVES_S = (
-    1.0  # how long guard and reception stay after control's own end: to the last it can see, and be stopped
-)
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class StationSpec:
     """A deployment with everything that can be known of it before anything is connected.
 
     `collecting`: it is set up to collect, so that what is asked is the leader of its [collection].
@@ -110,7 +104,9 @@ class Plan:
         wanted = self.deployment.collection
         if wanted is None or wanted.leader is None:
             raise ConfigurationError("this deployment has no [collection.leader]")
-        made: Leader = variants("runtime.leaders")[wanted.leader.kind].build(wanted.leader, self.robot, clock)
+        made: Leader = variants("runtime.teleoperators")[wanted.leader.kind].build(
+            wanted.leader, self.robot, clock
+        )
         return made
 
     @property
@@ -145,8 +141,8 @@ class Plan:
         return attached(source, settings.cameras, clock)
 
     @property
-    def layout(self) -> PageLayout:
-        return PageLayout(self.robot.dim, self.robot.eef_dim, self.cameras)
+    def layout(self) -> SharedStateLayout:
+        return SharedStateLayout(self.robot.dim, self.robot.eef_dim, self.cameras)
 
     @property
     def limits(self) -> Limits:
@@ -167,10 +163,10 @@ class Plan:
         )
 
     @property
-    def dims(self) -> Dims:
+    def dims(self) -> DimensionKinds:
         """Dimensions that do not blend as numbers do: grippers that switch, angles without limits."""
         endless = np.flatnonzero(np.isinf(self.robot.lower) & np.isinf(self.robot.upper))
-        return Dims(self.robot.binary_dims, tuple(endless.tolist()))
+        return DimensionKinds(self.robot.binary_dims, tuple(endless.tolist()))
 
     def kinematics(self) -> Kinematics:
         """Forward and inverse kinematics of the robot, compiled or loaded when this returns."""
@@ -178,23 +174,23 @@ class Plan:
         made: Kinematics = variants("runtime.kinematics")[settings.kind].build(settings, self.robot)
         return made
 
-    def spaces(self, kinematics: Kinematics | None = None) -> Spaces:
+    def spaces(self, kinematics: Kinematics | None = None) -> ActionSpaces:
         """The robot's action spaces, with these kinematics of it or with its own."""
-        return Spaces(self.robot, kinematics or self.kinematics(), self.rate)
+        return ActionSpaces(self.robot, kinematics or self.kinematics(), self.rate)
 
     def end_effectors(self) -> EndEffectors:
         """Where joints put the robot's end effectors: all that processes need that solve nothing."""
         return EndEffectors(self.robot, ChainForward(self.robot))
 
-    def publication(self) -> Publication | None:
+    def publication(self) -> PosePublisher | None:
         """What makes the poses that are published of a joint command; None where joints alone are."""
         wanted = self.deployment.publication
         if wanted.space == "joint":
             return None
-        return Publication(PoseRows(wanted.pose, self.robot, "publication.pose"), self.end_effectors())
+        return PosePublisher(PoseRows(wanted.pose, self.robot, "publication.pose"), self.end_effectors())
 
 
-def plan(resolved: Resolved) -> Plan:
+def plan(resolved: Resolved) -> StationSpec:
     """Check that the parts of a deployment fit each other; raises ConfigurationError or SetupError."""
     settings = resolved.deployment
     try:
@@ -204,7 +200,7 @@ def plan(resolved: Resolved) -> Plan:
         robot = robots.load(settings.robot, settings.groups, grippers)
     except robots.RobotError as error:
         raise ConfigurationError(str(error)) from None
-    made = Plan(resolved, robot)
+    made = StationSpec(resolved, robot)
     if settings.setup.pose not in robot.poses:
         raise ConfigurationError(
             f"setup.pose = {settings.setup.pose!r}: {robot.name} has {', '.join(sorted(robot.poses))}"
@@ -236,12 +232,12 @@ def plan(resolved: Resolved) -> Plan:
     return made
 
 
-def _check_collection(made: Plan) -> None:
+def _check_collection(made: StationSpec) -> None:
     """A node that drives by itself must be one that can be told to, and to leave off, and says what it applied."""
     wanted, capabilities = made.deployment.collection, made.capabilities
     if wanted is not None and wanted.source == "node" and not capabilities.leads:
         kind = made.deployment.transport.kind
-        leads = kind if kind in variants("runtime.leaders") else "zmq"
+        leads = kind if kind in variants("runtime.teleoperators") else "zmq"
         raise SetupError(
             f'collection.source = "node" with transport {kind!r}, over which a robot is neither told to follow a '
             "leader of its own and to leave off, which every stop of ours has to, nor says what it applied; allowed: "
@@ -249,7 +245,7 @@ def _check_collection(made: Plan) -> None:
         )
 
 
-def _check_publication(made: Plan) -> None:
+def _check_publication(made: StationSpec) -> None:
     """Poses are published only where the transport has such a command."""
     wanted, capabilities = made.deployment.publication, made.capabilities
     kind = made.deployment.transport.kind
@@ -269,41 +265,6 @@ def _check_publication(made: Plan) -> None:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Member:
-    """One process of a family: what it works with."""
-
-    plan: Plan
-    page: Page
-    boot: str  # of the supervisor: names this start of the station
-    lifeline: Lifeline
-
-    def needed(self, now: float) -> bool:
-        """Whether there is still something to do for who outlives control: until then the supervisor may be gone."""
-        return not self.lifeline.cut or self.page.alive("control", now, _OUTLIVES_S)
-
-
-class Lifeline:
-    """Standard input, held open by the supervisor; its end is the supervisor's end, however it came."""
-
-    def __init__(self, descriptor: int = 0) -> None:
-        self._descriptor = descriptor
-
-    @property
-    def cut(self) -> bool:
-        """Whether the supervisor is gone."""
-        readable, _, _ = select.select([self._descriptor], [], [], 0)
-        return bool(readable) and os.read(self._descriptor, 4096) == b""
-
-
-def join(process: str, pictures: bool = True) -> Member:
-    """Read what the supervisor handed over on the command line."""
-    parser = argparse.ArgumentParser(prog=f"runtime.{process}", description="started by the supervisor")
-    parser.add_argument("--resolved", required=True)
-    parser.add_argument("--page", required=True, type=int)
-    parser.add_argument("--boot", required=True)
-    given = parser.parse_args()
-    log.start(process)
-    tree = json.loads(Path(given.resolved).read_text("utf-8"))
-    made = plan(deployment.resolve(tree, {}, given.resolved))
-    return Member(made, Page.attach(made.layout, given.page, pictures), given.boot, Lifeline())
+def planned(path: str) -> StationSpec:
+    """The plan of the resolved deployment that a supervisor wrote there."""
+    return plan(deployment.resolve(json.loads(Path(path).read_text("utf-8")), {}, path))

@@ -11,16 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from runtime.section import Section
-from runtime.timeline import HELD, Dims, Fade, Makers, Timeline, fading, on_branch, single
-from runtime.types import Float64
+from runtime.core.settings import Settings
+from runtime.core.types import Float64
+from runtime.motion.timeline import (
+    HELD,
+    Contributions,
+    DimensionKinds,
+    Fade,
+    Timeline,
+    fading,
+    on_branch,
+    single,
+)
 
 BlendShape = Literal["linear", "cosine", "exponential"]
 JOIN_WINDOW = 8  # steps over which a chunk takes over from what it does not continue
 _MOST_SHARES = 4096  # that are told of a chunk: they pass the ring to main
 
 
-class StrategyParameters(Section):
+class StrategyParameters(Settings):
     """The one set of parameters of all strategies; each module's `USES` names those that mean something to it."""
 
     execution_horizon: int | None = Field(default=None, ge=1)
@@ -140,7 +149,7 @@ class Merge(ABC):
 
     def __call__(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Merged:
         """Change `timeline` from `free_step` on and say where the rows went; nothing is joined to."""
-        return join(self, timeline, arrival, free_step, None, Dims())
+        return join(self, timeline, arrival, free_step, None, DimensionKinds())
 
 
 def join(
@@ -149,7 +158,7 @@ def join(
     arrival: Arrival,
     free_step: int,
     held: Float64 | None,
-    dims: Dims,
+    dims: DimensionKinds,
     *,
     joining: bool = False,
     commanded: Float64 | None = None,
@@ -183,7 +192,7 @@ def join(
     return replace(placed.merged, overlap=sum(len(makers) > 1 for makers in made), shares=shares)
 
 
-def _shares(first: int, made: Sequence[Makers], chunk_id: int) -> Float64 | None:
+def _shares(first: int, made: Sequence[Contributions], chunk_id: int) -> Float64 | None:
     alone = ((chunk_id, 1.0),)
     told = [
         (step, maker, weight)
@@ -194,7 +203,14 @@ def _shares(first: int, made: Sequence[Makers], chunk_id: int) -> Float64 | None
     return np.array(told, np.float64).reshape(-1, 3) if len(told) <= _MOST_SHARES else None
 
 
-def _fade(timeline: Timeline, step: int, rows: Float64, makers: list[Makers], count: int, dims: Dims) -> None:
+def _fade(
+    timeline: Timeline,
+    step: int,
+    rows: Float64,
+    makers: list[Contributions],
+    count: int,
+    dims: DimensionKinds,
+) -> None:
     """Let what is planned next take over from `rows` within `count` steps; the last row is held where they end.
 
     Rows beyond `makers` are held targets.

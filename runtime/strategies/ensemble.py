@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
+from runtime.core.types import Float64
+from runtime.motion.timeline import Contributions, DimensionKinds, PlacedChunk, Timeline, difference
 from runtime.strategies.base import Arrival, Merge, Paced, Placement, Query, StrategyParameters
 from runtime.strategies.placing import place
-from runtime.timeline import Dims, Laid, Makers, Timeline, difference
-from runtime.types import Float64
 
 USES = frozenset({"inference_rate", "k_max", "ensemble_m", "ensemble_horizon"})
 
@@ -29,7 +29,7 @@ class EnsembleMerge(Merge):
     so that equal chunks average to themselves exactly.
     """
 
-    def __init__(self, k_max: int | None, m: float, horizon: int, dims: Dims) -> None:
+    def __init__(self, k_max: int | None, m: float, horizon: int, dims: DimensionKinds) -> None:
         self._k_max = k_max
         self._m = m
         self._horizon = horizon
@@ -41,11 +41,13 @@ class EnsembleMerge(Merge):
     def lay(self, timeline: Timeline, placed: Placement) -> None:
         step = placed.first
         older = (
-            Laid(old.chunk_id, step, old.rows[step - old.first :]) for old in timeline.laid if old.end > step
+            PlacedChunk(old.chunk_id, step, old.rows[step - old.first :])
+            for old in timeline.laid
+            if old.end > step
         )
-        laid = (*older, Laid(placed.merged.chunk_id, step, placed.rows))[-self._horizon :]
+        laid = (*older, PlacedChunk(placed.merged.chunk_id, step, placed.rows))[-self._horizon :]
         rows: list[Float64] = []
-        makers: list[Makers] = []
+        makers: list[Contributions] = []
         begin = step
         for end in sorted({chunk.end for chunk in laid}):
             covering = [chunk for chunk in laid if chunk.end >= end]
@@ -55,7 +57,7 @@ class EnsembleMerge(Merge):
             begin = end
         timeline.replace(step, np.concatenate(rows), makers, laid)
 
-    def _average(self, chunks: Sequence[Laid], part: slice) -> tuple[Float64, Makers]:
+    def _average(self, chunks: Sequence[PlacedChunk], part: slice) -> tuple[Float64, Contributions]:
         """The rows `part` that `chunks`, oldest first, make together, and the weights of each."""
         weights = np.exp(-self._m * np.arange(len(chunks)))
         weights /= weights.sum()
@@ -74,6 +76,6 @@ def query(config: Config) -> Query:
     return Paced(config.inference_rate)
 
 
-def merge(config: Config, dims: Dims) -> Merge:
+def merge(config: Config, dims: DimensionKinds) -> Merge:
     """The merging half; `dims` says what does not average as numbers do."""
     return EnsembleMerge(config.k_max, config.ensemble_m, config.ensemble_horizon, dims)

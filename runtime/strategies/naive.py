@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
+from runtime.motion.timeline import DimensionKinds, Timeline, single
 from runtime.strategies.base import Arrival, Merge, Paced, Placement, Query, StrategyParameters
 from runtime.strategies.placing import place
-from runtime.timeline import Dims, Timeline, single
 
 USES = frozenset({"execution_horizon", "inference_rate", "k_max"})
 
@@ -36,6 +36,6 @@ def query(config: Config) -> Query:
     return Paced(config.inference_rate)
 
 
-def merge(config: Config, dims: Dims) -> Merge:
+def merge(config: Config, dims: DimensionKinds) -> Merge:
     """The merging half."""
     return NaiveMerge(config.execution_horizon, config.k_max)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Literal
 
+from runtime.motion.timeline import DimensionKinds, Timeline, mixed, overlap_blend, single
 from runtime.strategies.base import Arrival, Merge, Paced, Placement, Query, StrategyParameters
 from runtime.strategies.placing import place
-from runtime.timeline import Dims, Timeline, mixed, overlap_blend, single
 
 USES = frozenset({"execution_horizon", "inference_rate", "k_max", "blend_window", "blend_shape"})
 
@@ -24,7 +24,7 @@ class Config(StrategyParameters):
 class OverlapMerge(Merge):
     """Drops what is stale, puts every row on the step it was meant for, blends over the overlap."""
 
-    def __init__(self, parameters: StrategyParameters, dims: Dims) -> None:
+    def __init__(self, parameters: StrategyParameters, dims: DimensionKinds) -> None:
         self._horizon = parameters.execution_horizon
         self._k_max = parameters.k_max
         self._window = None if parameters.blend_window == "all" else parameters.blend_window
@@ -48,6 +48,6 @@ def query(config: Config) -> Query:
     return Paced(config.inference_rate)
 
 
-def merge(config: Config, dims: Dims) -> Merge:
+def merge(config: Config, dims: DimensionKinds) -> Merge:
     """The merging half; `dims` says what does not blend as numbers do."""
     return OverlapMerge(config, dims)

@@ -11,9 +11,9 @@ from typing import Literal
 
 import numpy as np
 
+from runtime.motion.timeline import DimensionKinds, Timeline, difference, single
 from runtime.strategies.base import Merge, Paced, Placement, Query, StrategyParameters
 from runtime.strategies.overlap import OverlapMerge
-from runtime.timeline import Dims, Timeline, difference, single
 
 _CONTINUED = 1e-3  # [rad] that a model's arithmetic and inverse kinematics may be off by
 USES = frozenset(
@@ -59,6 +59,6 @@ def query(config: Config) -> Query:
     return RtcQuery(config.inference_rate)
 
 
-def merge(config: Config, dims: Dims) -> Merge:
+def merge(config: Config, dims: DimensionKinds) -> Merge:
     """The merging half; `dims` says what does not blend as numbers do."""
     return RtcMerge(config, dims)

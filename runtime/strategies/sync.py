@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
+from runtime.motion.timeline import DimensionKinds, Timeline, single
 from runtime.strategies.base import Arrival, Merge, Placement, Progress, Query, StrategyParameters
 from runtime.strategies.placing import dropped, place
-from runtime.timeline import Dims, Timeline, single
 
 USES = frozenset({"execution_horizon"})
 
@@ -52,6 +52,6 @@ def query(config: Config) -> Query:
     return SyncQuery()
 
 
-def merge(config: Config, dims: Dims) -> Merge:
+def merge(config: Config, dims: DimensionKinds) -> Merge:
     """The merging half."""
     return SyncMerge(config.execution_horizon)

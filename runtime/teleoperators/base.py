@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.clock import Clock
-from runtime.errors import CodecError
-from runtime.types import Float64
+from runtime.core.clock import Clock
+from runtime.core.errors import CodecError
+from runtime.core.types import Float64
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from runtime.clock import Clock
-from runtime.errors import PolicyError, PolicyLostError
-from runtime.leaders.base import Leader, LeaderPose
+from runtime.core.clock import Clock
+from runtime.core.errors import PolicyError, PolicyLostError
+from runtime.core.types import ActionChunk, Conditioning, Float64, Observation
+from runtime.motion.timeline import difference
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.timeline import difference
-from runtime.types import ActionChunk, Conditioning, Float64, Observation
+from runtime.teleoperators.base import Leader, LeaderPose
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from runtime.clock import Clock
-from runtime.errors import CodecError, ConfigurationError
-from runtime.leaders.base import Leader
-from runtime.section import Section
+from runtime.core.clock import Clock
+from runtime.core.errors import CodecError, ConfigurationError
+from runtime.core.settings import Settings
+from runtime.core.types import Float64
+from runtime.teleoperators.base import Leader
 from runtime.transports.ros.messages import JointState, Wire
 from runtime.transports.ros.middleware import Match, Middleware, Quality
 from runtime.transports.ros.reading import JointOrder, Names
 from runtime.transports.ros.source import Heard, subscriptions
 from runtime.transports.ros.topics import Part
-from runtime.types import Float64
 
 if TYPE_CHECKING:
     from robots import Group, Robot
@@ -27,7 +27,7 @@ NODE = "eva_web_leader"
 TABLE = "collection.leader"
 
 
-class LedGroup(Section):
+class LedGroup(Settings):
     """Where the leader of one group speaks."""
 
     topic: Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$")] | None = None
@@ -37,7 +37,7 @@ class LedGroup(Section):
     """What the messages call the group's joints, in its order, where that is not what the robot's description does."""
 
 
-class LedGroups(Section):
+class LedGroups(Settings):
     """What both generations of ROS have in common."""
 
     groups: dict[str, LedGroup] = Field(min_length=1)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from runtime.clock import Clock
-from runtime.leaders.ros import NODE, TABLE, LedGroups, RosLeader
+from runtime.core.clock import Clock
+from runtime.teleoperators.ros import NODE, TABLE, LedGroups, RosLeader
 from runtime.transports import ros1
 from runtime.transports.ros import packed
 from runtime.transports.ros.middleware import Quality

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import model_validator
 
-from runtime.clock import Clock
-from runtime.errors import ConfigurationError
-from runtime.leaders.ros import NODE, TABLE, LedGroups, RosLeader
+from runtime.core.clock import Clock
+from runtime.core.errors import ConfigurationError
+from runtime.teleoperators.ros import NODE, TABLE, LedGroups, RosLeader
 from runtime.transports import ros2
 from runtime.transports.ros import cdr
 from runtime.transports.ros.middleware import SENSOR_QUALITY, Quality

@@ -15,11 +15,11 @@ import numpy as np
 import zmq
 from pydantic import model_validator
 
-from runtime import codecs
-from runtime.clock import Clock
-from runtime.errors import CodecError, ConfigurationError, TransportError
-from runtime.leaders.base import Leader, joints_of
-from runtime.section import Section
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import Clock
+from runtime.core.errors import CodecError, ConfigurationError, TransportError
+from runtime.core.settings import Settings
+from runtime.teleoperators.base import Leader, joints_of
 from runtime.transports import node_link
 from runtime.transports.node_settings import Endpoint
 from runtime.transports.zmq import is_loopback
@@ -32,7 +32,7 @@ _REOPEN_S = 0.5
 _LIMIT = 64 * 1024  # bytes of a message
 
 
-class Config(Section):
+class Config(Settings):
     """A leader that publishes its joints over ZMQ."""
 
     kind: Literal["zmq"] = "zmq"

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from runtime.errors import TransportError
-from runtime.messages import Event
-from runtime.pose_format import PoseFormat
-from runtime.types import Observation, RobotCommand
+from runtime.core.errors import TransportError
+from runtime.core.pose_format import PoseFormat
+from runtime.core.types import Observation, RobotCommand
+from runtime.ipc.messages import Event
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from runtime.clock import Clock
+from runtime.core.clock import Clock
+from runtime.core.errors import RecordingError, SetupError, TransportError
+from runtime.core.settings import Settings
+from runtime.core.types import EEF_WIDTH, Observation, RobotCommand, UInt8
 from runtime.datasets.mapping import ColumnMapping, video_key
-from runtime.errors import RecordingError, SetupError, TransportError
-from runtime.section import Section
 from runtime.transports.base import Capabilities, Sink, Source
-from runtime.types import EEF_WIDTH, Observation, RobotCommand, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-6  # a frame counts as due this much early [s]: due times are sums of floats
 
 
-class Config(Section):
+class Config(Settings):
     """Plays one episode of a LeRobot dataset: v2.0, v2.1 or v3.0."""
 
     kind: Literal["dataset"] = "dataset"

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from runtime.types import UInt8
+from runtime.core.types import UInt8
 
 FROZEN_S = 0.5  # after which a camera counts as frozen; nothing is decided by it, a person is told
 _SAMPLED_ROWS = 16  # every so many rows are compared first: two pictures of a live camera differ there

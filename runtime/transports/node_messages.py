@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 from pydantic import ConfigDict, JsonValue, TypeAdapter, ValidationError
 
-from runtime import codecs
-from runtime.errors import CodecError
-from runtime.types import EEF_WIDTH, Float32, UInt8
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.errors import CodecError
+from runtime.core.types import EEF_WIDTH, Float32, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot

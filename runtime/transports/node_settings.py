@@ -6,13 +6,13 @@ from typing import Annotated
 
 from pydantic import Field
 
-from runtime.section import Section
+from runtime.core.settings import Settings
 from runtime.transports.node_messages import Encoding
 
 Endpoint = Annotated[str, Field(pattern=r"^(tcp|ipc|inproc)://.+")]
 
 
-class NodeSettings(Section):
+class NodeSettings(Settings):
     """Where a node publishes observations, and how they are taken."""
 
     sub_endpoint: Endpoint = "tcp://127.0.0.1:5555"

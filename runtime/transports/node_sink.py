@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zmq
 
-from runtime import codecs
-from runtime.clock import Clock
-from runtime.errors import TransportError
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import Clock
+from runtime.core.errors import TransportError
+from runtime.core.types import Float32, RobotCommand
 from runtime.transports import node_link
 from runtime.transports.base import Sink
-from runtime.types import Float32, RobotCommand
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import zmq
 
-from runtime.clock import Clock, ClockMap
-from runtime.errors import TransportError
-from runtime.messages import Event
+from runtime.core.clock import Clock, ClockMap
+from runtime.core.errors import TransportError
+from runtime.core.types import Observation, UInt8
+from runtime.ipc.messages import Event
 from runtime.transports import node_link
 from runtime.transports.base import Source
 from runtime.transports.freshness import FROZEN_S, Freshness
@@ -27,7 +28,6 @@ from runtime.transports.node_messages import (
     NodeMessages,
     NodeStatus,
 )
-from runtime.types import Observation, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot

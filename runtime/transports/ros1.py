@@ -13,9 +13,9 @@ from urllib.parse import urlsplit
 
 from pydantic import Field, model_validator
 
-from runtime.clock import Clock
-from runtime.errors import ConfigurationError
-from runtime.section import Section
+from runtime.core.clock import Clock
+from runtime.core.errors import ConfigurationError
+from runtime.core.settings import Settings
 from runtime.transports.base import Capabilities
 from runtime.transports.ros import packed
 from runtime.transports.ros.middleware import COMMAND_QUALITY, Middleware, Quality
@@ -35,7 +35,7 @@ _PICTURES = Quality(depth=1)
 REAL_TIME = True  # what is at its other end goes on by itself
 
 
-class Link(Section):
+class Link(Settings):
     """Where ROS 1 is, and who reaches whom."""
 
     table: ClassVar[str] = "transport"  # of a deployment, for sentences

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from runtime.clock import Clock
-from runtime.errors import ConfigurationError
-from runtime.section import Section
+from runtime.core.clock import Clock
+from runtime.core.errors import ConfigurationError
+from runtime.core.settings import Settings
 from runtime.transports.base import Capabilities
 from runtime.transports.ros import cdr, dds, rcl
 from runtime.transports.ros.middleware import COMMAND_QUALITY, SENSOR_QUALITY, Middleware, Quality
@@ -29,7 +29,7 @@ NODE = "eva_web"
 REAL_TIME = True  # what is at its other end goes on by itself
 
 
-class Link(Section):
+class Link(Settings):
     """Which ROS 2, by which middleware, on which network."""
 
     table: ClassVar[str] = "transport"  # of a deployment, for sentences

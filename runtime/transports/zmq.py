@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import model_validator
 
-from runtime.clock import Clock
-from runtime.errors import ConfigurationError
+from runtime.core.clock import Clock
+from runtime.core.errors import ConfigurationError
 from runtime.transports.base import Capabilities
 from runtime.transports.node_settings import Endpoint, NodeSettings
 from runtime.transports.node_sink import NodeSink

@@ -1,4 +1,4 @@
-"""`python -m runtime.channel STATION`: the control channel of a station that runs, as its deployment says.
+"""`python -m runtime.clients.channel STATION`: the control channel of a station that runs, as its deployment says.
 
 The station starts it by itself where `control_channel.enabled` is set.
 """
@@ -19,14 +19,16 @@ from pathlib import Path
 import zmq
 
 from robots.broken_pipe import unread_ends
-from runtime import deployment, log
-from runtime.bus import Endpoints
-from runtime.channel.door import Door, Names
-from runtime.client import StationClient
-from runtime.config import ControlChannelSettings
-from runtime.errors import ConfigurationError, RuntimeFault, TransportError
-from runtime.family import Lifeline
-from runtime.rerun import data_folder
+from runtime.clients.channel.door import Door
+from runtime.clients.channel.names import Names
+from runtime.clients.client import StationClient
+from runtime.config import loader as deployment
+from runtime.config.schema import ControlChannelSettings
+from runtime.core import logs as log
+from runtime.core.errors import ConfigurationError, RuntimeFault, TransportError
+from runtime.ipc.bus import Endpoints
+from runtime.ipc.lifeline import Lifeline
+from runtime.station.rerun import data_folder
 
 _log = logging.getLogger(__name__)
 _POLL_S = 0.1
@@ -53,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m runtime.channel", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m runtime.clients.channel", description=__doc__)
     parser.add_argument("station", help="name of a station that runs on this machine")
     parser.add_argument("--data-dir", type=Path, metavar="DIR", help="$EVA_DATA_DIR or ./data if not given")
     parser.add_argument("--lifeline", action="store_true", help="end when standard input ends")

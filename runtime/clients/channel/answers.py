@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from runtime.channel.message import Message
-from runtime.channel.outcomes import Outcome
+from runtime.clients.channel.message import Message
+from runtime.clients.channel.outcomes import Outcome
 
 
 def told(message: Message, outcome: Outcome, data: Mapping[str, Any], state: str | None) -> dict[str, Any]:

@@ -6,16 +6,15 @@ import uuid
 from collections.abc import Callable
 from typing import Any
 
-from runtime.channel import answers
-from runtime.channel.message import Message
-from runtime.channel.outcomes import Outcome, Outcomes
-from runtime.channel.scripts import Lives
-from runtime.channel.verbs import stops
-from runtime.client import Refused, StationClient
-from runtime.errors import RuntimeFault, TransportError
+from runtime.clients.channel import answers
+from runtime.clients.channel.message import Message
+from runtime.clients.channel.outcomes import Outcome, Outcomes
+from runtime.clients.channel.scripts import Lives
+from runtime.clients.channel.verbs import stops
+from runtime.clients.client import Refused, StationClient
+from runtime.core.errors import RuntimeFault, TransportError
 
 _ANYBODY = 'anybody may {"command": "estop"}'
-_LONGEST = 200  # characters of a reason
 
 
 def is_stop(message: Message) -> bool:
@@ -77,11 +76,10 @@ class EStop:
 
     def answer(self, holder: str, message: Message) -> dict[str, Any]:
         """What the guard says; never refused for an argument."""
-        given = message.arguments.get("why") or message.argument or "over the control channel"
         outcome = Outcome(message.id or str(uuid.uuid4()), message.name, "estop", "done")
         client = self._open(holder)
         try:
-            ack = client.estop(_readable(given))
+            ack = client.estop(str(message.arguments["why"]))
             outcome.result, outcome.reason = "done" if ack.status == "done" else "failed", ack.reason
         except RuntimeFault as fault:
             outcome.result, outcome.reason = "unknown", str(fault)
@@ -92,8 +90,3 @@ class EStop:
 
     def close(self) -> None:
         """Nothing is kept open."""
-
-
-def _readable(given: object) -> str:
-    """A reason of any kind as text that every wire takes."""
-    return str(given)[:_LONGEST].encode(errors="replace").decode()

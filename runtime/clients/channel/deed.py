@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
-from runtime.channel.message import Message
-from runtime.channel.selection import Selection
-from runtime.errors import RuntimeFault
+from runtime.clients.channel.message import Message
+from runtime.clients.channel.selection import Selection
+from runtime.core.errors import RuntimeFault
 
 Step = tuple[str, Mapping[str, Any]]
 

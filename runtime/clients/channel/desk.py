@@ -9,23 +9,23 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from runtime.channel import answers
-from runtime.channel import status as older
-from runtime.channel.deed import NotOurs, Scene
-from runtime.channel.message import Message
-from runtime.channel.outcomes import Outcome, Outcomes, lasts
-from runtime.channel.scripts import Lives, Script, Scripts
-from runtime.channel.verbs import VERBS, deed
-from runtime.client import Refused, StationClient
-from runtime.errors import RuntimeFault, TransportError
-from runtime.transitions import COMMANDS
+from runtime.clients.channel import answers
+from runtime.clients.channel import status as older
+from runtime.clients.channel.deed import NotOurs, Scene
+from runtime.clients.channel.message import Message
+from runtime.clients.channel.outcomes import Outcome, Outcomes, lasts
+from runtime.clients.channel.scripts import Lives, Script, Scripts
+from runtime.clients.channel.verbs import VERBS, deed
+from runtime.clients.client import Refused, StationClient
+from runtime.core.errors import RuntimeFault, TransportError
+from runtime.ipc.command_arguments import ARGUMENTS
 
 log = logging.getLogger(__name__)
-OWN = (*COMMANDS, "aim", "estop", "claim", "give_up")
+OWN = (*ARGUMENTS, "aim", "estop", "claim", "give_up")
 QUERIES = ("status", "config", "frame", "station", "events", "result", "commands")
 _APART = (
-    '; a script that connects anew for every message is one only where it says who it is ("client": NAME), or '
-    'the deployment says control_channel.scripts = "together"'
+    '; a script is who it says that it is ("client": NAME); those that do not say it are one holder, or one each '
+    'where the deployment says control_channel.scripts = "apart"'
 )
 _FRAME_S = 0.5
 _LOOK_S = 0.1

@@ -7,47 +7,26 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import zmq
 
-from runtime.channel import answers, strict
-from runtime.channel.brake import Brake, EStop, is_estop, is_stop
-from runtime.channel.desk import Desk
-from runtime.channel.lane import Job, Lane
-from runtime.channel.message import LARGEST, Malformed, Message, read
-from runtime.channel.outcomes import Outcomes
-from runtime.channel.scripts import Lives
-from runtime.client import StationClient
-from runtime.errors import TransportError
+from runtime.clients.channel import answers, strict
+from runtime.clients.channel.brake import Brake, EStop, is_estop, is_stop
+from runtime.clients.channel.desk import Desk
+from runtime.clients.channel.lane import Job, Lane
+from runtime.clients.channel.message import LARGEST, Malformed, Message, read
+from runtime.clients.channel.names import Names
+from runtime.clients.channel.outcomes import Outcomes
+from runtime.clients.channel.scripts import Lives
+from runtime.clients.client import StationClient
+from runtime.core.errors import TransportError
 
 HOST = "127.0.0.1"
-_CONNECTIONS = 1000  # whose numbers are remembered
 _REPLIES = "inproc://channel-replies-{}"
 _NUMBERS = itertools.count()
 _END_S = 1.0
 _AT_ONCE = 64  # messages, after which answers go out first: a flood keeps nobody waiting for theirs
-
-
-class Names:
-    """Who a message is of: a script that names itself, a connection, or all scripts together."""
-
-    def __init__(self, operator: str, scripts: Literal["apart", "together"]) -> None:
-        self._base, self._apart = f"channel:{operator}", scripts == "apart"
-        self._numbers: dict[bytes, int] = {}
-        self._next = itertools.count(1)
-
-    def holder(self, connection: bytes, client: str) -> str:
-        """The name under which it holds a lease; no script can give itself one outside the channel's."""
-        if client:
-            return f"{self._base}/{client}"
-        if not self._apart:
-            return self._base
-        number = self._numbers.pop(connection, None) or next(self._next)
-        self._numbers[connection] = number
-        if len(self._numbers) > _CONNECTIONS:
-            del self._numbers[next(iter(self._numbers))]
-        return f"{self._base}#{number}"
 
 
 class Door:
@@ -108,10 +87,12 @@ class Door:
             self._send([*address, strict.dumps(answers.error(str(fault)))])
             return
         holder = self._names.holder(address[0], message.client)
-        self._lives.heard(holder)
+        if self._names.lives(address[0], message, is_stop(message) or is_estop(message)):
+            self._lives.heard(holder)
         lane = self._lane_of(message)
         if not lane.put(Job(address, holder, message, time.monotonic(), self._stops)):
-            why = "too many commands wait: not carried out"
+            under_way = "so many presses are under way already that this one adds nothing"
+            why = under_way if is_estop(message) else "too many commands wait: not carried out"
             self._send([*address, strict.dumps(answers.error(why) | message.echo)])
 
     def _lane_of(self, message: Message) -> Lane:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from queue import Empty, Full, Queue
 from typing import Any, Protocol
 
-from runtime.channel import answers
-from runtime.channel.message import Message
+from runtime.clients.channel import answers
+from runtime.clients.channel.message import Message
 
 log = logging.getLogger(__name__)
 WAITING = 64  # messages in one inbox

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import re
 import uuid
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, NoReturn
 
-from runtime.errors import RuntimeFault
+from runtime.core.errors import RuntimeFault
+from runtime.ipc import estop_requests as pressing
 
 LARGEST = 64 * 1024  # bytes of one message
 _PREFIX = "web:"
+_LONGEST_NAME = 80  # characters of a press's name that its answer repeats
 _CLIENT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 _OWN_KEYS = ("command", "arguments", "client", "id")
 
@@ -44,7 +46,10 @@ class Message:
 
 
 def read(frames: list[bytes]) -> Message:
-    """The message in the frames behind the address; raises Malformed."""
+    """The message in the frames behind the address; raises Malformed, but for a press of the e-stop."""
+    for frame in frames:
+        if (said := pressing.in_json(frame, "command", "cmd")) is not None:
+            return _press(said)
     fields = _object(frames)
     client, identity = _client(fields), _identity(fields)
     if "query" in fields:
@@ -58,6 +63,25 @@ def read(frames: list[bytes]) -> Message:
             "command", _word(fields, "command"), fields, arguments=arguments, client=client, id=identity
         )
     raise Malformed("message must carry 'cmd' or 'query' (or 'command')")
+
+
+def _press(said: Mapping[str, Any]) -> Message:
+    """A press, of which only what makes sense is kept; `arguments` has the reason."""
+    form: Literal["cmd", "command"] = "cmd" if isinstance(said.get("cmd"), str) else "command"
+    word = said.get(form)
+    named = word if isinstance(word, str) else pressing.NAME
+    reason = named.partition(f"{pressing.NAME}:")[2] or "over the control channel"
+    arguments = {"why": pressing.why_in(said, pressing.kept(reason))}
+    fields: dict[str, Any] = {form: named[:_LONGEST_NAME]}
+    client, identity = _or_none(_client, said), _or_none(_identity, said)
+    return Message(form, pressing.NAME, fields, None, arguments, client, identity)
+
+
+def _or_none(read: Callable[[Mapping[str, Any]], str], said: Mapping[str, Any]) -> str:
+    try:
+        return read(said)
+    except Malformed:
+        return ""
 
 
 def _object(frames: list[bytes]) -> dict[str, Any]:

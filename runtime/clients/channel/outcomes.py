@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from runtime.terminal.settling import CALM_TICKS, Settled, busy
+from runtime.clients.terminal.settling import CALM_TICKS, Settled, busy
 
 KEPT = 1000
 # The state in which each goes on; the rest goes on within the state it was given in.

@@ -6,9 +6,9 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from runtime.channel.selection import Selection
-from runtime.client import Refused, StationClient
-from runtime.errors import TransportError
+from runtime.clients.channel.selection import Selection
+from runtime.clients.client import Refused, StationClient
+from runtime.core.errors import TransportError
 
 KEPT = 200  # scripts of one connection each, of which the oldest are forgotten
 

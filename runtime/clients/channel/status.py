@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from runtime.channel.selection import Selection
+from runtime.clients.channel.selection import Selection
 
 _STARTED = ("ready", "running", "holding")
 _CLI_MODES = {"continuous": "real", "preview": "step"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from runtime.channel.deed import Deed, Scene
+from runtime.clients.channel.deed import Deed, Scene, Step
 
 STOPS = ("stop", "halt", "rollout_stop")  # verbs that overtake whatever waits
 _STOPPING_INTENTS = ("accept", "cancel")  # of operator_action
@@ -96,10 +96,15 @@ def _saved(scene: Scene) -> Deed:
     return Deed(told={"episode": episode}, note="it was saved as it went on, when it was stopped")
 
 
-def _console_reset(scene: Scene) -> Deed:
+def _reset(scene: Scene) -> Deed:
+    """After a trial; a run that was halted is over then, one that goes on is not ended by it."""
+    end: tuple[Step, ...] = (("stop", {}),) if scene.state == "holding" else ()
+    return Deed((*end, ("home", {})))
+
+
+def _bare_reset(scene: Scene) -> Deed:
     scene.nothing()
-    forgotten = {"task": None, "collect_task": None, "mode": None, "target": None}
-    return Deed(chosen=forgotten, note="what this script had selected is forgotten, but for the strategy")
+    return _reset(scene)
 
 
 def _tab(scene: Scene) -> Deed:
@@ -157,9 +162,8 @@ def _send(scene: Scene) -> Deed:
 
 def _home(scene: Scene) -> Deed:
     scene.nothing()
-    if scene.state == "running":
-        return Deed((("move", {"joints": list(scene.status["facts"]["home"])}),))
-    return Deed((("home", {}),))
+    home = list(scene.status["facts"]["home"])
+    return Deed(chosen={"target": home}, note="nothing has moved: web:manual_send goes home")
 
 
 def _init_move(scene: Scene) -> Deed:
@@ -218,7 +222,7 @@ def _untaken(scene: Scene) -> Deed:
 
 _INTENTS: dict[str, Callable[[Scene], Deed]] = {
     "rollout_toggle": _toggle,
-    "rollout_reset": lambda scene: Deed((("home", {}),)),
+    "rollout_reset": _reset,
     "start": lambda scene: Deed((("run", scene.selection.run),)),
     "accept": _stopping("stop"),
     "cancel": _stopping("stop"),
@@ -300,8 +304,8 @@ VERBS: dict[str, Verb] = {
     "estop": Verb(_stopping("estop"), "`estop`; new here"),
     "rollout_stop": Verb(_stopping("stop"), "`stop`"),
     "rollout_save": Verb(_saved, "nothing: a run is recorded as it goes on; refused while one is open"),
-    "reset": Verb(_plain("home"), "`home`"),
-    "console_reset": Verb(_console_reset, "forgets what this script has selected"),
+    "reset": Verb(_bare_reset, "`home`; while holding `stop` first, which ends the run; refused in a run"),
+    "console_reset": Verb(_bare_reset, "the same; what was selected stays"),
     "step_infer": Verb(_plain("step"), "`step`"),
     "step_commit": Verb(_plain("commit"), "`commit`"),
     "step_cancel": Verb(_plain("cancel"), "`cancel`"),
@@ -309,7 +313,7 @@ VERBS: dict[str, Verb] = {
     "init_gripper": Verb(_init_gripper, "`gripper` of the side"),
     "manual_qpos": Verb(_target, "a target for web:manual_send"),
     "manual_send": Verb(_send, "`move` to that target; in a run in the mode manual"),
-    "manual_home": Verb(_home, "`home`, in a run in the mode manual a `move` there"),
+    "manual_home": Verb(_home, "the home pose as the target for web:manual_send; moves nothing"),
     "manual_dispatch": _never(_EXACTLY),
     "gripper": Verb(
         _gripper, "`gripper`: 1 opens or closes, 0 is `unlock`; a number is a `move` of it alone"

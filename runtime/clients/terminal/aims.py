@@ -7,8 +7,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from runtime.client import StationClient
-from runtime.errors import RuntimeFault
+from runtime.clients.client import StationClient
+from runtime.core.errors import RuntimeFault
 
 _STILL = 5e-4  # a joint that changes by less is not worth a line [rad, or the gripper's unit]
 

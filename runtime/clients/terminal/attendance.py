@@ -10,9 +10,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from runtime.client import Refused, StationClient
-from runtime.terminal.figures import away, line
-from runtime.terminal.keys import Keys, NoKeys, keys
+from runtime.clients.client import Refused, StationClient
+from runtime.clients.terminal.figures import away, line
+from runtime.clients.terminal.keys import Keys, NoKeys, keys
 
 # Commands that go on after they were accepted, and the states in which they do.
 LASTING = {

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from runtime.client import StationClient
+from runtime.clients.client import StationClient
 
 _BUSY = ("asking", "executing", "moving", "approaching", "starved")
 CALM_TICKS = 3  # an order reaches control, and its answer us, within that many

@@ -9,8 +9,8 @@ import os
 from collections.abc import Sequence
 from typing import Any, get_args
 
-from runtime.messages import Mode
-from runtime.recording.labels import Result
+from runtime.core.types import Result
+from runtime.ipc.messages import Mode
 
 # States of a station, and phases of a run that goes on.
 WORDS = (
@@ -23,9 +23,44 @@ _TRIPLES = (
     "--joints",
 )  # their numbers may begin with a minus, which argparse takes for an option
 
+_PRESSED = "pressed in a terminal"
+
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
-    """What was said; ends the process with exit code 2 and a sentence where it is nothing that there is."""
+    """What was said; ends the process with exit code 2 and a sentence where it is nothing that there is.
+
+    A press of the e-stop with whatever else is a press: the sentence is said all the same.
+    """
+    try:
+        return _strictly(words)
+    except SystemExit as end:
+        press = _press(words) if end.code else None
+        if press is None:
+            raise
+        return press
+
+
+def _press(words: Sequence[str]) -> argparse.Namespace | None:
+    """STATION estop, in either order, among words that mean nothing; None where it is something else."""
+    said, data_dir = [], _data_dir()
+    left = iter(words)
+    for word in left:
+        if word == "--data-dir":
+            data_dir = next(left, data_dir)
+        elif word.startswith("--data-dir="):
+            data_dir = word.partition("=")[2]
+        elif not word.startswith("-"):
+            said.append(word)
+    if "estop" not in said[:2] or len(said) < 2:
+        return None
+    station = said[0] if said[1] == "estop" else said[1]
+    why = " ".join(said[2:]) or _PRESSED
+    return argparse.Namespace(
+        data_dir=data_dir, station=station, command="estop", why=why, json="--json" in words
+    )
+
+
+def _strictly(words: Sequence[str]) -> argparse.Namespace:
     top, commands = _parser()
     given, unknown = top.parse_known_args(_joined(words))
     if unknown:
@@ -36,6 +71,10 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
         command.error(f"{given.command} does not take {' '.join(unknown)}; it takes {', '.join(options)}")
     _check(given, commands[given.command])
     return given
+
+
+def _data_dir() -> str:
+    return os.environ.get("EVA_DATA_DIR") or "data"
 
 
 def _joined(words: Sequence[str]) -> list[str]:
@@ -55,9 +94,7 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParse
         epilog="exit codes: 0 done, 1 refused or failed, 2 misspelt, 3 no answer in time: outcome unknown, 130 Ctrl-C",
         allow_abbrev=False,
     )
-    top.add_argument(
-        "--data-dir", default=os.environ.get("EVA_DATA_DIR") or "data", help="where stations lie"
-    )
+    top.add_argument("--data-dir", default=_data_dir(), help="where stations lie")
     top.add_argument("station")
     commands: dict[str, argparse.ArgumentParser] = {}
     lines = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -206,7 +243,7 @@ def _label(line: argparse.ArgumentParser) -> None:
 
 
 def _estop(line: argparse.ArgumentParser) -> None:
-    line.add_argument("why", nargs="?", default="pressed in a terminal")
+    line.add_argument("why", nargs="?", default=_PRESSED)
 
 
 def _wait(line: argparse.ArgumentParser) -> None:

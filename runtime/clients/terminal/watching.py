@@ -7,8 +7,8 @@ import json
 import time
 from typing import Any
 
-from runtime.client import StationClient
-from runtime.terminal.figures import line
+from runtime.clients.client import StationClient
+from runtime.clients.terminal.figures import line
 
 _SHOW_S = 0.5
 _PATIENCE_S = 2.0

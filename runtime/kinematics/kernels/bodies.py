@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.core.types import Float32, Float64
 from runtime.kinematics.kernels.compiling import kernel
 from runtime.kinematics.kernels.sines import sines_of
-from runtime.types import Float32, Float64
 
 
 class Parts(NamedTuple):

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from runtime.core.types import Float64
 from runtime.kinematics.kernels.compiling import kernel, part
 from runtime.kinematics.kernels.rotations import quaternion_of
 from runtime.kinematics.kernels.sines import sines_of
 from runtime.kinematics.tables import Record, Records
-from runtime.types import Float64
 
 
 def reach_type(moving: int) -> np.dtype[np.void]:

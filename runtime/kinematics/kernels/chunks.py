@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from runtime.core.types import Float64, UInt8
 from runtime.kinematics.kernels.chains import reach_for, reach_type
 from runtime.kinematics.kernels.compiling import kernel, part
 from runtime.kinematics.kernels.frames import Costs, frame_type, near_singular, solve_frame
-from runtime.kinematics.kernels.postures import POSED, lean, look
+from runtime.kinematics.kernels.postures import lean, look
 from runtime.kinematics.kernels.rotations import matrix_of
-from runtime.kinematics.tables import Record, Records, chain_type
-from runtime.types import Float64, UInt8
+from runtime.kinematics.tables import POSED, Record, Records, chain_type
 
 FINE, NOT_FINITE, NO_QUATERNION = 0, 1, 2
 _OVER_TOLERANCE, _AT_LIMIT, _AT_VELOCITY, _NEAR_SINGULAR = 1, 2, 4, 8  # runtime.kinematics.base.IkFlag

@@ -7,9 +7,8 @@ import numpy as np
 from runtime.kinematics.kernels.chains import jacobian_of, reach_for
 from runtime.kinematics.kernels.compiling import part
 from runtime.kinematics.kernels.frames import Costs, set_normal
-from runtime.kinematics.tables import Record
+from runtime.kinematics.tables import POSED, Record
 
-POSED = 6  # numbers that a pose holds: joints beyond them are free
 _FARTHEST = 0.6  # rad (m) from home beyond which the pull no longer grows, so that limits outweigh it
 _REPELLED = 4.0  # rad (m) that a limit pushes where the room is half of what it is kept at
 _TOUCHING = 0.01  # rad (m) of room below which that no longer grows

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from runtime.core.types import Float64
 from runtime.kinematics.kernels.compiling import part
-from runtime.types import Float64
 
 _SMALL = 0.02  # sine below which four terms of the arc sine's series are exact to the last digit
 _TURNED = -0.5  # cosine below which a matrix no longer shows its axis as a difference

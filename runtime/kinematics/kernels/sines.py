@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from runtime.core.types import Float64
 from runtime.kinematics.kernels.compiling import part
-from runtime.types import Float64
 
 # A quarter turn in three parts, the first two of 33 bits, so that multiples of them are exact (Cody and Waite 1980).
 _QUARTERS = 2 / math.pi

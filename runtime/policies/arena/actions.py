@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from runtime.errors import ActionSpaceError, ConfigurationError, ShapeError
-from runtime.formats import PoseRows
+from runtime.core.errors import ActionSpaceError, ConfigurationError, ShapeError
+from runtime.core.pose_format import PoseFormat
+from runtime.core.settings import Settings
+from runtime.core.types import ActionChunk, Float32
 from runtime.policies.answers import Rate
 from runtime.policies.arena.wants import ActionSpace, Wants
 from runtime.policies.grip import Convention, Grip
 from runtime.policies.rows import action_rows
-from runtime.pose_format import PoseFormat
-from runtime.section import Section
-from runtime.types import ActionChunk, Float32
+from runtime.spaces.pose_rows import PoseRows
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Step = Annotated[float, Field(gt=0, le=1.0)]
 
 
-class VelocitySteps(Section):
+class VelocitySteps(Settings):
     """What a velocity of 1.0 moves within one row of the answer; the defaults are DROID's, at 15 rows per second."""
 
     joint: Step = 0.2
@@ -35,7 +35,7 @@ class VelocitySteps(Section):
     """Of the end effector [rad]."""
 
 
-class MeantSettings(Section):
+class MeantSettings(Settings):
     """What the answers of a server of the RoboArena family are."""
 
     action_space: ActionSpace = "joint_position"

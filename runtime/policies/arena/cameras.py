@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Literal
 
-from runtime.errors import ConfigurationError, ContradictionError
+from runtime.core.errors import ConfigurationError, ContradictionError
 from runtime.policies.arena.wants import Wants
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Mapping
 
-from runtime.types import Observation, UInt8
+from runtime.core.types import Observation, UInt8
 
 _ROOM = 8.0  # steps beyond the oldest that is shown: a request is about an observation that is not the newest any more
 

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from runtime.errors import ConfigurationError, PolicyError
-from runtime.formats import PoseRows
+from runtime.core.errors import ConfigurationError, PolicyError
+from runtime.core.pose_format import PoseFormat
+from runtime.core.settings import Settings
+from runtime.core.types import EEF_WIDTH, Float32, Observation, UInt8
 from runtime.policies.arena.cameras import Cameras, Numbering, Slot
 from runtime.policies.arena.history import History
 from runtime.policies.arena.wants import Wants
 from runtime.policies.grip import Convention, Grip
 from runtime.policies.pictures import fitted
 from runtime.policies.request import Size
-from runtime.pose_format import PoseFormat
-from runtime.section import Section
-from runtime.types import EEF_WIDTH, Float32, Observation, UInt8
+from runtime.spaces.pose_rows import PoseRows
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -28,7 +28,7 @@ Steps = Annotated[int, Field(ge=0, le=64)]
 _FIELD_SIZE = (288, 512)  # to which the field's client brings every picture first
 
 
-class ShownSettings(Section):
+class ShownSettings(Settings):
     """What a server of the RoboArena family is shown."""
 
     cameras: dict[str, Slot] = Field(default_factory=dict)

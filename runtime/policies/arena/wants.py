@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from runtime.errors import ActionSpaceError, PolicyError, WrongProtocolError
+from runtime.core.errors import ActionSpaceError, PolicyError, WrongProtocolError
 
 ActionSpace = Literal["joint_position", "joint_velocity", "cartesian_position", "cartesian_velocity"]
 SPACES: tuple[ActionSpace, ...] = get_args(ActionSpace)

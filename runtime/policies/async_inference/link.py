@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from runtime.errors import (
+from runtime.core.errors import (
     ConfigurationError,
     PolicyError,
     PolicyGone,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from runtime.errors import CodecError
+from runtime.core.errors import CodecError
 
 READY = "/transport.AsyncInference/Ready"
 INSTRUCT = "/transport.AsyncInference/SendPolicyInstructions"

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from runtime.errors import CodecError
+from runtime.core.errors import CodecError
 from runtime.policies.async_inference.tensors import Tensors
 
 MODULES = {"0.4": "lerobot.async_inference.helpers", "0.3": "lerobot.scripts.server.helpers"}

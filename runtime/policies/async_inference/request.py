@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from runtime.errors import ConfigurationError, ContradictionError, ShapeError, WrongProtocolError
+from runtime.core.errors import ConfigurationError, ContradictionError, ShapeError, WrongProtocolError
+from runtime.core.types import Float32, Observation
 from runtime.policies.async_inference.pickles import (
     MODULES,
     RemotePolicyConfig,
@@ -21,7 +22,6 @@ from runtime.policies.grip import Convention, Grip
 from runtime.policies.meaning import MeaningSettings
 from runtime.policies.request import Dims, poses_of
 from runtime.policies.rows import action_rows
-from runtime.types import Float32, Observation
 
 if TYPE_CHECKING:
     from robots import Robot

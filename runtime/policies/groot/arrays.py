@@ -1,8 +1,8 @@
-"""The msgpack dialects of GR00T: arrays go out as numpy files (NPY), and come in so or as msgpack_numpy's (MNP).
+"""The msgpack dialects of GR00T: arrays as numpy files (NPY), or as the package msgpack_numpy has them (MNP).
 
 NPY, as N1.5 and N1.6 have it: a map of `__ndarray_class__` true and `as_npy`, the bytes of a .npy file. MNP, as
-N1.7 answers: a map of `nd`, `type`, `kind`, `shape`, `data` with binary keys. N1.7 reads both.
-Nothing here ever unpickles.
+N1.7 has it: a map of `nd`, `type`, `kind`, `shape`, `data` with binary keys. N1.7 reads both, its early access MNP
+alone. Nothing here ever unpickles.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped]
 import numpy as np
 
-from runtime.errors import CodecError
+from runtime.core.errors import CodecError
 
 _KINDS = "biuf"  # bool, integers, floats
 _MAGIC = b"\x93NUMPY"
@@ -27,10 +27,10 @@ _HEADER = re.compile(
 _MOST_DIMENSIONS = 32
 
 
-def pack(value: object) -> bytes:
-    """`value` as one message, arrays as NPY, numpy scalars as plain numbers; CodecError for anything else."""
+def pack(value: object, mnp: bool = False) -> bytes:
+    """`value` as one message, arrays as NPY or `mnp`, numpy scalars as plain numbers; CodecError for anything else."""
     try:
-        packed: bytes = msgpack.packb(value, default=_encode)
+        packed: bytes = msgpack.packb(value, default=_as_mnp if mnp else _as_npy)
     except (TypeError, ValueError, OverflowError) as error:
         raise CodecError(f"cannot pack {type(value).__name__}: {error}") from error
     return packed
@@ -53,13 +53,28 @@ def unpack(payload: bytes, limit: int) -> Any:
         raise CodecError(f"{len(payload)} bytes are not one msgpack message: {text}") from error
 
 
-def _encode(value: object) -> object:
-    if isinstance(value, np.ndarray):
-        if value.dtype.kind not in _KINDS:
-            raise CodecError(f"cannot pack an array of {value.dtype.str!r}; allowed: bool, integers, floats")
-        file = io.BytesIO()
-        np.save(file, value, allow_pickle=False)
-        return {"__ndarray_class__": True, "as_npy": file.getvalue()}
+def _as_npy(value: object) -> object:
+    if not isinstance(value, np.ndarray):
+        return _number(value)
+    file = io.BytesIO()
+    np.save(file, _plain(value), allow_pickle=False)
+    return {"__ndarray_class__": True, "as_npy": file.getvalue()}
+
+
+def _as_mnp(value: object) -> object:
+    if not isinstance(value, np.ndarray):
+        return _number(value)
+    fields = {b"nd": True, b"type": _plain(value).dtype.str, b"kind": b"", b"shape": list(value.shape)}
+    return fields | {b"data": value.tobytes()}
+
+
+def _plain(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    if array.dtype.kind not in _KINDS:
+        raise CodecError(f"cannot pack an array of {array.dtype.str!r}; allowed: bool, integers, floats")
+    return array
+
+
+def _number(value: object) -> object:
     if isinstance(value, np.generic):
         return value.item()  # N1.6 cannot pack numpy's own
     raise CodecError(f"cannot pack a {type(value).__name__}; allowed: numbers, strings, lists, maps, arrays")

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 import zmq
 
-from runtime.errors import PolicyError, PolicyGone, PolicyLostError, PolicyTimeout, WrongProtocolError
+from runtime.core.errors import PolicyError, PolicyGone, PolicyLostError, PolicyTimeout, WrongProtocolError
 from runtime.policies.reach import Dial, Place, reached
 
 _SPELL_MS = 20  # how soon a wait notices that it was aborted; an answer is noticed at once

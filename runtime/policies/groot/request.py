@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from runtime.errors import (
+from runtime.core.errors import (
     ActionSpaceError,
     ConfigurationError,
     ContradictionError,
@@ -18,18 +18,19 @@ from runtime.errors import (
     ShapeError,
     WrongProtocolError,
 )
+from runtime.core.types import Float32, Observation, UInt8
 from runtime.policies.grip import Convention, Grip
 from runtime.policies.groot.modality import Modalities, Modality, Written, listed
 from runtime.policies.meaning import MeaningSettings
 from runtime.policies.request import Dims, poses_of
 from runtime.policies.rows import action_rows
-from runtime.types import Float32, Observation, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot
 
 Parts = Annotated[dict[str, Dims], Field(min_length=1)]
 _ORIENTATIONS = {"XYZ_ROT6D": "6d", "XYZ_ROTVEC": "rotation_vector"}
+_LANGUAGE = "annotation.human.task_description"  # what servers that name no key look for
 _MOST_STEPS = 64  # of a modality; more pictures than that in one request are a mistake
 
 
@@ -92,10 +93,17 @@ class Gr00tRequest:
             raise ContradictionError(
                 f"the server is {version}, policy.dialect = {settings.dialect!r}; correct the one that is wrong"
             )
+        if wanted.contract is not None and settings.dialect != "nested":
+            raise ContradictionError(
+                f"the server has no modality configurations, policy.dialect = {settings.dialect!r}; "
+                'allowed for such a server: "nested"'
+            )
         _same_keys("video", wanted.video, settings.video)
         _same_keys("state", wanted.state, settings.state)
         if wanted.action.keys:
             _same_keys("actions", wanted.action, [*settings.actions, *settings.ignored_actions])
+        _check_widths("state", wanted.state.widths, settings.state)
+        _check_widths("actions", wanted.action.widths, settings.actions)
         for key in settings.actions:
             _check_written(key, wanted.action.written.get(key), settings)
         self._language = _language_key(wanted.language, settings.language_key)
@@ -227,7 +235,7 @@ def _check_cover(parts: Mapping[str, Sequence[int]], width: int) -> None:
 def _same_keys(name: str, wanted: Modality, given: Iterable[str]) -> None:
     """Servers refuse a request with a key too many or too few, and name neither."""
     here = list(given)
-    if set(here) != set(wanted.keys):
+    if wanted.keys is not None and set(here) != set(wanted.keys):
         kind = ActionSpaceError if name == "actions" else ContradictionError
         raise kind(
             f"the server's model has the {name} keys {listed(wanted.keys)}; policy.{name} has {listed(here)}; "
@@ -235,18 +243,27 @@ def _same_keys(name: str, wanted: Modality, given: Iterable[str]) -> None:
         )
 
 
+def _check_widths(name: str, wanted: Mapping[str, int], given: Parts) -> None:
+    for key, dims in given.items():
+        if wanted.get(key, len(dims)) != len(dims):
+            raise ContradictionError(
+                f"the server's model has {wanted[key]} numbers in {key!r}; policy.{name}.{key} has {len(dims)}"
+            )
+
+
 def _language_key(wanted: Modality, given: str | None) -> str:
-    if given is not None and wanted.keys and given not in wanted.keys:
+    keys = (_LANGUAGE,) if wanted.keys is None and given is None else wanted.keys or ()
+    if given is not None and keys and given not in keys:
         raise ContradictionError(
-            f"the server's model has the language keys {listed(wanted.keys)}; policy.language_key = {given!r}"
+            f"the server's model has the language keys {listed(keys)}; policy.language_key = {given!r}"
         )
     if given is not None:
         return given
-    if len(wanted.keys) != 1:
+    if len(keys) != 1:
         raise ContradictionError(
-            f"the server's model has the language keys {listed(wanted.keys)}; set policy.language_key to one of them"
+            f"the server's model has the language keys {listed(keys)}; set policy.language_key to one of them"
         )
-    return wanted.keys[0]
+    return keys[0]
 
 
 def _check_steps(name: str, wanted: Modality, history: str) -> None:

@@ -7,10 +7,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from runtime.errors import ServerSaysError, WrongProtocolError
+from runtime.core.errors import ServerSaysError, WrongProtocolError
+from runtime.core.types import Conditioning
 from runtime.policies.link import headline
 from runtime.policies.rtc.base import Dialect, Message
-from runtime.types import Conditioning
 
 NAME = "openpi-async-rtc"
 VERSION = 2

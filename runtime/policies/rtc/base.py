@@ -6,8 +6,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
-from runtime.errors import ContradictionError, PolicyError, WrongProtocolError
-from runtime.types import Conditioning
+from runtime.core.errors import ContradictionError, PolicyError, WrongProtocolError
+from runtime.core.types import Conditioning
 
 Message = dict[str, Any]
 

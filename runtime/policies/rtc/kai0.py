@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from runtime.core.types import Conditioning, Float32
 from runtime.policies.rtc.base import Dialect, Message, dialect_told
 from runtime.policies.rtc.openpi_rtc import Rows
 from runtime.policies.rtc.prev_action import padded
-from runtime.types import Conditioning, Float32
 
 NAME = "kai0"
 _COLUMNS = 32  # of the model: rows are padded with zeros to it, or cropped

@@ -13,16 +13,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from runtime.errors import ConfigurationError, ContradictionError
+from runtime.core.errors import ConfigurationError, ContradictionError
+from runtime.core.settings import Settings
+from runtime.core.types import Conditioning, Float32
 from runtime.policies.rtc.base import Dialect, Message, dialect_told
-from runtime.section import Section
-from runtime.types import Conditioning, Float32
 
 NAME = "openpi_rtc"
 Rows = Literal["aligned", "whole"]
 
 
-class EnvelopeKeys(Section):
+class EnvelopeKeys(Settings):
     """What the parts of the envelope are called, and how many rows the server takes off."""
 
     observation: Literal["obs", "observation"] = "obs"

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from runtime.core.types import Conditioning, Float32
 from runtime.policies.rtc.base import Dialect, Message, dialect_told
-from runtime.types import Conditioning, Float32
 
 NAME = "prev_action"
 

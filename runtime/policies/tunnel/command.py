@@ -6,7 +6,7 @@ import math
 import os
 from urllib.parse import urlsplit
 
-from runtime.errors import ConfigurationError
+from runtime.core.errors import ConfigurationError
 from runtime.policies.reach import Place
 from runtime.policies.tunnel.settings import TunnelSettings, is_host
 

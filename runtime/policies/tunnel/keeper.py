@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from runtime.back_off import BackOff
+from runtime.core.backoff import BackOff
 from runtime.policies.tunnel.process import Ssh
 from runtime.policies.tunnel.sentences import is_taken, unopened, why
 

@@ -7,7 +7,7 @@ import shutil
 import threading
 from collections.abc import Iterator
 
-from runtime.errors import (
+from runtime.core.errors import (
     ConfigurationError,
     PolicyError,
     PolicyLostError,
@@ -15,6 +15,8 @@ from runtime.errors import (
     TunnelError,
     UnreachableError,
 )
+from runtime.core.settings import Settings
+from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.reach import Place
 from runtime.policies.tunnel.command import command, far_end, require_files
@@ -22,14 +24,12 @@ from runtime.policies.tunnel.keeper import Keeper, Status
 from runtime.policies.tunnel.process import Ssh, free_port
 from runtime.policies.tunnel.sentences import unreached
 from runtime.policies.tunnel.settings import TunnelSettings
-from runtime.section import Section
-from runtime.types import ActionChunk, Conditioning, Observation
 
 _SLACK_S = 3.0  # of the keeper's own deadline, which says more
 _HEARD_S = 0.3  # how soon ssh is known to have ended, or to have said what it was refused
 
 
-def through_tunnel(policy: Policy, config: Section) -> Policy:
+def through_tunnel(policy: Policy, config: Settings) -> Policy:
     """`policy`, through the tunnel that its section has, or as it is where that has none.
 
     Starts nothing. ConfigurationError where ssh is not installed, or policy.url is nowhere that a tunnel could lead.

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 
+from runtime.core.environment import for_ssh
 from runtime.policies.tunnel.listening import listens
 
 _BOUND = Path(__file__).with_name("bound.py")
@@ -46,7 +47,7 @@ class Ssh:
             stdin=subprocess.PIPE if echoes else subprocess.DEVNULL,  # its end is that of a session, too
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            env=os.environ | {"SSH_ASKPASS_REQUIRE": "never"},
+            env=for_ssh(),
             start_new_session=True,  # without a terminal: nobody can be asked
         )
         self._pipes = [pipe for pipe in (self._process.stdout, self._process.stderr) if pipe is not None]

@@ -9,20 +9,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from runtime.behaviour import Target
-from runtime.collision import Collision
-from runtime.config import Answer
-from runtime.errors import RuntimeFault
-from runtime.limiter import CommandLimiter, Limited
-from runtime.motion import Brake
-from runtime.page import EStop, Page
-from runtime.safety import Limits, RobotState, SafetySettings, braking
-from runtime.seen import Seen
-from runtime.switching import Switch
-from runtime.timeline import Dims, difference
+from runtime.config.schema import Answer
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Float32, Float64, RobotCommand
+from runtime.ipc.observation_reader import LatestObservation
+from runtime.ipc.shared_state import EStop, SharedState
+from runtime.motion.timeline import DimensionKinds, difference
+from runtime.motion.trajectories import Brake
+from runtime.processes.control.behaviours import Target
+from runtime.processes.control.node_handover import END
+from runtime.safety.collision import Collision
+from runtime.safety.filter import Limits, RobotState, SafetySettings, braking
+from runtime.safety.limiter import CommandLimiter, Limited
+from runtime.spaces.binary_grippers import Switch, open_or_closed
 from runtime.transports.base import Sink
-from runtime.types import Float32, Float64, RobotCommand
-from runtime.yielding import END
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class TickSettings:
 
     period: float
     limits: Limits
-    dims: Dims
+    dims: DimensionKinds
     safety: SafetySettings
     heartbeat_timeout: float
     starvation: Answer
@@ -83,7 +83,7 @@ class Actuator(ABC):
         self._ends: Float64 | None = None  # at its end, where that is another
 
     @abstractmethod
-    def state(self, seen: Seen, planned: float, aim: Float64 | None) -> RobotState:
+    def state(self, seen: LatestObservation, planned: float, aim: Float64 | None) -> RobotState:
         """What an action is judged against; `aim` is the action that was wanted before it."""
 
     @abstractmethod
@@ -107,6 +107,10 @@ class Actuator(ABC):
     def rest_here(self) -> None:
         """Count the last command as one at rest."""
         self.velocity, self._ends = np.zeros(len(self.commanded)), None
+
+    def open_or_close(self) -> None:
+        """Count binary grippers as told open or closed, although they were taken over in between."""
+        self.commanded = open_or_closed(self._settings.switches, self.commanded, self.commanded)
 
     def step_to(self, measured: Float64, why: str, farthest: Float64 | float = np.inf) -> None:
         """Count from where the robot is, and not from where it was told to be, at most `farthest` [D] from there.
@@ -182,7 +186,9 @@ class Actuator(ABC):
 class RobotActuator(Actuator):
     """The robot itself, behind a transport. A restarted control goes on from the last command, at rest."""
 
-    def __init__(self, page: Page, sink: Sink, settings: TickSettings, clock: Callable[[], float]) -> None:
+    def __init__(
+        self, page: SharedState, sink: Sink, settings: TickSettings, clock: Callable[[], float]
+    ) -> None:
         super().__init__(settings)
         self._page = page
         self._sink = sink
@@ -192,11 +198,11 @@ class RobotActuator(Actuator):
         self.engaged = bool(before["engaged"])
         self.commanded = np.array(before["commanded"], np.float64)
 
-    def measured(self, seen: Seen, now: float) -> Float64 | None:
+    def measured(self, seen: LatestObservation, now: float) -> Float64 | None:
         """Where the robot is, None where that is not known freshly."""
         return self._branch(seen) if seen.fresh(now, self._settings.safety.joint_age_s) else None
 
-    def state(self, seen: Seen, planned: float, aim: Float64 | None) -> RobotState:
+    def state(self, seen: LatestObservation, planned: float, aim: Float64 | None) -> RobotState:
         return RobotState(
             previous=self.commanded,
             velocity=self.velocity,
@@ -208,7 +214,7 @@ class RobotActuator(Actuator):
             aim=aim,
         )
 
-    def _branch(self, seen: Seen) -> Float64:
+    def _branch(self, seen: LatestObservation) -> Float64:
         """The joints, angles that wrap counted in the turn of the last command, as the node may not count them."""
         wrapping = self._settings.dims.wrapping
         if not wrapping or not self.engaged:
@@ -251,8 +257,9 @@ class SimulatedActuator(Actuator):
         super().__init__(settings)
         self._clock = clock
         self.engage(start)
+        self.open_or_close()
 
-    def state(self, seen: Seen, planned: float, aim: Float64 | None) -> RobotState:
+    def state(self, seen: LatestObservation, planned: float, aim: Float64 | None) -> RobotState:
         # Its joints are known at once; pictures come from outside and grow old as they do for the real robot.
         return RobotState(
             previous=self.commanded,

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runtime.motion import Brake, Motion
+from runtime.core.types import Float64
+from runtime.motion.timeline import Contributions
+from runtime.motion.trajectories import Brake, Motion
 from runtime.recording.base import ControlSource
-from runtime.safety import Path
-from runtime.timeline import Makers
-from runtime.types import Float64
+from runtime.safety.filter import Path
 
 
 class Target(NamedTuple):
@@ -23,7 +23,7 @@ class Target(NamedTuple):
     action: Float64
     source: ControlSource
     path: Path | None
-    makers: Makers = ()
+    makers: Contributions = ()
     velocity: Float64 | None = None  # at the end of the tick, where it is not that on the way there
 
 

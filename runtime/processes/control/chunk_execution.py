@@ -10,15 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
-from runtime.actuator import TickSettings
-from runtime.behaviour import Behaviour, Target
-from runtime.errors import ConfigurationError
-from runtime.messages import ChunkMerged, Mode, PostedChunk
-from runtime.plugins import variants
+from runtime.core.errors import ConfigurationError
+from runtime.core.plugins import variants
+from runtime.core.types import Float64
+from runtime.ipc.messages import ChunkMerged, Mode, PostedChunk
+from runtime.motion.timeline import DimensionKinds, Timeline, difference
+from runtime.processes.control.actuator import TickSettings
+from runtime.processes.control.behaviours import Behaviour, Target
 from runtime.recording.base import ControlSource
 from runtime.strategies.base import Arrival, Merge, Merged, join
-from runtime.timeline import Dims, Timeline, difference
-from runtime.types import Float64
 
 log = logging.getLogger(__name__)
 _JOINED_AT_ONCE = 0.05  # [rad] that a run's first action may be off without being blended in
@@ -33,7 +33,7 @@ class Strategy:
     merge: Merge
 
 
-def strategy(section: Mapping[str, Any], dims: Dims) -> Strategy:
+def strategy(section: Mapping[str, Any], dims: DimensionKinds) -> Strategy:
     """The strategy of a deployment's section `strategy`; ConfigurationError where it is none."""
     known = variants("runtime.strategies")
     kind = section.get("kind")
@@ -49,7 +49,7 @@ def strategy(section: Mapping[str, Any], dims: Dims) -> Strategy:
     return Strategy(kind, module.merge(config, dims))
 
 
-class Joined(NamedTuple):
+class JoinResult(NamedTuple):
     """What became of a chunk; `far` says how far from where the robot stood it began, "" where it is near.
 
     `too_far`: it was not used for that.
@@ -60,7 +60,7 @@ class Joined(NamedTuple):
     too_far: bool = False
 
 
-class Follow(Behaviour):
+class ExecuteChunks(Behaviour):
     """Executes the timeline of one run; None for a step that nothing is planned for."""
 
     name = "follow"
@@ -94,7 +94,7 @@ class Follow(Behaviour):
             self._expecting = True  # what the old strategy waited for is no gap of the new one
         self._strategy, self._useless = chosen, False
 
-    def join(self, chunk: PostedChunk, step: int, commanded: Float64) -> Joined:
+    def join(self, chunk: PostedChunk, step: int, commanded: Float64) -> JoinResult:
         """Let a chunk join the plan from `step`, the first one not yet sent, on; `commanded` [D] was sent last.
 
         One that is dropped, for whatever reason, ends the wait for the first; one that the robot waited for and
@@ -104,28 +104,30 @@ class Follow(Behaviour):
             joined = self._join(chunk, step, commanded)
         except Exception as error:  # about one chunk: it must not end what keeps the robot held
             log.exception("chunk %d cannot be used", chunk.chunk_id)
-            joined = Joined(dropped(chunk, step, f"control cannot use it: {type(error).__name__}: {error}"))
+            joined = JoinResult(
+                dropped(chunk, step, f"control cannot use it: {type(error).__name__}: {error}")
+            )
         self._expecting = False
         self._useless = bool(joined.merged.dropped) and chunk.waited
         return joined
 
-    def _join(self, chunk: PostedChunk, step: int, commanded: Float64) -> Joined:
+    def _join(self, chunk: PostedChunk, step: int, commanded: Float64) -> JoinResult:
         rows, dim = chunk.rows, len(commanded)
         if rows.ndim != 2 or rows.shape[1] != dim or not len(rows):
             shape = f"it has the shape {list(rows.shape)}; expected [H, {dim}], H from 1 on"
-            return Joined(dropped(chunk, step, shape))
+            return JoinResult(dropped(chunk, step, shape))
         arrival = Arrival(chunk.chunk_id, chunk.observation_step, rows.astype(np.float64), chunk.waited)
         safety = self._settings.safety
         # A policy that means to begin elsewhere is told by its first row; a late one has gone on by the first used.
         begin = arrival.rows[0] if chunk.meant is None else chunk.meant.astype(np.float64)
         if begin.shape != (dim,):
-            return Joined(
+            return JoinResult(
                 dropped(chunk, step, f"it means to begin at {list(begin.shape)} numbers; expected {dim}")
             )
         meant, where = self._away(begin, commanded)
         if meant > safety.jump:
             far = f"{where}, allowed {safety.jump:g} (safety.jump): approach it, or start elsewhere"
-            return Joined(dropped(chunk, step, far), far, too_far=True)
+            return JoinResult(dropped(chunk, step, far), far, too_far=True)
         away, where = self._away_where_used(arrival, step, commanded)
         far = f"{where}: blended in" if away > safety.first_action_far else ""
         held = commanded if away > _JOINED_AT_ONCE or self.starved else None
@@ -141,7 +143,7 @@ class Follow(Behaviour):
             commanded=commanded,
         )
         self._switched = switched and bool(merged.dropped)
-        return Joined(self._told(chunk, merged), far)
+        return JoinResult(self._told(chunk, merged), far)
 
     def _away_where_used(self, arrival: Arrival, step: int, commanded: Float64) -> tuple[float, str]:
         """The same of the first row that is not stale."""

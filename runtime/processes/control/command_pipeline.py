@@ -3,34 +3,40 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
-from runtime.actuator import Actuator, Sent, TickSettings
-from runtime.behaviour import Behaviour, Hold, Move, Silent, Target, Yielded
-from runtime.execution import Follow
-from runtime.locks import Locks
-from runtime.motion import Trajectory
-from runtime.report import Report
-from runtime.safety import SafetyFilter
-from runtime.seen import Seen
-from runtime.switching import Dwell
-from runtime.timeline import difference
-from runtime.types import Float64
+from runtime.core.types import Float64
+from runtime.ipc.observation_reader import LatestObservation
+from runtime.motion.timeline import difference
+from runtime.motion.trajectories import Trajectory
+from runtime.processes.control.actuator import Actuator, Sent, TickSettings
+from runtime.processes.control.behaviours import Behaviour, Hold, Move, Silent, Target, Yielded
+from runtime.processes.control.chunk_execution import ExecuteChunks
+from runtime.processes.control.gripper_locks import GripperLocks
+from runtime.processes.control.telemetry import Telemetry
+from runtime.safety.filter import SafetyFilter
+from runtime.spaces.binary_grippers import Dwell, open_or_closed
 
 _ARRIVED = 1e-4  # [rad] of a motion's end: it may have been limited on its last steps
 _QUIET_S = 1.0  # without a refusal: the next one is told again
 
 
-class Lane:
-    """Behaviour -> target -> locked grippers, how often they switch -> safety -> actuator, once per tick.
+class CommandPipeline:
+    """Behaviour -> target -> locked grippers, those that switch -> safety -> actuator, once per tick.
 
     What safety refuses is replaced by the next point of a stop, so that something is sent on every tick; too many
     refusals, or too long with nothing planned, make it hold for that reason.
     """
 
     def __init__(
-        self, actuator: Actuator, safety: SafetyFilter, locks: Locks, settings: TickSettings, report: Report
+        self,
+        actuator: Actuator,
+        safety: SafetyFilter,
+        locks: GripperLocks,
+        settings: TickSettings,
+        report: Telemetry,
     ) -> None:
         self.actuator = actuator
         self._safety = safety
@@ -51,9 +57,9 @@ class Lane:
     # --- what it does --------------------------------------------------------------------------------------
 
     @property
-    def run(self) -> Follow | None:
+    def run(self) -> ExecuteChunks | None:
         """The run it executes, None where it does something else."""
-        return self.behaviour if isinstance(self.behaviour, Follow) else None
+        return self.behaviour if isinstance(self.behaviour, ExecuteChunks) else None
 
     @property
     def stands(self) -> bool:
@@ -101,14 +107,9 @@ class Lane:
         open or closed at its end, and switch at its beginning.
         """
         self._begin()
-        goal = goal.copy()
-        for switch in self._settings.switches:
-            if not np.isnan(goal[switch.dim]):
-                before = float(self.actuator.commanded[switch.dim])
-                goal[switch.dim] = switch.snapped(goal[switch.dim : switch.dim + 1], before)[0]
-        self._go(goal, speed)
+        self._go(open_or_closed(self._settings.switches, goal, self.actuator.commanded), speed)
 
-    def follow(self, run: Follow) -> None:
+    def follow(self, run: ExecuteChunks) -> None:
         """Execute `run` from the next tick on."""
         self._begin()
         self.behaviour = run
@@ -143,7 +144,7 @@ class Lane:
 
     # --- one tick ------------------------------------------------------------------------------------------
 
-    def drive(self, step: int, planned: float, seen: Seen) -> Sent:
+    def drive(self, step: int, planned: float, seen: LatestObservation) -> Sent:
         """Tell the robot what the behaviour wants, as far as locks and safety let it pass."""
         before = self.actuator.commanded
         sent = self._drive(step, planned, seen)
@@ -151,7 +152,7 @@ class Lane:
             self._dwell.sent(before, sent.executed, planned)
         return sent
 
-    def _drive(self, step: int, planned: float, seen: Seen) -> Sent:
+    def _drive(self, step: int, planned: float, seen: LatestObservation) -> Sent:
         target = self.behaviour.target(step, self.actuator.elapsed(planned))
         if target is None:
             return self._nothing_planned(step, planned, seen)
@@ -164,7 +165,7 @@ class Lane:
             self._finish(self.behaviour, sent)
         return sent
 
-    def _judge(self, step: int, planned: float, target: Target, seen: Seen) -> Sent:
+    def _judge(self, step: int, planned: float, target: Target, seen: LatestObservation) -> Sent:
         action, notes = self._permitted(target.action, planned)
         state = self.actuator.state(seen, planned, self._aim)
         verdict = self._safety.judge(action, state, target.path or "policy")
@@ -177,7 +178,7 @@ class Lane:
         sent = self.actuator.send(step, planned, target, verdict.action, (*notes, *verdict.notes))
         return sent._replace(limited=verdict.most, change=verdict.change, near=verdict.near)
 
-    def _hold_to(self, step: int, planned: float, target: Target, seen: Seen) -> Sent:
+    def _hold_to(self, step: int, planned: float, target: Target, seen: LatestObservation) -> Sent:
         """Send a braking or held target as it is; a gripper that is locked elsewhere goes there within its limits."""
         self._aim = None
         action = target.action
@@ -187,11 +188,17 @@ class Lane:
         else:
             locked, notes = self._permitted(action, planned)
             if notes:
-                state = self.actuator.state(seen, planned, locked)
-                action = np.where(self._locks.on, self._safety.reachable(locked, state, "motion"), action)
+                action = np.where(self._locks.on, self._to_lock(locked, seen, planned), action)
         return self.actuator.send(step, planned, target, action, notes)
 
-    def _approach(self, where: Float64, seen: Seen, planned: float) -> Float64:
+    def _to_lock(self, locked: Float64, seen: LatestObservation, planned: float) -> Float64:
+        """Towards where grippers are locked [D], as fast as motions of ours; to a stand while the robot is not seen."""
+        state = self.actuator.state(seen, planned, locked)
+        if self._safety.blind(state):
+            locked, state = state.previous, replace(state, aim=None)
+        return self._safety.reachable(locked, state, "motion")
+
+    def _approach(self, where: Float64, seen: LatestObservation, planned: float) -> Float64:
         """Towards where the e-stop holds the robot, as fast as it moves; a base stands at once."""
         if not self._settings.guarded:
             return where
@@ -201,12 +208,16 @@ class Lane:
         return reachable
 
     def _permitted(self, action: Float64, planned: float) -> tuple[Float64, tuple[str, ...]]:
-        """`action` [D] as far as locks, and how often a gripper may switch, let it be; and notes on that."""
+        """`action` [D] as far as locks, and what a gripper that switches can be, let it be; and notes on that."""
+        commanded = self.actuator.commanded
         action, locked = self._locks.apply(action)
-        action, kept = self._dwell.apply(action, self.actuator.commanded, planned)
+        action = open_or_closed(self._settings.switches, action, commanded)
+        action, kept = self._dwell.apply(action, commanded, planned)
         return action, (*locked, *kept)
 
-    def _refuse(self, step: int, planned: float, target: Target, notes: tuple[str, ...], seen: Seen) -> Sent:
+    def _refuse(
+        self, step: int, planned: float, target: Target, notes: tuple[str, ...], seen: LatestObservation
+    ) -> Sent:
         self.refused += 1
         self._verdicts.append(True)
         self._brace()
@@ -219,7 +230,7 @@ class Lane:
             self.hold_because("refusals", f"{refused} actions refused {how}, the last one: {notes[-1]}")
         return self._stand(step, planned, seen)._replace(target=target, notes=notes, refused=True)
 
-    def _nothing_planned(self, step: int, planned: float, seen: Seen) -> Sent:
+    def _nothing_planned(self, step: int, planned: float, seen: LatestObservation) -> Sent:
         run = self.run
         if run is None:
             return Sent(planned)
@@ -232,7 +243,7 @@ class Lane:
             self.hold_because("starvation", why)
         return self._stand(step, planned, seen)
 
-    def _stand(self, step: int, planned: float, seen: Seen) -> Sent:
+    def _stand(self, step: int, planned: float, seen: LatestObservation) -> Sent:
         """Send the next point of a stop instead of what could not be sent."""
         target = self._brace().target(step, self.actuator.elapsed(planned))
         return self._hold_to(step, planned, target, seen)._replace(target=None)

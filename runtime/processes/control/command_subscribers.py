@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from runtime.errors import RuntimeFault
-from runtime.page import Page
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.messages import HEARD, UNHEARD
+from runtime.ipc.shared_state import SharedState
 from runtime.transports.base import Sink
 
 _EVERY_S = 2.0
-UNHEARD, HEARD = "commands_unheard", "commands_heard"
 Say = Callable[[str, str, Mapping[str, object]], None]
 
 
-class Hearing:
+class SubscriberCheck:
     """Asks the sink now and then who does not take commands; the event has all of them under `unheard`."""
 
-    def __init__(self, page: Page, sink: Sink, say: Say) -> None:
+    def __init__(self, page: SharedState, sink: Sink, say: Say) -> None:
         self._page, self._sink, self._say = page, sink, say
         self._next = float("-inf")
         self._told: dict[str, str] = {}

@@ -4,32 +4,38 @@ from __future__ import annotations
 
 import numpy as np
 
-from runtime.safety import Limits
-from runtime.types import Float64
+from runtime.core.types import Float64
+from runtime.safety.filter import Limits
+from runtime.spaces.binary_grippers import Switch, open_or_closed
 
 _SAME = 1e-9
 
 
-class Locks:
+class GripperLocks:
     """Replaces locked dimensions of an action, after the plan and before safety."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: Limits, switches: tuple[Switch, ...] = ()) -> None:
         self._limits = limits
+        self._switches = switches
         self._notes: dict[int, str] = {}
         self.values: Float64 = np.full(
             len(limits.lower), np.nan
         )  # [D] where it is locked, NaN where it is free
         self.on = np.zeros(len(limits.lower), bool)  # [D]
 
-    def set(self, values: Float64) -> str:
-        """Lock grippers at `values` [D], NaN for free, within their limits; why not, "" where it was done."""
+    def set(self, values: Float64, commanded: Float64) -> str:
+        """Lock grippers at `values` [D], NaN for free, within their limits; why not, "" where it was done.
+
+        Binary ones are locked open or closed, near their threshold as they are `commanded` [D].
+        """
         limits = self._limits
         if values.shape != limits.lower.shape or values.dtype.kind != "f":
             return f"locks are {values.dtype} {values.shape}; expected float {limits.lower.shape}"
         wrong = np.flatnonzero(~np.isnan(values) & ~limits.grippers)
         if len(wrong):
             return f"{limits.names[wrong[0]]} is no gripper: only grippers are locked"
-        self.values = np.clip(values.astype(np.float64), limits.lower, limits.upper)
+        within = np.clip(values.astype(np.float64), limits.lower, limits.upper)
+        self.values = open_or_closed(self._switches, within, commanded)
         self.on = ~np.isnan(self.values)
         self._notes = {
             int(i): f"{limits.names[i]} locked at {round(float(self.values[i]), 4):g}"

@@ -10,7 +10,7 @@ _TIMES = 5  # nobody acknowledges them, and the first may be lost while a node i
 _APART_S = 0.02
 
 
-class Yielding:
+class NodeHandover:
     """Says `collect_start` when the robot is left to its node, `collect_stop` when it is not any more.
 
     `tell` passes a word on and returns why it could not, "" where it did; `say` is told that once per word. `before`:

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runtime.limits import Limits
-from runtime.seen import Seen
-from runtime.timeline import Dims, difference
-from runtime.types import Float64
+from runtime.core.types import Float64
+from runtime.ipc.observation_reader import LatestObservation
+from runtime.motion.timeline import DimensionKinds, difference
+from runtime.safety.limits import Limits
 
 UNSEEN_S = 0.5  # without joints: whatever has happened to the robot meanwhile was not seen
 CONSISTENT_S = 0.1  # that samples agree for before they are believed against what was known
@@ -26,6 +26,9 @@ _FROZEN_S, _FROZEN_RAD = 1.0, 0.05
 _LATENCY_S = 0.3  # a robot that stood may take this long to move after its command did
 _TURNS = 3  # times that the last digits of an encoder which is never still went there and back
 _STILL = 5  # samples that are equal, of one that is
+_DIGITS = 1e-3  # [rad] that the last digits of an encoder are worth at most
+_LEAP = 0.1  # [rad] between two samples, from which no joint comes to rest within the next one
+_HARDEST = 100.0  # [rad/s2] that no joint accelerates at
 _SAME = 0.02  # [rad] within which two joints have exchanged their values
 _LONGEST_DOUBT_S = 2.0
 _KEPT = 512  # samples: as many that agree are enough, however short their time at a high rate
@@ -78,7 +81,7 @@ class Plausibility:
     after UNSEEN_S without any.
     """
 
-    def __init__(self, limits: Limits, dims: Dims) -> None:
+    def __init__(self, limits: Limits, dims: DimensionKinds) -> None:
         self._limits = limits
         self._wrapping = dims.wrapping
         self._places = limits.places
@@ -95,9 +98,12 @@ class Plausibility:
         self._doubt = ""
         self._digits = _Digits(len(limits.names))
         self._frozen = _Frozen(limits)
+        self.leapt = np.zeros(
+            len(limits.names), bool
+        )  # were believed elsewhere, and no way was seen to there
         self.dead = ""  # the joints that have read exactly 0 since they came back from somewhere else
 
-    def judge(self, seen: Seen, now: float, commanded: Float64 | None) -> Seen:
+    def judge(self, seen: LatestObservation, now: float, commanded: Float64 | None) -> LatestObservation:
         """`seen` with why its joints are not believed; `commanded` float64 [D] of a robot that is being moved."""
         self._unseen += 0.0 if self._judged is None else min(now - self._judged, _STALL_S)
         self._judged = now
@@ -119,10 +125,13 @@ class Plausibility:
         """Whether samples have agreed for as long as they have to, up to the newest."""
         return self._chain is not None and not self._doubt and bool(self._chain.lately(self._needed))
 
-    def apart(self, held: Float64, allowed: float) -> bool:
-        """Whether all samples, for as long as they have to agree, are farther than `allowed` [rad] from `held` [D]."""
+    def apart(self, held: Float64, allowed: float, but: np.ndarray | bool = False) -> bool:
+        """Whether all samples, for as long as they have to agree, are farther than `allowed` [rad] from `held` [D].
+
+        The joints `but`, bool [D], do not count.
+        """
         lately = self._chain.lately(self._needed) if self._chain and not self._doubt else []
-        return bool(lately) and all(self._away(sample.joints, held) > allowed for sample in lately)
+        return bool(lately) and all(self._away(sample.joints, held, but) > allowed for sample in lately)
 
     def returned(self) -> float:
         """For how long the joints were missing before those that are believed now came [s]; 0 the second time."""
@@ -148,15 +157,20 @@ class Plausibility:
             self._other = None
             return beyond
         if self._chain is not None and self._goes_on(self._chain, sample):
-            self._digits.add(sample.joints - self._chain.newest.joints)
+            self._digits.add(difference(sample.joints, self._chain.newest.joints, self._wrapping))
+            if self._other is not None:  # what was believed before does not agree with this one for that long
+                self._chain.samples.clear()
             self._chain.samples.append(sample)
             self._other = None
-            return self._frozen(sample.joints, sample.captured, commanded)
+            stuck = self._stays(self._places & self._digits.leapt, sample.joints)
+            return stuck or self._frozen(sample.joints, sample.captured, commanded)
         return self._contradiction(sample)
 
     def _goes_on(self, chain: _Chain, sample: _Sample) -> bool:
         """Whether the sample follows what is believed, rather than what contradicts it."""
         if self._faster(chain.newest, sample).any() or self._dies(chain, sample):
+            return False
+        if self._swaps(chain, sample):
             return False
         other = self._other
         return other is None or self._way(chain.newest, sample) <= self._way(other.newest, sample)
@@ -169,6 +183,7 @@ class Plausibility:
     def _contradiction(self, sample: _Sample) -> str:
         other = self._other
         if other is not None and not self._faster(other.newest, sample).any():
+            self._digits.turn(difference(sample.joints, other.newest.joints, self._wrapping))
             other.samples.append(sample)
         else:
             if other is not None or self._chain is not None:
@@ -176,6 +191,10 @@ class Plausibility:
             self._other = other = _Chain(sample, self._never(sample))
         if not other.never and not (stuck := self._stuck(other)) and other.lately(self._needed):
             self.dead = "" if self._before is None else self._zeros(self._before, other.samples[0].joints)
+            if (
+                self._chain is not None
+            ):  # each was seen soon after the one before: a hand moves through samples
+                self.leapt |= self._faster(self._chain.newest, other.samples[0], np.inf)
             self._chain, self._other, self._before = other, None, None
             return ""
         return other.never or stuck or self._jump(sample)
@@ -199,10 +218,10 @@ class Plausibility:
             f"{limits.lower[worst]:.3f}..{limits.upper[worst]:.3f}"
         )
 
-    def _faster(self, before: _Sample, after: _Sample) -> np.ndarray:
-        """Which joints cannot have come from one sample to the other, bool [D]."""
+    def _faster(self, before: _Sample, after: _Sample, longest: float = _LONGEST_S) -> np.ndarray:
+        """Which joints cannot have come from one sample to the other, for which they had `longest` [s], bool [D]."""
         between = max(after.captured - before.captured, after.seen - before.seen, 0.0)
-        allowed = _EXCESS * self._limits.velocity * (min(between, _LONGEST_S) + _NOISE) + _NOISE
+        allowed = _EXCESS * self._limits.velocity * (min(between, longest) + _NOISE) + _NOISE
         moved = np.abs(difference(after.joints, before.joints, self._wrapping))
         return self._places & (moved > allowed)
 
@@ -231,7 +250,8 @@ class Plausibility:
 
     def _exchanged(self, before: _Sample, after: _Sample) -> str:
         """The joints whose values are those of each other, as far as they can have moved meanwhile."""
-        other = np.flatnonzero(self._places & (np.abs(after.joints - before.joints) > _SAME))
+        away = np.abs(difference(after.joints, before.joints, self._wrapping))
+        other = np.flatnonzero(self._places & (away > _SAME))
         apart = np.sort(before.joints[other]) - np.sort(after.joints[other])
         moved = _SAME + self._limits.velocity[other].max(initial=0.0) * min(
             after.seen - before.seen, _LONGEST_S
@@ -240,17 +260,41 @@ class Plausibility:
             return ""
         return " and ".join(self._limits.names[i] for i in other)
 
+    def _swaps(self, chain: _Chain, sample: _Sample) -> bool:
+        """Whether joints have leapt, no farther than they can but harder, to exactly each other's values."""
+        newest, before = chain.newest, chain.samples[-2 if len(chain.samples) > 1 else -1]
+        passed = max(sample.captured - newest.captured, _EPSILON)
+        onwards = passed / max(newest.captured - before.captured, _EPSILON)
+        went = difference(newest.joints, before.joints, self._wrapping) * onwards
+        step = difference(sample.joints, newest.joints, self._wrapping)
+        away = np.minimum(np.abs(step), np.abs(step - went))
+        leap = max(_LEAP, _HARDEST * passed * passed)
+        if (away > leap)[self._places].sum() < 2:
+            return False
+        for least in (leap, _SAME):  # others may be on their way, one of three may have read nearly the same
+            which = self._places & (away > least)
+            if np.abs(np.sort(newest.joints[which]) - np.sort(sample.joints[which])).max() <= _SAME:
+                return True
+        return False
+
     def _stuck(self, chain: _Chain) -> str:
         """The first joint that has read the same number throughout, far from before, although it was never still."""
         if self._chain is None or len(chain.samples) < _CONSISTENT:
             return ""
         joints = np.array([sample.joints for sample in chain.samples])
         moved = np.abs(difference(joints[-1], self._chain.newest.joints, self._wrapping)) > _SAME
-        still = self._places & self._digits.lively & moved & (np.ptp(joints, axis=0) == 0.0)
-        if not still.any():
+        still = np.ptp(joints, axis=0) == 0.0
+        never = self._digits.lively
+        if (self._places & ~still).any():  # not all have come to rest
+            never = never | self._digits.changing
+        return self._stays(self._places & never & moved & still, joints[-1])
+
+    def _stays(self, which: np.ndarray, joints: Float64) -> str:
+        """The first of the joints `which` that jumped and were still at once, "" where there are none."""
+        if not which.any():
             return ""
-        worst = int(still.argmax())
-        return f"{self._limits.names[worst]} jumped to {joints[-1, worst]:.3f} rad and reads exactly that: is it stuck?"
+        first = int(which.argmax())
+        return f"{self._limits.names[first]} jumped to {joints[first]:.3f} rad and reads exactly that: is it stuck?"
 
     def _dies(self, chain: _Chain, sample: _Sample) -> str:
         """The joints that jump to exactly 0, and neither come by it on their way nor go back to it."""
@@ -272,15 +316,15 @@ class Plausibility:
         was = ", ".join(f"{before[i]:.3f}" for i in dead)
         return f"{', '.join(self._limits.names[i] for i in dead)} read exactly 0 rad after {was}"
 
-    def _away(self, joints: Float64, held: Float64) -> float:
+    def _away(self, joints: Float64, held: Float64, but: np.ndarray | bool) -> float:
         apart = np.abs(difference(joints, held, self._wrapping))
-        return float(apart.max(where=self._places, initial=0.0))
+        return float(apart.max(where=self._places & np.logical_not(but), initial=0.0))
 
 
 class Unquestioned(Plausibility):
     """Believes each sample: what moves no robot jumps where its recording begins anew."""
 
-    def judge(self, seen: Seen, now: float, commanded: Float64 | None) -> Seen:
+    def judge(self, seen: LatestObservation, now: float, commanded: Float64 | None) -> LatestObservation:
         if seen.measured:
             self._chain = _Chain(_Sample(seen.joints, seen.joints_captured, now))
         return seen
@@ -289,8 +333,8 @@ class Unquestioned(Plausibility):
     def settled(self) -> bool:
         return self._chain is not None
 
-    def apart(self, held: Float64, allowed: float) -> bool:
-        return self._chain is not None and self._away(self._chain.newest.joints, held) > allowed
+    def apart(self, held: Float64, allowed: float, but: np.ndarray | bool = False) -> bool:
+        return self._chain is not None and self._away(self._chain.newest.joints, held, but) > allowed
 
 
 class _Digits:
@@ -300,18 +344,36 @@ class _Digits:
         self._step: Float64 = np.zeros(dim)  # the last one that was any
         self._turns = np.zeros(dim, np.int64)
         self._still = np.zeros(dim, np.int64)
+        self._leapt = np.zeros(dim, bool)
+        self._changed = np.zeros(dim, np.int64)
+
+    def turn(self, step: Float64) -> None:
+        """The difference of two samples [D], believed or not."""
+        self._turns += (step * self._step < 0.0) & (np.abs(step) < _DIGITS)
+        self._step = np.where(step != 0.0, step, self._step)
 
     def add(self, step: Float64) -> None:
-        """The difference of two samples [D]."""
-        self._turns += step * self._step < 0.0
-        self._step = np.where(step != 0.0, step, self._step)
+        """That of two which are believed [D]."""
+        self._leapt = np.where(step != 0.0, self.lively & (np.abs(step) > _LEAP), self._leapt)
+        self.turn(step)
         self._still = np.where(step == 0.0, self._still + 1, 0)
+        self._changed = np.where(step == 0.0, 0, self._changed + 1)
         self._turns[self._still >= _STILL] = 0
 
     @property
     def lively(self) -> np.ndarray:
         """Bool [D]."""
         return np.asarray(self._turns >= _TURNS)
+
+    @property
+    def changing(self) -> np.ndarray:
+        """Which ones were no more still than that while they moved, bool [D]."""
+        return np.asarray(self._changed >= _STILL)
+
+    @property
+    def leapt(self) -> np.ndarray:
+        """Which ones jumped to a number and have read exactly that for as many samples as say something, bool [D]."""
+        return np.asarray(self._leapt & (self._still >= _CONSISTENT - 1))
 
 
 class _Frozen:

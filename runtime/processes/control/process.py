@@ -8,25 +8,27 @@ from collections.abc import Callable
 
 import numpy as np
 
-from runtime import realtime
-from runtime.clock import Clock, MonotonicClock
-from runtime.collision import Collisions
-from runtime.errors import RuntimeFault
-from runtime.execution import Strategy
-from runtime.family import Lifeline, Plan, join
-from runtime.page import Page
-from runtime.report import StatusRecord
-from runtime.safety import SafetyFilter
-from runtime.switching import switches
-from runtime.tick import Tick, TickSettings
+from runtime.core import realtime
+from runtime.core.clock import Clock, MonotonicClock
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.lifeline import Lifeline
+from runtime.ipc.shared_state import SharedState
+from runtime.processes.child import join
+from runtime.processes.control.chunk_execution import Strategy
+from runtime.processes.control.telemetry import StatusRecord
+from runtime.processes.control.tick import Tick, TickSettings
+from runtime.safety.collision import Collisions
+from runtime.safety.filter import SafetyFilter
+from runtime.safety.workspace import Workspace
+from runtime.spaces.binary_grippers import switches
+from runtime.station.spec import StationSpec
 from runtime.transports.base import Sink
-from runtime.workspace import Workspace
 
 log = logging.getLogger(__name__)
 _LATENESS_KEPT = 2000
 
 
-def make_tick(plan: Plan, page: Page, sink: Sink, now: Callable[[], float]) -> Tick:
+def make_tick(plan: StationSpec, page: SharedState, sink: Sink, now: Callable[[], float]) -> Tick:
     """The tick of a deployment; the same object in real time and in lockstep."""
     deployment, limits = plan.deployment, plan.limits
     workspace = Workspace(plan.robot, deployment.safety.workspace)
@@ -82,7 +84,7 @@ class Lateness:
 class Loop:
     """Wakes at start + n * period; a tick that was missed is skipped and counted, never caught up."""
 
-    def __init__(self, tick: Tick, page: Page, clock: Clock, rate: float, scheduling: str) -> None:
+    def __init__(self, tick: Tick, page: SharedState, clock: Clock, rate: float, scheduling: str) -> None:
         self._tick = tick
         self._page = page
         self._clock = clock

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from runtime.actuator import Actuator, Sent
-from runtime.behaviour import Behaviour, EStopped
-from runtime.collision import Collision
-from runtime.messages import ChunkMerged, Event, Message, TickDone, encode
-from runtime.page import DOUBT_BYTES, Page
+from runtime.core.types import Float32, Float64
+from runtime.ipc.messages import ChunkMerged, Event, Message, TickDone, encode
+from runtime.ipc.observation_reader import LatestObservation
+from runtime.ipc.shared_state import DOUBT_BYTES, SharedState
+from runtime.motion.timeline import HELD, Contributions
+from runtime.processes.control.actuator import Actuator, Sent
+from runtime.processes.control.behaviours import Behaviour, EStopped
 from runtime.recording.base import ControlSource
-from runtime.seen import Seen
-from runtime.timeline import HELD, Makers
-from runtime.types import Float32, Float64
+from runtime.safety.collision import Collision
 
 StatusRecord = np.ndarray[Any, np.dtype[np.void]]  # of PageLayout.control_dtype, without dimensions
 _TOLD = 1e-4  # [rad] less than that is rounding at a limit, no news
@@ -25,7 +25,7 @@ _QUIET_S = 1.0  # without a change by safety: its sum is told, and the next chan
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class TickState:
     """Where control stands at the end of a tick."""
 
     robot: Actuator
@@ -95,10 +95,10 @@ class Nearing:
         self._count, self._nearest = 0, None
 
 
-class Report:
+class Telemetry:
     """Gathers what a tick has to say, hands it over at its end; a full ring is counted, never waited for."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: SharedState) -> None:
         self._page = page
         self._outbox: list[ChunkMerged | Event] = []
         self._records_lost = 0
@@ -125,7 +125,7 @@ class Report:
         """Where a chunk fell, told at the end of the tick."""
         self._outbox.append(merged)
 
-    def record(self, seen: Seen, sent: Sent, simulated: bool) -> None:
+    def record(self, seen: LatestObservation, sent: Sent, simulated: bool) -> None:
         """The tick, for the episode; `simulated`: it was the simulated robot that was told."""
         self.limiting.note(sent, self.planned)
         self._note_corrected(sent)
@@ -153,7 +153,7 @@ class Report:
         self._push("ticks", done)
         self._tell_makers(makers, sent)
 
-    def publish(self, seen: Seen, standing: Standing) -> None:
+    def publish(self, seen: LatestObservation, standing: TickState) -> None:
         """Control's status, and only then the events: main decides by it, so that none may overtake it.
 
         The tick's record comes before either, so that whoever ends an episode by them loses no row.
@@ -184,7 +184,7 @@ class Report:
             self.say("corrected", sent.corrected)
         self._corrected = self.planned if sent.corrected else self._corrected
 
-    def _tell_makers(self, makers: Makers, sent: Sent) -> None:
+    def _tell_makers(self, makers: Contributions, sent: Sent) -> None:
         if sent.target is not None and sent.target.source == "teleop":
             makers = ()  # what a leader said: each message is merged like a chunk, and is none to whoever looks
         status = self.status

@@ -7,23 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from runtime.actuator import Actuator, RobotActuator, Sent, SimulatedActuator, TickSettings
-from runtime.alarms import Displacement, silent_sibling
-from runtime.behaviour import EStopped, Yielded
-from runtime.errors import CodecError, ConfigurationError
-from runtime.execution import Follow, Strategy, dropped, strategy
-from runtime.hearing import Hearing
-from runtime.lane import Lane
-from runtime.locks import Locks
-from runtime.messages import LockGrippers, Message, NodeRequest, Order, PostedChunk, Tune, decode
-from runtime.page import EStop, Page
-from runtime.plausibility import Plausibility, Unquestioned
-from runtime.report import Report, Standing, StatusRecord
-from runtime.safety import SafetyFilter
-from runtime.seen import Eyes
+from runtime.core.errors import CodecError, ConfigurationError
+from runtime.core.types import Float64
+from runtime.ipc.messages import LockGrippers, Message, NodeRequest, Order, PostedChunk, Tune, decode
+from runtime.ipc.observation_reader import ObservationReader
+from runtime.ipc.shared_state import EStop, SharedState
+from runtime.processes.control.actuator import Actuator, RobotActuator, Sent, SimulatedActuator, TickSettings
+from runtime.processes.control.alarms import Displacement, silent_sibling
+from runtime.processes.control.behaviours import EStopped, Yielded
+from runtime.processes.control.chunk_execution import ExecuteChunks, Strategy, dropped, strategy
+from runtime.processes.control.command_pipeline import CommandPipeline
+from runtime.processes.control.command_subscribers import SubscriberCheck
+from runtime.processes.control.gripper_locks import GripperLocks
+from runtime.processes.control.node_handover import NodeHandover
+from runtime.processes.control.plausibility import Plausibility, Unquestioned
+from runtime.processes.control.telemetry import StatusRecord, Telemetry, TickState
+from runtime.safety.filter import SafetyFilter
 from runtime.transports.base import Sink
-from runtime.types import Float64
-from runtime.yielding import Yielding
 
 __all__ = ["Tick", "TickSettings"]
 _QUIET_S = 1.0  # without an implausible measurement: the next one is told again
@@ -38,7 +38,7 @@ class Tick:
 
     def __init__(
         self,
-        page: Page,
+        page: SharedState,
         sink: Sink,
         safety: SafetyFilter,
         chosen: Strategy,
@@ -50,19 +50,19 @@ class Tick:
         self._strategy = chosen
         self._settings = settings
         self._clock = clock
-        self._eyes = Eyes(page)
-        self._report = Report(page)
-        self._locks = Locks(settings.limits)
+        self._eyes = ObservationReader(page)
+        self._report = Telemetry(page)
+        self._locks = GripperLocks(settings.limits, settings.switches)
         judges = Plausibility if settings.guarded else Unquestioned
         self._plausibility = judges(settings.limits, settings.dims)
         self._displacement = Displacement(settings, self._plausibility)
         self._actuator = RobotActuator(page, sink, settings, clock)
-        self._hearing = Hearing(page, sink, self._report.say)
+        self._hearing = SubscriberCheck(page, sink, self._report.say)
         # A restarted control goes on holding where its predecessor stood; a new one keeps silent.
         self._robot = self._lane(self._actuator)
         left = bytes(self._report.status["behaviour"]) == Yielded.name.encode()
-        self._yielding = Yielding(self._actuator.tell, self._report.say, left)
-        self._simulated: Lane | None = None
+        self._yielding = NodeHandover(self._actuator.tell, self._report.say, left)
+        self._simulated: CommandPipeline | None = None
         self._simulated_run = 0
         self._left_run = -1  # the run during which the robot was left alone
         self._doubted = float("-inf")
@@ -94,16 +94,16 @@ class Tick:
     # --- lanes ---------------------------------------------------------------------------------------------
 
     @property
-    def _lanes(self) -> tuple[Lane, ...]:
+    def _lanes(self) -> tuple[CommandPipeline, ...]:
         return (self._robot,) if self._simulated is None else (self._robot, self._simulated)
 
     @property
-    def _led(self) -> Lane:
+    def _led(self) -> CommandPipeline:
         """The lane that chunks are for."""
         return self._robot if self._simulated is None else self._simulated
 
-    def _lane(self, actuator: Actuator) -> Lane:
-        return Lane(actuator, self._safety, self._locks, self._settings, self._report)
+    def _lane(self, actuator: Actuator) -> CommandPipeline:
+        return CommandPipeline(actuator, self._safety, self._locks, self._settings, self._report)
 
     def _drive(self, step: int, planned: float) -> Sent:
         """Move every lane on by a tick; what became of it on the one that is led, for the record."""
@@ -115,12 +115,12 @@ class Tick:
                 sent = shown._replace(notes=(*sent.notes, *shown.notes), corrected=sent.corrected)
         return sent
 
-    def _standing(self, step: int, sent: Sent) -> Standing:
+    def _standing(self, step: int, sent: Sent) -> TickState:
         led, run = self._led, self._led.run
         waits = run is None or run.waits
         empty = run is not None and sent.target is None
         simulated = None if self._simulated is None else self._simulated.actuator.commanded
-        return Standing(
+        return TickState(
             believed=self._measured(self._report.planned) is not None and self._plausibility.settled,
             doubt=self._seen.doubt,
             robot=self._actuator,
@@ -187,7 +187,7 @@ class Tick:
             self._report.say("tuned", f"chunks are merged by {chosen.kind} from now on")
 
     def _lock(self, values: Float64) -> None:
-        before, refusal = str(self._locks), self._locks.set(values)
+        before, refusal = str(self._locks), self._locks.set(values, self._led.actuator.commanded)
         if refusal:
             self._report.say("lock_refused", refusal)
             return
@@ -220,8 +220,8 @@ class Tick:
         elif self._engage(now):
             self._robot.follow(self._run(order))
 
-    def _run(self, order: Order) -> Follow:
-        return Follow(order.run, order.mode, self._strategy, self._settings)
+    def _run(self, order: Order) -> ExecuteChunks:
+        return ExecuteChunks(order.run, order.mode, self._strategy, self._settings)
 
     def _begin_motion(self, order: Order, now: float) -> None:
         goal = order.goal
@@ -234,6 +234,8 @@ class Tick:
             self._robot.hold()
             self._report.say("refusals", f"a motion at {order.speed} of its speed; allowed: above 0 up to 1")
         elif self._engage(now):
+            if not order.run:  # a set-up: where joints are believed to be is looked at anew
+                self._displacement.forget()
             self._robot.move(goal.astype(np.float64), order.speed)
 
     def _begin_simulation(self, order: Order, now: float) -> None:
@@ -267,6 +269,7 @@ class Tick:
                 return False
             self._plausibility.dead = ""
             self._actuator.engage(measured)
+        self._actuator.open_or_close()
         return True
 
     def _check_estop(self, now: float) -> None:
@@ -299,6 +302,9 @@ class Tick:
             stopped.stay(actuator.commanded.copy())
         elif stopped.follows:
             measured = self._plausibility.middle(measured)
+            if not stopped.seen:
+                self._displacement.follow(actuator, measured)
+            measured = self._displacement.trusted(actuator, measured)
             if not stopped.seen:
                 actuator.step_to(measured, "e-stop, towards where the robot is", stopped.rest)
             # An object in the gripper keeps it open: its command stays, or it would let go.
@@ -334,6 +340,7 @@ class Tick:
         behaviour = self._robot.behaviour
         held = (self._robot.stands or isinstance(behaviour, EStopped)) and self._actuator.engaged
         where = self._displacement(self._actuator, self._seen, now, held)
+        self._name_followed_twice()
         if where is None:
             return
         if self._plausibility.dead:
@@ -342,14 +349,24 @@ class Tick:
             )
             return
         away = self._displacement.distance(self._actuator, where)
-        self._actuator.step_to(where, "held where the robot is")
+        farthest = self._settings.limits.velocity * self._actuator.elapsed(now)
+        self._actuator.step_to(where, "held where the robot is", farthest)
         if isinstance(behaviour, EStopped):
             behaviour.stay(self._actuator.commanded.copy())
             return
-        self._tell_displaced(
-            f"the robot is {away:.2f} rad from where it was told to hold: holding where it is"
-        )
+        if self._displacement.begins:
+            self._tell_displaced(
+                f"the robot is {away:.2f} rad from where it was told to hold: holding where it is"
+            )
         self._robot.hold_here()
+
+    def _name_followed_twice(self) -> None:
+        """Say, once, which joints are not followed any more; what moves is held."""
+        doubt, self._displacement.doubt = self._displacement.doubt, ""
+        if doubt and self._robot.behaviour.moving:
+            self._robot.hold_because("implausible", doubt)
+        elif doubt:
+            self._report.say("implausible", doubt)
 
     def _leave(self, why: str) -> None:
         """Send nothing: a node that was started anew at 0 is pulled by an old target, a dead encoder by a new one."""
@@ -362,4 +379,4 @@ class Tick:
             self._robot.silence()
 
     def _tell_displaced(self, text: str) -> None:
-        self._report.say("displaced" if self._robot.run is None else "moved_away", text)
+        self._report.say("moved_away" if self._robot.behaviour.moving else "displaced", text)

@@ -6,12 +6,12 @@ import json
 import logging
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from runtime.messages import Ack, Command
+from runtime.ipc.messages import Ack, Command
 
 log = logging.getLogger(__name__)
 REMEMBERED = 5000
@@ -43,32 +43,30 @@ class CommandJournal:
         return answers
 
     def append(self, command: Command, ack: Ack) -> str:
-        """Write one answer before it is given; "" or why it is not on disk.
+        """Write one answer before it is given; "" or why it is not on disk."""
+        return self.append_all([(command, ack)])
 
-        A full disk must not end who carries out stops: the line is taken back and the reason logged.
+    def append_all(self, answered: Sequence[tuple[Command, Ack]]) -> str:
+        """Write answers before they are given, at the price of one; "" or why they are not on disk.
+
+        A full disk must not end who carries out stops: the lines are taken back and the reason logged.
         """
-        row = {
-            "uuid": command.uuid,
-            "kind": command.kind,
-            "args": _told(command.args),
-            "user": command.user,
-            "holder": command.holder,
-            "epoch": command.epoch,
-            "wall": time.time(),
-            "ack": asdict(ack),
-        }
+        if not answered:
+            return ""
+        lines = [json.dumps(_row(*one), default=str).encode() + b"\n" for one in answered]
         try:
-            self._write(json.dumps(row, default=str).encode() + b"\n")
+            self._write(b"".join(lines))
         except OSError as error:
-            log.error("the answer to %s is not on disk: %s", command.kind, error)
-            return f"not on disk ({error}): after a restart {command.kind} could be given twice"
+            kinds = ", ".join(sorted({command.kind for command, _ in answered}))
+            log.error("the answer to %s is not on disk: %s", kinds, error)
+            return f"not on disk ({error}): after a restart {kinds} could be given twice"
         return ""
 
     def _write(self, line: bytes) -> None:
         end = self._file.seek(0, os.SEEK_END)
         try:
             if self._file.write(line) != len(line):
-                raise OSError("the disk took only a part of the line")
+                raise OSError("the disk took only a part of the lines")
             os.fdatasync(self._file.fileno())
         except OSError:
             self._file.truncate(end)
@@ -77,6 +75,20 @@ class CommandJournal:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def _row(command: Command, ack: Ack) -> dict[str, Any]:
+    return {
+        "uuid": command.uuid,
+        "kind": command.kind,
+        "args": _told(command.args),
+        "user": command.user,
+        "role": command.role,
+        "holder": command.holder,
+        "epoch": command.epoch,
+        "wall": time.time(),
+        "ack": asdict(ack),
+    }
 
 
 def _told(arguments: Mapping[str, Any]) -> object:

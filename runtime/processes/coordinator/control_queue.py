@@ -6,8 +6,9 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
-from runtime.errors import RuntimeFault
-from runtime.messages import (
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Float64
+from runtime.ipc.messages import (
     LockGrippers,
     Message,
     Mode,
@@ -18,16 +19,15 @@ from runtime.messages import (
     Tune,
     encode,
 )
-from runtime.page import Page
-from runtime.types import Float64
+from runtime.ipc.shared_state import SharedState
 
 log = logging.getLogger(__name__)
 
 
-class Orders:
+class ControlQueue:
     """Writes orders and chunks; only the thread that owns main's loop may call it."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: SharedState) -> None:
         self._page = page
         self._number = int(page.control.read()["order"])
         self._chunk = 0

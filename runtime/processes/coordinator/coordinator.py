@@ -6,20 +6,14 @@ import logging
 import uuid
 from typing import Any
 
-from runtime.asking import Asking
-from runtime.bus import EventLog
-from runtime.by_hand import ByHand
-from runtime.clock import Clock
-from runtime.collecting import Collecting
-from runtime.commitment import Commitment
-from runtime.errors import PolicyLostError, RuntimeFault
-from runtime.family import Plan
-from runtime.hearing import HEARD, UNHEARD
-from runtime.inference import Inference, Patience
-from runtime.kinematics.forward import ChainForward
-from runtime.kinematics.loading import Loading
-from runtime.lease import Lease
-from runtime.messages import (
+from runtime.core.clock import Clock
+from runtime.core.errors import PolicyLostError, RuntimeFault
+from runtime.ipc.bus import EventLog
+from runtime.ipc.estop_requests import why_of
+from runtime.ipc.identity import named
+from runtime.ipc.messages import (
+    HEARD,
+    UNHEARD,
     Ack,
     ChunkMerged,
     Command,
@@ -30,24 +24,35 @@ from runtime.messages import (
     Message,
     ReceptionReport,
     decode,
+    encode,
 )
-from runtime.mixture import Mixture
-from runtime.operations import Operations, Parts
-from runtime.orders import Orders
-from runtime.page import Page
-from runtime.preflight.station import PREFLIGHT_QUERIES, PreflightDesk
-from runtime.punctuality import Punctuality
-from runtime.run import Provenance, Run
-from runtime.runner import Runner
-from runtime.runs import Runs
-from runtime.session import LEASE_COMMANDS, Session
-from runtime.setup import SetUp
-from runtime.sight import Sight, SightSettings
-from runtime.snapshot import View, control_figures, facts, snapshot
-from runtime.targets import Targets
-from runtime.transitions import Happening, State
-from runtime.tuning import strategy_of
-from runtime.watch import Watch
+from runtime.ipc.shared_state import EStop, SharedState
+from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.loading import Loading
+from runtime.processes.coordinator.control_queue import ControlQueue
+from runtime.processes.coordinator.demonstrations import Demonstrations
+from runtime.processes.coordinator.health_monitor import HealthMonitor
+from runtime.processes.coordinator.inference.chunk_mixture import Mixture
+from runtime.processes.coordinator.inference.inference import Inference, Patience
+from runtime.processes.coordinator.inference.policy_observation import PolicyObservation, SightSettings
+from runtime.processes.coordinator.inference.requests import PolicyRequests
+from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
+from runtime.processes.coordinator.inference.worker import Runner
+from runtime.processes.coordinator.lease import Lease
+from runtime.processes.coordinator.manual.manual_control import ManualControl
+from runtime.processes.coordinator.manual.targets import Targets
+from runtime.processes.coordinator.operations import Parts, SessionActions
+from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightDesk
+from runtime.processes.coordinator.runs import Runs
+from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, SessionMachine
+from runtime.processes.coordinator.session.transitions import SessionEvent, State
+from runtime.processes.coordinator.session.tuning import strategy_of
+from runtime.processes.coordinator.setup.sequence import SetUp
+from runtime.processes.coordinator.snapshot import View, control_figures, facts, snapshot
+from runtime.processes.coordinator.timing_report import TimingReport
+from runtime.station import permissions as rights
+from runtime.station.run import Provenance, Run
+from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
 _TO_MAIN = ("control_events", "reception_events", "media_events")  # rings
@@ -55,27 +60,28 @@ _TO_MAIN = ("control_events", "reception_events", "media_events")  # rings
 _HOLDS = ("refusals", "implausible", "unmeasured", "family", "orphaned", "too_far", "moved_away")
 
 
-class Director:
+class Coordinator:
     """One `pump` does everything that is due; lockstep calls it tick by tick."""
 
     def __init__(
-        self, plan: Plan, page: Page, clock: Clock, runner: Runner, people: Clock | None = None
+        self, plan: StationSpec, page: SharedState, clock: Clock, runner: Runner, people: Clock | None = None
     ) -> None:
         self.page, self.clock = page, clock
         self.people = people or clock  # of leases, and of how long commands are valid: lockstep has another
         self._facts = facts(plan)
         self.boot = str(uuid.uuid4())
+        self._own = plan.resolved
         settings = plan.deployment
         self.events = EventLog()
         self.lease = Lease(settings.lease.ttl_s)
-        self._orders = orders = Orders(page)
+        self._orders = orders = ControlQueue(page)
         self.media_report = MediaReport(0.0, 0, "", 0)
         self.reception_report = ReceptionReport(0.0)
         self.unheard: dict[str, str] = {}  # as by Sink.unheard
         kinematics = Loading(ChainForward(plan.robot), plan.kinematics, runner.aside)
         self.spaces = plan.spaces(kinematics)
         spaces, sight = plan.spaces(kinematics), _sight(plan, page, clock)
-        asking = Asking(plan.new_policy(clock), settings.task, spaces, sight, runner, clock)
+        asking = PolicyRequests(plan.new_policy(clock), settings.task, spaces, sight, runner, clock)
         patience = Patience(settings.control.starvation_hold_s, settings.faults.patience_s)
         self.inference = Inference(
             asking,
@@ -84,12 +90,12 @@ class Director:
             self._orders,
             clock,
             patience,
-            Commitment(plan.rate, Mixture(plan.dims, plan.robot)),
+            RtcPrefix(plan.rate, Mixture(plan.dims, plan.robot)),
         )
         self.setup = SetUp(plan, self.inference, self._orders, page, clock, lambda: self.reception_report)
-        self._watch = Watch(plan, page, self.lease, clock, self.people, lambda: self.reception_report)
+        self._watch = HealthMonitor(plan, page, self.lease, clock, self.people, lambda: self.reception_report)
         control = settings.control
-        self._punctuality = Punctuality(
+        self._punctuality = TimingReport(
             page, plan.rate, control.realtime_priority, control.realtime == "auto"
         )
         provenance = Provenance(plan, self.boot)
@@ -103,16 +109,16 @@ class Director:
             lambda: control_figures(page, plan.rate),
             kinematics.prepare,
         )
-        self.by_hand = ByHand(plan, page, orders, self.runs, Targets(plan, self.spaces, kinematics))
-        self.collecting = Collecting(
+        self.by_hand = ManualControl(plan, page, orders, self.runs, Targets(plan, self.spaces, kinematics))
+        self.collecting = Demonstrations(
             plan, page, clock, self.inference, self.setup, lambda: self.runs.open, self.say
         )
         parts = Parts(
             page, clock, orders, self.inference, self.setup, self.runs, self.by_hand, self.collecting
         )
-        self.operations = Operations(plan, parts, self._state, self._watch.absent, self.say)
+        self.operations = SessionActions(plan, parts, self._state, self._watch.absent, self.say)
         self.preflights = PreflightDesk(lambda: self.plan, plan, self._state, self.say, clock)
-        self.session = Session(self.operations, self.lease, self.boot, self.people.now)
+        self.session = SessionMachine(self.operations, self.lease, self.boot, self.people.now)
         self._take_over()
 
     def _take_over(self) -> None:
@@ -123,7 +129,7 @@ class Director:
                     self._note(message)
 
     @property
-    def plan(self) -> Plan:
+    def plan(self) -> StationSpec:
         """As it was last set up or tuned."""
         return self.operations.plan
 
@@ -179,7 +185,7 @@ class Director:
 
     def finish(self, reason: str) -> None:
         """The run is over, says who simulates what it is about."""
-        self._observe(Happening.RUN_ENDED, reason)
+        self._observe(SessionEvent.RUN_ENDED, reason)
 
     # --- what the family says ------------------------------------------------------------------------------
 
@@ -220,13 +226,13 @@ class Director:
             trouble = self.inference.trouble
             stops = settings.faults.starvation == "stop"
             why = f"{event.text}: {trouble}" if trouble else event.text
-            self._observe(Happening.RUN_FAILED if stops else Happening.HELD, why)
+            self._observe(SessionEvent.RUN_FAILED if stops else SessionEvent.HELD, why)
         elif event.kind in _HOLDS or (
             event.kind == "recording_failed" and settings.recording.on_failure == "hold"
         ):
-            self._observe(Happening.HELD, event.text)
+            self._observe(SessionEvent.HELD, event.text)
         elif event.kind == "displaced":
-            self._observe(Happening.DISPLACED, event.text)
+            self._observe(SessionEvent.DISPLACED, event.text)
 
     def _note(self, event: Event) -> None:
         self._log(event)  # the others write their own events into the episode
@@ -241,7 +247,7 @@ class Director:
         failure = self.runs.opened(opened, self.session.state is State.RUNNING)
         if failure:
             self.collecting.unopened()
-            self._observe(Happening.RUN_FAILED, failure)
+            self._observe(SessionEvent.RUN_FAILED, failure)
 
     def say(self, event: Event) -> None:
         """An event of main's own: to the log, to clients, into the episode."""
@@ -252,15 +258,15 @@ class Director:
         self.events.append(event)
         log.info("%s: %s", event.kind, event.text)
 
-    def _observe(self, happening: Happening, reason: str, process: str = "") -> None:
+    def _observe(self, happening: SessionEvent, reason: str, process: str = "") -> None:
         """Tell the session; `process` is the one that was restarted."""
-        if happening is Happening.FAMILY_DIED:
+        if happening is SessionEvent.FAMILY_DIED:
             self.say(Event("family_died", reason, self.clock.now()))
             self.unheard = {}  # a control that is started anew says so again
             self.runs.lost(process, reason)
-        if happening is Happening.ESTOPPED:
+        if happening is SessionEvent.ESTOPPED:
             self.runs.interrupt_alone(reason)
-        if happening in (Happening.FAMILY_DIED, Happening.ESTOPPED):
+        if happening in (SessionEvent.FAMILY_DIED, SessionEvent.ESTOPPED):
             self._unlock()
         self.collecting.noticed(happening, reason)
         before, run = self.session.state, self.runs.open
@@ -284,12 +290,12 @@ class Director:
         except RuntimeFault as error:
             self.setup.fail()
             self._orders.give("hold")
-            self._observe(Happening.SETUP_FAILED, str(error))
+            self._observe(SessionEvent.SETUP_FAILED, str(error))
             return
         if self.setup.stage is not stage:
             self.say(Event("setup", str(self.setup.stage), self.clock.now()))
         if done:
-            self._observe(Happening.SETUP_DONE, self.setup.outcome)
+            self._observe(SessionEvent.SETUP_DONE, self.setup.outcome)
 
     def _advance_inference(self) -> None:
         try:
@@ -312,16 +318,20 @@ class Director:
         if answer == "slow" and self.inference.retries(error):
             return
         self.say(Event("policy_lost" if lost else "policy_failed", str(error), self.clock.now()))
-        self._observe(Happening.RUN_FAILED if answer == "stop" else Happening.HELD, str(error))
+        self._observe(SessionEvent.RUN_FAILED if answer == "stop" else SessionEvent.HELD, str(error))
 
     # --- commands ------------------------------------------------------------------------------------------
 
     def handle(self, command: Command) -> Ack:
         """The answer to a command or a query of a client."""
+        if command.kind == "estop":
+            return self._press(command)
         if command.kind == "status":
             return Ack(
                 command.uuid, "done", boot=self.boot, sequence=self.session.sequence, data=self.snapshot()
             )
+        if refusal := self._beyond_rights(command):
+            return Ack(command.uuid, "refused", refusal, boot=self.boot, sequence=self.session.sequence)
         if command.kind == "events_since":
             return self._events_since(command)
         if command.kind == "aim":
@@ -331,16 +341,37 @@ class Director:
         before, sequence, run = self.session.state, self.session.sequence, self.runs.open
         ack = self.session.handle(command)
         if ack.status == "accepted" and command.kind in ("setup", "run"):
-            self.preflights.cancel(f"{command.kind} by {command.user or command.holder}")
+            self.preflights.cancel(f"{command.kind} by {named(command)}")
         # A lease that is kept is a stream; only its changes and refusals are worth a line.
         kept = command.kind in LEASE_COMMANDS and ack.status == "accepted" and ack.sequence == sequence
         if not kept:
             self.collecting.touch()
-            who = command.user or command.holder
-            what = f"{command.kind} by {who}: {ack.status}" + (f", {ack.reason}" if ack.reason else "")
+            what = f"{command.kind} by {named(command)}: {ack.status}"
+            what += f", {ack.reason}" if ack.reason else ""
             told = {"uuid": command.uuid, "from": str(before), "to": str(self.session.state)}
+            told |= {"user": command.user, "role": command.role, "holder": command.holder}
             self.say(Event("command", what, self.clock.now(), data=told | self._unbegun(run)))
         return ack
+
+    def _press(self, command: Command) -> Ack:
+        """Raise the flag, whatever goes on and whoever it is; the guard latches it, now or when it is there again."""
+        self.page.rings["presses"].push(encode(command))
+        self.page.set_estop(EStop.LATCHED)
+        told = {"uuid": command.uuid, "user": command.user, "role": command.role, "holder": command.holder}
+        text = f"estop by {named(command)}: accepted, {why_of(command)}"
+        self.say(Event("command", text, self.clock.now(), data=told))
+        reason = "the flag is raised; the guard's own socket says whether control obeys"
+        return Ack(command.uuid, "accepted", reason, boot=self.boot, kind=command.kind)
+
+    def _beyond_rights(self, command: Command) -> str:
+        """Why who gives it may not bring what it brings; "" where it may, or was answered before."""
+        if self.session.answered(command) is not None:
+            return ""
+        try:
+            rights.require(command, self._own)
+        except RuntimeFault as fault:
+            return str(fault)
+        return ""
 
     def _events_since(self, command: Command) -> Ack:
         number = command.args.get("number", 0)
@@ -366,6 +397,6 @@ class Director:
         self.inference.runner.close()
 
 
-def _sight(plan: Plan, page: Page, clock: Clock) -> Sight:
+def _sight(plan: StationSpec, page: SharedState, clock: Clock) -> PolicyObservation:
     safety = plan.deployment.safety
-    return Sight(page, clock, SightSettings(plan.rate, safety.joint_age_s, safety.picture_age_s))
+    return PolicyObservation(page, clock, SightSettings(plan.rate, safety.joint_age_s, safety.picture_age_s))

@@ -12,19 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from runtime.clock import Clock
-from runtime.errors import RuntimeFault
-from runtime.family import Plan
-from runtime.inference import Inference
-from runtime.leaders.relay import Relay
-from runtime.messages import EpisodeClosed, Event
-from runtime.page import Page
+from runtime.core.clock import Clock
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.command_arguments import DiscardRequest, LabelRequest, RunRequest
+from runtime.ipc.messages import EpisodeClosed, Event
+from runtime.ipc.shared_state import SharedState
+from runtime.processes.coordinator.inference.inference import Inference
+from runtime.processes.coordinator.session.transitions import SessionEvent, State
+from runtime.processes.coordinator.setup.sequence import SetUp
 from runtime.recording.labels import Label, append, newest
 from runtime.recording.schema import Schema
-from runtime.requests import DiscardRequest, LabelRequest, RunRequest
-from runtime.run import Run
-from runtime.setup import SetUp
-from runtime.transitions import Happening, State
+from runtime.station.run import Run
+from runtime.station.spec import StationSpec
+from runtime.teleoperators.relay import Relay
 
 IDLE_S = 300.0  # of nothing, after which the arm falls
 _REMEMBERED = 64  # episodes that may be spoken of before they are on disk
@@ -32,26 +32,26 @@ NODE_SILENT_S = 2.0  # for a node to report an action
 # What takes the arm away, whatever state it finds the station in.
 DISARMING = frozenset(
     {
-        Happening.HELD,
-        Happening.RUN_FAILED,
-        Happening.LEASE_ENDED,
-        Happening.LINK_LOST,
-        Happening.ESTOPPED,
-        Happening.FAMILY_DIED,
-        Happening.DISPLACED,
+        SessionEvent.HELD,
+        SessionEvent.RUN_FAILED,
+        SessionEvent.LEASE_ENDED,
+        SessionEvent.LINK_LOST,
+        SessionEvent.ESTOPPED,
+        SessionEvent.FAMILY_DIED,
+        SessionEvent.DISPLACED,
     }
 )
 _NOT_YET = "nobody has armed it since it was set up"
 _NOT_SET_UP = "the station is not set up to collect"
 
 
-class Collecting:
+class Demonstrations:
     """At most one episode is open; `armed` is a person's word that the next may begin."""
 
     def __init__(
         self,
-        plan: Plan,
-        page: Page,
+        plan: StationSpec,
+        page: SharedState,
         clock: Clock,
         inference: Inference,
         setup: SetUp,
@@ -130,12 +130,12 @@ class Collecting:
         """A person has done something."""
         self._touched = self._clock.now()
 
-    def noticed(self, happening: Happening, reason: str) -> None:
+    def noticed(self, happening: SessionEvent, reason: str) -> None:
         """What happens to a station takes the arm away."""
         if happening in DISARMING:
             self.disarm(reason)
 
-    def look(self, state: State) -> tuple[Happening, str] | None:
+    def look(self, state: State) -> tuple[SessionEvent, str] | None:
         """Once per pump: what is to be told to the session; an arm that nobody uses falls by itself."""
         now, run = self._clock.now(), self.run
         self._hear_node()
@@ -169,7 +169,7 @@ class Collecting:
             self._reported_at = at
             self._reported = [*self._reported[-39:], at]
 
-    def _missed(self, run: Run, state: State) -> tuple[Happening, str] | None:
+    def _missed(self, run: Run, state: State) -> tuple[SessionEvent, str] | None:
         """A node that was told to drive, and reports no action."""
         if not self._node_leads or run.begun is None or state is not State.RUNNING:
             return None
@@ -184,7 +184,7 @@ class Collecting:
             else f"the node has reported no action for {silent:.1f} s"
         )
         self._event("node_silent", why)
-        return (Happening.RUN_FAILED if never else Happening.HELD), why
+        return (SessionEvent.RUN_FAILED if never else SessionEvent.HELD), why
 
     # --- episodes --------------------------------------------------------------------------------------------
 

@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from runtime.cameras.telling import complaints
-from runtime.clock import Clock
-from runtime.family import Plan
-from runtime.latch import Latch
-from runtime.lease import Lease
-from runtime.messages import ReceptionReport
-from runtime.page import EStop, Page
-from runtime.run import Run
-from runtime.transitions import Happening, State
+from runtime.core.clock import Clock
+from runtime.ipc.estop_latch import Latch
+from runtime.ipc.messages import ReceptionReport
+from runtime.ipc.shared_state import EStop, SharedState
+from runtime.processes.coordinator.lease import Lease
+from runtime.processes.coordinator.session.transitions import SessionEvent, State
+from runtime.station.run import Run
+from runtime.station.spec import StationSpec
 
 SIBLINGS = ("control", "reception", "media", "guard")
 _LINK_LOST_S = 2.0
@@ -27,18 +27,18 @@ _LATCH_S = 0.2  # how long the e-stop's flag may be ahead of its latch on the di
 class Noticed(NamedTuple):
     """Something for the session, and the sentence that goes with it."""
 
-    happening: Happening
+    happening: SessionEvent
     reason: str
     process: str = ""  # that was restarted
 
 
-class Watch:
+class HealthMonitor:
     """Looks at page, lease and run once per pump; the session decides what follows."""
 
     def __init__(
         self,
-        plan: Plan,
-        page: Page,
+        plan: StationSpec,
+        page: SharedState,
         lease: Lease,
         clock: Clock,
         people: Clock,
@@ -83,11 +83,11 @@ class Watch:
             if generation != self._generations[name]:
                 self._generations[name] = generation
                 reason = f"the process {name} died and was restarted: set up again"
-                yield Noticed(Happening.FAMILY_DIED, reason, name)
+                yield Noticed(SessionEvent.FAMILY_DIED, reason, name)
         absent = self.absent() if state is State.RUNNING else ""  # a set-up looks for itself
         if absent:
             silent = self._page.silence(absent, self._clock.now())
-            yield Noticed(Happening.HELD, f"no sign of life from the process {absent} {silent}")
+            yield Noticed(SessionEvent.HELD, f"no sign of life from the process {absent} {silent}")
 
     def _estop(self, state: State) -> Iterator[Noticed]:
         latched = self._page.estop is EStop.LATCHED
@@ -96,10 +96,10 @@ class Watch:
             if not (pressed and pressed.wall) and self._just_pressed():  # absent, or half written
                 return
             self.estop = f"by {pressed.by}: {pressed.why}" if pressed else "pressed"
-            yield Noticed(Happening.ESTOPPED, f"e-stop {self.estop}: make safe, then release")
+            yield Noticed(SessionEvent.ESTOPPED, f"e-stop {self.estop}: make safe, then release")
         elif not latched and state is State.FAULTED:
             self.estop, self._pressed = "", None
-            yield Noticed(Happening.RELEASED, "e-stop released: set up again")
+            yield Noticed(SessionEvent.RELEASED, "e-stop released: set up again")
 
     def _just_pressed(self) -> bool:
         """Control obeys the flag already; who pressed and why is on the disk a moment later."""
@@ -110,7 +110,9 @@ class Watch:
     def _leases(self) -> Iterator[Noticed]:
         held = self._lease.current(self._people.now()) is not None
         if self._lease_held and not held:
-            yield Noticed(Happening.LEASE_ENDED, "the lease was not renewed: claim it, then resume or stop")
+            yield Noticed(
+                SessionEvent.LEASE_ENDED, "the lease was not renewed: claim it, then resume or stop"
+            )
         self._lease_held = held
 
     def _link(self) -> Iterator[Noticed]:
@@ -120,12 +122,12 @@ class Watch:
         age = self._clock.now() - float(record["arrived"])
         missing = self.missing_cameras()
         if age < _CONNECTED_S and not missing:
-            yield Noticed(Happening.CONNECTED, "observations arrive: set up")
+            yield Noticed(SessionEvent.CONNECTED, "observations arrive: set up")
         elif age < _CONNECTED_S:
             why = "".join(f"; {sentence}" for sentence in complaints(self._reception().cameras, missing))
-            yield Noticed(Happening.INCOMPLETE, f"no picture has arrived from {', '.join(missing)}{why}")
+            yield Noticed(SessionEvent.INCOMPLETE, f"no picture has arrived from {', '.join(missing)}{why}")
         elif age > _LINK_LOST_S and not record["last"]:
-            yield Noticed(Happening.LINK_LOST, f"no observation for {age:.1f} s: {self._who_is_silent()}")
+            yield Noticed(SessionEvent.LINK_LOST, f"no observation for {age:.1f} s: {self._who_is_silent()}")
 
     def _who_is_silent(self) -> str:
         now, within = self._clock.now(), self._plan.deployment.control.heartbeat_timeout_s
@@ -136,8 +138,8 @@ class Watch:
     def _end_of(self, run: Run) -> Iterator[Noticed]:
         limit = run.duration_s
         if limit is not None and run.elapsed(self._clock.now()) >= limit - _EARLY_S:
-            yield Noticed(Happening.RUN_ENDED, f"the run's {limit:g} s are over")
+            yield Noticed(SessionEvent.RUN_ENDED, f"the run's {limit:g} s are over")
             return
         record: np.void = self._page.observation.read()
         if record["last"] and int(self._page.control.read()["sequence"]) == int(record["sequence"]):
-            yield Noticed(Happening.RUN_ENDED, "the recording that is the source has ended")
+            yield Noticed(SessionEvent.RUN_ENDED, "the recording that is the source has ended")

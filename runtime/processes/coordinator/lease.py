@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 HIGHEST_EPOCH = 2**52  # of a claim; beyond 2**53 a browser counts no more
 
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """A lease as it stands: who, in which epoch, until when on our monotonic clock."""
+    """A lease as it stands: who, in which epoch, until when on our monotonic clock; `by`: as whom he is known."""
 
     holder: str
     epoch: int
     until: float
+    by: str = ""
 
 
 class Lease:
@@ -36,7 +37,7 @@ class Lease:
         """Epochs up to `epoch` were in use before a restart: they are over."""
         self._epoch = max(self._epoch, epoch)
 
-    def claim(self, holder: str, epoch: int, now: float) -> str:
+    def claim(self, holder: str, epoch: int, now: float, by: str = "") -> str:
         """Take or keep the lease; "" where granted, else the reason for the refusal.
 
         Epoch 0 is a terminal's: it takes a free lease under the next epoch, or keeps its own.
@@ -47,7 +48,7 @@ class Lease:
             return f"epoch {epoch} is impossible; allowed: 0 to {HIGHEST_EPOCH}"
         held = self.current(now)
         if held and held.holder == holder and epoch in (0, held.epoch):
-            self._held = Held(holder, held.epoch, now + self._ttl)
+            self._held = replace(held, until=now + self._ttl)
             return ""
         if epoch == 0:
             if held:
@@ -56,17 +57,17 @@ class Lease:
         if epoch <= self._epoch:
             return f"epoch {epoch} is over, the lease is in epoch {self._epoch}"
         self._epoch = epoch
-        self._held = Held(holder, epoch, now + self._ttl)
+        self._held = Held(holder, epoch, now + self._ttl, by)
         return ""
 
-    def renew(self, holder: str, epoch: int, now: float) -> str:
+    def renew(self, holder: str, epoch: int, now: float, by: str = "") -> str:
         """Extend the lease; "" where done, else the reason."""
         refusal = self.check(holder, epoch, now)
-        if not refusal:
-            self._held = Held(holder, epoch, now + self._ttl)
+        if not refusal and self._held:
+            self._held = replace(self._held, until=now + self._ttl)
         return refusal
 
-    def give_up(self, holder: str, epoch: int, now: float) -> str:
+    def give_up(self, holder: str, epoch: int, now: float, by: str = "") -> str:
         """End the lease before its time."""
         refusal = self.check(holder, epoch, now)
         if not refusal:

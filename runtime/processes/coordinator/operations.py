@@ -7,18 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from runtime import deployment
-from runtime.by_hand import ByHand
-from runtime.clock import Clock
-from runtime.collecting import Collecting
-from runtime.effects import Effects, Situation, Told
-from runtime.errors import RuntimeFault
-from runtime.family import Plan
-from runtime.inference import Inference
-from runtime.messages import Event, Mode
-from runtime.orders import Orders
-from runtime.page import Page
-from runtime.requests import (
+from runtime.config import loader as deployment
+from runtime.core.clock import Clock
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.command_arguments import (
     DiscardRequest,
     GripperRequest,
     LabelRequest,
@@ -27,32 +19,40 @@ from runtime.requests import (
     SetUpRequest,
     TuneRequest,
 )
-from runtime.runs import Runs
-from runtime.setup import SetUp
-from runtime.transitions import State
-from runtime.tuning import strategy_of, tuned
+from runtime.ipc.messages import Event, Mode
+from runtime.ipc.shared_state import SharedState
+from runtime.processes.coordinator.control_queue import ControlQueue
+from runtime.processes.coordinator.demonstrations import Demonstrations
+from runtime.processes.coordinator.inference.inference import Inference
+from runtime.processes.coordinator.manual.manual_control import ManualControl
+from runtime.processes.coordinator.runs import Runs
+from runtime.processes.coordinator.session.effects import Effects, GuardFacts, Told
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.coordinator.session.tuning import strategy_of, tuned
+from runtime.processes.coordinator.setup.sequence import SetUp
+from runtime.station.spec import StationSpec
 
 
 @dataclass(frozen=True, slots=True)
 class Parts:
     """What operations are carried out with."""
 
-    page: Page
+    page: SharedState
     clock: Clock
-    orders: Orders
+    orders: ControlQueue
     inference: Inference
     setup: SetUp
     runs: Runs
-    by_hand: ByHand
-    collecting: Collecting
+    by_hand: ManualControl
+    collecting: Demonstrations
 
 
-class Operations(Effects):
+class SessionActions(Effects):
     """Carries out what the session has allowed; `plan` is the one in force, `absent` names a process that is silent."""
 
     def __init__(
         self,
-        plan: Plan,
+        plan: StationSpec,
         parts: Parts,
         state: Callable[[], State],
         absent: Callable[[], str],
@@ -89,7 +89,7 @@ class Operations(Effects):
         self.setup.begin(reset, asked.least)
         return {"bench": reset["id"]} if reset else {}
 
-    def _changed(self, asked: SetUpRequest) -> Plan:
+    def _changed(self, asked: SetUpRequest) -> StationSpec:
         """The plan of a set-up; raises RuntimeFault where it is none, or an open recording would not be about it."""
         collects = self._collects(asked)
         changes = asked.changes | ({"strategy": {"kind": "naive"}} if collects else {})
@@ -180,9 +180,9 @@ class Operations(Effects):
     # --- what a person does within a run ------------------------------------------------------------
 
     @property
-    def situation(self) -> Situation:
+    def situation(self) -> GuardFacts:
         run, control = self.runs.open, self.page.control.read()
-        return Situation(
+        return GuardFacts(
             mode=run.mode if run else None,
             trial=run is not None and run.trial,
             proposed=self.inference.proposal is not None,

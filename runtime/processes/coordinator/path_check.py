@@ -6,22 +6,22 @@ import math
 
 import numpy as np
 
-from runtime.collision import Collisions
-from runtime.errors import RuntimeFault
-from runtime.family import Plan
-from runtime.timeline import difference
-from runtime.types import Float64
-from runtime.workspace import Workspace
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Float64
+from runtime.motion.timeline import difference
+from runtime.safety.collision import Collisions
+from runtime.safety.workspace import Workspace
+from runtime.station.spec import StationSpec
 
 _STEP = 0.01  # [rad or m] of the joint that goes farthest, between postures that are looked at
 # What is begun must not be stopped half-way by control, which judges what is really sent, at other postures.
 _SPARE = 0.001  # [m]
 
 
-class Ways:
+class PathCheck:
     """The ways of one robot, within its workspace boxes and without collisions."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: StationSpec) -> None:
         safety = plan.deployment.safety
         self._limits = plan.limits
         self._wrapping = plan.dims.wrapping

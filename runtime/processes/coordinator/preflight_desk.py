@@ -8,15 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from runtime.clock import Clock
-from runtime.deployment import changed, server_of
-from runtime.errors import RuntimeFault
-from runtime.family import Plan
-from runtime.messages import Ack, Command, Event
-from runtime.plugins import variants
-from runtime.preflight.child import Preflights
-from runtime.requests import PolicyServerRequest, PreflightReportRequest, PreflightRequest, read
-from runtime.transitions import State
+from runtime.config.loader import changed, server_of
+from runtime.core.clock import Clock
+from runtime.core.errors import RuntimeFault
+from runtime.core.plugins import variants
+from runtime.ipc.command_arguments import PolicyServerRequest, PreflightReportRequest, PreflightRequest, read
+from runtime.ipc.identity import named
+from runtime.ipc.messages import Ack, Command, Event
+from runtime.processes.coordinator.session.transitions import State
+from runtime.station.preflight_child import Preflights
+from runtime.station.spec import StationSpec
 
 PREFLIGHT_QUERIES = ("preflight", "preflight_report", "policy_server")
 _AT_WORK = (State.SETTING_UP, State.RUNNING, State.HOLDING)
@@ -27,8 +28,8 @@ class PreflightDesk:
 
     def __init__(
         self,
-        in_force: Callable[[], Plan],
-        own: Plan,
+        in_force: Callable[[], StationSpec],
+        own: StationSpec,
         state: Callable[[], State],
         say: Callable[[Event], None],
         clock: Clock,
@@ -69,7 +70,7 @@ class PreflightDesk:
         asked = read("preflight", PreflightRequest, command.args)
         self._require_free(asked)
         longest = self._preflights.start(asked, self._own.resolved)
-        self._note(f"preflight of {asked.about} by {command.user or command.holder}", {"id": asked.id})
+        self._note(f"preflight of {asked.about} by {named(command)}", {"id": asked.id})
         return {"id": asked.id, "longest_s": longest}
 
     def _require_free(self, asked: PreflightRequest) -> None:

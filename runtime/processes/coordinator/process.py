@@ -1,74 +1,139 @@
-"""Main's sockets: answers commands at once, publishes snapshots at 10 Hz, joints and poses at 30."""
+"""Main's sockets: answers stops at once and commands in turns, publishes snapshots at 10 Hz, joints and poses at 30."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import zmq
 
-from runtime import heap
-from runtime.bus import STREAM_HIGH_WATER, CommandServer, Endpoints, Publisher
-from runtime.clock import MonotonicClock
-from runtime.command_journal import CommandJournal
-from runtime.director import Director
-from runtime.family import join
-from runtime.inference import ShownChunk
-from runtime.messages import Ack, Command, Event
-from runtime.runner import ThreadRunner
-from runtime.transitions import STOPPING
+from runtime.core import file_limits as descriptors
+from runtime.core import malloc as heap
+from runtime.core.clock import MonotonicClock
+from runtime.ipc.bus import STREAM_HIGH_WATER, TOO_MANY, Call, CommandServer, Endpoints, Key, Publisher
+from runtime.ipc.fair_queue import Asked, Turns
+from runtime.ipc.identity import forged, identified, lacking
+from runtime.ipc.messages import Ack, Command, Event
+from runtime.processes.child import join
+from runtime.processes.coordinator.command_journal import CommandJournal
+from runtime.processes.coordinator.coordinator import Coordinator
+from runtime.processes.coordinator.inference.inference import ShownChunk
+from runtime.processes.coordinator.inference.worker import ThreadRunner
+from runtime.processes.coordinator.session.transitions import STOPPING
 
 _NOT_JOURNALLED = ("status", "events_since", "aim", "lease_renew", "preflight_report", "policy_server")
 _MOST_WAITING = 100  # commands
+_SHARE = 8  # commands that are carried out in one turn, besides all stops
+_FLOOD_S = 5.0  # between two events about one
 
 
-class Service:
+Answered = tuple[Command, Ack, Call]
+
+
+class CommandService:
     """What clients of the station talk to."""
 
-    def __init__(self, main: Director, context: zmq.Context[Any]) -> None:
+    def __init__(self, main: Coordinator, context: zmq.Context[Any]) -> None:
         self._main = main
         settings = main.plan.deployment
-        self._server = CommandServer(context, settings.bus.host, settings.bus.command_port)
-        self._streams = Publisher(context, settings.bus.host, settings.bus.state_port, STREAM_HIGH_WATER)
-        self._journal = CommandJournal(settings.station_dir)
+        folder = settings.station_dir
+        self._server = CommandServer(context, folder, "commands")
+        self._turns = Turns(self._server, STOPPING, _SHARE)
+        self._key = Key(folder)
+        self._streams = Publisher(context, folder, "state", STREAM_HIGH_WATER)
+        self._journal = CommandJournal(folder)
         main.session.remember(self._journal.answers)
-        endpoints = {"commands": self._server.endpoint, "state": self._streams.endpoint, "boot": main.boot}
-        Endpoints(settings.station_dir).write("main", endpoints)
+        self._endpoints = Endpoints(folder)
+        self._tell_where()
         self._due: dict[str, float] = {}
         self._told = 0
         self._shown: ShownChunk | None = None
         self._unjournalled = ""
-        self._waiting: list[tuple[list[bytes], Command]] = []  # for what is still being loaded
+        self._waiting: list[Asked] = []  # for what is still being loaded
+
+    def _tell_where(self) -> None:
+        where = {"commands": self._server.endpoint, "state": self._streams.endpoint, "boot": self._main.boot}
+        self._endpoints.write("main", where)
 
     def serve(self, timeout: float) -> None:
-        """Wait up to `timeout` seconds for a command; answer all there are; publish what is due."""
-        self._server.socket.poll(int(timeout * 1000))
-        waiting, self._waiting = self._waiting, []
-        while (received := self._server.receive()) is not None:
-            waiting.append(received)
-        for address, command in waiting:
-            if self._main.waits(command):
-                self._keep(address, command)
-                continue
-            ack = self._main.handle(command)
-            # Who stops a robot waits for no disk; to stop it twice does no harm.
-            stops = command.kind in STOPPING
-            if stops:
-                self._server.answer(address, ack)
-            if command.kind not in _NOT_JOURNALLED:
-                self._tell_once(self._journal.append(command, ack))
-            if not stops:
-                self._server.answer(address, ack)
+        """Wait up to `timeout` seconds for a command; answer all stops and some of the rest; publish what is due."""
+        if not self._turns.waiting:
+            self._server.socket.poll(int(timeout * 1000))
+        stops, others = self._turns.take()
+        stopped = self._stop([(call, self._identified(call, command)) for call, command in stops])
+        loading, self._waiting = self._waiting, []
+        answered = self._carry_out(
+            [*loading, *((call, self._identified(call, command)) for call, command in others)]
+        )
+        journalled = [
+            (command, ack) for command, ack, _ in (*stopped, *answered) if command.kind not in _NOT_JOURNALLED
+        ]
+        if journalled:
+            self._tell_once(self._journal.append_all(journalled))
+        for _, ack, call in answered:
+            self._server.answer(call, ack)
+        self._tell_of_flood()
         self._publish()
+        if any(
+            [self._server.moved(), self._streams.moved(), self._endpoints.lost("main")]
+        ):  # all are looked after
+            self._tell_where()
 
-    def _keep(self, address: list[bytes], command: Command) -> None:
+    def _identified(self, call: Call, command: Command) -> Command:
+        return identified(command, call.payload, call.signature, call.uid, self._key)
+
+    def _stop(self, stops: list[Asked]) -> list[Answered]:
+        """Who stops a robot waits for no disk. One stop like another of this turn gets the same answer."""
+        first: dict[tuple[str, str, str, int], Ack] = {}
+        fresh: list[Answered] = []
+        for call, command in stops:
+            same = (command.kind, command.user, command.holder, command.epoch)
+            known = None if command.kind == "estop" else self._main.session.answered(command)
+            ack = known or first.get(same)
+            if ack is None:
+                ack = first[same] = self._main.handle(command)
+                fresh.append((command, ack, call))
+            self._server.answer(call, replace(ack, uuid=command.uuid))
+        return fresh
+
+    def _carry_out(self, asked: list[Asked]) -> list[Answered]:
+        """Answers that are new, to be given when they are on disk."""
+        fresh: list[Answered] = []
+        for call, command in asked:
+            if (first := self._main.session.answered(command)) is not None:
+                self._server.answer(call, first)
+            elif refusal := forged(command) or lacking(command):
+                self._refuse(call, command, refusal)
+            elif self._main.waits(command):
+                self._keep(call, command)
+            else:
+                fresh.append((command, self._main.handle(command), call))
+        return fresh
+
+    def _refuse(self, call: Call, command: Command, reason: str) -> None:
+        text = f"{command.kind} by {command.user}: refused, {reason}"
+        self._say_seldom("not_allowed", text)
+        self._server.answer(call, Ack(command.uuid, "refused", reason, kind=command.kind))
+
+    def _keep(self, call: Call, command: Command) -> None:
         """Answer it when what it needs is loaded; nobody waits for that here."""
         if len(self._waiting) < _MOST_WAITING:
-            self._waiting.append((address, command))
+            self._waiting.append((call, command))
         else:
             reason = f"{command.kind}: {_MOST_WAITING} wait already for what is still being loaded: ask again"
-            self._server.answer(address, Ack(command.uuid, "refused", reason))
+            self._server.answer(call, Ack(command.uuid, "refused", reason))
+
+    def _tell_of_flood(self) -> None:
+        if (call := self._turns.refused) is not None:
+            self._say_seldom("flood", f"process {call.pid} of this machine is refused: {TOO_MANY}")
+
+    def _say_seldom(self, kind: str, text: str) -> None:
+        """An event, unless there was one of its kind just now: a flood is not to fill the record."""
+        if (now := self._main.people.now()) >= self._due.get(kind, 0.0):
+            self._due[kind] = now + _FLOOD_S
+            self._main.say(Event(kind, text, self._main.clock.now()))
 
     def _tell_once(self, failure: str) -> None:
         """A disk that is full stays so for a while: one event when it begins."""
@@ -155,9 +220,10 @@ class Service:
 def main() -> None:
     """The process main: decide and serve until the supervisor is gone."""
     heap.keep()
+    descriptors.allow_all()
     member = join("main")
-    deciding = Director(member.plan, member.page, MonotonicClock(), ThreadRunner())
-    service = Service(deciding, zmq.Context.instance())
+    deciding = Coordinator(member.plan, member.page, MonotonicClock(), ThreadRunner())
+    service = CommandService(deciding, zmq.Context.instance())
     while not member.lifeline.cut:
         deciding.pump()
         service.serve(0.004)

@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
-from runtime.clock import Clock
-from runtime.errors import RuntimeFault
-from runtime.family import Plan
-from runtime.inference import Inference
-from runtime.messages import (
+from runtime.core.clock import Clock
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Float64
+from runtime.ipc.command_arguments import RunRequest
+from runtime.ipc.messages import (
     BeginEpisode,
     EndEpisode,
     EpisodeClosed,
@@ -21,13 +21,13 @@ from runtime.messages import (
     Message,
     encode,
 )
-from runtime.orders import Orders
-from runtime.page import Page
+from runtime.ipc.shared_state import SharedState
 from runtime.policies.base import PolicyInfo
+from runtime.processes.coordinator.control_queue import ControlQueue
+from runtime.processes.coordinator.inference.inference import Inference
 from runtime.recording.files import require_room
-from runtime.requests import RunRequest
-from runtime.run import Provenance, Run
-from runtime.types import Float64
+from runtime.station.run import Provenance, Run
+from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
 
@@ -37,11 +37,11 @@ class Runs:
 
     def __init__(
         self,
-        plan: Plan,
-        page: Page,
+        plan: StationSpec,
+        page: SharedState,
         clock: Clock,
         inference: Inference,
-        orders: Orders,
+        orders: ControlQueue,
         provenance: Provenance,
         figures: Callable[[], dict[str, Any]],
         prepared: Callable[[], bool],

@@ -10,28 +10,28 @@ from typing import Any, get_args
 import numpy as np
 
 from robots.units import units_of
-from runtime.by_hand import ByHand
-from runtime.collecting import Collecting
-from runtime.family import Plan
-from runtime.inference import Inference
-from runtime.lease import Lease
-from runtime.messages import MediaReport, PolicyMode, ReceptionReport
-from runtime.page import Page
-from runtime.plugins import variants
-from runtime.runs import Runs
-from runtime.session import Session
-from runtime.setup import SetUp, Stage, first_action
-from runtime.transitions import State
-from runtime.types import Float64
+from runtime.core.plugins import variants
+from runtime.core.types import Float64
+from runtime.ipc.messages import MediaReport, PolicyMode, ReceptionReport
+from runtime.ipc.shared_state import SharedState
+from runtime.processes.coordinator.demonstrations import Demonstrations
+from runtime.processes.coordinator.inference.inference import Inference
+from runtime.processes.coordinator.lease import Lease
+from runtime.processes.coordinator.manual.manual_control import ManualControl
+from runtime.processes.coordinator.runs import Runs
+from runtime.processes.coordinator.session.machine import SessionMachine
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.coordinator.setup.sequence import SetUp, Stage, first_action
+from runtime.station.spec import StationSpec
 
 
 @dataclass(frozen=True, slots=True)
 class View:
     """The parts of main that a snapshot shows, at the moment `now` of the runtime's clock."""
 
-    plan: Plan
-    page: Page
-    session: Session
+    plan: StationSpec
+    page: SharedState
+    session: SessionMachine
     lease: Lease
     inference: Inference
     setup: SetUp
@@ -39,8 +39,8 @@ class View:
     media: MediaReport
     reception: ReceptionReport
     unheard: Mapping[str, str]  # as by Sink.unheard
-    by_hand: ByHand
-    collecting: Collecting
+    by_hand: ManualControl
+    collecting: Demonstrations
     estop: str
     boot: str
     now: float
@@ -103,7 +103,7 @@ def snapshot(view: View) -> dict[str, Any]:
     }
 
 
-def facts(plan: Plan) -> dict[str, Any]:
+def facts(plan: StationSpec) -> dict[str, Any]:
     """What never changes while a station runs: names, sizes, limits [rad or the gripper's unit], rates [Hz]."""
     robot, bus = plan.robot, plan.deployment.bus
     return {
@@ -137,8 +137,9 @@ def facts(plan: Plan) -> dict[str, Any]:
 def _lease(view: View) -> dict[str, Any]:
     held = view.lease.current(view.people)
     if held is None:
-        return {"holder": "", "epoch": view.lease.epoch, "expires_in": 0.0}
-    return {"holder": held.holder, "epoch": held.epoch, "expires_in": held.until - view.people}
+        return {"holder": "", "by": "", "epoch": view.lease.epoch, "expires_in": 0.0}
+    left = held.until - view.people
+    return {"holder": held.holder, "by": held.by, "epoch": held.epoch, "expires_in": left}
 
 
 def _run(view: View) -> dict[str, Any]:
@@ -232,7 +233,7 @@ def _joints(view: View) -> Float64:
     return np.array(view.page.observation.read()["qpos"], np.float64)
 
 
-def control_figures(page: Page, rate: float) -> dict[str, Any]:
+def control_figures(page: SharedState, rate: float) -> dict[str, Any]:
     """What control last did and how well it keeps time."""
     status = page.control.read()
     return {

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from runtime import realtime
-from runtime.messages import Event
-from runtime.page import Page
+from runtime.core import realtime
+from runtime.ipc.messages import Event
+from runtime.ipc.shared_state import SharedState
 
 _LATE_S, _PUNCTUAL_S = 1e-3, 0.5e-3  # p99: from here on it is told, below the other it is over
 _MEASURED_S = 2.0  # of ticks before they are judged
 _LOOK_S = 1.0
 
 
-class Punctuality:
+class TimingReport:
     """Looks at control's own figures once a second; `asked`: control asks for the real-time class."""
 
-    def __init__(self, page: Page, rate: float, priority: int, asked: bool) -> None:
+    def __init__(self, page: SharedState, rate: float, priority: int, asked: bool) -> None:
         self._page = page
         self._rate = rate
         self._priority = priority

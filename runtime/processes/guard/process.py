@@ -2,25 +2,41 @@
 
 from __future__ import annotations
 
+import argparse
+import json
 import logging
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import zmq
 
-from runtime.bus import CommandServer, Endpoints
-from runtime.clock import Clock, MonotonicClock
-from runtime.family import join
-from runtime.latch import Latch
-from runtime.messages import Ack, Command
-from runtime.page import EStop, Page
+from runtime.core import file_limits as descriptors
+from runtime.core import logs
+from runtime.core.clock import Clock, MonotonicClock
+from runtime.ipc.bus import Call, CommandServer, Endpoints, Key
+from runtime.ipc.estop_latch import Latch
+from runtime.ipc.estop_requests import in_packed, why_of
+from runtime.ipc.fair_queue import LONGEST_STOP, Asked, Turns
+from runtime.ipc.identity import identified, named
+from runtime.ipc.lifeline import Lifeline
+from runtime.ipc.membership import Membership
+from runtime.ipc.messages import Ack, Command
+from runtime.ipc.shared_state import EStop, SharedState, SharedStateLayout
 
 log = logging.getLogger(__name__)
 _POLL_S = 0.005
+_SHARE = 8  # questions that are answered in one turn, besides all presses
+_REMEMBERED = 10_000  # presses of one e-stop
 
 
 class Guard:
     """Presses and releases: the flag, the disk, the answer, then the log; none delays what comes before it."""
 
-    def __init__(self, page: Page, latch: Latch, clock: Clock, period: float, station: str = "") -> None:
+    def __init__(
+        self, page: SharedState, latch: Latch, clock: Clock, period: float, station: str = ""
+    ) -> None:
         self._page = page
         self._latch = latch
         self._clock = clock
@@ -28,28 +44,45 @@ class Guard:
         self._patience = max(0.05, 2.0 * period)
         self._unsaid: list[tuple[int, str]] = []  # level and line, for after the answer
         self._releases = page.releases  # what was asked for before is void
+        self._latched: tuple[str, str] | None = None  # by whom and why, as this process has written it
         latched = latch.read()
         # A restarted guard also trusts the flag of its predecessor, which may not have reached the disk.
         page.set_estop(EStop.LATCHED if latched or page.estop is EStop.LATCHED else EStop.CLEAR)
         if latched:
             log.warning("e-stop is latched since before this start, by %s: %s", latched.by, latched.why)
 
-    def press(self, by: str, why: str) -> str:
-        """Raise the flag, then latch on disk; returns "" or why the latch will not outlive a restart."""
+    def raise_flag(self) -> None:
+        """Stop the robot: before anybody is asked who he is."""
         self._page.set_estop(EStop.LATCHED)
         self._releases = self._page.releases  # a release asked for before this press is not for this press
+
+    def press(self, by: str, why: str) -> str:
+        """Raise the flag, then latch on disk; returns "" or why the latch will not outlive a restart.
+
+        What is latched by the same person for the same reason is written already.
+        """
+        self.raise_flag()
+        if (by, why) == self._latched:
+            return ""
         self._unsaid.append((logging.WARNING, f"E-STOP by {by}: {why}"))
         try:
             self._latch.set(by, why)
         except OSError as error:
             self._unsaid.append((logging.ERROR, f"the e-stop is not on disk: {error}"))
             return f"; not on disk ({error.strerror or error}): a restart of the station may forget it"
+        self._latched = (by, why)
         return ""
 
     def watch(self) -> None:
-        """Release where main has asked for it, then log what there is to say."""
+        """Release where main has asked for it, latch what came to main meanwhile, then log what there is to say.
+
+        Main has raised the flag for such a press itself: a release in between has lowered it again.
+        """
         if self._page.releases != self._releases:
             self._release()
+        for payload in self._page.rings["presses"].drain():
+            if (command := in_packed(payload)) is not None:
+                self.press(named(command), why_of(command))
         for level, line in self._unsaid:
             log.log(level, "%s", line)
         self._unsaid.clear()
@@ -62,6 +95,7 @@ class Guard:
         except OSError as error:
             self._unsaid.append((logging.ERROR, f"the e-stop stays: its latch cannot be removed: {error}"))
             return
+        self._latched = None
         self._page.set_estop(EStop.CLEAR)
         self._unsaid.append((logging.WARNING, "e-stop released"))
 
@@ -84,9 +118,8 @@ class Guard:
     def answer(self, command: Command) -> Ack:
         """Any user may press; "failed" means that control did not answer in time: use the hardware stop."""
         if command.kind == "estop":
-            why = str(command.args.get("why", "pressed"))
             version = self._page.control.version
-            doubt = self.press(command.user or command.holder or "unknown", why)
+            doubt = self.press(named(command), why_of(command))
             if self.obeyed(version):
                 return Ack(
                     command.uuid,
@@ -108,22 +141,97 @@ class Guard:
         return Ack(command.uuid, "refused", f"the guard knows estop and status, not {command.kind!r}")
 
 
+class Desk:
+    """The guard's socket: every press that has come is answered in the turn in which it comes, however many there are.
+
+    They raise one flag and are one latch, that of the first of them: the answer to it is that to all. A repeated uuid
+    gets the first answer for as long as it is true: until the e-stop is released.
+
+    The data of an answer say when that press was carried out (`carried_out_at`, Unix time [s]) and whether it
+    `latched`: "anew", "already" where the e-stop was latched when it came, "before" where this is the answer to an
+    earlier one.
+    """
+
+    def __init__(self, guard: Guard, page: SharedState, context: zmq.Context[Any], station_dir: Path) -> None:
+        self._guard, self._page, self._key = guard, page, Key(station_dir)
+        self._server = CommandServer(context, station_dir, "estop")
+        self._turns = Turns(self._server, (), _SHARE, LONGEST_STOP)
+        self._endpoints = Endpoints(station_dir)
+        self._answered: dict[str, Ack] = {}
+        self._tell_where()
+
+    def _tell_where(self) -> None:
+        self._endpoints.write("guard", {"estop": self._server.endpoint})
+
+    def serve(self, timeout: float) -> None:
+        """Wait up to `timeout` seconds for a message, answer what there is."""
+        if not self._turns.waiting:
+            self._server.socket.poll(int(timeout * 1000))
+        presses, others = self._turns.take()
+        anew = self._page.estop is not EStop.LATCHED
+        if anew:
+            self._answered.clear()
+        if presses:
+            self._guard.raise_flag()
+            self._answer(presses, "anew" if anew else "already")
+        for call, command in others:
+            self._server.answer(call, self._guard.answer(command))
+        if self._server.moved() or self._endpoints.lost("guard"):
+            self._tell_where()
+
+    def _answer(self, presses: list[Asked], latched: str) -> None:
+        fresh, at = None, time.time()
+        for call, command in presses:
+            answer = self._answered.get(command.uuid)
+            if answer is None:
+                fresh = fresh or self._guard.answer(self._identified(call, command))
+                said = {**fresh.data, "latched": latched, "carried_out_at": at}
+                answer, latched = replace(fresh, uuid=command.uuid, data=said), "already"
+            self._server.answer(call, answer)
+            if answer.status == "done":
+                self._remember(answer)
+
+    def _identified(self, call: Call, command: Command) -> Command:
+        return identified(command, call.payload, call.signature, call.uid, self._key)
+
+    def _remember(self, ack: Ack) -> None:
+        self._answered.setdefault(ack.uuid, replace(ack, data={**ack.data, "latched": "before"}))
+        if len(self._answered) > _REMEMBERED:
+            del self._answered[next(iter(self._answered))]
+
+    def close(self) -> None:
+        """Release the socket."""
+        self._server.close()
+
+
+def _arguments() -> argparse.Namespace:
+    """What the supervisor hands over: values, so that nothing that a deployment may name is loaded here."""
+    parser = argparse.ArgumentParser(prog="runtime.guard", description="started by the supervisor")
+    parser.add_argument("--station", required=True)
+    parser.add_argument("--folder", required=True, type=Path, help="of the station: latch, key, endpoints")
+    parser.add_argument("--period", required=True, type=float, help="of control's ticks [s]")
+    parser.add_argument("--layout", required=True, help="of the shared state, as JSON")
+    parser.add_argument("--page", required=True, type=int)
+    parser.add_argument("--boot", required=True)
+    return parser.parse_args()
+
+
 def main() -> None:
     """Guard until the supervisor is gone and control has stopped ticking."""
-    member = join("guard")
-    settings, clock = member.plan.deployment, MonotonicClock()
-    server = CommandServer(zmq.Context.instance(), settings.bus.host, settings.bus.estop_port)
-    guard = Guard(member.page, Latch(settings.station_dir), clock, 1.0 / member.plan.rate, settings.station)
-    Endpoints(settings.station_dir).write("guard", {"estop": server.endpoint})
+    descriptors.allow_all()
+    given = _arguments()
+    logs.start("guard")
+    sizes = json.loads(given.layout)
+    layout = SharedStateLayout(**{**sizes, "cameras": tuple(sizes["cameras"])})
+    member = Membership(SharedState.attach(layout, given.page), given.boot, Lifeline())
+    clock = MonotonicClock()
+    guard = Guard(member.page, Latch(given.folder), clock, given.period, given.station)
+    desk = Desk(guard, member.page, zmq.Context.instance(), given.folder)
     while member.needed(clock.now()):
         member.page.beat("guard", clock.now())
         guard.watch()
-        if server.socket.poll(int(_POLL_S * 1000)):
-            received = server.receive()
-            if received is not None:
-                address, command = received
-                server.answer(address, guard.answer(command))
-    server.close()
+        desk.serve(_POLL_S)
+    desk.close()
 
 
 if __name__ == "__main__":

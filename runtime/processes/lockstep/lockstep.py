@@ -11,24 +11,25 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from runtime.clock import Clock, VirtualClock
-from runtime.closing import Close, at_once
-from runtime.control import make_tick
-from runtime.director import Director
-from runtime.errors import SetupError
-from runtime.family import Plan
-from runtime.guard import Guard
-from runtime.latch import Latch
-from runtime.media import Media, make_recorder
-from runtime.messages import Ack, Command
-from runtime.page import Page
-from runtime.plugins import variants
-from runtime.realtime import LOCKSTEP
-from runtime.reception import Reception
-from runtime.recorder import Closed
-from runtime.runner import LockstepRunner, Runner
-from runtime.transitions import State
-from runtime.types import Observation
+from runtime.core.clock import Clock, VirtualClock
+from runtime.core.errors import SetupError
+from runtime.core.plugins import variants
+from runtime.core.realtime import LOCKSTEP
+from runtime.core.types import Observation
+from runtime.ipc.estop_latch import Latch
+from runtime.ipc.identity import LOCAL
+from runtime.ipc.messages import Ack, Command
+from runtime.ipc.shared_state import SharedState
+from runtime.processes.control.process import make_tick
+from runtime.processes.coordinator.coordinator import Coordinator
+from runtime.processes.coordinator.inference.worker import LockstepRunner, Runner
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.guard.process import Guard
+from runtime.processes.media.episode_closing import Close, at_once
+from runtime.processes.media.process import Media, make_recorder
+from runtime.processes.media.recorder import ClosedEpisode
+from runtime.processes.reception.process import Reception
+from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
 _HOLDER = "lockstep"
@@ -53,7 +54,7 @@ class Around:
     people: Clock | None = None  # the clock of leases and commands
     waits: Clock | None = None  # what the guard waits by
     preview: Callable[[Observation], None] = lambda observation: None
-    closer: Callable[[Close], Future[Closed]] = at_once
+    closer: Callable[[Close], Future[ClosedEpisode]] = at_once
     on_disk: Callable[[Path], None] = lambda folder: None
 
 
@@ -63,10 +64,12 @@ class Lockstep:
     `clock` and `around` are given where somebody else has a part in it.
     """
 
-    def __init__(self, plan: Plan, clock: VirtualClock | None = None, around: Around | None = None) -> None:
+    def __init__(
+        self, plan: StationSpec, clock: VirtualClock | None = None, around: Around | None = None
+    ) -> None:
         self.plan = plan
         self.clock = clock = clock or VirtualClock()
-        self.page = Page(plan.layout, mmap.mmap(-1, Page.size(plan.layout)))
+        self.page = SharedState(plan.layout, mmap.mmap(-1, SharedState.size(plan.layout)))
         settings, around = plan.deployment, around or Around()
         waits = around.waits or clock
         self.guard = Guard(self.page, Latch(settings.station_dir), waits, 1.0 / plan.rate, settings.station)
@@ -76,7 +79,7 @@ class Lockstep:
         self.media = Media(self.page, recorder, clock, around.preview, around.closer, around.on_disk)
         self.reception = Reception(self.page, self._source, clock, LOCKSTEP)
         self._runner = around.runner or LockstepRunner(settings.lockstep.delay_ticks)
-        self.main = Director(plan, self.page, clock, self._runner, around.people)
+        self.main = Coordinator(plan, self.page, clock, self._runner, around.people)
         self._tick = make_tick(plan, self.page, self._sink, self.clock.now)
         self.step = 0
 
@@ -125,6 +128,7 @@ class Lockstep:
                 epoch=0 if kind == "lease_claim" else self.main.lease.epoch,
                 boot=self.main.boot,
                 sequence=session.sequence,
+                role=LOCAL,
             )
         )
 
@@ -148,7 +152,7 @@ class Lockstep:
         self._sink.close()
 
 
-def check(plan: Plan) -> None:
+def check(plan: StationSpec) -> None:
     """Raise SetupError where what is at the other end of the transport goes on by itself.
 
     Its messages are stamped in a time that the virtual clock does not have: a run would only hold, for the age of
@@ -164,7 +168,7 @@ def check(plan: Plan) -> None:
         )
 
 
-def run(plan: Plan, longest: float = 3600.0) -> LockstepRun:
+def run(plan: StationSpec, longest: float = 3600.0) -> LockstepRun:
     """Set up, run to the end of the source or of run.duration_s, close; raises RuntimeFault where it cannot.
 
     `longest` bounds the virtual time of the run [s].

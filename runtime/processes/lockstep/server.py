@@ -15,22 +15,24 @@ from typing import Any
 
 import zmq
 
-from runtime.asking import Answered
-from runtime.bus import CommandServer, Endpoints
-from runtime.clock import Clock, MonotonicClock, VirtualClock
-from runtime.closing import in_background
-from runtime.control import Lateness
-from runtime.errors import PolicyError, SetupError
-from runtime.exports import Exports
-from runtime.family import Plan
-from runtime.leftovers import start_repair
-from runtime.lockstep import Around, Lockstep
-from runtime.main import Service
-from runtime.previews import Previews
-from runtime.realtime import LOCKSTEP
-from runtime.runner import DeclaredRunner
-from runtime.supervisor import hold
-from runtime.transitions import State
+from runtime.core import file_limits as descriptors
+from runtime.core.clock import Clock, MonotonicClock, VirtualClock
+from runtime.core.errors import PolicyError, SetupError
+from runtime.core.realtime import LOCKSTEP
+from runtime.ipc.bus import Endpoints, Key
+from runtime.processes.control.process import Lateness
+from runtime.processes.coordinator.inference.requests import PolicyResponse
+from runtime.processes.coordinator.inference.worker import DeclaredRunner
+from runtime.processes.coordinator.process import CommandService
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.guard.process import Desk
+from runtime.processes.lockstep.lockstep import Around, Lockstep
+from runtime.processes.media.crash_repair import start_repair
+from runtime.processes.media.episode_closing import in_background
+from runtime.processes.media.export_jobs import Exports
+from runtime.processes.media.previews import Previews
+from runtime.station.lock import hold
+from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
 _POLL_S = 0.002  # for a command, while time stands still
@@ -49,7 +51,7 @@ def declared(rate: float) -> Callable[[Any], tuple[Any, int]]:
     """
 
     def told(result: Any) -> tuple[Any, int]:
-        if not isinstance(result, Answered):
+        if not isinstance(result, PolicyResponse):
             return result, 1
         ms = result.chunk.timing.get("policy.infer_ms", 0.0)
         if not 0.0 <= ms < math.inf:
@@ -82,15 +84,21 @@ class ServedLockstep(Lockstep):
     """
 
     def __init__(
-        self, plan: Plan, clock: VirtualClock, over: Over = lambda running: "", people: Clock | None = None
+        self,
+        plan: StationSpec,
+        clock: VirtualClock,
+        over: Over = lambda running: "",
+        people: Clock | None = None,
     ) -> None:
         settings = plan.deployment
         if settings.control_channel.enabled:
             raise SetupError("control_channel.enabled = true in lockstep, which has none; allowed: false")
         self._people = people or MonotonicClock()
         self._over = over
+        descriptors.allow_all()
         self._lock = hold(settings)
-        Endpoints(settings.station_dir).clear()
+        Endpoints(settings.station_dir).begin()
+        Key(settings.station_dir).secret()
         self._exports = Exports(settings.data, settings.recording.export)
         start_repair(settings.episodes_dir, settings.station, self._exports.start)
         self._previews = Previews(plan)
@@ -106,9 +114,8 @@ class ServedLockstep(Lockstep):
         super().__init__(plan, clock, around)
         self._figures = Lateness(self._tick.status, LOCKSTEP)
         context: zmq.Context[Any] = zmq.Context.instance()
-        self._estops = CommandServer(context, settings.bus.host, settings.bus.estop_port)
-        Endpoints(settings.station_dir).write("guard", {"estop": self._estops.endpoint})
-        self._service = Service(self.main, context)
+        self._estops = Desk(self.guard, self.page, context, settings.station_dir)
+        self._service = CommandService(self.main, context)
         self._told_at = -1  # the step that main was last told of how it goes, time standing still
         self._again_at = self._next_at = 0.0  # on the people's clock
 
@@ -132,9 +139,7 @@ class ServedLockstep(Lockstep):
         else:
             self._stand()
         self._service.serve(wait)
-        while (received := self._estops.receive()) is not None:
-            address, command = received
-            self._estops.answer(address, self.guard.answer(command))
+        self._estops.serve(0.0)
 
     def tick(self) -> None:
         """One control period; a run that is over ends within it."""

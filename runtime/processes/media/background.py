@@ -6,12 +6,12 @@ import os
 import threading
 from collections.abc import Callable
 
-from runtime.types import Observation
+from runtime.core.types import Observation
 
 NICE = 5  # as the web, which is whom live pictures are for
 
 
-class Aside:
+class LowPriorityWorker:
     """Calls `work` with the newest observation; those that come while it is at work replace each other.
 
     Where `work` fails, the next call raises what it failed with.

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from runtime.messages import Event
+from runtime.core.types import Observation, UInt8
+from runtime.ipc.messages import Event
+from runtime.processes.media.dropouts import DropoutLog
 from runtime.recording.settings import RecordingSettings
-from runtime.silences import Silences
-from runtime.types import Observation, UInt8
 
 
-class Shown:
+class CameraRows:
     """Follows the cameras of one episode row by row."""
 
     def __init__(self, cameras: Sequence[str], settings: RecordingSettings) -> None:
@@ -19,7 +19,7 @@ class Shown:
         self._settings = settings
         self._captured: dict[str, float] = {}  # of the newest picture that a row has
         self._began: float | None = None
-        self._silences = Silences(cameras)
+        self._silences = DropoutLog(cameras)
         self.stale: frozenset[str] = frozenset()  # cameras whose newest picture is too old for the newest row
         self.lost: frozenset[str] = (
             frozenset()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from runtime.messages import ChunkMerged, PolicyAnswer
+from runtime.core.types import Float32, UInt8
+from runtime.ipc.messages import ChunkMerged, PolicyAnswer
 from runtime.recording.base import Journal, RawChunk
-from runtime.types import Float32, UInt8
 
 _KEPT = 256  # of either half, until the other comes
 

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.repair import repair
 
 log = logging.getLogger(__name__)
@@ -42,7 +42,7 @@ def repair_leftovers(
             report = repair(folder)
             found = report.problem or f"{report.frames} rows"
             log.warning("episode %s was left open: %s, %s", folder.name, report.verdict, found)
-            if report.verdict in ("repaired", "complete"):
+            if report.verdict in ("repaired", "restored", "complete"):
                 repaired(folder)
         except RecordingError as error:
             log.error("episode %s was left open and stays as it is: %s", folder.name, error)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from runtime.messages import Event
+from runtime.ipc.messages import Event
 
 QUIET_S = 5.0  # from one pictures_stopped of a camera to its next
 
@@ -21,7 +21,7 @@ class _Camera:
     spoken: float = -math.inf  # when that was
 
 
-class Silences:
+class DropoutLog:
     """Follows the cameras of one episode row by row.
 
     A camera is said to have stopped, and to be back, at most once in QUIET_S. What comes meanwhile is counted, and said

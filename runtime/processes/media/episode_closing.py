@@ -6,21 +6,21 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 
-from runtime.recorder import Closed
+from runtime.processes.media.recorder import ClosedEpisode
 
-Close = Callable[[], Closed]
+Close = Callable[[], ClosedEpisode]
 
 
-def at_once(close: Close) -> Future[Closed]:
+def at_once(close: Close) -> Future[ClosedEpisode]:
     """Close an episode here and now, as lockstep does."""
-    done: Future[Closed] = Future()
+    done: Future[ClosedEpisode] = Future()
     done.set_result(close())
     return done
 
 
-def in_background(close: Close) -> Future[Closed]:
+def in_background(close: Close) -> Future[ClosedEpisode]:
     """Close an episode on a thread of its own, so that a slow disk stops nothing else."""
-    done: Future[Closed] = Future()
+    done: Future[ClosedEpisode] = Future()
 
     def run() -> None:
         try:

@@ -7,9 +7,9 @@ import numpy as np
 import simplejpeg
 import zmq
 
-from runtime.bus import CAMERA_HIGH_WATER, Endpoints, Publisher
-from runtime.family import Plan
-from runtime.types import Observation, UInt8
+from runtime.core.types import Observation, UInt8
+from runtime.ipc.bus import CAMERA_HIGH_WATER, Endpoints, Publisher
+from runtime.station.spec import StationSpec
 
 
 class Previews:
@@ -18,20 +18,25 @@ class Previews:
     One that only stands in further observations is not shown again: who looks sees it grow old.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: StationSpec) -> None:
         settings = plan.deployment.bus
-        self._publisher = Publisher(
-            zmq.Context.instance(), settings.host, settings.camera_port, CAMERA_HIGH_WATER
-        )
+        folder = plan.deployment.station_dir
+        self._publisher = Publisher(zmq.Context.instance(), folder, "cameras", CAMERA_HIGH_WATER)
         self._period = 1.0 / settings.preview_rate if settings.preview_rate else float("inf")
         self._height = settings.preview_height
         self._due: dict[str, float] = {}
         self._shown: dict[str, float] = {}  # when each camera's last one was captured
         self._newest: dict[str, bytes] = {}
         cv2.setNumThreads(1)  # the other cores belong to the rest of the family
-        Endpoints(plan.deployment.station_dir).write("media", {"cameras": self._publisher.endpoint})
+        self._endpoints = Endpoints(folder)
+        self._tell_where()
+
+    def _tell_where(self) -> None:
+        self._endpoints.write("media", {"cameras": self._publisher.endpoint})
 
     def __call__(self, observation: Observation) -> None:
+        if self._publisher.moved():
+            self._tell_where()
         for camera in observation.pictures:
             captured = observation.captured.get(camera, observation.arrived)
             if observation.arrived < self._due.get(camera, 0.0) or captured == self._shown.get(camera):

@@ -8,16 +8,12 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any
 
-from runtime import heap
-from runtime.aside import Aside
-from runtime.clock import Clock, MonotonicClock
-from runtime.closing import Close, at_once, in_background
-from runtime.errors import RecordingError
-from runtime.exports import Exports
-from runtime.family import Plan, join
-from runtime.leftovers import start_repair
-from runtime.memory import TornReadError
-from runtime.messages import (
+from runtime.core import file_limits as descriptors
+from runtime.core import malloc as heap
+from runtime.core.clock import Clock, MonotonicClock
+from runtime.core.errors import RecordingError
+from runtime.core.types import Observation
+from runtime.ipc.messages import (
     BeginEpisode,
     BeginRun,
     ChunkMerged,
@@ -36,13 +32,19 @@ from runtime.messages import (
     encode,
     event_row,
 )
-from runtime.page import Page
-from runtime.previews import Previews
-from runtime.received import as_observation
-from runtime.recorder import Closed, Grid, Recorder
+from runtime.ipc.observation_messages import as_observation
+from runtime.ipc.shared_memory import TornReadError
+from runtime.ipc.shared_state import SharedState
+from runtime.processes.child import join
+from runtime.processes.media.background import LowPriorityWorker
+from runtime.processes.media.crash_repair import start_repair
+from runtime.processes.media.episode_closing import Close, at_once, in_background
+from runtime.processes.media.export_jobs import Exports
+from runtime.processes.media.previews import Previews
+from runtime.processes.media.recorder import ClosedEpisode, DatasetGrid, Recorder
+from runtime.processes.media.unclosed_episodes import Unclosed
 from runtime.recording.episode import EpisodeJournal
-from runtime.types import Observation
-from runtime.unclosed import Unclosed
+from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
 _REPORT_PERIOD = 0.2
@@ -57,11 +59,11 @@ class Media:
 
     def __init__(
         self,
-        page: Page,
+        page: SharedState,
         recorder: Recorder,
         clock: Clock,
         preview: Callable[[Observation], None] = lambda observation: None,
-        closer: Callable[[Close], Future[Closed]] = at_once,
+        closer: Callable[[Close], Future[ClosedEpisode]] = at_once,
         on_disk: Callable[[Path], None] = lambda folder: None,
     ) -> None:
         self._page = page
@@ -71,7 +73,7 @@ class Media:
         self._closer = closer
         self._on_disk = on_disk  # hears of every episode that was closed
         self._unclosed = Unclosed(closer, clock.now)
-        self._closing: Future[Closed] | None = None
+        self._closing: Future[ClosedEpisode] | None = None
         self._closing_uuid = ""
         self._waiting: BeginEpisode | None = None  # for the episode before it to be closed
         self._waiting_since = 0.0
@@ -226,7 +228,7 @@ class Media:
         closed, self._closing, self._closing_uuid = self._closing.result(), None, ""
         self._closed(closed)
 
-    def _closed(self, closed: Closed) -> None:
+    def _closed(self, closed: ClosedEpisode) -> None:
         waits = closed.again is not None
         path, told = str(closed.path), (closed.status, closed.reason, closed.rows, closed.error)
         self._tell(EpisodeClosed(closed.uuid, path, *told, waits))
@@ -267,7 +269,7 @@ class Media:
             log.warning("main does not read: %s lost", type(message).__name__)
 
 
-def make_recorder(plan: Plan, now: Callable[[], float], patient: bool = False) -> Recorder:
+def make_recorder(plan: StationSpec, now: Callable[[], float], patient: bool = False) -> Recorder:
     """The recorder of a deployment; `patient` waits for encoders, as lockstep may."""
     robot = plan.robot
     described = {
@@ -280,20 +282,23 @@ def make_recorder(plan: Plan, now: Callable[[], float], patient: bool = False) -
     }
     root, recording = plan.deployment.episodes_dir, plan.deployment.recording
     journal = EpisodeJournal(root, recording, patient=patient)
-    grid = Grid(described, plan.layout.cameras, plan.rate, plan.fps, plan.end_effectors().eef_of, recording)
+    grid = DatasetGrid(
+        described, plan.layout.cameras, plan.rate, plan.fps, plan.end_effectors().eef_of, recording
+    )
     return Recorder(journal, root, grid, now)
 
 
 def main() -> None:
     """Run media until the supervisor is gone."""
     heap.keep()
+    descriptors.allow_all()
     member = join("media")
     plan, page = member.plan, member.page
     clock = MonotonicClock()
     page.beat("media", clock.now())
     exports = Exports(plan.deployment.data, plan.deployment.recording.export)
     start_repair(plan.deployment.episodes_dir, plan.deployment.station, exports.start)
-    previews = Aside(Previews(plan))  # late on a busy machine, rather than what is recorded
+    previews = LowPriorityWorker(Previews(plan))  # late on a busy machine, rather than what is recorded
     media = Media(page, make_recorder(plan, clock.now), clock, previews, in_background, exports.start)
     try:
         while not member.lifeline.cut:

@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from runtime.errors import RecordingError
-from runtime.messages import ChunkMerged, Event, PolicyAnswer, TickDone, event_row
-from runtime.recorded_chunks import RecordedChunks
+from runtime.core.errors import RecordingError
+from runtime.core.types import Float32, Observation
+from runtime.ipc.messages import ChunkMerged, Event, PolicyAnswer, TickDone, event_row
+from runtime.processes.media.camera_rows import CameraRows
+from runtime.processes.media.chunk_log import RecordedChunks
 from runtime.recording.base import VIDEO_LOST, ExecutedTick, Journal, Outcome, Row, Status
 from runtime.recording.files import UnclosedError
 from runtime.recording.schema import Schema
 from runtime.recording.settings import RecordingSettings
-from runtime.shown import Shown
-from runtime.types import Float32, Observation
 
 _OBSERVATIONS_KEPT = (
     256  # ticks reach us within a few ms, after a stall of ours later; at 200 Hz this is a second
@@ -30,7 +30,7 @@ _OBSERVATIONS_KEPT = (
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class DatasetGrid:
     """The robot's side of an episode: names, sizes and rates."""
 
     robot: Mapping[str, Any]  # as the manifest has it
@@ -42,7 +42,7 @@ class Grid:
 
 
 @dataclass(frozen=True, slots=True)
-class Closed:
+class ClosedEpisode:
     """A finished episode."""
 
     uuid: str
@@ -51,7 +51,9 @@ class Closed:
     reason: str
     rows: int
     error: str = ""
-    again: Callable[[], Closed] | None = None  # where its end waits for room on the disk: tries once more
+    again: Callable[[], ClosedEpisode] | None = (
+        None  # where its end waits for room on the disk: tries once more
+    )
 
 
 class Recorder:
@@ -60,7 +62,7 @@ class Recorder:
     A row that falls into a gap of missed ticks repeats the tick before it; its pictures are flagged repeats.
     """
 
-    def __init__(self, journal: Journal, root: Path, grid: Grid, now: Callable[[], float]) -> None:
+    def __init__(self, journal: Journal, root: Path, grid: DatasetGrid, now: Callable[[], float]) -> None:
         self._journal = journal
         self._root = root
         self._grid = grid
@@ -90,7 +92,7 @@ class Recorder:
         if missing:
             raise RecordingError(f"no picture has arrived from {', '.join(missing)}")
         self._schema.check(newest)
-        self._shown = Shown(self._cameras, self._grid.recording)
+        self._shown = CameraRows(self._cameras, self._grid.recording)
         identity = str(manifest.get("uuid") or uuid.uuid4())
         self._journal.begin(self._manifest(dict(manifest), identity, newest))
         self._uuid, self._run, self.rows, self.repeated = identity, run, 0, 0
@@ -123,11 +125,11 @@ class Recorder:
             "started_monotonic": self._now(),
         }
 
-    def end(self, status: Status, reason: str, details: Mapping[str, Any]) -> Callable[[], Closed]:
+    def end(self, status: Status, reason: str, details: Mapping[str, Any]) -> Callable[[], ClosedEpisode]:
         """End the episode: nothing more is taken for it.
 
         What is returned closes its files, on any thread, and may wait for the disk; until it is done no other
-        episode may begin. What could not be saved is named in `Closed.error`.
+        episode may begin. What could not be saved is named in `ClosedEpisode.error`.
         """
         error, rows, lost = "", self.rows, self._lost
         identity, path = self._uuid, self._root / self._uuid
@@ -142,7 +144,7 @@ class Recorder:
 
         told = list(lost)
 
-        def attempt(finish: Callable[[], None]) -> Closed:
+        def attempt(finish: Callable[[], None]) -> ClosedEpisode:
             failure, again = error, None
             try:
                 finish()
@@ -151,7 +153,7 @@ class Recorder:
             except RecordingError as fault:
                 failure = str(fault)
             why = "; ".join(filter(None, (failure or reason, *told)))
-            return Closed(identity, path, "failed" if failure else status, why, rows, failure, again)
+            return ClosedEpisode(identity, path, "failed" if failure else status, why, rows, failure, again)
 
         def end_journal() -> None:
             try:

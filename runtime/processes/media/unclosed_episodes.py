@@ -6,9 +6,9 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 
-from runtime.back_off import BackOff
-from runtime.closing import Close
-from runtime.recorder import Closed
+from runtime.core.backoff import BackOff
+from runtime.processes.media.episode_closing import Close
+from runtime.processes.media.recorder import ClosedEpisode
 
 _FIRST_S, _MOST_S = 1.0, 30.0  # between two attempts, doubled each time
 
@@ -16,11 +16,11 @@ _FIRST_S, _MOST_S = 1.0, 30.0  # between two attempts, doubled each time
 class Unclosed:
     """The oldest is tried first; a disk that takes its end takes the next one at once."""
 
-    def __init__(self, closer: Callable[[Close], Future[Closed]], now: Callable[[], float]) -> None:
+    def __init__(self, closer: Callable[[Close], Future[ClosedEpisode]], now: Callable[[], float]) -> None:
         self._closer = closer
         self._now = now
-        self._episodes: deque[Closed] = deque()
-        self._attempt: Future[Closed] | None = None
+        self._episodes: deque[ClosedEpisode] = deque()
+        self._attempt: Future[ClosedEpisode] | None = None
         self._back_off = BackOff(_FIRST_S, _MOST_S)
 
     @property
@@ -28,13 +28,13 @@ class Unclosed:
         """What each of them waits for, by uuid."""
         return {episode.uuid: episode.error for episode in self._episodes}
 
-    def add(self, episode: Closed) -> None:
+    def add(self, episode: ClosedEpisode) -> None:
         """One that has `again`."""
         if not self._episodes:
             self._back_off.failed(self._now())
         self._episodes.append(episode)
 
-    def look(self) -> Closed | None:
+    def look(self) -> ClosedEpisode | None:
         """One that is closed now, None where none is; begins an attempt where one is due. Never waits for the disk."""
         if self._attempt is None and self._episodes and not self._back_off.waiting(self._now()):
             again = self._episodes[0].again
@@ -51,7 +51,7 @@ class Unclosed:
         self._back_off.failed(self._now())
         return None
 
-    def finish(self, seconds: float) -> Closed | None:
+    def finish(self, seconds: float) -> ClosedEpisode | None:
         """Try once more, and wait at most so long; the same as `look`. What is left then, repair completes."""
         self._back_off.forget()
         closed = self.look()

@@ -6,16 +6,18 @@ import logging
 import time
 from collections.abc import Mapping
 
-from runtime import heap, realtime
-from runtime.clock import Clock, MonotonicClock
-from runtime.errors import RuntimeFault
-from runtime.family import Plan, join
-from runtime.intake import Intake
-from runtime.messages import BeginRun, EndRun, Event, Message, ReceptionReport, RunBegun, decode, encode
-from runtime.page import Page
-from runtime.received import as_message
+from runtime.core import malloc as heap
+from runtime.core import realtime
+from runtime.core.clock import Clock, MonotonicClock
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Observation
+from runtime.ipc.messages import BeginRun, EndRun, Event, Message, ReceptionReport, RunBegun, decode, encode
+from runtime.ipc.observation_messages import as_message
+from runtime.ipc.shared_state import SharedState
+from runtime.processes.child import join
+from runtime.processes.reception.receiver import ObservationReceiver
+from runtime.station.spec import StationSpec
 from runtime.transports.base import Source
-from runtime.types import Observation
 
 log = logging.getLogger(__name__)
 _REPORT_PERIOD = 0.2
@@ -43,11 +45,11 @@ class Share:
 class Reception:
     """One `pump` takes what there is; lockstep calls it tick by tick."""
 
-    def __init__(self, page: Page, source: Source, clock: Clock, scheduling: str = "") -> None:
+    def __init__(self, page: SharedState, source: Source, clock: Clock, scheduling: str = "") -> None:
         self._page = page
         self._clock = clock
         self._scheduling = scheduling
-        self._intake = Intake(page, source, clock, self._say, self._hand_on)
+        self._intake = ObservationReceiver(page, source, clock, self._say, self._hand_on)
         self._begun: RunBegun | None = None  # media is not told yet
         self._next_report = 0.0
         self._missed = 0  # observations that media had no room for
@@ -152,7 +154,7 @@ def main() -> None:
     source.close()
 
 
-def _scheduling(plan: Plan) -> str:
+def _scheduling(plan: StationSpec) -> str:
     """The class that this process got; it asks for one only where what it sees is a robot."""
     settings = plan.deployment.control
     if settings.realtime == "off" or not plan.capabilities.moves_robot:

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from runtime.clock import Clock
-from runtime.drives import Drives
-from runtime.errors import TransportError
-from runtime.messages import Event
-from runtime.page import Page
+from runtime.core.clock import Clock
+from runtime.core.errors import TransportError
+from runtime.core.types import Observation
+from runtime.ipc.messages import Event
+from runtime.ipc.shared_state import SharedState
+from runtime.processes.reception.drive_status import Drives
 from runtime.transports.base import Source
-from runtime.types import Observation
 
 log = logging.getLogger(__name__)
 _RATE_WINDOW = 40  # arrivals per stream
@@ -27,7 +27,7 @@ _REPEAT_S = 5.0  # between two events of one fault: thousands of lost frames are
 _STANDING = "_unusable"  # ends the names of faults that are in every message of a node: said once in each run
 
 
-class Intake:
+class ObservationReceiver:
     """The way of an observation: pictures into their slots, `hand_on` with their numbers, numbers into the page.
 
     Numbers of observations and of pictures go on where a predecessor in the same page ended. `truth` is what a
@@ -36,7 +36,7 @@ class Intake:
 
     def __init__(
         self,
-        page: Page,
+        page: SharedState,
         source: Source,
         clock: Clock,
         say: Callable[[Event], None],

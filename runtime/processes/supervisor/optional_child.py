@@ -12,7 +12,7 @@ SHORTEST_S, LONGEST_S = 1.0, 30.0  # between two starts
 _STEADY_S = 60.0  # who lives that long has earned the shortest wait again
 
 
-class Companion:
+class OptionalChild:
     """`look` starts it again where it has ended; the robot does not depend on it."""
 
     def __init__(

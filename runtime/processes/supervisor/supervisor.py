@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import os
@@ -12,18 +11,26 @@ import sys
 import time
 import uuid
 from collections import deque
+from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
-from typing import IO
 
-from runtime.bus import Endpoints
-from runtime.companion import Companion
-from runtime.config import Deployment
-from runtime.errors import SetupError
-from runtime.family import Lifeline, Plan
-from runtime.page import PROCESSES, Page
+from runtime.ipc.bus import Endpoints, Key
+from runtime.ipc.lifeline import Lifeline
+from runtime.ipc.shared_state import PROCESSES, SharedState
+from runtime.processes.supervisor.optional_child import OptionalChild
+from runtime.station.lock import hold, unwritable
+from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
+_MODULES = {
+    "guard": "runtime.processes.guard.process",
+    "reception": "runtime.processes.reception.process",
+    "media": "runtime.processes.media.process",
+    "control": "runtime.processes.control.process",
+    "main": "runtime.processes.coordinator.process",
+    "headless": "runtime.clients.headless",
+}
 _START_ORDER = ("guard", "reception", "media", "control", "main")
 MOST_RESTARTS, RESTART_WINDOW_S = 5, 60.0
 _PATIENCE_S = 9.0  # after the lifeline is cut; then what is left is killed
@@ -31,41 +38,10 @@ _DRIVER_PATIENCE_S = 2.0  # for what drives a headless run, after it was told to
 _POLL_S = 0.05
 
 
-def hold(settings: Deployment) -> IO[str]:
-    """The lock of a station, for as long as it runs; SetupError names the process that has it, or why it cannot be."""
-    try:
-        return _locked(settings)
-    except OSError as error:
-        raise _unwritable(settings, error) from None
-
-
-def _unwritable(settings: Deployment, error: OSError) -> SetupError:
-    return SetupError(
-        f"{settings.station_dir} cannot be written ({error.strerror}): make room there, or name another folder with "
-        "data_dir"
-    )
-
-
-def _locked(settings: Deployment) -> IO[str]:
-    settings.station_dir.mkdir(parents=True, exist_ok=True)
-    lock = (settings.station_dir / "lock").open("a+", encoding="utf-8")
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        lock.seek(0)
-        raise SetupError(
-            f"station {settings.station!r} is already running (process {lock.read().strip() or '?'}); "
-            "end it first, or give this one another name with --set station=NAME"
-        ) from None
-    lock.truncate(0)
-    os.write(lock.fileno(), str(os.getpid()).encode())
-    return lock
-
-
 class Supervisor:
     """One family; everything it starts ends with it, however it ends."""
 
-    def __init__(self, plan: Plan, lifeline: Lifeline | None = None) -> None:
+    def __init__(self, plan: StationSpec, lifeline: Lifeline | None = None) -> None:
         self._plan = plan
         self._lifeline = lifeline  # of our own parent, where it wants us to end with it
         self._station_dir = plan.deployment.station_dir
@@ -73,7 +49,7 @@ class Supervisor:
         self._environment = dict(os.environ)
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._driver: subprocess.Popen[bytes] | None = None
-        self._channel: Companion | None = None
+        self._channel: OptionalChild | None = None
         self._restarts: deque[float] = deque()
         self._ending = False
         self.boot = str(uuid.uuid4())
@@ -84,9 +60,10 @@ class Supervisor:
         try:
             self._resolved = self._write_resolved()
         except OSError as error:
-            raise _unwritable(self._plan.deployment, error) from None
-        self._endpoints.clear()
-        self._page, self._page_fd = Page.create(self._plan.layout)
+            raise unwritable(self._plan.deployment, error) from None
+        self._endpoints.begin()
+        Key(self._station_dir).secret()  # what is wrong with it is said before anything moves
+        self._page, self._page_fd = SharedState.create(self._plan.layout)
         # Children hold the reading end as their standard input: it ends when this process does, however it does.
         self._lifeline_out, self._lifeline_in = os.pipe()
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -97,7 +74,7 @@ class Supervisor:
             for process in _START_ORDER:
                 self._start(process)
             if self._plan.deployment.control_channel.enabled:
-                self._channel = Companion("channel", self._spawn_channel)
+                self._channel = OptionalChild("channel", self._spawn_channel)
             if headless:
                 self._driver = self._spawn("headless")
             return self._watch()
@@ -114,26 +91,39 @@ class Supervisor:
         self._page.beat(process, 0.0)  # not alive until it says so itself
         self._page.set_generation(process, self._page.generation(process) + 1)
         self._children[process] = self._spawn(process)
+        self._tell_where()
+
+    def _tell_where(self) -> None:
         pids = {name: str(child.pid) for name, child in self._children.items()}
         self._endpoints.write("supervisor", {"boot": self.boot, **pids})
 
     def _spawn(self, process: str) -> subprocess.Popen[bytes]:
+        page = () if process == "headless" else ("--page", str(self._page_fd))
         return subprocess.Popen(
             [
-                *(sys.executable, "-m", f"runtime.{process}"),
-                *("--resolved", str(self._resolved), "--page", str(self._page_fd), "--boot", self.boot),
+                *(sys.executable, "-m", _MODULES[process], "--boot", self.boot),
+                *(self._for_guard() if process == "guard" else ("--resolved", str(self._resolved))),
+                *page,
             ],
             stdin=self._lifeline_out,
-            pass_fds=(self._page_fd,),
+            pass_fds=(self._page_fd,) if page else (),
             env=self._environment,
             start_new_session=True,  # Ctrl-C reaches the supervisor alone, which ends them in order
+        )
+
+    def _for_guard(self) -> tuple[str, ...]:
+        """Values alone: the guard reads no deployment, which could name what fails to load."""
+        plan = self._plan
+        return (
+            *("--station", plan.deployment.station, "--folder", str(self._station_dir)),
+            *("--period", repr(1.0 / plan.rate), "--layout", json.dumps(asdict(plan.layout))),
         )
 
     def _spawn_channel(self) -> subprocess.Popen[bytes]:
         """The control channel: a client like any other, without a part in the page."""
         station, data = self._plan.deployment.station, str(self._plan.deployment.data)
         return subprocess.Popen(
-            [sys.executable, "-m", "runtime.channel", station, "--data-dir", data, "--lifeline"],
+            [sys.executable, "-m", "runtime.clients.channel", station, "--data-dir", data, "--lifeline"],
             stdin=self._lifeline_out,
             env=self._environment,
             start_new_session=True,
@@ -149,6 +139,8 @@ class Supervisor:
                     return 1
             if self._channel is not None:
                 self._channel.look()
+            if self._endpoints.lost("supervisor"):
+                self._tell_where()
             time.sleep(_POLL_S)
         return 130
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.types import Float32
+from runtime.core.types import Float32
 
 Bool = NDArray[np.bool_]
 

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.core.types import Float32, UInt8
 from runtime.sim.bench import PinholeCamera
 from runtime.sim.render.order import Order, painted
 from runtime.sim.render.solids import Placed, Solids
-from runtime.types import Float32, UInt8
 
 LIGHT = np.array([-0.36, 0.28, 0.89], np.float32)  # towards the lamp
 LIGHT /= np.linalg.norm(LIGHT)

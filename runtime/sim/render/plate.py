@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from runtime.core.types import Float32, UInt8
 from runtime.sim.bench import Bench, PinholeCamera
 from runtime.sim.render.painter import fill_ahead
 from runtime.sim.render.solids import circle
-from runtime.types import Float32, UInt8
 
 _POINTS = 64
 _NEAR = 0.02  # m before the camera

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robots import scene_of
+from runtime.core.types import Float64, UInt8
 from runtime.sim import bench as benches
 from runtime.sim.bench import Bench, BenchState, PinholeCamera
 from runtime.sim.render.painter import Painter
@@ -14,7 +15,6 @@ from runtime.sim.render.plate import Plate
 from runtime.sim.render.shadows import Shadows, darken
 from runtime.sim.render.solids import Solid, Solids
 from runtime.sim.render.table import Table
-from runtime.types import Float64, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot

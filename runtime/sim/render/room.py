@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from runtime.core.types import Float32, UInt8
 from runtime.sim.bench import PinholeCamera
 from runtime.sim.render.painter import fill_ahead
-from runtime.types import Float32, UInt8
 
 _FLOOR, _CEILING, _WALL = -0.75, 1.9, 2.4  # m from the table's surface; m from its middle
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from runtime.core.types import Float64, UInt8
 from runtime.sim.bench import Bench, PinholeCamera
 from runtime.sim.render.painter import LIGHT
 from runtime.sim.render.solids import Placed, Solids
 from runtime.sim.render.table import X, Y, covers, outline_of, texels_to_pixels
-from runtime.types import Float64, UInt8
 
 _TEXEL = 0.004  # m
 _SOFT_FROM = 0.09  # m above the table from which a shadow is softer

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.types import Float32, Float64
+from runtime.core.types import Float32, Float64
 
 Face = tuple[int, ...]
 _SIDES = 16  # of a cylinder

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.core.types import Float32, Float64, UInt8
 from runtime.sim.bench import Belt, Bench, PinholeCamera
 from runtime.sim.render.painter import ahead
 from runtime.sim.render.room import draw_room
-from runtime.types import Float32, Float64, UInt8
 
 X, Y = (-0.80, 0.80), (-0.42, 0.86)  # m, the table's edges
 _TEXEL = 0.001  # m

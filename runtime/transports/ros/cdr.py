@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 
-from runtime.errors import CodecError
+from runtime.core.errors import CodecError
 from runtime.transports.ros import fields
 from runtime.transports.ros.fields import SECOND
 from runtime.transports.ros.messages import Message, MessageName

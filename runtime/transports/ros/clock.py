@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 
-from runtime.clock import ClockMap, Steps
+from runtime.core.clock import ClockMap, Steps
 
 
 class RosClock:

@@ -11,7 +11,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from runtime.errors import CodecError
+from runtime.core.errors import CodecError
+from runtime.core.types import Float64, UInt8
 from runtime.transports.ros.messages import (
     CompressedImage,
     Image,
@@ -20,7 +21,6 @@ from runtime.transports.ros.messages import (
     MessageName,
     PoseStamped,
 )
-from runtime.types import Float64, UInt8
 
 SECOND = 1_000_000_000
 

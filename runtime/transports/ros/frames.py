@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from runtime.core.types import EEF_WIDTH, Float32, Float64, Observation, UInt8
 from runtime.transports.freshness import Freshness
 from runtime.transports.ros import reading
 from runtime.transports.ros.alignment import Aligned
 from runtime.transports.ros.messages import CompressedImage, Image, JointState, Message, PoseStamped
 from runtime.transports.ros.reading import JointOrder, Names, Unusable
 from runtime.transports.ros.topics import Part
-from runtime.types import EEF_WIDTH, Float32, Float64, Observation, UInt8
 
 if TYPE_CHECKING:
     from robots import Robot

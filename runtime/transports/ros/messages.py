@@ -7,7 +7,7 @@ from typing import Literal, Protocol, TypeAlias
 
 import numpy as np
 
-from runtime.types import Float64, UInt8
+from runtime.core.types import Float64, UInt8
 
 MessageName = Literal["JointState", "Image", "CompressedImage", "PoseStamped"]
 

@@ -9,14 +9,14 @@ from typing import Literal, TypeAlias
 
 from pydantic import Field
 
-from runtime.section import Section
+from runtime.core.settings import Settings
 from runtime.transports.ros.messages import MessageName
 
 Deliver: TypeAlias = Callable[[bytes], None]
 Publish: TypeAlias = Callable[[bytes], None]
 
 
-class Quality(Section):
+class Quality(Settings):
     """Quality of service of a topic, where it is not as usual."""
 
     reliability: Literal["best_effort", "reliable"] | None = None

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
-from runtime.errors import SetupError, TransportError
+from runtime.core.errors import SetupError, TransportError
 from runtime.transports.ros.messages import PACKAGES
 from runtime.transports.ros.middleware import (
     Deliver,

@@ -6,10 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-from runtime.errors import CodecError
+from runtime.core.errors import CodecError
+from runtime.core.types import Float32, Float64, UInt8
 from runtime.transports.ros.messages import CompressedImage, Image, JointState, PoseStamped
 from runtime.transports.ros.topics import Part
-from runtime.types import Float32, Float64, UInt8
 
 Names = Literal["check", "ignore"]
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "rgba8": 4, "bgra8": 4}

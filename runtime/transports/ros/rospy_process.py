@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from runtime.errors import SetupError, TransportError
+from runtime.core.errors import SetupError, TransportError
 from runtime.transports.ros.middleware import COMMAND_LIFE_S
 
 MESSAGE, WORD = 1, 2  # as in rospy_node, which imports nothing of ours

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, model_validator
 
-from runtime.errors import ConfigurationError
-from runtime.pose_format import PoseFormat
-from runtime.section import Section
+from runtime.core.errors import ConfigurationError
+from runtime.core.pose_format import PoseFormat
+from runtime.core.settings import Settings
 from runtime.transports.base import Capabilities
 from runtime.transports.ros.reading import Names
 from runtime.transports.ros.source import Terms
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from robots import Robot
 
 
-class RosSettings(Section):
+class RosSettings(Settings):
     """What both generations of ROS have in common."""
 
     topics: Topics = Topics()

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.clock import Clock
-from runtime.errors import TransportError
+from runtime.core.clock import Clock
+from runtime.core.errors import TransportError
+from runtime.core.types import EEF_WIDTH, Float32, RobotCommand
 from runtime.transports.base import Sink
 from runtime.transports.ros.messages import JointState, Message, PoseStamped, Wire
 from runtime.transports.ros.middleware import Middleware, Publish, Topic
 from runtime.transports.ros.topics import Outlet
-from runtime.types import EEF_WIDTH, Float32, RobotCommand
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from runtime.clock import Clock
-from runtime.errors import CodecError, ConfigurationError, TransportError
-from runtime.messages import Event
+from runtime.core.clock import Clock
+from runtime.core.errors import CodecError, ConfigurationError, TransportError
+from runtime.core.types import Observation
+from runtime.ipc.messages import Event
 from runtime.transports.base import Source
 from runtime.transports.freshness import FROZEN_S
 from runtime.transports.ros.alignment import Aligned, Alignment, Sample
@@ -21,7 +22,6 @@ from runtime.transports.ros.messages import Message, Wire
 from runtime.transports.ros.middleware import Match, Middleware, Quality, Topic
 from runtime.transports.ros.reading import Names, Unusable
 from runtime.transports.ros.topics import Part
-from runtime.types import Observation
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -13,7 +13,7 @@ import uuid
 from collections.abc import Mapping
 from typing import Any
 
-from runtime.errors import RuntimeFault
+from runtime.core.errors import RuntimeFault
 from runtime.transports.ros.messages import PACKAGES
 from runtime.transports.ros.middleware import Deliver, Match, Middleware, Publish, Topic
 from runtime.transports.ros.rospy_process import RospyProcess, Site, require

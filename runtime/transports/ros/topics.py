@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
-from runtime.errors import ConfigurationError
-from runtime.section import Section
+from runtime.core.errors import ConfigurationError
+from runtime.core.settings import Settings
 from runtime.transports.ros.messages import MessageName
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ TopicName = Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$|^$")]
 Target = Literal["robot", "simulation"]
 
 
-class GroupTopics(Section):
+class GroupTopics(Settings):
     """Topics of one group where they are not those of the robot's description; "" for one that there is none of."""
 
     state: TopicName | None = None
@@ -40,7 +40,7 @@ class GroupTopics(Section):
     """What the messages call the group's joints, in its order, where that is not what the robot's description does."""
 
 
-class Topics(Section):
+class Topics(Settings):
     """Topics that are not those of the robot's description."""
 
     cameras: dict[str, TopicName] = Field(default_factory=dict)

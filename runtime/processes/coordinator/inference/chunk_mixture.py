@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from runtime.end_effectors import EndEffectors
-from runtime.errors import PolicyError
-from runtime.formats import PoseRows
+from runtime.core.errors import PolicyError
+from runtime.core.pose_format import CANONICAL
+from runtime.core.types import ActionChunk, Float64
 from runtime.kinematics.forward import ChainForward
-from runtime.pose_format import CANONICAL
-from runtime.timeline import Dims, difference
-from runtime.types import ActionChunk, Float64
+from runtime.motion.timeline import DimensionKinds, difference
+from runtime.spaces.end_effectors import EndEffectors
+from runtime.spaces.pose_rows import PoseRows
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -37,8 +37,8 @@ class Mixture:
     Binary grippers are those of the newest row, as the policy gave them.
     """
 
-    def __init__(self, dims: Dims | None = None, robot: Robot | None = None) -> None:
-        self._dims = Dims() if dims is None else dims
+    def __init__(self, dims: DimensionKinds | None = None, robot: Robot | None = None) -> None:
+        self._dims = DimensionKinds() if dims is None else dims
         self._robot = robot
         self._layout: PoseRows | None = None  # a policy speaks one format
 

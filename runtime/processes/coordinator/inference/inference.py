@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.asking import Answered, Asking
-from runtime.back_off import BackOff
-from runtime.clock import Clock
-from runtime.commitment import Commitment
-from runtime.errors import PolicyLostError, RuntimeFault
-from runtime.messages import ChunkMerged, Event, Mode, PolicyAnswer, PostedChunk
-from runtime.orders import Orders
-from runtime.page import Page
+from runtime.core.backoff import BackOff
+from runtime.core.clock import Clock
+from runtime.core.errors import PolicyLostError, RuntimeFault
+from runtime.core.types import Conditioning, Float64
+from runtime.ipc.messages import ChunkMerged, Event, Mode, PolicyAnswer, PostedChunk
+from runtime.ipc.shared_state import SharedState
 from runtime.policies.base import Policy
-from runtime.runner import telling
-from runtime.sight import StaleObservationError
+from runtime.processes.coordinator.control_queue import ControlQueue
+from runtime.processes.coordinator.inference.metrics import PolicyMetrics
+from runtime.processes.coordinator.inference.policy_observation import StaleObservationError
+from runtime.processes.coordinator.inference.requests import PolicyRequests, PolicyResponse
+from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
+from runtime.processes.coordinator.inference.worker import telling
 from runtime.strategies.base import Progress, Query, StrategyParameters
-from runtime.tally import Tally
-from runtime.types import Conditioning, Float64
 
 ON_DEMAND: tuple[Mode, ...] = ("step", "preview")  # modes that ask when a person says so
 
@@ -45,12 +45,12 @@ class Strategy:
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class PendingChunk:
     """An answer in command space, under its number."""
 
     number: int
     rows: Float64
-    answered: Answered
+    answered: PolicyResponse
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,18 +72,18 @@ class Inference:
 
     def __init__(
         self,
-        asking: Asking,
+        asking: PolicyRequests,
         strategy: Strategy,
-        page: Page,
-        orders: Orders,
+        page: SharedState,
+        orders: ControlQueue,
         clock: Clock,
         patience: Patience,
-        commitment: Commitment,
+        commitment: RtcPrefix,
     ) -> None:
         self.asking = asking
         self.runner = asking.runner
-        self.tally = Tally()
-        self.proposal: Made | None = None  # shown, and neither committed nor cancelled
+        self.tally = PolicyMetrics()
+        self.proposal: PendingChunk | None = None  # shown, and neither committed nor cancelled
         self.shown: ShownChunk | None = None
         self._planned: ShownChunk | None = None  # the newest that control has merged
         self.failure = ""  # why the policy is being tried again
@@ -99,8 +99,8 @@ class Inference:
         self._run = 0
         self._mode: Mode = "continuous"
         self._wanted = False  # in a mode on demand: one chunk
-        self._flight: Future[Answered] | None = None
-        self._unmerged: dict[int, Made] = {}  # posted
+        self._flight: Future[PolicyResponse] | None = None
+        self._unmerged: dict[int, PendingChunk] = {}  # posted
         self._stale_since: float | None = None
         self._asked_at = float("-inf")
         self._generation = 0  # of the commitment, when the newest request went out
@@ -315,10 +315,10 @@ class Inference:
         self.rtc_warning, self._given = warning, found
         return found
 
-    def _take(self, answered: Answered) -> PolicyAnswer:
+    def _take(self, answered: PolicyResponse) -> PolicyAnswer:
         step, chunk = answered.observation.step, answered.chunk
         self.asking.note(answered)
-        made = Made(self._orders.next_chunk(), answered.made.rows, answered)
+        made = PendingChunk(self._orders.next_chunk(), answered.made.rows, answered)
         self._wanted = False
         self.tally.answered(answered.seconds, answered.age, answered.ik)
         self._commitment.answered(made.number, chunk, step, answered.waited, self._generation, made.rows)
@@ -333,7 +333,7 @@ class Inference:
         self._recovered()  # not before: one whose answers cannot be used is not back
         return recorded
 
-    def _record(self, made: Made) -> PolicyAnswer:
+    def _record(self, made: PendingChunk) -> PolicyAnswer:
         answered, solved = made.answered, made.answered.made.solved
         return PolicyAnswer(
             made.number,
@@ -349,7 +349,7 @@ class Inference:
             eef=answered.eef if self.policy.sees_poses else "",
         )
 
-    def _post(self, made: Made) -> None:
+    def _post(self, made: PendingChunk) -> None:
         answered, step = made.answered, made.answered.observation.step
         first = answered.made.first
         self._orders.post(PostedChunk(made.number, self._run, step, made.rows, answered.waited, first))

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from runtime.messages import ChunkMerged
+from runtime.ipc.messages import ChunkMerged
 
 _KEPT = 20_000  # answers; half an hour back to back at 10 Hz
 _SHOWN = 60
@@ -33,7 +33,7 @@ def quantile(values: Sequence[float], percent: float) -> float:
     return ordered[below] + (ordered[above] - ordered[below]) * (place - below)
 
 
-class Tally:
+class PolicyMetrics:
     """Counts from the beginning of a run; memory is bounded, counts are not."""
 
     def __init__(self) -> None:

@@ -8,10 +8,10 @@ from typing import Protocol
 
 import numpy as np
 
-from runtime.clock import Clock
-from runtime.errors import PolicyError
-from runtime.page import Page
-from runtime.types import Float64, Observation
+from runtime.core.clock import Clock
+from runtime.core.errors import PolicyError
+from runtime.core.types import Float64, Observation
+from runtime.ipc.shared_state import SharedState
 
 
 class StaleObservationError(PolicyError):
@@ -39,10 +39,10 @@ class SightSettings:
     picture_age: float
 
 
-class Sight:
+class PolicyObservation:
     """Reads the page; `simulated` shows the joints of the simulated robot in place of the real one's."""
 
-    def __init__(self, page: Page, clock: Clock, settings: SightSettings) -> None:
+    def __init__(self, page: SharedState, clock: Clock, settings: SightSettings) -> None:
         self._page = page
         self._clock = clock
         self._settings = settings

@@ -10,15 +10,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from runtime.clock import Clock
-from runtime.errors import PolicyError, RuntimeFault, SetupError
+from runtime.core.clock import Clock
+from runtime.core.errors import PolicyError, RuntimeFault, SetupError
+from runtime.core.types import ActionChunk, Conditioning, Observation
+from runtime.ipc.messages import Event
 from runtime.kinematics.base import IkFlag, IkResult
-from runtime.messages import Event
 from runtime.policies.base import Policy
-from runtime.runner import Runner
-from runtime.sight import Eyes
-from runtime.spaces import CommandRows, Onset, Spaces
-from runtime.types import ActionChunk, Conditioning, Observation
+from runtime.processes.coordinator.inference.policy_observation import Eyes
+from runtime.processes.coordinator.inference.worker import Runner
+from runtime.spaces.conversion import ActionSpaces, CommandRows, Onset
 
 log = logging.getLogger(__name__)
 _EARLY_S = 1e-6  # moments are sums of floats
@@ -26,7 +26,7 @@ Committed = Callable[[int], Conditioning | None]  # by the step of the observati
 
 
 @dataclass(frozen=True, slots=True)
-class Answered:
+class PolicyResponse:
     """An inference that came back: the chunk, how long it took [s], what it was asked about, what it means.
 
     `made` are its rows in command space. `waited`: the robot stood meanwhile. `eef` says where the poses of the
@@ -45,14 +45,14 @@ class Answered:
     )  # how its poses were met, as by `figures`; {} for joints
 
 
-class Asking:
+class PolicyRequests:
     """Asks one policy; calls are made one after the other, and nobody waits for them here.
 
     Kinematics belong to the call: for a chunk of poses they take as long as a small model, and main must not.
     """
 
     def __init__(
-        self, policy: Policy, task: str, spaces: Spaces, sight: Eyes, runner: Runner, clock: Clock
+        self, policy: Policy, task: str, spaces: ActionSpaces, sight: Eyes, runner: Runner, clock: Clock
     ) -> None:
         self.policy = policy
         self.task = task
@@ -117,7 +117,7 @@ class Asking:
 
     def ask(
         self, waited: bool = False, committed: Committed | None = None, k_max: int | None = None
-    ) -> Future[Answered]:
+    ) -> Future[PolicyResponse]:
         """Send one request about the newest observation; raises PolicyError where that is too old.
 
         `k_max` is how many rows of the answer may be dropped as stale at most, None: as many as are.
@@ -127,7 +127,7 @@ class Asking:
         policy, fresh, held = self.policy, self._fresh, self._held
         self._fresh = self._held = False
 
-        def infer() -> Answered:
+        def infer() -> PolicyResponse:
             if fresh:
                 policy.reset()
             elif held:
@@ -144,7 +144,7 @@ class Asking:
             made = self._spaces.to_command(chunk, shown, onset)
             source: Literal["measured", "fk"] = "measured" if measured else "fk"
             ik = {} if made.solved is None else figures(made.solved)
-            return Answered(chunk, seconds, shown, made, waited, age, source, ik)
+            return PolicyResponse(chunk, seconds, shown, made, waited, age, source, ik)
 
         return self.runner.submit(infer)
 
@@ -163,7 +163,7 @@ class Asking:
         row = passed if k_max is None else min(passed, k_max)
         return Onset(commanded, qpos if rests else commanded, row)
 
-    def compare(self, answered: Answered) -> None:
+    def compare(self, answered: PolicyResponse) -> None:
         """Hold the poses that the robot measures against those of its joints: they may be of another frame.
 
         Raises SetupError where the policy depends on them; else it is only said.
@@ -179,7 +179,7 @@ class Asking:
         if wrong:
             self.notes.append(Event("eef_disagrees", wrong, self._clock.now(), shown.step))
 
-    def note(self, answered: Answered) -> None:
+    def note(self, answered: PolicyResponse) -> None:
         """Say what could not be done of an answer."""
         ik = answered.ik
         if ik.get("over"):

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runtime.messages import ChunkMerged
-from runtime.mixture import Mixture, Parts
-from runtime.timeline import HELD
-from runtime.types import ActionChunk, Conditioning, Float32, Float64
+from runtime.core.types import ActionChunk, Conditioning, Float32, Float64
+from runtime.ipc.messages import ChunkMerged
+from runtime.motion.timeline import HELD
+from runtime.processes.coordinator.inference.chunk_mixture import Mixture, Parts
 
 _HAIR = 1e-9  # of a row: what rates divided by rates are off by
 Numbers = Float32 | Float64
@@ -55,7 +55,7 @@ class _Commitment:
         return chunk.space, chunk.mode, chunk.pose, chunk.actions.shape[1], self.rows.shape[1]
 
 
-class Commitment:
+class RtcPrefix:
     """Says what is planned for the steps from a new observation on, in the rows of the newest merged chunk.
 
     These are as the server gave them, and not the joint rows that they became: those are solved, snapped and
@@ -139,9 +139,9 @@ class Commitment:
         """What a request about `observation_step` carries; None where nothing is left, or nothing was merged.
 
         `delays` are recent measured ones in control steps (that of the chunk itself where there are none); their
-        `quantile` is predicted, in rows rounded up. `execution_horizon` is in control steps, None is the whole
-        chunk. Sets `warning` where the answer is expected later than the rows last that may still be executed; no
-        more than these are said to be executed until then.
+        `quantile` is predicted, in rows rounded up. `execution_horizon` is that of the answer in control steps, None
+        is the whole chunk: what is planned already stays planned, whatever it is now. Sets `warning` where the answer
+        is expected after the last planned step; no more rows than are planned are said to be executed until then.
 
         At a rate of its own a chunk has no row exactly at the observation: what is left is resampled from there on.
         """
@@ -157,18 +157,19 @@ class Commitment:
             return None
         passed = math.floor((observation_step - held.anchor) * held.pace + 0.5 + _HAIR)
         consumed = max(0, passed)
+        steps = observation_step + np.arange(held.usable - consumed) / held.pace
+        steps = steps[np.ceil(steps - _HAIR) < held.end]
+        if not len(steps):
+            return None
+        delay = _expected(delays or [held.delay], quantile)
+        self.predicted_delay = max(0, math.ceil(delay * held.pace - _HAIR))
+        self._judge(delay, held.end - observation_step)
+        previous = self._planned(held, steps, passed)
+        if previous is None:
+            return None
         last = held.usable
         if execution_horizon is not None:
             last = min(last, math.ceil(execution_horizon * held.pace - _HAIR))
-        if consumed >= last:
-            return None
-        self.predicted_delay = _rows_of(delays or [held.delay], quantile, held.pace)
-        self._judge(last - consumed, last)
-        steps = observation_step + np.arange(last - consumed) / held.pace
-        steps = steps[np.ceil(steps - _HAIR) < held.end]
-        previous = self._planned(held, steps, passed) if len(steps) else None
-        if previous is None:
-            return None
         return Conditioning(previous, consumed, min(self.predicted_delay, len(steps)), last)
 
     def _planned(self, held: _Commitment, steps: Float64, passed: int) -> Float32 | None:
@@ -255,20 +256,19 @@ class Commitment:
         every = np.array(numbers, np.float64)
         return Parts(every, np.array(weights), every[newest, np.arange(len(steps))])
 
-    def _judge(self, left: int, last: int) -> None:
-        """RTC needs rows to go on with until the answer arrives."""
-        if self.predicted_delay > left:
+    def _judge(self, delay: float, left: int) -> None:
+        """RTC needs steps to go on with until the answer arrives."""
+        if delay > left:
             self.warning = (
-                f"RTC: an answer is expected after {self.predicted_delay} rows, but {left} of the {last} that may be "
-                "executed are left: the robot will stand before it arrives; allowed: a delay that fits, so ask more "
-                "often, or raise strategy.execution_horizon, or take a faster policy"
+                f"RTC: an answer is expected after {delay:g} steps, but {left} are planned: the robot will stand "
+                "before it arrives; allowed: a delay that fits, so ask more often, or raise "
+                "strategy.execution_horizon, or take a faster policy"
             )
 
 
-def _rows_of(delays: Sequence[int], quantile: float, pace: float) -> int:
-    """The quantile of the delays, one that was measured, as rows that pass meanwhile."""
-    delay = float(np.quantile(np.asarray(delays, np.float64), quantile, method="higher"))
-    return max(0, math.ceil(delay * pace - _HAIR))
+def _expected(delays: Sequence[int], quantile: float) -> float:
+    """The quantile of the delays [control steps], one that was measured."""
+    return float(np.quantile(np.asarray(delays, np.float64), quantile, method="higher"))
 
 
 def _shares(merged: ChunkMerged) -> dict[int, Shares] | None:

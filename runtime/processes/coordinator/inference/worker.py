@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
-from runtime.errors import PolicyError, RuntimeFault
+from runtime.core.errors import PolicyError, RuntimeFault
 
 log = logging.getLogger(__name__)
 Result = TypeVar("Result")

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from robots.robot import Group
-from runtime.errors import RuntimeFault
-from runtime.family import Plan
-from runtime.requests import GripperRequest
-from runtime.types import Float64
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Float64
+from runtime.ipc.command_arguments import GripperRequest
+from runtime.spaces.binary_grippers import open_or_closed, switches
+from runtime.station.spec import StationSpec
 
 _REACHED = 1e-3  # of its travel: a gripper that is so near to its lock is there
 
@@ -30,10 +31,11 @@ class Grip:
 class Grippers:
     """The locks in force, and what requests make of them."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: StationSpec) -> None:
         self._groups = [group for group in plan.robot.groups if group.gripper is not None]
         self._robot = plan.robot.name
         self._limits = plan.limits
+        self._switches = switches(plan.robot)
         self.locks: Float64 = np.full(plan.robot.dim, np.nan)
 
     def asked(self, request: GripperRequest, commanded: Float64, free: bool) -> Grip:
@@ -42,6 +44,7 @@ class Grippers:
         `commanded` [D] is where the robot was told to be. Raises RuntimeFault where it has no such gripper.
         """
         chosen = self._chosen(request.arm)
+        commanded = open_or_closed(self._switches, commanded, commanded)
         locks, goal = self.locks.copy(), np.full(len(commanded), np.nan)
         for group in chosen:
             dim, gripper = group.gripper_dim, group.gripper
@@ -60,6 +63,7 @@ class Grippers:
 
     def standing(self, commanded: Float64) -> Float64:
         """The locks float64 [D], those that a gripper is still on its way to moved to where it was told to be."""
+        commanded = open_or_closed(self._switches, commanded, commanded)
         travel = self._limits.upper - self._limits.lower
         away = np.abs(self.locks - commanded) > _REACHED * travel  # NaN, what is free, is not
         return np.where(away, commanded, self.locks)

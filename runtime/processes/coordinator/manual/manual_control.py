@@ -8,24 +8,26 @@ from typing import Any
 
 import numpy as np
 
-from runtime.errors import RuntimeFault
-from runtime.family import Plan
-from runtime.grippers import Grippers
-from runtime.orders import Orders
-from runtime.page import Page
-from runtime.requests import AimRequest, GripperRequest, MoveRequest, read
-from runtime.runs import Runs
-from runtime.setup import first_action
-from runtime.targets import Targets, told
-from runtime.types import Float64
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Float64
+from runtime.ipc.command_arguments import AimRequest, GripperRequest, MoveRequest, read
+from runtime.ipc.shared_state import SharedState
+from runtime.processes.coordinator.control_queue import ControlQueue
+from runtime.processes.coordinator.manual.grippers import Grippers
+from runtime.processes.coordinator.manual.targets import Targets, told
+from runtime.processes.coordinator.runs import Runs
+from runtime.processes.coordinator.setup.sequence import first_action
+from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
 
 
-class ByHand:
+class ManualControl:
     """Motions within limits and the workspace box, locks of grippers; raises RuntimeFault where it refuses."""
 
-    def __init__(self, plan: Plan, page: Page, orders: Orders, runs: Runs, targets: Targets) -> None:
+    def __init__(
+        self, plan: StationSpec, page: SharedState, orders: ControlQueue, runs: Runs, targets: Targets
+    ) -> None:
         self._plan = plan
         self._page = page
         self._orders = orders

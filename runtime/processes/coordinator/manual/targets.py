@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 
 from robots.rotations import matrix_of_quaternion, matrix_of_rpy, quaternion_of_matrix
-from runtime.errors import RuntimeFault
-from runtime.family import Plan
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Float32, Float64
+from runtime.ipc.command_arguments import AimRequest, Jog, MoveRequest
 from runtime.kinematics.base import Kinematics
-from runtime.motion import Trajectory
-from runtime.requests import AimRequest, Jog, MoveRequest
-from runtime.spaces import Spaces
-from runtime.types import Float32, Float64
-from runtime.ways import Ways
+from runtime.motion.trajectories import Trajectory
+from runtime.processes.coordinator.path_check import PathCheck
+from runtime.spaces.conversion import ActionSpaces
+from runtime.station.spec import StationSpec
 
 _TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Aim:
+class TargetPreview:
     """A target float64 [D] within the limits, its poses float32 [8 * arms], and what became of the wish.
 
     `clipped` names the joints that a limit has moved; errors are those of a jog's pose, 0 where none was asked for.
@@ -39,17 +39,17 @@ class Aim:
 class Targets:
     """Turns what a person asks for into joint targets of one robot."""
 
-    def __init__(self, plan: Plan, spaces: Spaces, kinematics: Kinematics) -> None:
+    def __init__(self, plan: StationSpec, spaces: ActionSpaces, kinematics: Kinematics) -> None:
         self._plan = plan
         self._spaces = spaces
         self._kinematics = kinematics
-        self._ways = Ways(plan)
+        self._ways = PathCheck(plan)
 
     def prepare(self) -> bool:
         """Begin to load what a jog needs, where nobody has; whether it is there."""
         return self._kinematics.prepare()
 
-    def aim(self, asked: AimRequest, commanded: Float64) -> Aim:
+    def aim(self, asked: AimRequest, commanded: Float64) -> TargetPreview:
         """Where it would go; RuntimeFault for a pose, an arm or a number of joints that the robot has not."""
         start = self._wanted("aim", asked.joints, asked.pose, commanded)
         if asked.jog is None:
@@ -113,13 +113,13 @@ class Targets:
     def _poses(self) -> str:
         return ", ".join(sorted(self._plan.robot.poses))
 
-    def _clipped(self, joints: Float64) -> Aim:
+    def _clipped(self, joints: Float64) -> TargetPreview:
         limits = self._plan.limits
         allowed = np.clip(joints, limits.lower, limits.upper)
         moved = np.flatnonzero(np.abs(allowed - joints) > _TOLERANCE)
-        return Aim(allowed, self._spaces.eef_of(allowed), tuple(limits.names[i] for i in moved))
+        return TargetPreview(allowed, self._spaces.eef_of(allowed), tuple(limits.names[i] for i in moved))
 
-    def _jogged(self, jog: Jog, start: Float64) -> Aim:
+    def _jogged(self, jog: Jog, start: Float64) -> TargetPreview:
         arms = [arm.name for arm in self._plan.robot.arms]
         if jog.arm not in arms:
             raise RuntimeFault(f"aim: jog.arm = {jog.arm!r}; {self._plan.robot.name} has {', '.join(arms)}")
@@ -128,7 +128,7 @@ class Targets:
         poses[index] = _stepped(poses[index], jog)
         solved = self._kinematics.solve(poses[None], start)
         aimed = self._clipped(solved.q[0])
-        return Aim(
+        return TargetPreview(
             aimed.joints,
             aimed.poses,
             aimed.clipped,
@@ -147,7 +147,7 @@ def _stepped(pose: Float64, jog: Jog) -> Float64:
     return np.concatenate([pose[:3] + way, quaternion_of_matrix(there)])
 
 
-def told(aim: Aim, plan: Plan, distance: float, duration: float) -> dict[str, Any]:
+def told(aim: TargetPreview, plan: StationSpec, distance: float, duration: float) -> dict[str, Any]:
     """The aim as an answer to a client: joints, poses, errors in mm and degrees."""
     return {
         "joints": aim.joints.tolist(),

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from runtime.messages import Mode
-from runtime.requests import (
+from runtime.ipc.command_arguments import (
     DiscardRequest,
     GripperRequest,
     LabelRequest,
@@ -17,12 +16,13 @@ from runtime.requests import (
     SetUpRequest,
     TuneRequest,
 )
+from runtime.ipc.messages import Mode
 
 Told = Mapping[str, Any]  # for the data of an answer
 
 
 @dataclass(frozen=True, slots=True)
-class Situation:
+class GuardFacts:
     """What the guards of commands look at, beside the state."""
 
     mode: Mode | None = None  # of the open run
@@ -51,7 +51,7 @@ class Effects(ABC):
 
     @property
     @abstractmethod
-    def situation(self) -> Situation: ...
+    def situation(self) -> GuardFacts: ...
 
     @abstractmethod
     def begin_setup(self, asked: SetUpRequest) -> Told: ...

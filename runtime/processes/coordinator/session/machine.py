@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from runtime.effects import Effects, Told
-from runtime.errors import RuntimeFault
-from runtime.lease import Lease
-from runtime.messages import Ack, AckStatus, Command
-from runtime.requests import read
-from runtime.transitions import (
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.command_arguments import ARGUMENTS, read
+from runtime.ipc.identity import named
+from runtime.ipc.messages import Ack, AckStatus, Command
+from runtime.processes.coordinator.lease import Lease
+from runtime.processes.coordinator.session.effects import Effects, Told
+from runtime.processes.coordinator.session.transitions import (
     CANCEL,
     CANCELLED,
     CANCELLING,
     COMMANDS,
-    HAPPENINGS,
+    EVENT_TRANSITIONS,
     MOVED_BY_HAND,
     REASONS,
     STOPPING,
-    Happening,
+    SessionEvent,
     State,
 )
 
@@ -26,7 +27,7 @@ LEASE_COMMANDS = ("lease_claim", "lease_renew", "lease_give_up")
 ANSWERS_KEPT = 5000
 
 
-class Session:
+class SessionMachine:
     """Holds the state; `handle` and `observe` are the only places that change it."""
 
     def __init__(self, effects: Effects, lease: Lease, boot: str, now: Callable[[], float]) -> None:
@@ -74,9 +75,9 @@ class Session:
         """
         if not command.uuid:  # all such commands would be repetitions of each other
             return self._ack(command, "refused", "a command needs a uuid of its own")
+        if (repeated := self.answered(command)) is not None:
+            return repeated
         first = self._answers.get(command.uuid)
-        if first is not None and first.kind in ("", command.kind):
-            return first
         if first is not None and command.kind not in STOPPING:
             return self._ack(command, "refused", f"its uuid was given to the command {first.kind!r} before")
         refusal, told = self._refusal(command), None
@@ -92,24 +93,29 @@ class Session:
                 del self._answers[next(iter(self._answers))]
         return ack
 
-    def observe(self, happening: Happening, reason: str = "") -> bool:
+    def answered(self, command: Command) -> Ack | None:
+        """The first answer to a command that is a repetition."""
+        first = self._answers.get(command.uuid)
+        return first if first is not None and first.kind in ("", command.kind) else None
+
+    def observe(self, happening: SessionEvent, reason: str = "") -> bool:
         """Tell the session what happened; True where the state changed.
 
         A RuntimeFault of an effect passes through, with the state as it was: nobody is there to be refused.
         """
-        after = HAPPENINGS.get((happening, self.state))
-        if happening is Happening.LEASE_ENDED and self.state in MOVED_BY_HAND:
+        after = EVENT_TRANSITIONS.get((happening, self.state))
+        if happening is SessionEvent.LEASE_ENDED and self.state in MOVED_BY_HAND:
             self._effects.hold(reason)
         if after is None or (after is self.state and reason == self.reason):
             return False
         before = self.state
-        if happening in (Happening.HELD, Happening.LEASE_ENDED, Happening.LINK_LOST):
+        if happening in (SessionEvent.HELD, SessionEvent.LEASE_ENDED, SessionEvent.LINK_LOST):
             self._stop_for(before, reason)
-        elif happening in (Happening.ESTOPPED, Happening.FAMILY_DIED):
+        elif happening in (SessionEvent.ESTOPPED, SessionEvent.FAMILY_DIED):
             self._interrupt(before, reason)
-        elif happening is Happening.RUN_ENDED:
+        elif happening is SessionEvent.RUN_ENDED:
             self._effects.end_run("finished", reason)
-        elif happening is Happening.RUN_FAILED:
+        elif happening is SessionEvent.RUN_FAILED:
             self._effects.end_run("failed", reason)
         self._enter(after, reason)
         return True
@@ -169,7 +175,8 @@ class Session:
         rule = COMMANDS[command.kind]
         if self.state is State.SETTING_UP and command.kind in CANCELLING:
             rule = CANCEL
-        asked = read(command.kind, rule.takes, command.args) if rule.takes else None
+        takes = ARGUMENTS[command.kind]
+        asked = read(command.kind, takes, command.args) if takes else None
         self._effects.by, self._effects.command = command.user or command.holder, command.uuid
         told = rule.effect(self._effects, asked)
         after = rule.next(self.state, asked)
@@ -186,7 +193,7 @@ class Session:
             "lease_renew": self._lease.renew,
             "lease_give_up": self._lease.give_up,
         }[command.kind]
-        refusal = act(command.holder, command.epoch, now)
+        refusal = act(command.holder, command.epoch, now, named(command))
         after = self._lease.current(now)
         if (before and before.epoch) != (after and after.epoch):
             self.sequence += 1

@@ -7,18 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from runtime.effects import Effects, Situation, Told
-from runtime.requests import (
-    DiscardRequest,
-    GripperRequest,
-    LabelRequest,
-    MoveRequest,
-    Nothing,
-    RunRequest,
-    SetUpRequest,
-    TuneRequest,
-)
-from runtime.section import Section
+from runtime.processes.coordinator.session.effects import Effects, GuardFacts, Told
 
 
 class State(StrEnum):
@@ -33,7 +22,7 @@ class State(StrEnum):
     FAULTED = "faulted"
 
 
-class Happening(StrEnum):
+class SessionEvent(StrEnum):
     """What the session is told of by the rest of the runtime."""
 
     CONNECTED = "connected"  # a complete observation arrived
@@ -51,25 +40,23 @@ class Happening(StrEnum):
     FAMILY_DIED = "family_died"  # a process of the family was restarted
 
 
-Guard = Callable[[State, Situation], str]  # why it is not allowed just now, "" where it is
+Guard = Callable[[State, GuardFacts], str]  # why it is not allowed just now, "" where it is
 
 
-def _always(state: State, situation: Situation) -> str:
+def _always(state: State, situation: GuardFacts) -> str:
     return ""
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """A command: the states it is allowed in, the state after it, what it does, what it takes, its guard.
+    """A command: the states it is allowed in, the state after it, what it does, its guard.
 
-    `after` None leaves the state as it is. `takes` None: whatever comes with it is not looked at, because a stop
-    is not refused for a word too many.
+    `after` None leaves the state as it is. What a command takes is in runtime.ipc.command_arguments.ARGUMENTS.
     """
 
     allowed: tuple[State, ...]
     after: State | Mapping[State, State] | None
     effect: Callable[[Effects, Any], Told | None]
-    takes: type[Section] | None = Nothing
     guard: Guard = _always
     stays: Callable[[Any], bool] = lambda asked: False  # by what it took, whether the state is left as it is
 
@@ -83,21 +70,21 @@ class Rule:
 _NO_COLLECTION = "this station collects nothing: its deployment has no [collection]"
 
 
-def _may_run(state: State, situation: Situation) -> str:
+def _may_run(state: State, situation: GuardFacts) -> str:
     unarmed = situation.collecting and not situation.armed
     return "the station is set up to collect and is not armed: arm first" if unarmed else ""
 
 
-def _may_resume(state: State, situation: Situation) -> str:
+def _may_resume(state: State, situation: GuardFacts) -> str:
     unarmed = situation.mode == "collect" and not situation.armed
     return "a demonstration is open and the station is not armed: arm first, or stop" if unarmed else ""
 
 
-def _may_collect(state: State, situation: Situation) -> str:
+def _may_collect(state: State, situation: GuardFacts) -> str:
     return "" if situation.collection else _NO_COLLECTION
 
 
-def _may_arm(state: State, situation: Situation) -> str:
+def _may_arm(state: State, situation: GuardFacts) -> str:
     if not situation.collection:
         return _NO_COLLECTION
     if not situation.collecting:
@@ -105,26 +92,26 @@ def _may_arm(state: State, situation: Situation) -> str:
     return "it is armed already" if situation.armed else situation.unled
 
 
-def _may_disarm(state: State, situation: Situation) -> str:
+def _may_disarm(state: State, situation: GuardFacts) -> str:
     if not situation.collection:
         return _NO_COLLECTION
     return "" if situation.armed else "it is not armed"
 
 
-def _untried(state: State, situation: Situation) -> str:
+def _untried(state: State, situation: GuardFacts) -> str:
     return "the open run is one of a trial: what is measured may not be changed" if situation.trial else ""
 
 
 _OPENING = "the run has not begun, its recording is being opened: try again in a moment"
 
 
-def _may_grip(state: State, situation: Situation) -> str:
+def _may_grip(state: State, situation: GuardFacts) -> str:
     if state is State.RUNNING and situation.opening:
         return _OPENING
     return _untried(state, situation)
 
 
-def _may_step(state: State, situation: Situation) -> str:
+def _may_step(state: State, situation: GuardFacts) -> str:
     if situation.mode not in ("step", "preview"):
         return f"the run's mode is {situation.mode}, and step is for step and preview"
     if situation.opening:  # what is asked for now would be forgotten when it begins
@@ -136,7 +123,7 @@ def _may_step(state: State, situation: Situation) -> str:
     return "the last chunk is still being executed" if situation.executing else ""
 
 
-def _may_commit(state: State, situation: Situation) -> str:
+def _may_commit(state: State, situation: GuardFacts) -> str:
     if situation.mode != "preview":
         return f"the run's mode is {situation.mode}, and commit is for preview"
     if situation.approaching:  # control would not take the chunk, and it would be gone
@@ -144,19 +131,19 @@ def _may_commit(state: State, situation: Situation) -> str:
     return "" if situation.proposed else "no chunk is shown: step first"
 
 
-def _may_cancel(state: State, situation: Situation) -> str:
+def _may_cancel(state: State, situation: GuardFacts) -> str:
     if situation.mode in ("step", "preview", "manual"):
         return _OPENING if situation.opening else ""
     return f"the run's mode is {situation.mode}, and cancel is for step, preview and manual: stop or halt it"
 
 
-def _may_move(state: State, situation: Situation) -> str:
+def _may_move(state: State, situation: GuardFacts) -> str:
     if situation.mode == "manual":
         return _OPENING if situation.opening else ""
     return f"the run's mode is {situation.mode}, and move is for manual"
 
 
-def _may_approach(state: State, situation: Situation) -> str:
+def _may_approach(state: State, situation: GuardFacts) -> str:
     if state is State.READY:
         return "" if situation.first_action else "the policy's first action is not known: set up again"
     if situation.mode != "preview":
@@ -167,12 +154,10 @@ def _may_approach(state: State, situation: Situation) -> str:
 S = State
 _STOPPED = "stopped by the operator"
 COMMANDS: dict[str, Rule] = {
-    "setup": Rule((S.IDLE, S.READY), S.SETTING_UP, lambda e, asked: e.begin_setup(asked), SetUpRequest),
-    "run": Rule((S.READY,), S.RUNNING, lambda e, asked: e.begin_run(asked), RunRequest, _may_run),
-    "stop": Rule(
-        (S.RUNNING, S.HOLDING, S.READY), S.READY, lambda e, _: e.end_run("finished", _STOPPED), None
-    ),
-    "halt": Rule((S.RUNNING, S.HOLDING), S.HOLDING, lambda e, _: e.hold("halted by the operator"), None),
+    "setup": Rule((S.IDLE, S.READY), S.SETTING_UP, lambda e, asked: e.begin_setup(asked)),
+    "run": Rule((S.READY,), S.RUNNING, lambda e, asked: e.begin_run(asked), guard=_may_run),
+    "stop": Rule((S.RUNNING, S.HOLDING, S.READY), S.READY, lambda e, _: e.end_run("finished", _STOPPED)),
+    "halt": Rule((S.RUNNING, S.HOLDING), S.HOLDING, lambda e, _: e.hold("halted by the operator")),
     "resume": Rule((S.HOLDING,), S.RUNNING, lambda e, _: e.resume_run(), guard=_may_resume),
     "home": Rule((S.READY,), S.SETTING_UP, lambda e, _: e.go_home()),
     "release": Rule((S.FAULTED,), None, lambda e, _: e.release_estop()),
@@ -181,15 +166,13 @@ COMMANDS: dict[str, Rule] = {
         (S.DISCONNECTED, S.IDLE, S.SETTING_UP, S.READY, S.HOLDING), None, lambda e, _: e.stop_recording()
     ),
     "tune": Rule(
-        (S.IDLE, S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.tune(asked), TuneRequest, _untried
+        (S.IDLE, S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.tune(asked), guard=_untried
     ),
     "step": Rule((S.RUNNING,), None, lambda e, _: e.step(), guard=_may_step),
     "commit": Rule((S.RUNNING,), None, lambda e, _: e.commit(), guard=_may_commit),
     "cancel": Rule((S.RUNNING,), None, lambda e, _: e.cancel(), guard=_may_cancel),
-    "move": Rule((S.RUNNING,), None, lambda e, asked: e.move(asked), MoveRequest, _may_move),
-    "gripper": Rule(
-        (S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.grip(asked), GripperRequest, _may_grip
-    ),
+    "move": Rule((S.RUNNING,), None, lambda e, asked: e.move(asked), guard=_may_move),
+    "gripper": Rule((S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.grip(asked), guard=_may_grip),
     "approach": Rule(
         (S.READY, S.RUNNING),
         {S.READY: S.SETTING_UP},
@@ -198,13 +181,12 @@ COMMANDS: dict[str, Rule] = {
     ),
     "arm": Rule((S.READY, S.HOLDING), None, lambda e, _: e.arm(), guard=_may_arm),
     "disarm": Rule((S.READY, S.HOLDING), None, lambda e, _: e.disarm(), guard=_may_disarm),
-    "label": Rule(tuple(State), None, lambda e, asked: e.label(asked), LabelRequest, _may_collect),
+    "label": Rule(tuple(State), None, lambda e, asked: e.label(asked), guard=_may_collect),
     "discard": Rule(
         tuple(State),
         {S.RUNNING: S.READY, S.HOLDING: S.READY},
         lambda e, asked: e.discard(asked),
-        DiscardRequest,
-        _may_collect,
+        guard=_may_collect,
         stays=lambda asked: asked is not None and asked.episode is not None,
     ),
 }
@@ -212,32 +194,32 @@ COMMANDS: dict[str, Rule] = {
 CANCELLING = ("stop", "halt")
 STOPPING = ("stop", "halt", "estop")  # never stale
 # What happens by itself: (happening, state) -> the state after it. Pairs that are not here change nothing.
-HAPPENINGS: dict[tuple[Happening, State], State] = {
-    (Happening.CONNECTED, S.DISCONNECTED): S.IDLE,
-    (Happening.INCOMPLETE, S.DISCONNECTED): S.DISCONNECTED,
-    (Happening.DISPLACED, S.READY): S.IDLE,
-    (Happening.LINK_LOST, S.IDLE): S.DISCONNECTED,
-    (Happening.LINK_LOST, S.READY): S.DISCONNECTED,
-    (Happening.LINK_LOST, S.SETTING_UP): S.DISCONNECTED,
-    (Happening.SETUP_DONE, S.SETTING_UP): S.READY,
-    (Happening.SETUP_FAILED, S.SETTING_UP): S.IDLE,
-    (Happening.HELD, S.RUNNING): S.HOLDING,
-    (Happening.HELD, S.SETTING_UP): S.IDLE,
-    (Happening.RUN_ENDED, S.RUNNING): S.READY,
-    (Happening.RUN_ENDED, S.HOLDING): S.READY,
-    (Happening.RUN_FAILED, S.RUNNING): S.READY,
-    (Happening.RUN_FAILED, S.HOLDING): S.READY,
-    (Happening.LEASE_ENDED, S.RUNNING): S.HOLDING,
-    (Happening.LEASE_ENDED, S.SETTING_UP): S.IDLE,
-    (Happening.RELEASED, S.FAULTED): S.IDLE,
-    **{(Happening.ESTOPPED, state): S.FAULTED for state in State if state is not S.FAULTED},
-    **{(Happening.FAMILY_DIED, state): S.IDLE for state in (S.READY, S.RUNNING, S.HOLDING, S.SETTING_UP)},
+EVENT_TRANSITIONS: dict[tuple[SessionEvent, State], State] = {
+    (SessionEvent.CONNECTED, S.DISCONNECTED): S.IDLE,
+    (SessionEvent.INCOMPLETE, S.DISCONNECTED): S.DISCONNECTED,
+    (SessionEvent.DISPLACED, S.READY): S.IDLE,
+    (SessionEvent.LINK_LOST, S.IDLE): S.DISCONNECTED,
+    (SessionEvent.LINK_LOST, S.READY): S.DISCONNECTED,
+    (SessionEvent.LINK_LOST, S.SETTING_UP): S.DISCONNECTED,
+    (SessionEvent.SETUP_DONE, S.SETTING_UP): S.READY,
+    (SessionEvent.SETUP_FAILED, S.SETTING_UP): S.IDLE,
+    (SessionEvent.HELD, S.RUNNING): S.HOLDING,
+    (SessionEvent.HELD, S.SETTING_UP): S.IDLE,
+    (SessionEvent.RUN_ENDED, S.RUNNING): S.READY,
+    (SessionEvent.RUN_ENDED, S.HOLDING): S.READY,
+    (SessionEvent.RUN_FAILED, S.RUNNING): S.READY,
+    (SessionEvent.RUN_FAILED, S.HOLDING): S.READY,
+    (SessionEvent.LEASE_ENDED, S.RUNNING): S.HOLDING,
+    (SessionEvent.LEASE_ENDED, S.SETTING_UP): S.IDLE,
+    (SessionEvent.RELEASED, S.FAULTED): S.IDLE,
+    **{(SessionEvent.ESTOPPED, state): S.FAULTED for state in State if state is not S.FAULTED},
+    **{(SessionEvent.FAMILY_DIED, state): S.IDLE for state in (S.READY, S.RUNNING, S.HOLDING, S.SETTING_UP)},
 }
 
 # A gripper may be on its way in these, although no run goes on: the end of the lease stops it, and no more.
 MOVED_BY_HAND = (S.READY, S.HOLDING)
 CANCELLED = "set-up cancelled by the operator"
-CANCEL = Rule((S.SETTING_UP,), S.IDLE, lambda e, _: e.cancel_setup(CANCELLED), None)
+CANCEL = Rule((S.SETTING_UP,), S.IDLE, lambda e, _: e.cancel_setup(CANCELLED))
 REASONS = {
     "stop": _STOPPED,
     "halt": "halted by the operator: resume or stop",

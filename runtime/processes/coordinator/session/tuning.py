@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from runtime import deployment
-from runtime.errors import RuntimeFault
-from runtime.family import Plan
-from runtime.inference import Strategy
+from runtime.config import loader as deployment
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.command_arguments import TuneRequest
 from runtime.policies.base import PolicyInfo
-from runtime.requests import TuneRequest
+from runtime.processes.coordinator.inference.inference import Strategy
+from runtime.station.spec import StationSpec
 
 
-def strategy_of(plan: Plan) -> Strategy:
+def strategy_of(plan: StationSpec) -> Strategy:
     """The asking half of a plan's strategy."""
     settings = plan.deployment.strategy
     return Strategy(plan.strategy.query(settings), settings)
 
 
-def tuned(plan: Plan, asked: TuneRequest, info: PolicyInfo | None) -> Plan:
+def tuned(plan: StationSpec, asked: TuneRequest, info: PolicyInfo | None) -> StationSpec:
     """`plan` with what is asked; another kind keeps the parameters. RuntimeFault names what is wrong.
 
     `info` is what the connected policy says of itself, None where none is.

@@ -6,12 +6,12 @@ import uuid
 from collections.abc import Callable
 from typing import Any
 
-from runtime.clock import Clock
-from runtime.errors import SetupError
-from runtime.family import Plan
-from runtime.messages import Event, ReceptionReport
-from runtime.orders import Orders
-from runtime.requests import BenchRequest
+from runtime.core.clock import Clock
+from runtime.core.errors import SetupError
+from runtime.ipc.command_arguments import BenchRequest
+from runtime.ipc.messages import Event, ReceptionReport
+from runtime.processes.coordinator.control_queue import ControlQueue
+from runtime.station.spec import StationSpec
 
 _RESET_S = 3.0  # for a simulated bench to be laid out
 _REPEAT_S = 0.2  # a control word may be lost on its way
@@ -21,7 +21,7 @@ class BenchReset:
     """One reset at a time; a node that simulates no bench has none."""
 
     def __init__(
-        self, plan: Plan, orders: Orders, clock: Clock, reception: Callable[[], ReceptionReport]
+        self, plan: StationSpec, orders: ControlQueue, clock: Clock, reception: Callable[[], ReceptionReport]
     ) -> None:
         self._plan = plan
         self._orders = orders

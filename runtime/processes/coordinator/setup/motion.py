@@ -4,30 +4,30 @@ from __future__ import annotations
 
 import numpy as np
 
-from runtime.clock import Clock
-from runtime.errors import SetupError
-from runtime.family import Plan
-from runtime.messages import Event
-from runtime.motion import Trajectory
-from runtime.orders import Orders
-from runtime.page import Page
-from runtime.timeline import difference
-from runtime.types import Float64
-from runtime.ways import Ways
+from runtime.core.clock import Clock
+from runtime.core.errors import SetupError
+from runtime.core.types import Float64
+from runtime.ipc.messages import Event
+from runtime.ipc.shared_state import SharedState
+from runtime.motion.timeline import difference
+from runtime.motion.trajectories import Trajectory
+from runtime.processes.coordinator.control_queue import ControlQueue
+from runtime.processes.coordinator.path_check import PathCheck
+from runtime.station.spec import StationSpec
 
 _SETTLE_S = 2.0  # for the arm to follow the last target of a motion
 _ARRIVED_RAD = 0.1
 
 
-class Going:
+class SetupMotion:
     """One motion at a time; `where` names its goal in sentences."""
 
-    def __init__(self, plan: Plan, orders: Orders, page: Page, clock: Clock) -> None:
+    def __init__(self, plan: StationSpec, orders: ControlQueue, page: SharedState, clock: Clock) -> None:
         self._plan = plan
         self._orders = orders
         self._page = page
         self._clock = clock
-        self._ways = Ways(plan)
+        self._ways = PathCheck(plan)
 
     def start(self, goal: Float64, where: str) -> None:
         """Have control go to `goal` [D]; RuntimeFault, and nothing moves, where the way there is not free."""

@@ -9,24 +9,24 @@ from typing import Any
 
 import numpy as np
 
-from runtime import resampling
-from runtime.asking import Answered
-from runtime.bench_reset import BenchReset
 from runtime.cameras.telling import complaints
-from runtime.clock import Clock
-from runtime.errors import PolicyError, SetupError
-from runtime.family import Plan
-from runtime.going import Going
-from runtime.inference import Inference
-from runtime.messages import Event, ReceptionReport
-from runtime.orders import Orders
-from runtime.page import Page
+from runtime.core.clock import Clock
+from runtime.core.errors import PolicyError, SetupError
+from runtime.core.types import Float64
+from runtime.ipc.command_arguments import LeastTimes
+from runtime.ipc.messages import Event, ReceptionReport
+from runtime.ipc.shared_state import SharedState
+from runtime.motion import resampling
+from runtime.motion.timeline import difference
 from runtime.policies.base import PolicyInfo
-from runtime.requests import LeastTimes
-from runtime.runner import telling
-from runtime.timeline import difference
-from runtime.types import Float64
-from runtime.watch import SIBLINGS
+from runtime.processes.coordinator.control_queue import ControlQueue
+from runtime.processes.coordinator.health_monitor import SIBLINGS
+from runtime.processes.coordinator.inference.inference import Inference
+from runtime.processes.coordinator.inference.requests import PolicyResponse
+from runtime.processes.coordinator.inference.worker import telling
+from runtime.processes.coordinator.setup.bench_reset import BenchReset
+from runtime.processes.coordinator.setup.motion import SetupMotion
+from runtime.station.spec import StationSpec
 
 
 class Stage(StrEnum):
@@ -51,10 +51,10 @@ class SetUp:
 
     def __init__(
         self,
-        plan: Plan,
+        plan: StationSpec,
         inference: Inference,
-        orders: Orders,
-        page: Page,
+        orders: ControlQueue,
+        page: SharedState,
         clock: Clock,
         reception: Callable[[], ReceptionReport],
     ) -> None:
@@ -63,7 +63,7 @@ class SetUp:
         self._page = page
         self._clock = clock
         self._reception = reception  # what it last reported
-        self._going = Going(plan, orders, page, clock)
+        self._going = SetupMotion(plan, orders, page, clock)
         self.bench = BenchReset(plan, orders, clock, reception)
         self.stage = Stage.IDLE
         self.info: PolicyInfo | None = None
@@ -245,7 +245,7 @@ class SetUp:
             self.stage = Stage.IDLE
             return True
         self._left = self._plan.deployment.setup.warmup_chunks
-        self._asked: Future[Answered] | None = None
+        self._asked: Future[PolicyResponse] | None = None
         self._enter(Stage.WARM_UP)
         return False
 
@@ -276,7 +276,7 @@ class SetUp:
         self.took.setdefault(name, waited)
         return waited >= least
 
-    def _validate(self, answered: Answered) -> None:
+    def _validate(self, answered: PolicyResponse) -> None:
         self._inference.asking.note(answered)
         if self._left == self._plan.deployment.setup.warmup_chunks:
             self._inference.asking.compare(answered)
@@ -289,7 +289,7 @@ class SetUp:
         )
 
 
-def check_info(info: PolicyInfo, plan: Plan, continues: bool) -> None:
+def check_info(info: PolicyInfo, plan: StationSpec, continues: bool) -> None:
     """Hold what a policy says of itself against the strategy that asks it; SetupError with both sides.
 
     `continues`: the strategy's requests carry what the robot is committed to.
@@ -312,7 +312,7 @@ def check_info(info: PolicyInfo, plan: Plan, continues: bool) -> None:
         )
 
 
-def first_action(action: Float64, joints: Float64, plan: Plan) -> dict[str, Any]:
+def first_action(action: Float64, joints: Float64, plan: StationSpec) -> dict[str, Any]:
     """How far an action [D] is from `joints` [D]: {"distance" rad, "joint", "far"}; joints count, and nothing else."""
     limits = plan.limits
     away = np.where(limits.places, np.abs(difference(action, joints, plan.dims.wrapping)), 0.0)

@@ -1,0 +1,1 @@
+"""Programs that command a station over the bus."""

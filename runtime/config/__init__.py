@@ -1,0 +1,1 @@
+"""What a deployment file may say: schema, loader, reference."""

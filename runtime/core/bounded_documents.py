@@ -1,0 +1,103 @@
+"""Reads TOML and JSON that others wrote: how long, how deep and how many they are is looked at before they are parsed.
+
+Parsers pay for depth by its square, or with their stack: 20,000 nested parts of TOML cost a minute and gigabytes. What
+comes after them pays for each value: a list of three characters is 60 bytes, and is looked at a dozen times.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import stat
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+LARGEST = 2_000_000  # characters
+DEEPEST = 40  # tables and lists within each other
+MOST = 100_000  # values, counted by brackets, commas and the = of keys
+
+_JSON = re.compile(r'"(?:[^"\\]++|\\.)*+"?|[\[\]{},]', re.DOTALL)
+_TOML = re.compile(
+    r'"""(?:[^"\\]++|\\.|"(?!""))*+(?:"{3,5}+)?'  # up to two of the quotes at its end are its own
+    r"|'''(?:[^']++|'(?!''))*+(?:'{3,5}+)?"
+    r'|"(?:[^"\\\n]++|\\.)*+"?'
+    r"|'[^'\n]*+'?"
+    r"|\#[^\n]*+"
+    r"|[\[\]{}.=,\n]",
+    re.DOTALL,
+)
+
+
+class Unreadable(ValueError):
+    """It cannot be read; the message says what it is, why, and what is allowed."""
+
+
+def toml(text: str, what: str, largest: int = LARGEST) -> dict[str, Any]:
+    """The table in `text`; Unreadable, which calls it `what`."""
+    _require_small(text, what, largest)
+    _require_flat(text, what, _TOML)
+    found: dict[str, Any] = _parsed(tomllib.loads, text, what, "TOML")
+    return found
+
+
+def toml_file(path: Path, what: str) -> dict[str, Any]:
+    """The table in a file, which is one; Unreadable, OSError."""
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise Unreadable(f"{what}: is no file")
+    if found.st_size > LARGEST:
+        raise Unreadable(f"{what}: {found.st_size} bytes; allowed: at most {LARGEST}")
+    try:
+        return toml(path.read_text("utf-8"), what)
+    except UnicodeDecodeError as error:
+        raise Unreadable(f"{what}: is not valid TOML: {error}") from None
+
+
+def from_json(text: str | bytes, what: str, largest: int = LARGEST, most: int = MOST) -> Any:
+    """The value in `text`; Unreadable, which calls it `what`."""
+    _require_small(text, what, largest)
+    try:
+        text = text if isinstance(text, str) else text.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise Unreadable(f"{what}: is not valid JSON: {error}") from None
+    _require_flat(text, what, _JSON, most)
+    return _parsed(json.loads, text, what, "JSON")
+
+
+def _parsed(parse: Callable[[str], Any], text: str, what: str, language: str) -> Any:
+    try:
+        return parse(text)
+    except ValueError as error:  # also what Python refuses of long numbers
+        raise Unreadable(f"{what}: is not valid {language}: {error}") from None
+
+
+def _require_small(text: str | bytes, what: str, largest: int) -> None:
+    if len(text) > largest:
+        raise Unreadable(f"{what}: {len(text)} characters; allowed: at most {largest}")
+
+
+def _require_flat(text: str, what: str, marks: re.Pattern[str], most: int = MOST) -> None:
+    """Brackets, commas and the dots of keys, outside of strings: never fewer levels than a parser would make."""
+    depth = dots = values = 0
+    for mark in marks.finditer(text):
+        word = mark[0]
+        values += word in "[{,="
+        if values > most:
+            raise Unreadable(f"{what}: more than {most} values; allowed: at most {most}")
+        if word in "[{":
+            depth, dots = depth + 1, 0
+        elif word in "]}":
+            depth = max(0, depth - 1)
+            dots = 0
+        elif word == ".":
+            dots += 1
+        elif word in "=,\n":
+            dots = 0
+        if depth + dots > DEEPEST:
+            line = text.count("\n", 0, mark.start()) + 1
+            raise Unreadable(
+                f"{what}: line {line} has more than {DEEPEST} tables or lists within each other; allowed: at most "
+                f"{DEEPEST}"
+            )

@@ -1,0 +1,60 @@
+"""What a station takes from the environment: nothing that is the web's, and secrets by their names alone."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+
+from runtime.core.errors import ConfigurationError
+
+# What signs sessions, opens the database and the broker, and logs in at the hub: no station has a use for it.
+WEB_ALONE = frozenset(
+    (
+        *("EVA_SECRET_KEY", "DATABASE_URL", "REDIS_URL", "DJANGO_SUPERUSER_PASSWORD"),
+        *("PGPASSWORD", "PGPASSFILE", "PGSERVICEFILE"),
+        *("HF_TOKEN", "HUGGING_FACE_HUB_TOKEN", "HF_TOKEN_PATH"),
+    )
+)
+# For ssh: its agent, its tickets, its language, and where it finds itself.
+_OF_SSH = frozenset(
+    (
+        *("HOME", "USER", "LOGNAME", "SHELL", "PATH", "TZ", "TMPDIR", "XDG_RUNTIME_DIR"),
+        *("SSH_AUTH_SOCK", "SSH_AGENT_PID", "KRB5CCNAME", "KRB5_CONFIG", "LANG", "LANGUAGE"),
+    )
+)
+
+
+def without_secrets(given: Mapping[str, str]) -> dict[str, str]:
+    """An environment without what is the web's alone."""
+    return {name: value for name, value in given.items() if name not in WEB_ALONE}
+
+
+def for_ssh() -> dict[str, str]:
+    """What of ours an ssh gets: it may be told by its configuration to send on whatever it has."""
+    return {
+        name: value for name, value in os.environ.items() if name in _OF_SSH or name.startswith("LC_")
+    } | {"SSH_ASKPASS_REQUIRE": "never"}
+
+
+def shed() -> None:
+    """Where this program was started with secrets of the web, it is started again without, as the same process.
+
+    Else they could be read in /proc for as long as it lives, and every child would have them.
+    """
+    kept = without_secrets(os.environ)
+    if len(kept) < len(os.environ):
+        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], kept)
+
+
+def secret(key: str, name: str) -> str:
+    """The value of the variable `name`, which `key` of a deployment names; ConfigurationError where there is none."""
+    if name in WEB_ALONE:
+        raise ConfigurationError(
+            f"{key} names {name}, which is the web's and never a station's; allowed: a variable of its own, "
+            "such as EVA_POLICY_KEY"
+        )
+    value = os.environ.get(name)
+    if not value:
+        raise ConfigurationError(f"{key} names {name}, which is not set in the environment")
+    return value

@@ -1,0 +1,17 @@
+"""How many files and connections a process may have open."""
+
+from __future__ import annotations
+
+import logging
+import resource
+
+log = logging.getLogger(__name__)
+_ENOUGH = 4096
+
+
+def allow_all() -> None:
+    """Raise the soft limit to the hard one: who runs out of descriptors is ended by ZMQ when somebody connects."""
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    if hard != resource.RLIM_INFINITY and hard < _ENOUGH:
+        log.warning("only %d files may be open (ulimit -Hn): allow at least %d", hard, _ENOUGH)

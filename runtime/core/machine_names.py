@@ -1,0 +1,40 @@
+"""Keys whose values name something of the station's own machine, so that others may not set them at will."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from enum import Enum
+from typing import Annotated, Any, get_args, get_origin
+
+from pydantic import BaseModel
+
+
+class Names(Enum):
+    """What the value of such a key names."""
+
+    VARIABLE = "an environment variable"
+    FILE = "a file that is read"
+    WRITTEN = "a file that is written"
+    RECORDING = "a recording or a dataset"
+
+
+Variable = Annotated[str, Names.VARIABLE]
+Recording = Annotated[str, Names.RECORDING]
+
+
+def named(table: BaseModel, prefix: str = "") -> Iterator[tuple[str, Names, str]]:
+    """The keys of a table, and of those in it, that name something, with what and which."""
+    for key, field in type(table).model_fields.items():
+        value = getattr(table, key)
+        if isinstance(value, BaseModel):
+            yield from named(value, f"{prefix}{key}.")
+        elif isinstance(value, str):
+            found = [mark for mark in (*field.metadata, *_marks(field.annotation)) if isinstance(mark, Names)]
+            yield from ((prefix + key, mark, value) for mark in found)
+
+
+def _marks(annotation: Any) -> Iterator[Any]:
+    if get_origin(annotation) is Annotated:
+        yield from annotation.__metadata__
+    for part in get_args(annotation):
+        yield from _marks(part)

@@ -1,0 +1,86 @@
+"""A stop that has to arrive: over a connection of its own, and after its socket wherever that goes."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import zmq
+
+from runtime.core.errors import TransportError
+from runtime.ipc.bus import CommandClient, Endpoints, Key
+from runtime.ipc.endpoints import LOOK_S, trouble
+from runtime.ipc.messages import Ack, Command
+
+_AGAIN_S = 0.02
+
+
+class NotSent(TransportError):
+    """Nobody listened, all the time: it was not carried out."""
+
+
+class NoAnswer(TransportError):
+    """It may have been carried out: nobody knows. `why`, as far as that can be told."""
+
+    def __init__(self, kind: str, seconds: float, why: str) -> None:
+        self.why = f"; {why}" if why else ""
+        super().__init__(f"no answer to {kind} within {seconds:g} s: outcome unknown{self.why}")
+
+
+def urgent(
+    context: zmq.Context[Any],
+    endpoints: Endpoints,
+    where: tuple[str, str],
+    command: Command,
+    timeout: float,
+    key: Key | None = None,
+) -> Ack:
+    """The answer to it; `where` names process and socket: ("guard", "estop").
+
+    It is sent again wherever the socket is found meanwhile; the file that says where may come late. Raises NotSent,
+    NoAnswer, both with what to do, CodecError, and TransportError where the station has none.
+    """
+    deadline = time.monotonic() + timeout
+    client, place, heard, why = None, "", False, ""
+    try:
+        while True:
+            try:
+                there = _now(endpoints, where, place)
+            except TransportError:
+                if time.monotonic() >= deadline or not endpoints.listens(where[1]):
+                    raise
+                time.sleep(_AGAIN_S)  # its process writes the file anew within two looks
+                continue
+            if client is None or there != place:
+                if client is not None:
+                    client.close()
+                client, place = CommandClient(context, there, key, endpoints.owner), there
+                client.post(command)
+            why = trouble(place)
+            heard = heard or not why
+            answer = client.heard(command, min(LOOK_S, max(0.0, deadline - time.monotonic())))
+            if answer is not None:
+                return answer
+            why = client.strangers or why
+            if time.monotonic() >= deadline:
+                break
+    finally:
+        if client is not None:
+            client.close()
+    if not heard:
+        raise NotSent(f"{command.kind} was not sent: {why}")
+    raise NoAnswer(command.kind, timeout, why)
+
+
+def _now(endpoints: Endpoints, where: tuple[str, str], before: str) -> str:
+    """Where it is now, which is where it was `before` as long as nobody says otherwise."""
+    process, name = where
+    try:
+        return str(endpoints.read(process)[name])
+    except KeyError:
+        if not before:
+            raise TransportError(f"{process} has no socket {name!r}: start the station again") from None
+    except TransportError:
+        if not before:
+            raise
+    return before

@@ -1,0 +1,176 @@
+"""What presses the e-stop, per wire format: a message that says so does, whatever else is wrong with it.
+
+Here alone that is decided, for every door. A message that can be read is of the kind that it names itself; of one that
+cannot, or that names none, the words decide. Nothing here raises, and what is looked through is looked through once.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+from uuid import uuid4
+
+import msgpack  # type: ignore[import-untyped]
+
+from runtime.ipc.messages import Command
+
+NAME = "estop"
+WHY = "pressed"  # where no reason is given
+LONGEST = 240  # characters that are kept of a reason, a name, or what was wrong
+_LONGEST_UUID = 64
+_TEXTS = ("uuid", "user", "holder", "role")
+_READ = frozenset(("kind", "args", *_TEXTS))
+_UNREADABLE = (ValueError, TypeError, RecursionError, OverflowError, msgpack.exceptions.UnpackException)
+_PACKED = re.compile(rb"kind.{0,8}?estop", re.DOTALL)
+_ESCAPED = re.compile(r"\\u([0-9a-fA-F]{4})")
+_WORD = re.compile(r"\s*(?:web:)?estop\s*(?::.*)?", re.DOTALL)
+_LOOSE = r"""\b(?:%s)["']?\s{0,9}[:=]\s{0,9}["']?\s{0,9}(?:web:)?estop\b"""
+
+
+def kept(text: str) -> str:
+    """As much of it as is kept, with nothing in it that cannot be sent or written down."""
+    return text[:LONGEST].encode("utf-8", "replace").decode().replace("\x00", "")
+
+
+def why_of(command: Command) -> str:
+    """Why it was pressed, whatever stands there."""
+    why = command.args.get("why")
+    return why if isinstance(why, str) and why else WHY
+
+
+# --- the bus: msgpack ----------------------------------------------------------------------------------------
+
+
+def kind_of(payload: bytes) -> str:
+    """What a message of the bus says first that it is, read without its arguments; "" where that is not to be seen."""
+    try:
+        return next((_text(value) or "" for key, value in _pairs(payload) if key == "kind"), "")
+    except _UNREADABLE:
+        return ""
+
+
+def in_packed(payload: bytes) -> Command | None:
+    """The press that a message of the bus is, made of what can be read of it; None where it is none."""
+    if b"estop" not in payload or _PACKED.search(payload) is None:
+        return None
+    found: dict[str, bytes] = {}
+    kinds, wrong = [], []
+    try:
+        for key, value in _pairs(payload):
+            if key == "kind":
+                kinds.append(_text(value))
+                if kinds[-1] is None:
+                    wrong.append("kind is no text")
+            found[key] = value
+    except _UNREADABLE as error:
+        wrong.append(f"unreadable: {error or type(error).__name__}")
+    if kinds and NAME not in kinds and not wrong:
+        return None
+    return _press(found, wrong)
+
+
+def _press(found: Mapping[str, bytes], wrong: list[str]) -> Command:
+    texts = {key: _text(found[key]) for key in _TEXTS if key in found}
+    wrong += [f"{key} is no text" for key, text in texts.items() if text is None]
+    given = texts.pop("uuid", None) or ""
+    if len(given) > _LONGEST_UUID:
+        wrong.append(f"uuid has {len(given)} characters")
+    uuid = given if 0 < len(given) <= _LONGEST_UUID else str(uuid4())
+    why = _why(found.get("args"), wrong)
+    said = f" (message: {'; '.join(wrong)})" if wrong else ""
+    user, holder, role = (kept(texts.get(key) or "") for key in ("user", "holder", "role"))
+    return Command(uuid, NAME, {"why": kept(why) + said[:LONGEST]}, user, holder, role=role)
+
+
+def _why(args: bytes | None, wrong: list[str]) -> str:
+    if args is None:
+        return WHY
+    try:
+        given = [value for key, value in _pairs(args, ("why",)) if key == "why"]
+    except _UNREADABLE:
+        wrong.append("args is no map")
+        return WHY
+    why = _text(given[-1]) if given else WHY
+    if why is None:
+        wrong.append("why is no text")
+    return why or WHY
+
+
+def _pairs(packed: bytes, wanted: frozenset[str] | tuple[str, ...] = _READ) -> Iterator[tuple[str, bytes]]:
+    """The wanted keys of the outermost map with their values as they are packed; nothing else is made of it.
+
+    Raises where it is no map, cannot be read to its end, or is followed by something.
+    """
+    reader = msgpack.Unpacker(raw=True)
+    reader.feed(packed)
+    for _ in range(reader.read_map_header()):
+        begin = reader.tell()
+        reader.skip()
+        middle = reader.tell()
+        reader.skip()
+        key = _text(packed[begin:middle])
+        if key is not None and key in wanted:
+            yield key, packed[middle : reader.tell()]
+    if reader.tell() != len(packed):
+        raise ValueError(f"{len(packed) - reader.tell()} bytes follow it")
+
+
+def _text(packed: bytes) -> str | None:
+    """A text or bytes as a text; None for anything else."""
+    if len(packed) > 1 << 20 or not packed or not _is_text(packed[0]):
+        return None
+    value: bytes = msgpack.unpackb(packed, raw=True)
+    return value.decode("utf-8", "replace")
+
+
+def _is_text(mark: int) -> bool:
+    return 0xA0 <= mark <= 0xBF or 0xD9 <= mark <= 0xDB or 0xC4 <= mark <= 0xC6
+
+
+# --- pages, REST and scripts: JSON ---------------------------------------------------------------------------
+
+
+class _Table(list[tuple[str, Any]]):
+    """An object of JSON with all that it says, also what it says twice."""
+
+
+_JSON = json.JSONDecoder(object_pairs_hook=_Table)
+
+
+def in_json(said: str | bytes, *keys: str) -> dict[str, Any] | None:
+    """What a message in JSON says with a press, {} where that cannot be read; None where it is no press.
+
+    `keys` are those under which such a message names what it is: {"type": "estop"}. "web:estop" and "estop:REASON" are
+    names of it too.
+    """
+    text = said if isinstance(said, str) else said.decode(json.detect_encoding(said), "replace")
+    text = text.lstrip("\ufeff \t\r\n")
+    if NAME not in text and "\\u" not in text:
+        return None
+    try:
+        found, end = _JSON.raw_decode(text)
+    except (ValueError, RecursionError):
+        found, end = None, 0
+    if isinstance(found, _Table):
+        named = [value for key, value in found if key in keys]
+        if any(isinstance(value, str) and _WORD.fullmatch(value) for value in named):
+            return {key: _plain(value) for key, value in found}
+        if named and not text[end:].strip():
+            return None
+    bare = _ESCAPED.sub(lambda code: chr(int(code[1], 16)), text).replace("\\", "")
+    return {} if re.search(_LOOSE % "|".join(keys), bare) else None
+
+
+def why_in(said: Mapping[str, Any], default: str = WHY) -> str:
+    """The reason that stands in a press in JSON, beside its name or among its arguments."""
+    args = [said.get(key) for key in ("args", "arguments")]
+    for table in (said, *(one for one in args if isinstance(one, dict))):
+        if isinstance(why := table.get("why"), str) and why:
+            return kept(why)
+    return default
+
+
+def _plain(value: Any) -> Any:
+    return dict(value) if isinstance(value, _Table) else value

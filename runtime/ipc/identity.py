@@ -1,0 +1,146 @@
+"""Who gave a command: what the web signs, the account that connects, or somebody who cannot be verified.
+
+What a command says of itself is believed of nobody. The web signs the whole message, so that user and role go with this
+one command and no other.
+"""
+
+from __future__ import annotations
+
+import hmac
+import os
+import secrets
+import stat
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from runtime.core.errors import ConfigurationError
+from runtime.ipc.endpoints import account
+from runtime.ipc.messages import Command
+
+SIGNED = "web:"  # how the names of holders begin that only a signature may use
+SCRIPTS = "channel:"  # of holders who are scripts: the channel passes on what they say, and cannot know who they are
+# Roles of those who have none of the web's: programs of this account, scripts that these pass on, everybody else.
+LOCAL, SCRIPT, UNVERIFIED = "local", "script", "unverified"
+_MAY = ("operator", "admin", LOCAL, SCRIPT)
+# For which no role is needed: what changes nothing, and what keeps or ends what a role was needed for.
+_OPEN = (
+    *("status", "events_since", "aim", "preflight_report", "policy_server"),
+    *("lease_renew", "lease_give_up"),
+)
+_KEY_BYTES = 32
+_ROOT = 0
+_DOMAIN = b"eva-web command 1\0"
+
+
+class Key:
+    """The secret that web and station share: DATA/stations/NAME/bus.key, which this account alone can read."""
+
+    def __init__(self, station_dir: Path) -> None:
+        self.path = station_dir / "bus.key"
+        self._secret = b""
+        self._seen = (0, 0)  # which file that was
+
+    def secret(self) -> bytes:
+        """The key, made where there is none; ConfigurationError says what is wrong with its file."""
+        try:
+            return self._read()
+        except FileNotFoundError:
+            return self._make()
+        except OSError as error:
+            raise ConfigurationError(f"the key {self.path} cannot be read: {error.strerror}") from None
+
+    def sign(self, payload: bytes) -> bytes:
+        """The signature of a message; raises ConfigurationError where there is no key to sign it with."""
+        return hmac.digest(self.secret(), _DOMAIN + payload, "sha256")
+
+    def verifies(self, payload: bytes, signature: bytes) -> bool:
+        """Whether the web has signed just this; whatever is wrong with the key, it has not."""
+        try:
+            return hmac.compare_digest(self.sign(payload), signature)
+        except ConfigurationError:
+            return False
+
+    def _read(self) -> bytes:
+        found = os.stat(self.path, follow_symlinks=False)
+        if (found.st_ino, found.st_mtime_ns) == self._seen:
+            return self._secret
+        if not stat.S_ISREG(found.st_mode) or found.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+            raise ConfigurationError(
+                f"the key {self.path} has the mode {stat.S_IMODE(found.st_mode):04o}: whoever reads it can sign "
+                "commands as anybody; allowed: a file with 0600; remove it, and another is made"
+            )
+        if found.st_uid not in (os.geteuid(), _ROOT):
+            raise ConfigurationError(
+                f"the key {self.path} belongs to {account(found.st_uid)}; allowed: {account(os.geteuid())}"
+            )
+        secret = self.path.read_bytes()
+        if len(secret) != _KEY_BYTES:
+            raise ConfigurationError(
+                f"the key {self.path} has {len(secret)} bytes; allowed: {_KEY_BYTES}; remove it, and another is made"
+            )
+        self._secret, self._seen = secret, (found.st_ino, found.st_mtime_ns)
+        return secret
+
+    def _make(self) -> bytes:
+        """Whoever is first, station or web, makes it; nobody ever sees a part of it."""
+        draft = self.path.with_name(f".bus.key.{secrets.token_hex(4)}")
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            handle = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with open(handle, "wb") as file:
+                file.write(secrets.token_bytes(_KEY_BYTES))
+                file.flush()
+                os.fsync(file.fileno())
+            with suppress(FileExistsError):
+                os.link(draft, self.path)
+            draft.unlink()
+            return self._read()
+        except OSError as error:
+            raise ConfigurationError(f"the key {self.path} cannot be made: {error.strerror}") from None
+
+
+def identified(command: Command, payload: bytes, signature: bytes, uid: int | None, key: Key) -> Command:
+    """The command with user and role as they are known, whatever it says of itself.
+
+    `signature` is empty where there is none, `uid` the account that connects, None where nobody knows it. The role is
+    the web's, "local" for a program of this account, "script" for what one passes on, else "unverified".
+    """
+    if signature:
+        return command if key.verifies(payload, signature) else _unverified(command, UNVERIFIED)
+    if uid is None or uid not in (os.geteuid(), _ROOT) or command.holder.startswith(SIGNED):
+        return _unverified(command, UNVERIFIED)
+    if command.holder.startswith(SCRIPTS):
+        return _unverified(command, SCRIPT)
+    return replace(command, user=f"account:{account(uid)}", role=LOCAL)
+
+
+def _unverified(command: Command, role: str) -> Command:
+    """Named as it names itself, and marked wherever that name is written down."""
+    name = command.user or command.holder or "somebody"
+    return replace(command, user=f"{name} (unverified)", role=role)
+
+
+def forged(command: Command) -> str:
+    """Why what was `identified` is obeyed in nothing but stops; "" where it may be."""
+    if command.role != UNVERIFIED:
+        return ""
+    return (
+        f"{command.kind} is not signed by this lab's web, and not given by a program of the station's account: "
+        "refused; stops are obeyed"
+    )
+
+
+def lacking(command: Command) -> str:
+    """Why the role of who gave the command is too little for it; "" where it will do."""
+    if command.kind in _OPEN or command.role in _MAY:
+        return ""
+    return (
+        f"{command.kind} needs an operator; {command.user} is {command.role or 'signed for without a role'}"
+    )
+
+
+def named(command: Command) -> str:
+    """Who gave the command, for the record: with the role that the web has signed."""
+    name = command.user or command.holder or "unknown"
+    return name if command.role in ("", LOCAL, SCRIPT, UNVERIFIED) else f"{name} ({command.role})"

@@ -1,0 +1,19 @@
+"""Tells a process that its parent has ended, however that came."""
+
+from __future__ import annotations
+
+import os
+import select
+
+
+class Lifeline:
+    """Standard input, held open by the supervisor; its end is the supervisor's end, however it came."""
+
+    def __init__(self, descriptor: int = 0) -> None:
+        self._descriptor = descriptor
+
+    @property
+    def cut(self) -> bool:
+        """Whether the supervisor is gone."""
+        readable, _, _ = select.select([self._descriptor], [], [], 0)
+        return bool(readable) and os.read(self._descriptor, 4096) == b""

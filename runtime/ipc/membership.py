@@ -1,0 +1,24 @@
+"""What each process of a station holds of the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from runtime.ipc.lifeline import Lifeline
+from runtime.ipc.shared_state import SharedState
+
+# [s] how long guard and reception stay after control's own end: to the last it can see, and be stopped
+_OUTLIVES_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Membership:
+    """The shared state, the name of this start of the station, and the lifeline to its supervisor."""
+
+    page: SharedState
+    boot: str
+    lifeline: Lifeline
+
+    def needed(self, now: float) -> bool:
+        """Whether there is still something to do for who outlives control: until then the supervisor may be gone."""
+        return not self.lifeline.cut or self.page.alive("control", now, _OUTLIVES_S)

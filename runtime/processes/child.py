@@ -1,0 +1,31 @@
+"""What every process of a station starts from: its plan, the page, a lifeline, a log."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+
+from runtime.core import logs as log
+from runtime.ipc.lifeline import Lifeline
+from runtime.ipc.membership import Membership
+from runtime.ipc.shared_state import SharedState
+from runtime.station.spec import StationSpec, planned
+
+
+@dataclass(frozen=True, slots=True)
+class Member(Membership):
+    """One process of a station: what it works with."""
+
+    plan: StationSpec
+
+
+def join(process: str, pictures: bool = True) -> Member:
+    """Read what the supervisor handed over on the command line."""
+    parser = argparse.ArgumentParser(prog=f"runtime.{process}", description="started by the supervisor")
+    parser.add_argument("--resolved", required=True)
+    parser.add_argument("--page", required=True, type=int)
+    parser.add_argument("--boot", required=True)
+    given = parser.parse_args()
+    log.start(process)
+    made = planned(given.resolved)
+    return Member(SharedState.attach(made.layout, given.page, pictures), given.boot, Lifeline(), made)

@@ -1,0 +1,116 @@
+"""What makes control hold although nobody told it to: a family that is silent, an arm that was moved."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.core.types import Float64
+from runtime.ipc.observation_reader import LatestObservation
+from runtime.ipc.shared_state import SharedState
+from runtime.processes.control.actuator import RobotActuator, TickSettings
+from runtime.processes.control.plausibility import Plausibility
+
+_RETURNED_AWAY = 0.1  # [rad] that an arm may be off after it was not seen, by sagging
+_AGREES_S = 1.0  # that a joint reads where it is told to be, before its readings lead its command again
+_THERE = 1e-6  # [rad]
+
+
+def silent_sibling(page: SharedState, now: float, allowed: float) -> str:
+    """The process whose heartbeat is older than `allowed` seconds, in a sentence; "" where none is."""
+    for process in ("main", "guard"):
+        if not page.alive(process, now, allowed):
+            return f"no sign of life from {process} {page.silence(process, now)}"
+    return ""
+
+
+class Displacement:
+    """Notices a robot that is far from where it is told to hold, and leads what is held to where it is.
+
+    It was moved by hand, switched off, or its node was restarted: to send the old target would make it move by
+    itself, and so would what moved it before it was not seen for a time. One sample says nothing: it is there when
+    several agree (`Plausibility.apart`).
+
+    An encoder that is off looks like that, but its joint follows the command, and its readings keep their distance. So
+    no command follows a joint that leapt, nor one a second time before the two have agreed for _AGREES_S.
+    """
+
+    def __init__(self, settings: TickSettings, plausibility: Plausibility) -> None:
+        self._settings = settings
+        self._plausibility = plausibility
+        self._angles = settings.limits.places
+        dim = len(settings.limits.names)
+        self._followed = np.zeros(dim, bool)  # their command was led to where they were read
+        self._off = np.zeros(dim, bool)  # they were somewhere else again then
+        self._apart_at = np.full(dim, float("-inf"))  # when each was last read away from its command
+        self.goal: Float64 | None = None  # where the command is being led to
+        self.begins = False  # whether it has been since this tick
+        self.doubt = ""  # which joints are not followed since this tick, and why
+
+    def __call__(
+        self, robot: RobotActuator, seen: LatestObservation, now: float, held: bool
+    ) -> Float64 | None:
+        """Where the command is to go [D], as the robot is too far from where it is `held`; None where all is well."""
+        self.begins = False
+        measured = robot.measured(seen, now)
+        self._compare(robot, measured, now)
+        if measured is None:
+            return None
+        returned = self._plausibility.returned()
+        if not (held or (returned and robot.engaged)) or self._settings.safety.report_only:
+            self.goal = None
+            return None
+        if self.goal is not None and self.distance(robot, self.goal) <= _THERE:
+            self.goal = None
+        allowed = _RETURNED_AWAY if returned else self._settings.safety.following_error
+        if self.goal is None and self._away(robot, measured, allowed):
+            self.follow(robot, measured)
+            if self._away(robot, measured, allowed):
+                limits = self._settings.limits
+                self.goal = np.clip(self.trusted(robot, measured), limits.lower, limits.upper)
+                self.begins = True
+        return self.goal
+
+    def distance(self, robot: RobotActuator, measured: Float64) -> float:
+        """How far the farthest joint is from its command [rad]."""
+        return float(np.abs(measured - robot.commanded).max(where=self._angles, initial=0.0))
+
+    def trusted(self, robot: RobotActuator, measured: Float64) -> Float64:
+        """`measured` [D], and where it is told to be for a joint whose readings are not followed."""
+        return np.where(self._distrusted, robot.commanded, measured)
+
+    def follow(self, robot: RobotActuator, measured: Float64) -> None:
+        """The command is about to be led to `measured` [D]: `doubt` names the joints for which it was before."""
+        where = self.trusted(robot, measured)
+        away = self._angles & (np.abs(where - robot.commanded) > _RETURNED_AWAY)
+        off = away & self._followed
+        self._off |= off
+        self._followed |= away
+        self.doubt = "; ".join(
+            f"{self._settings.limits.names[i]} reads {measured[i]:.3f} rad, {robot.commanded[i]:.3f} is held, "
+            "to which it was led already: is its encoder off?"
+            for i in np.flatnonzero(off)
+        )
+
+    def forget(self) -> None:
+        """Follow all joints again."""
+        for joints in (self._followed, self._off, self._plausibility.leapt):
+            joints[:] = False
+
+    @property
+    def _distrusted(self) -> np.ndarray:
+        return np.asarray(self._off | self._plausibility.leapt)
+
+    def _away(self, robot: RobotActuator, measured: Float64, allowed: float) -> bool:
+        far = self.distance(robot, self.trusted(robot, measured)) > allowed
+        return far and self._plausibility.apart(robot.commanded, allowed, self._distrusted)
+
+    def _compare(self, robot: RobotActuator, measured: Float64 | None, now: float) -> None:
+        """Follow those joints again that agree with their command."""
+        if not robot.engaged:
+            self.forget()
+            self.goal = None
+        apart = True if measured is None else np.abs(measured - robot.commanded) > _RETURNED_AWAY
+        self._apart_at[apart & self._angles] = now
+        agrees = now - self._apart_at >= _AGREES_S
+        for joints in (self._followed, self._off, self._plausibility.leapt):
+            joints[agrees] = False

@@ -1,0 +1,1 @@
+"""Asking the policy, and what its answers become."""

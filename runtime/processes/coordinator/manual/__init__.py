@@ -1,0 +1,1 @@
+"""Joints, grippers and poses that a person gives."""

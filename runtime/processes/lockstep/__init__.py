@@ -1,0 +1,1 @@
+"""All processes in one, on a virtual clock."""

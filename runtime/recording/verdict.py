@@ -1,0 +1,89 @@
+"""What a look at the files of a recording came to, in words and as JSON."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from runtime.core.errors import RecordingError
+
+UNSEALED = (
+    "it is from before recordings had digests: nobody can say whether its files are as they were written"
+)
+
+State = Literal["sound", "damaged", "unsealed", "open"]
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """What is wrong with one file of an episode, and in which rows; of events.jsonl in which lines."""
+
+    file: str
+    what: str
+    rows: tuple[tuple[int, int], ...] = ()  # first and last, both included
+    times: tuple[
+        tuple[float, float], ...
+    ] = ()  # of these rows [s since the episode began], where that is known
+
+    @property
+    def text(self) -> str:
+        """For a person."""
+        unit = "lines" if self.file.endswith(".jsonl") else "rows"
+        spans = [f"{first} to {last}" for first, last in self.rows]
+        times = [f"{first:.2f} to {last:.2f}" for first, last in self.times]
+        where = f", {unit} {', '.join(spans)}" if spans else ""
+        return f"{self.file} {self.what}{where}" + (f" ({', '.join(times)} s)" if times else "")
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Of one episode. "unsealed": nobody can say whether its files are as they were written. "open": it has no outcome.
+
+    `seal` is that of its outcome, or of the copy of it where that is lost; "" where there is neither.
+    """
+
+    path: Path
+    state: State
+    damage: tuple[Damage, ...] = ()
+    bytes: int = 0  # that were read
+    seal: str = ""
+    repaired: bool = False  # it was repair that sealed it: what was before that, it does not prove
+    why: str = ""  # of "unsealed" and "open", where there is more to be said
+
+    @property
+    def text(self) -> str:
+        """For a person."""
+        said = {
+            "sound": f"every file is as {'repair left it' if self.repaired else 'it was recorded'}",
+            "unsealed": self.why or UNSEALED,
+            "open": self.why or "it has no outcome: it is being recorded, or wants repair",
+            "damaged": "; ".join(one.text for one in self.damage),
+        }
+        return said[self.state]
+
+    def document(self) -> dict[str, Any]:
+        """As JSON."""
+        damage = [
+            {
+                "file": one.file,
+                "what": one.what,
+                "rows": [list(span) for span in one.rows],
+                "times": [list(span) for span in one.times],
+                "text": one.text,
+            }
+            for one in self.damage
+        ]
+        told = {"episode": self.path.name, "state": self.state, "text": self.text}
+        return {**told, "bytes": self.bytes, "damage": damage}
+
+
+class DamagedError(RecordingError):
+    """A recording is not what was recorded."""
+
+    def __init__(self, verdict: Verdict) -> None:
+        self.verdict = verdict
+        super().__init__(
+            f"{verdict.path} is damaged: {verdict.text}. It is left as it is and never published; bring its files "
+            "back from a copy"
+        )

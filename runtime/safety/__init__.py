@@ -1,0 +1,1 @@
+"""Whether an action may be sent: limits, workspace, collision, the last check."""

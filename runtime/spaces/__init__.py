@@ -1,0 +1,1 @@
+"""Joints, poses, formats and frames, as mathematics on arrays."""

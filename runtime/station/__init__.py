@@ -1,0 +1,1 @@
+"""One deployment with its robot, before anything is connected."""

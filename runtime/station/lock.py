@@ -1,0 +1,42 @@
+"""The lock that a station holds while it runs, so that there is one of each name in a data folder."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from typing import IO
+
+from runtime.config.schema import Deployment
+from runtime.core.errors import SetupError
+
+
+def hold(settings: Deployment) -> IO[str]:
+    """The lock of a station, for as long as it runs; SetupError names the process that has it, or why it cannot be."""
+    try:
+        return _locked(settings)
+    except OSError as error:
+        raise unwritable(settings, error) from None
+
+
+def unwritable(settings: Deployment, error: OSError) -> SetupError:
+    """What to say where the folder of a station cannot be written."""
+    return SetupError(
+        f"{settings.station_dir} cannot be written ({error.strerror}): make room there, or name another folder with "
+        "data_dir"
+    )
+
+
+def _locked(settings: Deployment) -> IO[str]:
+    settings.station_dir.mkdir(parents=True, exist_ok=True)
+    lock = (settings.station_dir / "lock").open("a+", encoding="utf-8")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.seek(0)
+        raise SetupError(
+            f"station {settings.station!r} is already running (process {lock.read().strip() or '?'}); "
+            "end it first, or give this one another name with --set station=NAME"
+        ) from None
+    lock.truncate(0)
+    os.write(lock.fileno(), str(os.getpid()).encode())
+    return lock
