@@ -9,11 +9,12 @@ from typing import Any
 from django.contrib.admin import AdminSite
 from django.contrib.auth.backends import BaseBackend
 from django.contrib.auth.forms import AuthenticationForm
-from django.http import HttpRequest
+from django.http import HttpRequest, HttpResponseRedirect
+from django.shortcuts import redirect
 
+from evaweb.blinding import sight_of
 from evaweb.errors import NotAllowed
 from evaweb.roles import Role, role_of
-from evaweb.sight import sight_of
 
 # Pages that say which checkpoint a trial, a recording, a command or a job is about.
 _TELLING = (
@@ -36,6 +37,10 @@ class LabAdminSite(AdminSite):
     def has_permission(self, request: HttpRequest) -> bool:
         """Whether this user is an admin."""
         return bool(request.user.is_active and is_admin(request.user))
+
+    def password_change(self, request: HttpRequest, extra_context: Any = None) -> HttpResponseRedirect:
+        """The lab's page for it, where guesses of the old password are counted."""
+        return redirect("password")
 
     def admin_view(self, view: Callable[..., Any], cacheable: bool = False) -> Callable[..., Any]:
         """With pages that would tell what is hidden from this administrator closed to them."""

@@ -10,18 +10,20 @@ from django.core.asgi import get_asgi_application
 
 http = get_asgi_application()  # before anything that imports models
 
-from channels.auth import AuthMiddlewareStack
 from channels.routing import ProtocolTypeRouter, URLRouter
 from channels.security.websocket import AllowedHostsOriginValidator
+from channels.sessions import CookieMiddleware
 
+from evaweb.api.door import StopDoor
 from evaweb.console.origins import SameOrigin
 from evaweb.console.routing import websocket_urlpatterns
+from evaweb.slots import Slots
 
 application = ProtocolTypeRouter(
     {
-        "http": http,
+        "http": StopDoor(Slots(http)),
         "websocket": SameOrigin(
-            AllowedHostsOriginValidator(AuthMiddlewareStack(URLRouter(websocket_urlpatterns)))
+            AllowedHostsOriginValidator(CookieMiddleware(URLRouter(websocket_urlpatterns)))
         ),
     }
 )

@@ -2,7 +2,7 @@
 
 A plan is blind for everybody who has not looked behind it, until it is revealed. Hidden are its checkpoints, and with
 them whatever tells one from another: names, addresses, figures of the policy, texts in which a server is named. Who
-hides what is declared from above (evaweb.plans.sight); without that nobody is shown anything.
+hides what is declared from above (evaweb.plans.blinding_rules); without that nobody is shown anything.
 """
 
 from __future__ import annotations
@@ -146,7 +146,9 @@ def declare(find: Callable[[Any], Sight]) -> None:
 def sight_of(user: Any) -> Sight:
     """What is hidden from this user now."""
     if _find is None:
-        raise ImproperlyConfigured("nobody has declared what is hidden from whom (evaweb.plans.sight does)")
+        raise ImproperlyConfigured(
+            "nobody has declared what is hidden from whom (evaweb.plans.blinding_rules does)"
+        )
     return _find(user)
 
 

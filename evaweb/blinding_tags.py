@@ -6,7 +6,7 @@ from typing import Any
 
 from django import template
 
-from evaweb.sight import code_of, sight_for
+from evaweb.blinding import code_of, sight_for
 
 register = template.Library()
 

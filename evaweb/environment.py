@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import secrets
+from contextlib import suppress
 from importlib.util import find_spec
+from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
@@ -43,6 +45,17 @@ def seconds(name: str, default: float) -> float:
     if not 0 < value < float("inf"):
         raise ImproperlyConfigured(f"{name} = {given!r}; allowed: seconds above zero")
     return value
+
+
+def networks(name: str) -> list[IPv4Network | IPv6Network]:
+    """Addresses and networks, separated by commas; none where it is not given."""
+    try:
+        return [ip_network(word) for word in words(name)]
+    except ValueError as error:
+        given = os.environ[name]
+        raise ImproperlyConfigured(
+            f"{name} = {given!r}: {error}; allowed: addresses and networks such as 127.0.0.1, 10.0.0.0/24"
+        ) from None
 
 
 def log_level(name: str, default: str) -> str:
@@ -86,10 +99,10 @@ def checkout(folder: Path) -> Path:
 
 
 def data_dir(default: Path) -> Path:
-    """The folder that holds everything of this lab; created where it is absent."""
+    """The folder that holds everything of this lab; created for its user alone where it is absent."""
     folder = Path(os.environ.get("EVA_DATA_DIR") or default).expanduser().absolute()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise ImproperlyConfigured(
             f"EVA_DATA_DIR = {folder}: {error.strerror}; name a folder that can be written"
@@ -98,9 +111,32 @@ def data_dir(default: Path) -> Path:
 
 
 def private_file(path: Path) -> Path:
-    """`path`, made empty where it is absent: for its user alone, as is what SQLite puts beside it."""
+    """`path`, made empty where it is absent: for its user alone, as is what SQLite puts beside it.
+
+    One that was copied back from somewhere, readable by others, no longer is.
+    """
     os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
+    for file in beside(path):
+        _take_from_others(file)
     return path
+
+
+def beside(database: Path) -> list[Path]:
+    """A file of SQLite with those of its journal, as far as they are there."""
+    names = [database, *(database.with_name(database.name + end) for end in ("-wal", "-shm", "-journal"))]
+    return [path for path in names if path.exists()]
+
+
+def readable_by_others(path: Path) -> bool:
+    """Whether its mode lets anybody but its user read or write it."""
+    return bool(path.stat().st_mode & 0o077)
+
+
+def _take_from_others(path: Path) -> None:
+    """Where it is somebody else's file it stays; evaweb.private says so at every start."""
+    if readable_by_others(path):
+        with suppress(PermissionError):
+            path.chmod(0o600)
 
 
 def secret_key(folder: Path) -> str:
@@ -112,6 +148,7 @@ def secret_key(folder: Path) -> str:
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:
+        _take_from_others(path)
         found = path.read_text("utf-8").strip()
         if not found:
             raise ImproperlyConfigured(f"{path} is empty: remove it, and everybody logs in anew") from None

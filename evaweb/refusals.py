@@ -1,21 +1,121 @@
-"""Turns an EvaError that a page raises into its HTTP answer; evaweb.api does the same for REST."""
+"""Turns an EvaError that a page raises into its HTTP answer; evaweb.api does the same for REST.
+
+What fails before a view is reached or after it is said here too: to programs as JSON.
+"""
 
 from __future__ import annotations
 
+import logging
+import re
+import sys
+from typing import Any
+
+from django.contrib.auth.middleware import LoginRequiredMiddleware
+from django.db import Error
 from django.http import HttpRequest, HttpResponse, JsonResponse
+from django.http.response import HttpResponseBase
 from django.shortcuts import render
 from django.utils.deprecation import MiddlewareMixin
+from django.views import defaults
 
 from evaweb.errors import EvaError
+from evaweb.storage import refusal_of
+
+log = logging.getLogger(__name__)
+_NO_TEXT = re.compile("[\x00\ud800-\udfff]")
+
+
+class LoginMiddleware(LoginRequiredMiddleware):
+    """Django's own, which asks the database for the user of every address, also where nobody need be logged in."""
+
+    def process_view(self, request: HttpRequest, view: Any, *given: Any) -> HttpResponseBase | None:
+        if not getattr(view, "login_required", True):
+            return None
+        found: HttpResponseBase | None = super().process_view(request, view, *given)
+        return found
 
 
 class RefusalMiddleware(MiddlewareMixin):
     """A page with the sentence for a browser that navigates, {"error": sentence} for everything else."""
 
+    def process_view(self, request: HttpRequest, *given: Any) -> HttpResponse | None:
+        # REST reads its body itself, and looks at it in evaweb.api.questions.
+        fields = [request.GET] if _of_programs(request) else [request.GET, request.POST]
+        texts = (text for one in fields for name, values in one.lists() for text in (name, *values))
+        if not is_text(request.path):
+            return told(request, "there is a NUL in the address", 404, "refused.html")
+        if not all(map(is_text, texts)):
+            return told(request, "there is a NUL in what was sent; allowed: text", 400, "refused.html")
+        return None
+
+    def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
+        """What was refused without a word, or to a program in HTML, is said as everything is."""
+        status = response.status_code
+        spoken = response.headers.get("Content-Type", "").startswith("application/json")
+        if status < 400 or spoken or not (_of_programs(request) or status == 405):
+            return response
+        said = told(request, _sentence_of(request, response), status, "refused.html")
+        if "Allow" in response.headers:
+            said["Allow"] = response["Allow"]
+        return said
+
     def process_exception(self, request: HttpRequest, exception: Exception) -> HttpResponse | None:
+        if _is_no_number(exception):
+            log.warning("%a was refused", request.path, exc_info=exception)
+            return told(request, f"{exception!s:.120}", 400, "refused.html")
         if not isinstance(exception, EvaError):
             return None
-        if "text/html" in request.headers.get("Accept", ""):
-            context = {"sentence": str(exception), "status": exception.status}
-            return render(request, "refused.html", context, status=exception.status)
-        return JsonResponse({"error": str(exception)}, status=exception.status)
+        return told(request, str(exception), exception.status, "refused.html")
+
+
+def nowhere(path: str) -> str:
+    """What is said of an address of REST that there is not."""
+    return f"{path} does not exist; docs/openapi.json and /api/v1/openapi.json list the addresses"
+
+
+def _sentence_of(request: HttpRequest, response: HttpResponseBase) -> str:
+    if response.status_code == 404:
+        return nowhere(request.path)
+    if response.status_code == 405:
+        allowed = response.headers.get("Allow") or "nothing"
+        return f"{request.method:.20} is not possible at this address; allowed: {allowed}"
+    return response.reason_phrase
+
+
+def _is_no_number(exception: Exception) -> bool:
+    """Whether forms have let through what is no number of the database's."""
+    return isinstance(exception, OverflowError) or "expected a number but got" in str(exception)
+
+
+def is_text(given: str) -> bool:
+    """Whether every database and every wire takes it: no NUL, no half of a character."""
+    return _NO_TEXT.search(given) is None
+
+
+def told(request: HttpRequest, sentence: str, status: int, template: str) -> HttpResponse:
+    """`template` with the sentence for a browser that navigates, {"error": sentence} for everything else."""
+    if "text/html" in request.headers.get("Accept", "") and not _of_programs(request):
+        return render(request, template, {"sentence": sentence, "status": status}, status=status)
+    return JsonResponse({"error": sentence}, status=status)
+
+
+def bad_request(request: HttpRequest, exception: Exception) -> HttpResponse:
+    """handler400: such as a host that is not allowed."""
+    return told(request, f"{exception!s:.300}" or "bad request", 400, "unavailable.html")
+
+
+def server_error(request: HttpRequest) -> HttpResponse:
+    """handler500: what the disk or the database refused, with a sentence, or a fault of ours."""
+    fault = sys.exc_info()[1]
+    refused = refusal_of(fault)
+    if refused is not None:
+        return told(request, *refused, "unavailable.html")
+    if not _of_programs(request):
+        return defaults.server_error(request)
+    if isinstance(fault, Error):
+        return JsonResponse({"error": "the database is busy or gone: try again"}, status=503)
+    return JsonResponse({"error": "this failed; the log of the web has why"}, status=500)
+
+
+def _of_programs(request: HttpRequest) -> bool:
+    return request.path.startswith("/api/")

@@ -20,6 +20,11 @@ class Role(StrEnum):
     OPERATOR = "operator"
     ADMIN = "admin"
 
+    @property
+    def a(self) -> str:
+        """With its article, as sentences say it."""
+        return f"a {self}" if self is Role.VIEWER else f"an {self}"
+
 
 _RANK = {Role.VIEWER: 0, Role.OPERATOR: 1, Role.ADMIN: 2}
 
@@ -32,11 +37,12 @@ def role_of(user: Any) -> Role:
     return max((role for role in Role if role.value in held), key=_RANK.__getitem__, default=Role.VIEWER)
 
 
-def require(user: Any, role: Role) -> None:
-    """Raise NotAllowed unless the user has at least `role`."""
+def require(user: Any, role: Role) -> Role:
+    """The role of the user; NotAllowed unless it is at least `role`."""
     has = role_of(user)
     if _RANK[has] < _RANK[role]:
-        raise NotAllowed(f"{user.get_username()} is a {has}; this needs an {role}: ask an administrator")
+        raise NotAllowed(f"{user.get_username()} is {has.a}; this needs {role.a}: ask an administrator")
+    return has
 
 
 @transaction.atomic

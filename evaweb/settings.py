@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from importlib.metadata import files
+from datetime import timedelta
+from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
 import dj_database_url
 from django.core.exceptions import ImproperlyConfigured
 
-from evaweb import environment
+from evaweb import environment, headers
 
 BASE_DIR = environment.checkout(Path(__file__).parents[1])
 DATA_DIR = environment.data_dir(BASE_DIR / "data")
@@ -27,6 +28,8 @@ INSTALLED_APPS = [
     "django.contrib.messages",
     "django.contrib.staticfiles",
     "django_htmx",
+    "axes",
+    "csp",
     "channels",
     "evaweb.stations",
     "evaweb.jobs",
@@ -44,17 +47,20 @@ INSTALLED_APPS = [
 ]
 
 MIDDLEWARE = [
+    "evaweb.headers.HeadersMiddleware",
     "django.middleware.security.SecurityMiddleware",
+    "csp.middleware.CSPMiddleware",
     "whitenoise.middleware.WhiteNoiseMiddleware",
     "django.contrib.sessions.middleware.SessionMiddleware",
     "django.middleware.common.CommonMiddleware",
     "django.middleware.csrf.CsrfViewMiddleware",
     "django.contrib.auth.middleware.AuthenticationMiddleware",
-    "django.contrib.auth.middleware.LoginRequiredMiddleware",
+    "evaweb.refusals.LoginMiddleware",
     "django.contrib.messages.middleware.MessageMiddleware",
     "django.middleware.clickjacking.XFrameOptionsMiddleware",
     "django_htmx.middleware.HtmxMiddleware",
     "evaweb.refusals.RefusalMiddleware",
+    "axes.middleware.AxesMiddleware",
 ]
 
 ROOT_URLCONF = "evaweb.urls"
@@ -74,7 +80,7 @@ TEMPLATES = [
                 "django.contrib.auth.context_processors.auth",
                 "django.contrib.messages.context_processors.messages",
             ],
-            "builtins": ["evaweb.sight_tags"],  # no template names a checkpoint in another way
+            "builtins": ["evaweb.blinding_tags"],  # no template names a checkpoint in another way
         },
     }
 ]
@@ -88,6 +94,15 @@ _SQLITE = {
 }
 
 
+_POSTGRESQL = {
+    "connect_timeout": 10,  # of the web shorter: evaweb.lock_wait
+    "tcp_user_timeout": 10_000,  # ms, for a server whose machine is gone
+    "keepalives_idle": 5,
+    "keepalives_interval": 2,
+    "keepalives_count": 3,
+}
+
+
 def _database() -> dict[str, object]:
     url = os.environ.get("DATABASE_URL")
     if not url:
@@ -95,7 +110,8 @@ def _database() -> dict[str, object]:
         name = environment.private_file(DATA_DIR / "eva.sqlite3")
         return {"ENGINE": "django.db.backends.sqlite3", "NAME": name, "OPTIONS": _SQLITE}
     try:
-        found = dj_database_url.parse(url, conn_max_age=60, conn_health_checks=True)
+        # Each request has a thread of its own: a connection that outlived its request would never be used again.
+        found = dj_database_url.parse(url, conn_max_age=0)
     except (ValueError, dj_database_url.ParseError) as error:
         raise ImproperlyConfigured(
             f"DATABASE_URL: {error}; for example postgres://user:password@host/name"
@@ -103,6 +119,8 @@ def _database() -> dict[str, object]:
     environment.require_driver("DATABASE_URL", found["ENGINE"])
     if found["ENGINE"].endswith("sqlite3"):
         found["OPTIONS"] = _SQLITE
+    if found["ENGINE"].endswith("postgresql"):
+        found["OPTIONS"] = {**_POSTGRESQL, **found.get("OPTIONS", {})}
     return dict(found)
 
 
@@ -116,23 +134,24 @@ REDIS_URL = os.environ.get("REDIS_URL", "")  # of evaweb.celery; without it a fo
 # --- static files ------------------------------------------------------------------------------------------
 
 
-def _viewer() -> Path:
-    """The folder of the 3D viewer's script; the Python package around it is never imported."""
-    for file in files("meshcat") or ():
-        if file.name == "main.min.js" and file.parent.name == "dist":
-            return Path(str(file.locate())).parent
-    raise ImproperlyConfigured(
-        "the package meshcat is installed without its viewer: pip install --force-reinstall meshcat"
-    )
+def _viewer() -> Path | None:
+    """The folder of the 3D viewer's script; the Python package around it, and what that wants, is never imported."""
+    try:
+        brought = files("meshcat") or ()
+    except PackageNotFoundError:
+        return None
+    scripts = [file for file in brought if file.name == "main.min.js" and file.parent.name == "dist"]
+    return Path(str(scripts[0].locate())).parent if scripts else None
 
 
 STATIC_URL = "static/"
 STATIC_ROOT = DATA_DIR / "static"  # for a web server in front; our own processes serve from the sources
 STATIC_ROOT.mkdir(exist_ok=True)
-STATICFILES_DIRS: list[object] = [BASE_DIR / "static", ("meshcat", _viewer())]
-_UPLOT = BASE_DIR / "node_modules" / "uplot" / "dist"
-if _UPLOT.is_dir():  # `make setup` brings it; the system check of evaweb.console says so where it is absent
-    STATICFILES_DIRS.append(("uplot", _UPLOT))
+STATICFILES_DIRS: list[object] = [BASE_DIR / "static"]
+# `make setup` brings both; the system check of evaweb.console says so where one is absent.
+for _name, _folder in (("meshcat", _viewer()), ("uplot", BASE_DIR / "node_modules" / "uplot" / "dist")):
+    if _folder is not None and _folder.is_dir():
+        STATICFILES_DIRS.append((_name, _folder))
 WHITENOISE_USE_FINDERS = True
 WHITENOISE_MAX_AGE = 0  # names carry no hash: a browser asks each time, and is told that nothing changed
 
@@ -142,32 +161,50 @@ LANGUAGE_CODE = "en-gb"
 TIME_ZONE = environment.time_zone("EVA_TIME_ZONE", "UTC")
 USE_TZ = True
 SESSION_COOKIE_AGE = 14 * 24 * 3600
-SESSION_COOKIE_SECURE = CSRF_COOKIE_SECURE = environment.flag("EVA_HTTPS", False)
-SECURE_PROXY_SSL_HEADER = (
-    ("HTTP_X_FORWARDED_PROTO", "https") if environment.flag("EVA_HTTPS", False) else None
-)
+_HTTPS = environment.flag("EVA_HTTPS", False)
+SESSION_COOKIE_SECURE = CSRF_COOKIE_SECURE = _HTTPS
+SECURE_PROXY_SSL_HEADER = ("HTTP_X_FORWARDED_PROTO", "https") if _HTTPS else None
+# Browsers remember for so long that this name is reached over HTTPS alone; a month, so that it can be taken back.
+SECURE_HSTS_SECONDS = int(environment.seconds("EVA_HSTS_S", 30 * 24 * 3600)) if _HTTPS else 0
+CONTENT_SECURITY_POLICY = headers.CONTENT_SECURITY_POLICY
 SECURE_REFERRER_POLICY = "same-origin"
 X_FRAME_OPTIONS = "DENY"
 AUTHENTICATION_BACKENDS = [
+    "axes.backends.AxesStandaloneBackend",
     "django.contrib.auth.backends.ModelBackend",
     "evaweb.administration.RoleBackend",
 ]
-PASSWORD_HASHERS = ["django.contrib.auth.hashers.PBKDF2PasswordHasher"]
+PASSWORD_HASHERS = ["evaweb.hashing.QueuedHasher"]  # whose hashes are those of PBKDF2PasswordHasher
 AUTH_PASSWORD_VALIDATORS = [
     {"NAME": "django.contrib.auth.password_validation.UserAttributeSimilarityValidator"},
     {"NAME": "django.contrib.auth.password_validation.MinimumLengthValidator"},
     {"NAME": "django.contrib.auth.password_validation.CommonPasswordValidator"},
 ]
+# A name is locked at an address, not everywhere: nobody can lock others out from elsewhere.
+AXES_LOCKOUT_PARAMETERS = [["username", "ip_address"]]
+AXES_FAILURE_LIMIT = 5
+AXES_COOLOFF_TIME = timedelta(minutes=15)
+AXES_RESET_ON_SUCCESS = True
+AXES_RESET_COOL_OFF_ON_FAILURE_DURING_LOCKOUT = False
+AXES_CLIENT_IP_CALLABLE = "evaweb.callers.address_of"
+AXES_LOCKOUT_CALLABLE = "evaweb.lockout.answer"
+AXES_SENSITIVE_PARAMETERS = ["username", "ip_address", "csrfmiddlewaretoken"]
+AXES_DISABLE_ACCESS_LOG = True  # evaweb.audit logs who comes and goes
+AXES_ENABLE_ADMIN = False  # evaweb.api.admin has a page of its own
+AXES_VERBOSE = False
 LOGGING = {
     "version": 1,
     "disable_existing_loggers": False,
     "formatters": {"line": {"format": "%(asctime)s %(levelname)s %(name)s: %(message)s"}},
     "handlers": {"console": {"class": "logging.StreamHandler", "formatter": "line"}},
+    "loggers": {"axes": {"level": "ERROR"}},  # what it tells of logins evaweb.audit tells better
     "root": {"handlers": ["console"], "level": environment.log_level("EVA_LOG_LEVEL", "INFO")},
 }
 
 # --- ours --------------------------------------------------------------------------------------------------
 
+# The proxies in front, whose X-Forwarded-For is believed.
+EVA_PROXIES = environment.networks("EVA_PROXIES")
 # How long a request waits for a station's answer [s]; after it the outcome is unknown.
 EVA_COMMAND_TIMEOUT_S = environment.seconds("EVA_COMMAND_TIMEOUT_S", 2.0)
 # Without a sign of life for so long a worker's job is taken from it [s].

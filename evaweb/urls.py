@@ -9,6 +9,7 @@ from django.http import HttpRequest, HttpResponse
 from django.urls import include, path
 
 from evaweb.api.urls import urls as rest
+from evaweb.passwords import OwnPasswordView
 
 
 @login_not_required
@@ -17,19 +18,12 @@ async def healthz(request: HttpRequest) -> HttpResponse:
     return HttpResponse("ok\n", content_type="text/plain")
 
 
+handler400, handler500 = "evaweb.refusals.bad_request", "evaweb.refusals.server_error"
 urlpatterns = [
     path("healthz", healthz),
     path("login/", auth_views.LoginView.as_view(redirect_authenticated_user=True), name="login"),
     path("logout/", auth_views.LogoutView.as_view(), name="logout"),
-    path(
-        "password/",
-        auth_views.PasswordChangeView.as_view(
-            template_name="registration/password.html",
-            success_url="/",
-            extra_context={"title": "Your password"},
-        ),
-        name="password",
-    ),
+    path("password/", OwnPasswordView.as_view(), name="password"),
     path("admin/", admin.site.urls),
     path("api/v1/", rest),
     path("", include("evaweb.console.urls")),

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
+from axes.models import AccessAttempt
 from django import forms
+from django.conf import settings
 from django.contrib import admin
 from django.contrib.auth.admin import UserAdmin
 from django.contrib.auth.forms import UserChangeForm, UserCreationForm
 from django.contrib.auth.models import Group, User
 from django.db.models import QuerySet
 from django.http import HttpRequest
+from django.utils import timezone
 
 from evaweb.api.models import Token
 from evaweb.roles import Role, grant, role_of
 
+log = logging.getLogger(__name__)
 _MEANINGS = (
     "A viewer sees everything and can press the e-stop. An operator also takes stations, runs and scores "
     "trials. An admin also writes scenes, checkpoints, stations and accounts."
@@ -130,7 +135,7 @@ admin.site.register(User, AccountAdmin)
 class TokenAdmin(admin.ModelAdmin):
     """Tokens are made by `manage.py api_token USER NAME`, and revoked here by deleting them."""
 
-    list_display = ("name", "user", "created_at", "used_at")
+    list_display = ("name", "user", "created_at", "ends_at", "used_at")
     list_filter = ("user",)
     search_fields = ("name", "user__username")
 
@@ -141,3 +146,37 @@ class TokenAdmin(admin.ModelAdmin):
     def has_change_permission(self, request: HttpRequest, obj: Token | None = None) -> bool:
         """Nobody."""
         return False
+
+    def log_deletions(self, request: HttpRequest, queryset: QuerySet[Token]) -> Any:
+        """Also where logins are logged."""
+        for token in queryset:
+            log.info(
+                "token %a of %a is withdrawn by %a",
+                token.name,
+                token.user.get_username(),
+                request.user.get_username(),
+            )
+        return super().log_deletions(request, queryset)
+
+
+@admin.register(AccessAttempt)
+class AttemptAdmin(admin.ModelAdmin):
+    """Logins that failed of late; removing them unlocks the name at that address."""
+
+    list_display = ("username", "ip_address", "failures_since_start", "attempt_time", "locks")
+    search_fields = ("username", "ip_address")
+    fields = ("username", "ip_address", "user_agent", "failures_since_start", "attempt_time")
+
+    def has_add_permission(self, request: HttpRequest) -> bool:
+        """Nobody."""
+        return False
+
+    def has_change_permission(self, request: HttpRequest, obj: AccessAttempt | None = None) -> bool:
+        """Nobody."""
+        return False
+
+    @admin.display(boolean=True, description="locks the name there")
+    def locks(self, attempt: AccessAttempt) -> bool:
+        """Whether it alone is enough, and still counts."""
+        counts = timezone.now() - attempt.attempt_time < settings.AXES_COOLOFF_TIME
+        return counts and attempt.failures_since_start >= settings.AXES_FAILURE_LIMIT

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from django.db import OperationalError
+from django.db import InterfaceError, InternalError, OperationalError
 from django.http import Http404, HttpRequest, HttpResponse
 from ninja import NinjaAPI
 from ninja.errors import AuthenticationError, HttpError, ValidationError, ValidationErrorContext
@@ -27,11 +27,14 @@ from evaweb.api import (
     trials,
 )
 from evaweb.api.auth import Bearer, Session
-from evaweb.api.questions import only_known
+from evaweb.api.questions import Bounded, only_known
 from evaweb.errors import EvaError
+from evaweb.storage import refusal_of
+from runtime.core import bounded_documents as bounded
 
 log = logging.getLogger(__name__)
 _WRAPPERS = ("given", "filters", "paging")  # parameters of views that stand for the whole question
+_MOST_SAID = 10  # faults of one question
 
 
 class _Api(NinjaAPI):
@@ -51,6 +54,7 @@ class _Api(NinjaAPI):
 
 
 api = _Api(
+    parser=Bounded(),
     title="EVA Web",
     version="1",
     urls_namespace="api",
@@ -94,13 +98,17 @@ def _not_logged_in(request: HttpRequest, fault: AuthenticationError) -> HttpResp
 
 @api.exception_handler(ValidationError)
 def _malformed(request: HttpRequest, fault: ValidationError) -> HttpResponse:
-    said = "; ".join(_sentence(error) for error in fault.errors)
-    return _failure(request, said, 422)
+    said = [_sentence(error) for error in fault.errors[:_MOST_SAID]]
+    more = len(fault.errors) - len(said)
+    return _failure(request, "; ".join(said) + (f"; and {more} more" if more > 0 else ""), 422)
 
 
 @api.exception_handler(HttpError)
 def _http(request: HttpRequest, fault: HttpError) -> HttpResponse:
-    return _failure(request, str(fault), fault.status_code)
+    cause = fault.__cause__  # why a body was not read: Ninja itself says only that it was not
+    if isinstance(cause, Exception) and not isinstance(cause, bounded.Unreadable):
+        return api.on_exception(request, cause)
+    return _failure(request, str(cause or fault), fault.status_code)
 
 
 @api.exception_handler(Http404)
@@ -109,9 +117,15 @@ def _nowhere(request: HttpRequest, fault: Http404) -> HttpResponse:
 
 
 @api.exception_handler(OperationalError)
-def _database(request: HttpRequest, fault: OperationalError) -> HttpResponse:
-    log.error("the database did not take %s %s: %s", request.method, request.path, fault)
-    return _failure(request, f"the database is busy or gone ({fault}): nothing was changed, try again", 503)
+@api.exception_handler(InterfaceError)
+@api.exception_handler(InternalError)
+@api.exception_handler(OSError)
+def _storage(request: HttpRequest, fault: Exception) -> HttpResponse:
+    refused = refusal_of(fault)
+    if refused is None:
+        raise fault
+    log.error("%s %s was not taken: %s", request.method, request.path, fault)
+    return _failure(request, *refused)
 
 
 def _failure(request: HttpRequest, sentence: str, status: int) -> HttpResponse:
@@ -121,5 +135,5 @@ def _failure(request: HttpRequest, sentence: str, status: int) -> HttpResponse:
 def _sentence(error: Any) -> str:
     place = ".".join(str(part) for part in error["loc"] if part not in _WRAPPERS) or "body"
     given = error["input"]
-    shown = "" if given is None or isinstance(given, dict | bytes) else f" = {given!r:.80}"
+    shown = f" = {given!r:.80}" if isinstance(given, str | int | float) else ""
     return f"{place}{shown}: {error['msg']}"

@@ -8,3 +8,7 @@ class ApiConfig(AppConfig):
 
     name = "evaweb.api"
     default_auto_field = "django.db.models.BigAutoField"
+
+    def ready(self) -> None:
+        """Listen to changes of passwords."""
+        from evaweb.api import passwords  # noqa: F401  its receiver

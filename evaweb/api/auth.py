@@ -7,7 +7,10 @@ from typing import Any
 from django.http import HttpRequest
 from ninja.security import HttpBearer, SessionAuth
 
-from evaweb.api.tokens import token_user
+from evaweb import audit
+from evaweb.api.tokens import UNKNOWN
+from evaweb.callers import address_of
+from evaweb.credentials import SESSION, TOKEN, credentials
 from evaweb.errors import EvaError
 
 
@@ -22,9 +25,10 @@ class Bearer(HttpBearer):
 
     def authenticate(self, request: HttpRequest, token: str) -> Any:
         """The token's user; a wrong token is an error, even where a session would do."""
-        user = token_user(secret=token)
+        user = credentials.look(TOKEN, token)
         if user is None:
-            raise NotLoggedIn("the token is not known: make one with manage.py api_token USER NAME")
+            audit.token_refused(address_of(request), UNKNOWN)
+            raise NotLoggedIn(f"the token {UNKNOWN}: make one with manage.py api_token USER NAME")
         return user
 
 
@@ -34,4 +38,7 @@ class Session(SessionAuth):
     def _get_key(self, request: HttpRequest) -> str | None:
         if not request.user.is_authenticated:  # 401 before CSRF's 403: log in first
             return None
-        return super()._get_key(request)
+        key = super()._get_key(request)
+        if key:
+            credentials.note(SESSION, key, request.user)
+        return key

@@ -9,7 +9,7 @@ from django.http import HttpRequest
 from ninja import Query, Router, Schema
 
 from evaweb.api.answers import FAILURES, Page, Paging
-from evaweb.sight import sight_for
+from evaweb.blinding import sight_for
 from evaweb.trials import selectors
 from evaweb.trials.models import Checkpoint
 

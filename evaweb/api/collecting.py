@@ -11,10 +11,10 @@ from ninja import Field, Query, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.jobs import JobOut
+from evaweb.blinding import Sight, sight_for
 from evaweb.collect import selectors, services
 from evaweb.collect.models import CollectSession
 from evaweb.collect.work import Item, queue_of
-from evaweb.sight import Sight, sight_for
 from evaweb.stations.selectors import station_get
 
 router = Router(tags=["collecting"])

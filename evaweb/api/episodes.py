@@ -12,13 +12,13 @@ from ninja import Field, Query, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.jobs import JobOut
+from evaweb.blinding import Sight, sight_for
 from evaweb.episodes import services
 from evaweb.episodes.exporting import CONTENT_TYPE, table_file
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.streaming import file_answer
 from evaweb.errors import NotFound
 from evaweb.roles import Role, require
-from evaweb.sight import Sight, sight_for
 from evaweb.stations.selectors import station_get
 
 router = Router(tags=["episodes"])

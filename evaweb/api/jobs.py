@@ -9,11 +9,11 @@ from django.http import HttpRequest
 from ninja import Query, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.blinding import HIDDEN, Sight, sight_for
 from evaweb.jobs import services
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import job_get
 from evaweb.roles import Role, require
-from evaweb.sight import HIDDEN, Sight, sight_for
 
 router = Router(tags=["jobs"])
 

@@ -13,6 +13,7 @@ class Token(models.Model):
     name = models.CharField(max_length=80, help_text="What uses it.")
     digest = models.CharField(max_length=64, unique=True, editable=False)
     created_at = models.DateTimeField(auto_now_add=True)
+    ends_at = models.DateTimeField(editable=False)
     used_at = models.DateTimeField(null=True, blank=True, editable=False)
 
     class Meta:

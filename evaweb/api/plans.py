@@ -10,12 +10,13 @@ from ninja import Field, Query, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.trials import TrialDetail
-from evaweb.plans import bench, services
-from evaweb.plans.handing import give_back, progress
+from evaweb.blinding import sight_for
+from evaweb.plans import bench_checks as bench
+from evaweb.plans import services
+from evaweb.plans.allocation import give_back, progress
+from evaweb.plans.blinding_rules import look, sealed_for
 from evaweb.plans.models import Achieved, CameraCheck, Plan, PlanState, Reference
 from evaweb.plans.selectors import plan_get, plan_list
-from evaweb.plans.sight import look, sealed_for
-from evaweb.sight import sight_for
 from evaweb.stations.selectors import station_get
 from evaweb.trials import selectors as trials
 

@@ -10,10 +10,10 @@ from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.blinding import sight_for
 from evaweb.preflights import selectors, services
+from evaweb.preflights.blinding_rules import shown
 from evaweb.preflights.models import Preflight, PreflightStatus
-from evaweb.preflights.sight import shown
-from evaweb.sight import sight_for
 from evaweb.stations.selectors import station_get
 from evaweb.trials.selectors import checkpoint_get
 

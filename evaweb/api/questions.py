@@ -1,14 +1,25 @@
-"""What a question may ask: a parameter nobody knows is refused, because a filter that is misspelt filters nothing."""
+"""What a question may ask, and what a body may say.
+
+A parameter nobody knows is refused, because a filter that is misspelt filters nothing. A body is measured and read
+when it is known who sends it, and text that no database and no wire takes is refused before anything is done with it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import wraps
 from typing import Any
 
 from django.http import HttpRequest
+from ninja.parser import Parser
 
 from evaweb.errors import EvaError
+from evaweb.posts import post_at
+from evaweb.refusals import is_text
+from evaweb.roles import require
+from evaweb.stations.commands import STOPPING
+from runtime.core import bounded_documents as bounded
+from runtime.ipc import estop_requests as pressing
 
 View = Callable[..., Any]
 
@@ -20,7 +31,7 @@ class UnknownParameter(EvaError):
 
 
 def only_known(view: View) -> View:
-    """Wrap the view of an operation: of a reading one every parameter of the query has to be known."""
+    """Wrap the view of an operation: every parameter of a query has to be known."""
 
     @wraps(view)
     def asked(request: HttpRequest, *args: Any, **named: Any) -> Any:
@@ -41,3 +52,52 @@ def _check(given: set[str], known: list[str]) -> None:
     unknown = ", ".join(sorted(given - set(known)))
     if unknown:
         raise UnknownParameter(f"{unknown:.200}: unknown parameter; allowed: {', '.join(known) or 'none'}")
+
+
+class TooLong(EvaError):
+    """More than is needed there."""
+
+    status = 413
+
+
+class Bounded(Parser):
+    """Reads a body when it is known who sends it; that of a press of the e-stop may be anything."""
+
+    def parse_body(self, request: Any) -> Any:
+        """What the JSON says, which is text that can be kept; NotAllowed, TooLong, Unreadable, EvaError."""
+        pressed = request.path.endswith("/estop")
+        if not (request.path.endswith("/commands") and pressing.in_json(request.body, "kind")):
+            require(request.auth, post_at(request.path).role)
+        try:
+            return _read(request)
+        except (EvaError, bounded.Unreadable):
+            if pressed:
+                return {}
+            raise
+
+
+def _read(request: HttpRequest) -> Any:
+    post = post_at(request.path)
+    if len(request.body) > post.largest:
+        raise TooLong(f"the body has {len(request.body)} bytes; allowed here: at most {post.largest}")
+    given = bounded.from_json(request.body, "the body", most=post.values)
+    if b"\\u" in request.body and not (isinstance(given, dict) and given.get("kind") in STOPPING):
+        for place, text in _texts(given):
+            if not is_text(text):
+                raise EvaError(
+                    f"{place or 'body'} = {text!r:.80}: allowed: text without NUL and half characters"
+                )
+    return given
+
+
+def _texts(given: Any, place: str = "") -> Iterator[tuple[str, str]]:
+    """Every string with where it stands, names of fields as well."""
+    if isinstance(given, str):
+        yield place, given
+    elif isinstance(given, list):
+        for value in given:
+            yield from _texts(value, place)
+    elif isinstance(given, dict):
+        for name, value in given.items():
+            yield place, name
+            yield from _texts(value, f"{place}.{name}".strip("."))

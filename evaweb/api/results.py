@@ -12,19 +12,19 @@ from pydantic import create_model
 
 from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.tables import Format, table_answer
-from evaweb.cells import in_pages
 from evaweb.errors import NotFound
 from evaweb.plans.models import Plan
-from evaweb.results import caching
-from evaweb.results.agreement import agreement_of, preferences_of
-from evaweb.results.analysis import Analysis
-from evaweb.results.document import analysis_document, arm_document, comparison_document
-from evaweb.results.filters import Chosen, chosen
+from evaweb.results.analysis import caching
+from evaweb.results.analysis.agreement import agreement_of, preferences_of
+from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.filters import Chosen, chosen
+from evaweb.results.analysis.planner import Question, question_of, table_of
 from evaweb.results.models import Preference, Rating
-from evaweb.results.planner import Question, question_of, table_of
-from evaweb.results.seen import require_seen
+from evaweb.results.ratings.unblinding import require_seen
+from evaweb.results.reports.document import analysis_document, arm_document, comparison_document
+from evaweb.results.reports.tables import COLUMNS, outcome_page, outcome_pages
 from evaweb.results.selectors import plan_get
-from evaweb.results.tables import COLUMNS, outcome_page, outcome_pages
+from evaweb.tabular_export import in_pages
 from evaweb.trials.models import Score
 
 router = Router(tags=["results"])

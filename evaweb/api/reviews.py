@@ -11,11 +11,11 @@ from ninja import Field, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES
 from evaweb.api.jobs import JobOut
+from evaweb.blinding import sight_for
 from evaweb.episodes.selectors import episode_get
 from evaweb.reviews import selectors, services
 from evaweb.reviews.models import Review, Segment
 from evaweb.roles import Role, require
-from evaweb.sight import sight_for
 
 router = Router(tags=["reviews"])
 

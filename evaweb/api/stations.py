@@ -7,28 +7,31 @@ from datetime import datetime
 from typing import Annotated, Any, Literal
 from uuid import UUID, uuid4
 
-from django.db import DatabaseError
 from django.http import HttpRequest
+from django.utils import timezone
 from ninja import Field, Router, Schema, Status
 from pydantic import AfterValidator, ValidationError, field_validator
 
 from evaweb.api.answers import FAILURES, Failure
 from evaweb.api.trials import TrialDetail
-from evaweb.collect.bench import session_command
+from evaweb.blinding import Sight, sight_for
 from evaweb.collect.selectors import session_get
+from evaweb.collect.station_commands import session_command
+from evaweb.datasets.on_robot import replay_command
 from evaweb.errors import EvaError, StationGone
-from evaweb.sight import Sight, sight_for
-from evaweb.stations import commands, leases, selectors, stops, veil
+from evaweb.stations import commands, leases, selectors, stops
+from evaweb.stations import redaction as veil
 from evaweb.stations.holders import who
 from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
-from evaweb.stations.wire import wire_to
+from evaweb.stations.runtime_client import wire_to
 from evaweb.trials import selectors as trial_selectors
 from evaweb.trials import services
-from evaweb.trials.bench import checkpoint_command, trial_command
+from evaweb.trials.station_commands import checkpoint_command, trial_command
 
 router = Router(tags=["stations"])
 PageId = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$", description="Made by the page at random")]
-_HTTP = {
+_NAMED = ("trial", "checkpoint", "session", "replay")  # of which each brings its own arguments
+HTTP_OF = {
     CommandStatus.ACCEPTED: 200,
     CommandStatus.DONE: 200,
     CommandStatus.REFUSED: 409,
@@ -115,17 +118,25 @@ class LeaseIn(Schema):
 
 
 def _no_trial(args: dict[str, Any]) -> dict[str, Any]:
-    """What goes with the run of a trial is checked first: see evaweb.trials.bench."""
+    """What goes with the run of a trial is checked first: see evaweb.trials.station_commands."""
     if "trial" in args:
         raise ValueError("args name a trial: name it beside them, as `trial`")
     return args
+
+
+class ReplayIn(Schema):
+    """A recorded episode, by its uuid or as DATASET:INDEX; `robot` is whose numbers those of a dataset are."""
+
+    episode: Annotated[str, Field(min_length=1, max_length=220)]
+    space: Literal["joint", "eef"] = "joint"
+    robot: Annotated[str, Field(max_length=63)] = ""
 
 
 class CommandIn(Schema):
     """A discrete verb; boot and sequence are those of the snapshot that it was decided by.
 
     With `trial`, set-up and run get their arguments from the trial, with `session` from what is collected;
-    `checkpoint`, by name or id, is for a set-up without one.
+    `checkpoint`, by name or id, and `replay` are for a set-up without one. Tables of one's own are for administrators.
     """
 
     uuid: UUID
@@ -138,6 +149,7 @@ class CommandIn(Schema):
     trial: int | None = None
     checkpoint: str | int | None = None
     session: UUID | None = None
+    replay: ReplayIn | None = None
 
 
 class CommandOut(Schema):
@@ -240,8 +252,8 @@ def lease(request: HttpRequest, name: str, given: LeaseIn) -> Any:
 def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
     """Set-up, run, stop, modes, strategy, motions, grippers; the same uuid again gets the first answer."""
     found, seen = selectors.station_get(name=name), sight_for(request)
-    order = given.model_dump(exclude={"trial", "checkpoint", "session"})
-    named = [name for name in ("trial", "checkpoint", "session") if getattr(given, name) is not None]
+    order = given.model_dump(exclude=set(_NAMED))
+    named = [name for name in _NAMED if getattr(given, name) is not None]
     if len(named) > 1:
         raise EvaError(f"{' and '.join(named)}: each has its own arguments, name one of them")
     if given.session is not None:
@@ -252,6 +264,8 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
     elif given.checkpoint is not None:
         checkpoint = trial_selectors.checkpoint_get(name=given.checkpoint, sight=seen)
         row = checkpoint_command(user=request.auth, station=found, checkpoint=checkpoint, **order)
+    elif given.replay is not None:
+        row = replay_command(user=request.auth, station=found, **given.replay.model_dump(), **order)
     elif given.trial is None:
         row = commands.issue(user=request.auth, station=found, **order)
     else:
@@ -259,7 +273,7 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
         if trial.station_id != found.pk:
             raise EvaError(f"trial {trial.pk} is one of {trial.station.name}, not of {found.name}")
         row = trial_command(user=request.auth, trial=trial, **order)
-    return Status(_HTTP[CommandStatus(row.status)], _command_out(row, seen))
+    return Status(HTTP_OF[CommandStatus(row.status)], _command_out(row, seen))
 
 
 @router.post(
@@ -267,12 +281,14 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
 )
 def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
     """Stop the robot now; anybody who is logged in. To the wire first, and nobody waits for the row."""
-    given = given or EStopIn()
-    identity = given.uuid or uuid4()
-    answer = stops.estop(station=name, username=request.auth.get_username(), why=given.why, uuid=identity)
-    _note_estop(request, name, given.why, identity, answer)
+    # A served lab answers at evaweb.api.door, also where the database does not say who is logged in.
+    given, at = given or EStopIn(), timezone.now()
+    identity, user = given.uuid or uuid4(), request.auth
+    answer = stops.press(station=name, username=user.get_username(), why=given.why, uuid=identity).result()
+    place = Station(name=name)
+    commands.estop_noted(user=user, station=place, why=given.why, uuid=identity, answer=answer, at=at)
     said = {name: getattr(answer, name) for name in ("status", "reason", "allowed", "data")}
-    return Status(_HTTP[answer.status], {"uuid": identity, **said})
+    return Status(HTTP_OF[answer.status], {"uuid": identity, **said})
 
 
 @router.post(
@@ -306,16 +322,3 @@ def _command_out(row: Command, sight: Sight) -> dict[str, Any]:
     if sight.veils_events(row.station.name) or sight.veils(row.station.name, row.args):
         answer |= {"reason": sight.told(row.reason), "data": veil.answer(row.data)}
     return answer
-
-
-def _note_estop(request: HttpRequest, name: str, why: str, uuid: UUID, answer: stops.Answer) -> None:
-    """Write the press down where the database has the station; it is done already, whatever comes of this."""
-    try:
-        try:
-            found = Station.objects.filter(name=name).first()
-        except DatabaseError:
-            found = Station(name=name)
-        if found is not None:
-            commands.estop_noted(user=request.auth, station=found, why=why, uuid=uuid, answer=answer)
-    except (DatabaseError, EvaError) as fault:
-        commands.log.error("the e-stop of %s (%s) is not in the database: %s", name, uuid, fault)

@@ -10,7 +10,7 @@ from ninja import Query, Router, Schema
 from evaweb.api.answers import FAILURES
 from evaweb.api.tables import Format, table_answer
 from evaweb.api.trials import Filters
-from evaweb.sight import sight_for
+from evaweb.blinding import sight_for
 from evaweb.trials import selectors
 from evaweb.trials.selectors import StatisticsRow
 

@@ -9,7 +9,7 @@ from asgiref.sync import sync_to_async
 from django.core.handlers.asgi import ASGIRequest
 from django.http import HttpRequest, StreamingHttpResponse
 
-from evaweb.cells import Pages, cell, csv_lines, parquet_pieces
+from evaweb.tabular_export import Pages, cell, csv_lines, parquet_pieces
 
 __all__ = ["Format", "Pages", "cell", "csv_answer", "table_answer"]
 

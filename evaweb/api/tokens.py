@@ -1,45 +1,66 @@
-"""Tokens: made and shown once, known afterwards by their SHA-256 alone."""
+"""Tokens: made and shown once, known afterwards by their SHA-256 alone, and good until a day that is named then."""
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import secrets
 from datetime import timedelta
+from typing import Any
 
 from django.contrib.auth.models import User
 from django.db import IntegrityError, OperationalError, transaction
+from django.db.models.signals import post_delete
+from django.dispatch import receiver
 from django.utils import timezone
 
 from evaweb.api.models import Token
+from evaweb.credentials import OF_ANY_AGE, TOKEN, credentials, digest
 from evaweb.errors import Conflict, EvaError
 from evaweb.lock_wait import lock_wait
 
 log = logging.getLogger(__name__)
+UNKNOWN = "is not known, or its time is over"
 PREFIX = "eva_"  # so that a scanner of secrets knows one when it sees it
+DAYS, MOST_DAYS = 90, 366
+_LENGTH = len(PREFIX) + 43
 _USED_EVERY = timedelta(minutes=1)  # how exactly `used_at` is kept: not every request is a write
 
 
-def token_create(*, user: User, name: str) -> str:
-    """A new token of 256 random bits; the only time that it can be seen."""
+def token_create(*, user: User, name: str, days: int = DAYS) -> str:
+    """A new token of 256 random bits that ends after `days`; the only time that it can be seen."""
     name = name.strip()
-    if not 0 < len(name) <= 80:
+    if not 0 < len(name) <= 80 or not name.isprintable():
         raise EvaError(f"name = {name!r:.100}; allowed: 1 to 80 characters that say what uses the token")
-    secret = PREFIX + secrets.token_urlsafe(32)
+    if not 1 <= days <= MOST_DAYS:
+        raise EvaError(f"days = {days}; allowed: 1 to {MOST_DAYS}")
+    secret, end = PREFIX + secrets.token_urlsafe(32), timezone.now() + timedelta(days=days)
     try:
         with transaction.atomic():
-            Token.objects.create(user=user, name=name, digest=_digest(secret))
+            Token.objects.create(user=user, name=name, digest=digest(secret), ends_at=end)
     except IntegrityError:
         raise Conflict(
             f"{user.get_username()} has a token named {name!r}: revoke it, or choose another name"
         ) from None
+    log.info("token %a of %a is made, until %s", name, user.get_username(), f"{end:%Y-%m-%d}")
     return secret
 
 
-def token_user(*, secret: str) -> User | None:
-    """Whose token this is, None where nobody's, or of somebody who may not log in."""
-    found = Token.objects.select_related("user").filter(digest=_digest(secret), user__is_active=True).first()
-    if found is None:
+def tokens_withdraw(*, user: User, why: str) -> None:
+    """End every token of a user for good."""
+    for token in Token.objects.filter(user=user):
+        token.delete()
+        log.info("token %a of %a is withdrawn: %s", token.name, user.get_username(), why)
+
+
+def token_user(*, secret: str, ended: bool = False) -> User | None:
+    """Whose token this is, None where nobody's, or of somebody who may not log in.
+
+    One whose time is over is nobody's, unless `ended`: who stops a robot is not asked for the date.
+    """
+    if not ended and (len(secret) != _LENGTH or not secret.startswith(PREFIX)):
+        return None  # no question to the database
+    found = Token.objects.select_related("user").filter(digest=digest(secret), user__is_active=True).first()
+    if found is None or (found.ends_at <= timezone.now() and not ended):
         return None
     _note_use(found)
     user: User = found.user
@@ -58,6 +79,11 @@ def _note_use(token: Token) -> None:
         log.warning("the use of token %s is not noted: %s", token, error)
 
 
-def _digest(secret: str) -> str:
-    """Not salted and not slow: a secret of 256 random bits cannot be guessed."""
-    return hashlib.sha256(secret.encode("utf-8", "surrogateescape")).hexdigest()
+@receiver(post_delete, sender=Token)
+def _withdrawn(instance: Token, **named: Any) -> None:
+    for kind in (TOKEN, OF_ANY_AGE[TOKEN]):
+        credentials.forget(kind, instance.digest)
+
+
+credentials.learn(TOKEN, lambda secret: token_user(secret=secret))
+credentials.learn(OF_ANY_AGE[TOKEN], lambda secret: token_user(secret=secret, ended=True))

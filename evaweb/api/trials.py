@@ -12,7 +12,7 @@ from ninja import Field, Query, Router, Schema
 
 from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.tables import Format, table_answer
-from evaweb.sight import Sight, code_of, sight_for
+from evaweb.blinding import Sight, code_of, sight_for
 from evaweb.trials import selectors, services
 from evaweb.trials.models import Score, Trial, TrialStatus
 from evaweb.trials.selectors import TrialFilters

@@ -7,14 +7,14 @@ from django.http import HttpRequest, JsonResponse
 from django.urls import URLPattern, path
 from django.views.decorators.csrf import csrf_exempt
 
+from evaweb import refusals
 from evaweb.api.api import api
 
 
 @csrf_exempt  # it changes nothing, and its answer is the truer one
 def nowhere(request: HttpRequest, rest: str) -> JsonResponse:
     """What is at no address of the interface, said as the interface says everything."""
-    known = "docs/openapi.json and /api/v1/openapi.json list the addresses"
-    return JsonResponse({"error": f"{request.path} does not exist; {known}"}, status=404)
+    return JsonResponse({"error": refusals.nowhere(request.path)}, status=404)
 
 
 patterns, app_name, namespace = api.urls

@@ -9,14 +9,14 @@ from uuid import UUID
 from django.db import transaction
 from django.utils import timezone
 
-from evaweb.collect.following import demonstration_bound, label_read
 from evaweb.collect.kept import KeptEvent, kept_events, opening
 from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
 from evaweb.collect.setups import setup_in
+from evaweb.collect.station_events import demonstration_bound, label_read
 from evaweb.episodes.folders import journal_folder
+from evaweb.episodes.manifest import recorded_in
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import Kept, restores
-from evaweb.episodes.recorded import recorded_in
 from evaweb.episodes.services import station_known
 from evaweb.errors import EvaError
 from evaweb.roles import known_person

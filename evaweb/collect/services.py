@@ -12,7 +12,7 @@ from evaweb.collect import selectors
 from evaweb.collect.kept import event_line, session_file
 from evaweb.collect.models import CollectSession, Result, SessionEvent, SessionEventKind
 from evaweb.collect.setups import require_same, setup_of
-from evaweb.episodes.lines import append_line, text
+from evaweb.episodes.jsonl import append_line, text
 from evaweb.episodes.publishing import DATASET_NAME
 from evaweb.episodes.services import publish_asked
 from evaweb.errors import Conflict, EvaError
@@ -20,7 +20,7 @@ from evaweb.jobs.models import Job
 from evaweb.roles import Role, require
 from evaweb.stations.holders import who
 from evaweb.stations.models import Station
-from evaweb.stations.wire import wire_to
+from evaweb.stations.runtime_client import wire_to
 
 LONGEST_TASK = 2000  # characters; as a station takes it
 HIGHEST_TARGET = 100_000

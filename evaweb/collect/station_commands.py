@@ -8,16 +8,16 @@ from uuid import UUID
 
 from django.db import transaction
 
-from evaweb.collect.following import demonstration_bound
 from evaweb.collect.models import CollectSession
 from evaweb.collect.selectors import session_get
 from evaweb.collect.setups import require_same, setup_of
+from evaweb.collect.station_events import demonstration_bound
 from evaweb.episodes.services import episode_opened
 from evaweb.errors import Conflict, EvaError
 from evaweb.roles import Role, require
 from evaweb.stations.commands import identity_of, issue
 from evaweb.stations.models import CARRIED_OUT, Command
-from evaweb.stations.wire import wire_to
+from evaweb.stations.runtime_client import wire_to
 
 
 def session_command(

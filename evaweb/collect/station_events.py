@@ -12,8 +12,8 @@ from django.db import transaction
 
 from evaweb.collect.models import CollectSession, Demonstration
 from evaweb.episodes.folders import data_dir, journal_folder
+from evaweb.episodes.manifest import recorded_in
 from evaweb.episodes.models import Episode
-from evaweb.episodes.recorded import recorded_in
 from evaweb.episodes.services import publish_asked
 from runtime.recording.files import RecordingError
 from runtime.recording.labels import newest

@@ -9,7 +9,7 @@ from typing import Any
 from channels.db import database_sync_to_async
 from django.db import Error
 
-from evaweb.sight import Sight, sight_of
+from evaweb.blinding import Sight, sight_of
 
 log = logging.getLogger(__name__)
 

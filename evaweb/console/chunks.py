@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from evaweb.console import parts
 from evaweb.console.parts import Part
-from evaweb.stations.looks import Looks
+from evaweb.stations.robot_geometry import Looks
 
 GHOSTS = 12  # whole robots at most; the page moves the ghost on between them
 _WORDS = ("chunk", "run", "state", "observation_step", "step", "overlap", "ik")

@@ -1,8 +1,9 @@
 """The live socket of a page on a station.
 
 Watching needs the database once, when the socket opens. Renewing a lease and stopping never do: they have
-threads of their own, and go straight to the runtime. Beside them the login is looked at every few seconds: who has
-logged out, or is no operator any more, keeps no lease.
+threads of their own, and go straight to the runtime; what stops is obeyed even before the database has said who is
+there. Beside them the login is looked at every few seconds: who has logged out, or is no operator any more, keeps no
+lease.
 """
 
 from __future__ import annotations
@@ -10,40 +11,44 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections.abc import Coroutine
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Collection, Coroutine
 from functools import partial
 from typing import Any
 from urllib.parse import parse_qs
-from uuid import UUID
 
 from channels.db import database_sync_to_async
 from channels.generic.websocket import AsyncWebsocketConsumer
+from django.conf import settings
 from django.db import Error
 
+from evaweb.blinding import EVERYTHING, Sight, sight_of
 from evaweb.console import requests
-from evaweb.console.aims import Aims
 from evaweb.console.hub import Room, hub
 from evaweb.console.logins import role_now
 from evaweb.console.mailbox import Mailbox
+from evaweb.console.pose_queries import Aims
+from evaweb.console.quota import PER_SECOND, Quota
 from evaweb.console.requests import Aim, BadRequest, Credit, EStop, Events, Renew, Request, Stop, Watch
+from evaweb.console.stopping import Stopping
+from evaweb.credentials import COUNTS_S, SESSION, Login, credentials
 from evaweb.errors import NotFound, StationGone
 from evaweb.roles import Role, role_of
-from evaweb.sight import Sight, sight_of
-from evaweb.stations import commands, leases, stops
-from evaweb.stations.looks import facts_of
+from evaweb.stations import leases
+from evaweb.stations.flights import Flights, TooMany
 from evaweb.stations.models import Station
+from evaweb.stations.robot_geometry import facts_of
 from evaweb.stations.selectors import station_get
+from runtime.ipc.messages import Ack
 
 log = logging.getLogger(__name__)
 # Codes of a closed socket, after those of HTTP. After NEW_ROLE a page may come again at once.
-BAD_REQUEST, NO_LOGIN, NEW_ROLE, NO_STATION = 4400, 4401, 4403, 4404
+BAD_REQUEST, NO_LOGIN, NEW_ROLE, NO_STATION, TOO_MUCH = 4400, 4401, 4403, 4404, 4429
 _MOST_ERRORS = 20
+_MOST_EARLY = 50  # messages that wait until the database has said who is there
 _LOGIN_S = 5.0  # how often the login is looked at
-# Each waits for a station that may hang, and none of them may keep the others waiting; an e-stop least of all.
-_renewals = ThreadPoolExecutor(32, "renew")
-_stops = ThreadPoolExecutor(32, "stop")
-_presses = ThreadPoolExecutor(32, "e-stop")
+_AGAIN_S = 1.0  # after which a database that did not answer is asked again
+_renewals: Flights[Ack] = Flights("renew", most=32)  # of one station, which may hang
+_NOT_SAID = f"the database has not said for {COUNTS_S:.0f} s whose login this is; stopping works"
 _under_way: set[asyncio.Task[None]] = set()  # they go on when the page is closed
 
 
@@ -60,8 +65,12 @@ class StationConsumer(AsyncWebsocketConsumer):
         self._room: Room | None = None
         self._mailbox: Mailbox | None = None
         self._aims: Aims | None = None
-        self._renewing = False
+        self._renewing = self._admitted = False
         self._errors = 0
+        self._session = ""  # the key of the login; empty where the page has no business here
+        self._cameras: Collection[str] = ()
+        self._early: list[str] = []
+        self._quota, self._over = Quota(), False
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """Serve the page until it is gone, however that comes about."""
@@ -76,37 +85,62 @@ class StationConsumer(AsyncWebsocketConsumer):
         """Channels would first close old connections to the database, in a thread that may be waiting for it."""
         if message["type"] == "websocket.receive":
             await self.websocket_receive(message)
+            await asyncio.sleep(0)  # one that floods lets all others have their turn
         else:
             await super().dispatch(message)
 
     async def connect(self) -> None:
         """Accept, and close again with a code where the page has no business here: a browser sees no other."""
         await self.accept()
-        self._user = self.scope["user"]
+        session = self.scope["cookies"].get(settings.SESSION_COOKIE_NAME, "")
         self._page = parse_qs(self.scope["query_string"].decode()).get("page", [""])[-1]
-        if not self._user.is_authenticated:
+        self._station = self.scope["url_route"]["kwargs"]["name"]
+        if not session:
             await self.close(NO_LOGIN, "log in first")
         elif not requests.PAGE.fullmatch(self._page):
             await self.close(BAD_REQUEST, "page = 1 to 64 letters, digits, - or _")
         else:
-            await self._admit(self.scope["url_route"]["kwargs"]["name"])
+            self._session = session
+            self._stopping = Stopping(self._station, self._page, session, self._say, _go_on)
+            self._keep(self._write())
+            self._keep(self._admit())
 
-    async def _admit(self, name: str) -> None:
-        try:
-            station, role, facts, sight = await _in_database(_facts_of, name, self._user)
-        except NotFound as error:
-            await self.close(NO_STATION, str(error)[:120])
+    async def _admit(self) -> None:
+        """Ask the database who is there until it answers; what stops is obeyed meanwhile."""
+        admitted = None
+        while admitted is None:
+            try:
+                admitted = await _in_database(_admitted, self._station, self._session)
+            except NotFound as error:
+                await self._end(NO_STATION, _short(str(error)))
+                return
+            except Error as error:
+                log.warning("the database does not say who has opened a page of %s: %s", self._station, error)
+                await asyncio.sleep(_AGAIN_S)
+        user, station, role, facts, sight = admitted
+        if user is None:
+            await self._end(NO_LOGIN, "log in first")
             return
-        self._station, self._cameras = station, facts["cameras"]
-        self._username = self._user.get_username()
-        hello = {"station": station.name, "user": self._username, "role": role, "page": self._page}
+        self._stopping.login, self._cameras = credentials.recall(SESSION, self._session), facts["cameras"]
+        hello = {"station": station.name, "user": user.get_username(), "role": role, "page": self._page}
         self._say({"type": "hello", **hello, "facts": facts})
         room = self._room = hub().room(station.name, station.robot)
-        self._aims = Aims(station, self._username, role, self._say, lambda: room.looks)
-        self._mailbox = room.join(self._outbox.put_nowait, self._user, sight)
-        self._tasks = [asyncio.create_task(work) for work in (self._write(), self._follow_login(role))]
-        for task in self._tasks:
-            task.add_done_callback(_finished)
+        self._aims = Aims(station, user.get_username(), role, self._say, lambda: room.looks)
+        self._mailbox = room.join(self._outbox.put_nowait, user, sight)
+        self._keep(self._follow_login(role))
+        self._admitted = True
+        early, self._early = self._early, []
+        for text in early:
+            await self.receive(text)
+
+    def _keep(self, work: Coroutine[Any, Any, None]) -> None:
+        """Go on with it as long as the page is there."""
+        self._tasks.append(asyncio.create_task(work))
+        self._tasks[-1].add_done_callback(_finished)
+
+    async def _end(self, code: int, reason: str) -> None:
+        self._session = ""
+        await self.close(code, reason)
 
     def _leave(self) -> None:
         """Show nothing more, and hear nothing."""
@@ -120,39 +154,60 @@ class StationConsumer(AsyncWebsocketConsumer):
         while now is role:
             await asyncio.sleep(_LOGIN_S)
             try:
-                now = await _in_database(role_now, self.scope["session"].session_key)
+                now = await _in_database(role_now, self._session)
             except Error as error:
                 log.warning("the database does not say who is logged in: %s", error)
         self._leave()
         if now is None:
             await self.close(NO_LOGIN, "log in again")
         else:
-            await self.close(NEW_ROLE, f"you are {now} now")
+            await self.close(NEW_ROLE, f"you are {now.a} now")
 
     async def receive(self, text_data: str | None = None, bytes_data: bytes | None = None) -> None:
         """One message of the page."""
-        if self._mailbox is None:
+        text = text_data or _as_said(bytes_data or b"")
+        if not self._session or (self._over and not requests.may_stop(text)):
             return
-        self._mailbox.heard()
-        try:
-            request = requests.parse(text_data or "", self._cameras)
-        except BadRequest as error:
-            await self._complain(str(error))
-        else:
-            self._do(request)
+        within, request = self._quota.take(), self._parsed(text)
+        if isinstance(request, EStop | Stop):
+            self._stopping.heard(request)
+        elif not within:
+            await self._too_much()
+        elif self._mailbox is not None:
+            self._mailbox.heard()
+            await self._do(request)
+        elif isinstance(request, Renew) and not self._admitted and self._counted is not None:
+            self._keep_lease(request)  # the page was loaded anew while the database is away
+        elif len(self._early) < _MOST_EARLY:
+            self._early.append(text)
 
-    def _do(self, request: Request) -> None:
+    @property
+    def _counted(self) -> Login | None:
+        return credentials.counted(SESSION, self._session)
+
+    def _parsed(self, text: str) -> Request | BadRequest:
+        try:
+            return requests.parse(text, self._cameras)
+        except BadRequest as error:
+            return error
+
+    async def _too_much(self) -> None:
+        """Say so once, and close; what stops is obeyed to the last."""
+        if not self._over:
+            self._over = True
+            self._leave()
+            reason = f"more than {PER_SECOND:.0f} messages a second"
+            await self.send(text_data=_as_text({"type": "error", "reason": reason}))
+            await self.close(TOO_MUCH, reason)
+
+    async def _do(self, request: Request | BadRequest) -> None:
         assert self._room is not None
         assert self._mailbox is not None
         assert self._aims is not None
-        if isinstance(request, EStop):
-            _go_on(self._press(request))
-        elif isinstance(request, Stop):
-            _go_on(self._stop(request))
+        if isinstance(request, BadRequest):
+            await self._complain(str(request))
         elif isinstance(request, Renew):
-            if not self._renewing:  # else the one before has no answer yet
-                self._renewing = True
-                _go_on(self._renew(request))
+            self._keep_lease(request)
         elif isinstance(request, Watch):
             self._room.watch(self._mailbox, request.streams)
         elif isinstance(request, Credit):
@@ -161,45 +216,37 @@ class StationConsumer(AsyncWebsocketConsumer):
         elif isinstance(request, Events):
             self._mailbox.want_events(request.after, request.boot)
             self._room.ring()
+        elif isinstance(request, Aim) and self._counted is None:
+            self._say({"type": "aimed", "id": request.id, "ok": False, "reason": _NOT_SAID})
         elif isinstance(request, Aim) and self._aims.ask(request):
             _go_on(self._aims.answer())
 
-    async def _press(self, request: EStop) -> None:
-        """Press and say what came of it; then write it down."""
-        name, why, uuid = self._station.name, request.why, request.uuid
-        press = partial(stops.estop, station=name, username=self._username, why=why, uuid=uuid)
-        answer = await asyncio.get_running_loop().run_in_executor(_presses, press)
-        self._acknowledge("estop", uuid, answer)
-        note = partial(commands.estop_noted, why=why, uuid=uuid, answer=answer)
-        await _in_database(note, user=self._user, station=self._station)
+    def _keep_lease(self, request: Renew) -> None:
+        """Where the database has said within the last minute who is there; it may be away since."""
+        login = self._counted
+        if login is None:
+            self._say({"type": "renewed", "ok": False, "lost": False, "reason": _NOT_SAID})
+        elif not self._renewing:  # else the one before has no answer yet
+            self._renewing = True
+            _go_on(self._renew(request, login.username))
 
-    async def _stop(self, request: Stop) -> None:
-        """Stop or halt and say what came of it; then write it down."""
-        given = {"kind": request.kind, "page": self._page, "epoch": request.epoch, "uuid": request.uuid}
-        stop = partial(stops.stop, station=self._station.name, username=self._username, **given)
-        answer = await asyncio.get_running_loop().run_in_executor(_stops, stop)
-        self._acknowledge(request.kind, request.uuid, answer)
-        note = partial(commands.stop_noted, answer=answer, **given)
-        await _in_database(note, user=self._user, station=self._station)
-
-    def _acknowledge(self, kind: str, uuid: UUID, answer: stops.Answer) -> None:
-        said = {"kind": kind, "uuid": str(uuid), "status": answer.status.value, "reason": answer.reason}
-        self._say({"type": "ack", **said})
-
-    async def _renew(self, request: Renew) -> None:
+    async def _renew(self, request: Renew, username: str) -> None:
         """Pass the page's sign of life on; `lost`: the runtime says that the lease has ended."""
         renew = partial(
             leases.renew,
-            username=self._username,
+            username=username,
             page=self._page,
-            station=self._station.name,
+            station=self._station,
             epoch=request.epoch,
         )
         try:
-            ack = await asyncio.get_running_loop().run_in_executor(_renewals, renew)
+            key = (username, self._page)
+            ack = await asyncio.wrap_future(
+                _renewals.ask(self._station, renew, key=key, identity=request.epoch)
+            )
             refused = ack.status == "refused"
             self._say({"type": "renewed", "ok": not refused, "lost": refused, "reason": ack.reason})
-        except StationGone as gone:
+        except (StationGone, TooMany) as gone:
             self._say({"type": "renewed", "ok": False, "lost": False, "reason": str(gone)})
         finally:
             self._renewing = False
@@ -212,7 +259,7 @@ class StationConsumer(AsyncWebsocketConsumer):
             self._say({"type": "error", "reason": reason})
 
     def _say(self, message: dict[str, Any]) -> None:
-        self._outbox.put_nowait(json.dumps(message, separators=(",", ":")))
+        self._outbox.put_nowait(_as_text(message))
 
     async def _write(self) -> None:
         """Send what is in the outbox, in order."""
@@ -224,9 +271,41 @@ class StationConsumer(AsyncWebsocketConsumer):
                 await self.send(bytes_data=message)
 
 
-def _facts_of(name: str, user: Any) -> tuple[Station, Role, dict[str, Any], Sight]:
+class NowhereConsumer(AsyncWebsocketConsumer):
+    """What is at no address of the live sockets."""
+
+    channel_layer_alias = ""
+
+    async def connect(self) -> None:
+        """Accept, and close again with a code."""
+        await self.accept()
+        await self.close(NO_STATION, "there is nothing at this address")
+
+
+def _short(reason: str) -> str:
+    """As much of it as a closed socket may say: 123 bytes."""
+    return reason.encode("utf-8", "replace")[:123].decode("utf-8", "ignore")
+
+
+_Admitted = tuple[Any, Station | None, Role, dict[str, Any], Sight]
+
+
+def _admitted(name: str, session: str) -> _Admitted:
+    """Who is there, and what they are shown of the station; nobody is shown nothing. NotFound."""
+    user = credentials.look(SESSION, session)
+    if user is None:
+        return None, None, Role.VIEWER, {}, EVERYTHING
     station = station_get(name=name)
-    return station, role_of(user), facts_of(station.robot), sight_of(user)
+    return user, station, role_of(user), facts_of(station.robot), sight_of(user)
+
+
+def _as_said(message: bytes) -> str:
+    """What a binary message says, which is no page's way and may be a press."""
+    return message.decode(json.detect_encoding(message), "replace")
+
+
+def _as_text(message: dict[str, Any]) -> str:
+    return json.dumps(message, separators=(",", ":"))
 
 
 async def _in_database(work: Any, *arguments: Any, **named: Any) -> Any:

@@ -15,8 +15,8 @@ from evaweb.console.chunks import chunk_part
 from evaweb.console.parts import Part
 from evaweb.console.recent import Recent
 from evaweb.errors import NotFound
-from evaweb.stations import veil
-from evaweb.stations.looks import Looks, looks_of
+from evaweb.stations import redaction as veil
+from evaweb.stations.robot_geometry import Looks, looks_of
 
 log = logging.getLogger(__name__)
 _VECTORS = ("measured", "raw", "planned", "commanded", "simulated")  # of the joints, as the runtime has them

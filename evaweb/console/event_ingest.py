@@ -16,7 +16,7 @@ from typing import Any
 from django.db import Error, close_old_connections
 from django.db.models import Q
 
-from evaweb.collect import following as collect
+from evaweb.collect import station_events as collect
 from evaweb.console.feed import Feeds, History, feeds
 from evaweb.episodes import services as episodes
 from evaweb.preflights.services import preflights_settled

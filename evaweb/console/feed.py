@@ -16,10 +16,10 @@ from typing import Any
 
 import zmq
 
+from evaweb.binary_frames import plain
 from evaweb.errors import StationGone
-from evaweb.frames import plain
-from evaweb.stations.wire import StationWire, wire_to
-from runtime.bus import CodecError, Subscriber
+from evaweb.stations.runtime_client import StationWire, wire_to
+from runtime.ipc.bus import CodecError, Subscriber
 
 log = logging.getLogger(__name__)
 EVENTS_KEPT = 2000

@@ -8,14 +8,15 @@ from collections.abc import Iterable
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from evaweb.console import changes, parts, sights
+from evaweb.blinding import EVERYTHING, Sight
+from evaweb.console import blinding as sights
+from evaweb.console import changes, parts
 from evaweb.console.encoder import Encoder
 from evaweb.console.feed import Feeds, History, Link, feeds
 from evaweb.console.mailbox import Deliver, Mailbox
 from evaweb.console.parts import Part
-from evaweb.sight import EVERYTHING, Sight
-from evaweb.stations import veil
-from evaweb.stations.looks import Looks
+from evaweb.stations import redaction as veil
+from evaweb.stations.robot_geometry import Looks
 
 _FLUSH_S = 1 / 40  # frames leave at most so often
 _CHANGES_S = 1.0

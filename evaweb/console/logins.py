@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from types import SimpleNamespace
-from typing import Any
-
-from django.conf import settings
-from django.contrib.auth import get_user
-
+from evaweb.credentials import SESSION, credentials
 from evaweb.roles import Role, role_of
 
 
@@ -17,7 +11,5 @@ def role_now(session_key: str) -> Role | None:
 
     None: they have logged out, were switched off, or their password was changed elsewhere. Reads only.
     """
-    sessions = import_module(settings.SESSION_ENGINE)
-    asks: Any = SimpleNamespace(session=sessions.SessionStore(session_key))
-    user = get_user(asks)
-    return role_of(user) if user.is_authenticated else None
+    user = credentials.look(SESSION, session_key)
+    return None if user is None else role_of(user)

@@ -10,10 +10,10 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from evaweb.blinding import EVERYTHING, Sight
 from evaweb.console.feed import History, Link
 from evaweb.console.parts import Part
-from evaweb.sight import EVERYTHING, Sight
-from evaweb.stations import veil
+from evaweb.stations import redaction as veil
 
 CREDITS = 2
 EVENTS_AT_ONCE = 200

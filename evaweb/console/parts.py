@@ -1,6 +1,6 @@
 """Live streams encoded once for all viewers: a frame for one of them is nothing but a concatenation.
 
-The layout is that of evaweb.frames, which also reads it.
+The layout is that of evaweb.binary_frames, which also reads it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evaweb.frames import plain
+from evaweb.binary_frames import plain
 
 _ALIGNMENT = 8
 _AGE = "age"  # stands where a part's age is to be put in

@@ -8,27 +8,27 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from typing import Any
 from uuid import uuid4
 
 import numpy as np
 
+from evaweb.binary_frames import plain
 from evaweb.console.requests import Aim
 from evaweb.errors import EvaError
-from evaweb.frames import plain
 from evaweb.roles import Role
+from evaweb.stations.flights import Flights, TooMany
 from evaweb.stations.holders import readable
-from evaweb.stations.looks import Looks
 from evaweb.stations.models import Station
-from evaweb.stations.wire import StationWire
-from runtime import messages
-from runtime.bus import CodecError
+from evaweb.stations.robot_geometry import Looks
+from evaweb.stations.runtime_client import StationWire
+from runtime.ipc import messages
+from runtime.ipc.bus import CodecError
 
 _TIMEOUT_S = 3.0  # the first one may have to wait until the station's kinematics are loaded
 _DIGITS = 5  # of a matrix in the answer: a hundredth of a millimetre
-_threads = ThreadPoolExecutor(8, "aim")
+_under_way: Flights[dict[str, Any]] = Flights("aim", most=8)  # of one station, which may hang
 Say = Callable[[dict[str, Any]], None]
 See = Callable[[], Looks | None]  # the robot as it is drawn now
 
@@ -54,15 +54,21 @@ class Aims:
 
     async def answer(self) -> None:
         """Answer the newest question until none waits any more; one that was replaced has no answer."""
-        loop = asyncio.get_running_loop()
         try:
             while (request := self._waiting) is not None:
                 self._waiting = None
                 work = partial(aimed, self._station.name, self._username, request.args, self._looks())
-                found = await loop.run_in_executor(_threads, work)
+                found = await self._found(work, request.id)
                 self._say({"type": "aimed", "id": request.id, **found})
         finally:
             self._under_way = False
+
+    async def _found(self, work: Callable[[], dict[str, Any]], identity: int) -> dict[str, Any]:
+        try:
+            asked = _under_way.ask(self._station.name, work, key=id(self), identity=identity)
+            return await asyncio.wrap_future(asked)
+        except TooMany as fault:
+            return {"ok": False, "reason": str(fault)}
 
 
 def aimed(station: str, username: str, args: Mapping[str, Any], looks: Looks | None) -> dict[str, Any]:

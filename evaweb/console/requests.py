@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -10,10 +9,14 @@ from typing import Any
 from uuid import UUID, uuid4
 
 from evaweb.errors import EvaError
+from runtime.core import bounded_documents as bounded
+from runtime.ipc import estop_requests as pressing
 
+_LARGEST = 64 * 1024  # characters of what is no press; a page says little
 STREAMS = ("state", "joints", "recent", "poses", "chunk")
 PAGE = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_LONGEST_WHY = 240
+_MOST_VALUES = 1000  # of one message
+_LONGEST_STOP = 4096  # characters of a stop or halt, from a page that floods
 
 
 class BadRequest(EvaError):
@@ -75,18 +78,28 @@ class Aim:
 Request = Watch | Credit | Renew | EStop | Stop | Events | Aim
 
 
+def may_stop(text: str) -> bool:
+    """Whether a message that nobody has the time to read may be one that stops a robot."""
+    if pressing.in_json(text, "type") is not None:
+        return True
+    return len(text) <= _LONGEST_STOP and any(f'"{kind}"' in text for kind in ("stop", "halt"))
+
+
 def parse(text: str, cameras: Collection[str]) -> Request:
     """The request in a text message; raises BadRequest."""
+    press = pressing.in_json(text, "type")
+    if press is not None:  # no press is lost for what else is said with it
+        return EStop(_uuid(press), pressing.why_in(press))
     try:
-        said = json.loads(text)
-    except (ValueError, RecursionError):
-        raise BadRequest(f"{text!r:.60} is no JSON") from None
+        said = bounded.from_json(text, "the message", _LARGEST, _MOST_VALUES)
+    except bounded.Unreadable as error:
+        raise BadRequest(f"{error} (given: {text!r:.60})") from None
     kind = said.get("type") if isinstance(said, dict) else None
     if kind == "watch":
         return Watch(_streams(said, cameras))
     read = _READ.get(kind) if isinstance(kind, str) else None
     if read is None:
-        raise BadRequest(f"type {kind!r:.40} is unknown; allowed: watch, {', '.join(_READ)}")
+        raise BadRequest(f"type {kind!r:.40} is unknown; allowed: watch, estop, {', '.join(_READ)}")
     return read(said)
 
 
@@ -119,12 +132,6 @@ def _text(said: Mapping[str, Any], key: str, default: str) -> str:
     return value
 
 
-def _estop(said: Mapping[str, Any]) -> EStop:
-    """Pressing is never refused for what else the message says."""
-    why = said.get("why")
-    return EStop(_uuid(said), why[:_LONGEST_WHY] if isinstance(why, str) and why else "pressed")
-
-
 def _stop(kind: str) -> Callable[[Mapping[str, Any]], Stop]:
     return lambda said: Stop(kind, _uuid(said), _whole(said, "epoch"))
 
@@ -140,7 +147,6 @@ def _uuid(said: Mapping[str, Any]) -> UUID:
 _READ: dict[str, Callable[[Mapping[str, Any]], Request]] = {
     "credit": lambda said: Credit(),
     "renew": lambda said: Renew(_whole(said, "epoch")),
-    "estop": _estop,
     "stop": _stop("stop"),
     "halt": _stop("halt"),
     "events": lambda said: Events(_whole(said, "after"), _text(said, "boot", "")),

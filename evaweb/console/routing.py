@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from django.urls import path
+from django.urls import path, re_path
 
-from evaweb.console.consumers import StationConsumer
+from evaweb.console.consumers import NowhereConsumer, StationConsumer
 
-websocket_urlpatterns = [path("ws/stations/<str:name>", StationConsumer.as_asgi())]
+websocket_urlpatterns = [
+    path("ws/stations/<str:name>", StationConsumer.as_asgi()),
+    re_path("", NowhereConsumer.as_asgi()),
+]

@@ -7,13 +7,13 @@ from typing import Any
 
 from django.contrib.sessions.backends.base import SessionBase
 
-from evaweb.plans.bench import cameras_confirmed, cameras_of, references
-from evaweb.plans.handing import Progress, progress
+from evaweb.blinding import Sight
+from evaweb.plans.allocation import Progress, progress
+from evaweb.plans.bench_checks import cameras_confirmed, cameras_of, references
 from evaweb.plans.models import CameraCheck, Handout, Plan, Reference
 from evaweb.plans.selectors import handout_of, plans_open
-from evaweb.sight import Sight
-from evaweb.stations.looks import facts_of
 from evaweb.stations.models import Lease, Station
+from evaweb.stations.robot_geometry import facts_of
 from evaweb.stations.selectors import last_set_up, leases_open, station_list
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene, Score, Trial, TrialStatus
 from evaweb.trials.selectors import UNFINISHED, checkpoint_list, scene_list, trial_list, trial_open

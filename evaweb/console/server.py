@@ -1,66 +1,109 @@
-"""The web process: daphne in this process, with the chronicle beside it, ended by signal or lifeline."""
+"""A process of the web: daphne in this process, with what it does beside, ended by signal or lifeline."""
 
 from __future__ import annotations
 
 import json
 import os
+import resource
 import socket
+import sys
 import threading
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, Protocol
 
-from daphne.server import Server  # first: it decides which reactor there is
+from daphne.server import Server, twisted_loop  # first: it decides which reactor there is
 
 # isort: split
-from twisted.internet import reactor
+from twisted.internet import reactor, task
 
-from evaweb.console.chronicle import Chronicle
-from evaweb.errors import EvaError
+from evaweb.console.arrivals import Arrivals, Entrance, Request
+from evaweb.console.sockets import CountedSocket
+from evaweb.lock_wait import for_pages
 
-_BACKLOG = 128
+_ACCEPTED = 16  # connections that are taken up in one turn of the loop
+_MOST_WAITING = 4096  # connections without a whole request, where a quarter of all files is as many
+_SWEEP_S = 1.0
+_THREADS = 16  # for what live pages ask the database
 _LAST_S = 4.0  # for requests that are under way, before the process ends all the same
-_LARGEST_REQUEST = 64 * 1024  # bytes over a websocket; a page says little
+_LARGEST_REQUEST = 2 * 1024 * 1024  # bytes over a websocket, as over REST: a press may say whatever it likes
+_TURN_S = 0.001  # of the interpreter, where others wait for it: an e-stop takes several, and each is 5 ms by default
 
 
-class PortTaken(EvaError):
-    """Something else listens there already."""
+class Beside(Protocol):
+    """What a process does as long as it serves."""
+
+    def start(self) -> None:
+        """It serves."""
+
+    def end(self) -> None:
+        """It ends."""
 
 
-def listen(host: str, port: int) -> socket.socket:
-    """A listening socket; port 0 takes a free one. PortTaken says what to do."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((host, port))
-        listener.listen(_BACKLOG)
-    except OSError as error:
-        listener.close()
-        raise PortTaken(
-            f"cannot listen on {host}:{port}: {error.strerror}; name another address or port with --host, --port"
-        ) from None
-    listener.setblocking(False)
-    return listener
-
-
-def serve(application: Any, listener: socket.socket, *, lifeline: bool) -> None:
+def serve(
+    application: Any,
+    listener: socket.socket,
+    *,
+    beside: Beside | None,
+    lifeline: bool,
+    request: type[Request] = Request,
+) -> None:
     """Serve until SIGINT, SIGTERM or, with `lifeline`, the end of standard input; prints where as JSON."""
+    sys.setswitchinterval(_TURN_S)
     address = _address(listener)
-    server = Server(
+    arrivals = _arrivals(raise_file_limit())
+    for_pages()
+    twisted_loop.set_default_executor(ThreadPoolExecutor(_THREADS, "page"))
+    server = _Server(
+        partial(Entrance, arrivals=arrivals, request=request),
+        arrivals,
         application,
         endpoints=[f"fd:fileno={listener.detach()}"],  # which is Twisted's from now on
         websocket_max_message_size=_LARGEST_REQUEST,
         websocket_max_frame_size=_LARGEST_REQUEST,
         server_name="eva",
     )
-    chronicle = Chronicle()
     events: Any = reactor
+    if beside is not None:
+        events.callWhenRunning(beside.start)
     events.callWhenRunning(lambda: print(json.dumps(address), flush=True))
-    events.callWhenRunning(chronicle.start)
     events.addSystemEventTrigger("before", "shutdown", _end_for_sure)
-    events.addSystemEventTrigger("before", "shutdown", chronicle.end)
+    if beside is not None:
+        events.addSystemEventTrigger("before", "shutdown", beside.end)
     if lifeline:
         threading.Thread(target=_watch, args=(server,), name="lifeline", daemon=True).start()
     server.run()
+
+
+class _Server(Server):
+    def __init__(self, entrance: Any, arrivals: Arrivals, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        self._entrance, self._arrivals = entrance, arrivals
+
+    def listen_success(self, port: Any) -> None:
+        """Daphne makes its own factory and listens with it: ours stands before it from now on."""
+        super().listen_success(port)
+        port.factory = self._entrance(port.factory)
+        self.ws_factory.protocol = CountedSocket
+
+        def few_at_once() -> None:
+            port.numberAccepts = _ACCEPTED  # which Twisted raises as long as there are more
+            type(port).doRead(port)
+
+        port.doRead = few_at_once
+        task.LoopingCall(self._arrivals.sweep).start(_SWEEP_S)
+
+
+def raise_file_limit() -> int:
+    """As many open files and connections as the system lets this process have; how many."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    return hard
+
+
+def _arrivals(files: int) -> Arrivals:
+    most = min(_MOST_WAITING, max(16, files // 4))
+    return Arrivals(most, most // 2)
 
 
 def _address(listener: socket.socket) -> dict[str, Any]:

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
+from django.contrib.sessions.backends.base import UpdateError
 from django.http import Http404, HttpRequest, HttpResponse
 from django.shortcuts import redirect, render
 from django.templatetags.static import static
 from django.urls import reverse
 
+from evaweb.blinding import sight_for
 from evaweb.collect import panel as collecting
 from evaweb.console import selectors
 from evaweb.datasets.on_robot import offer, recorded_at
 from evaweb.errors import EvaError, NotFound
+from evaweb.lock_wait import lock_wait
 from evaweb.roles import role_of
-from evaweb.sight import sight_for
 from evaweb.stations.models import Station
 from evaweb.stations.selectors import request_list, station_get
+from evaweb.stop_port import origin_for
 from evaweb.trials.selectors import checkpoint_list
+
+log = logging.getLogger(__name__)
+_REMEMBER_S = 0.5
 
 
 def home(request: HttpRequest) -> HttpResponse:
@@ -95,19 +102,34 @@ def _station(name: str) -> Station:
 
 
 def _page(request: HttpRequest, station: Station, page: str, extra: dict[str, Any]) -> HttpResponse:
-    if (
-        request.session.get(selectors.SESSION_KEY) != station.name
-    ):  # a page is shown while the database is locked
-        request.session[selectors.SESSION_KEY] = station.name
-    robot = selectors.robot_facts(robot=station.robot)
+    _remember(request, station)
+    robot, stops = selectors.robot_facts(robot=station.robot), origin_for(request)
     context = {
         "station": station,
         "robot": robot,
-        "config": _config(request, station, page, robot),
+        "config": {**_config(request, station, page, robot), "stops": stops},
         **_lease(request, station),
         **extra,
     }
-    return render(request, f"console/{page}.html", context)
+    shown = render(request, f"console/{page}.html", context)
+    if stops:
+        shown._csp_update = {"connect-src": [stops]}  # type: ignore[attr-defined]
+    return shown
+
+
+def _remember(request: HttpRequest, station: Station) -> None:
+    """Where the tabs of this browser lead; the page is shown also where the database does not take it."""
+    if request.session.get(selectors.SESSION_KEY) == station.name:
+        return
+    request.session[selectors.SESSION_KEY] = station.name
+    try:
+        with lock_wait(_REMEMBER_S):
+            request.session.save()
+    except UpdateError as error:
+        log.warning(
+            "nobody notes that %a is at %a: %r", request.user.get_username(), station.name, error.__context__
+        )
+    request.session.modified = False
 
 
 def _config(request: HttpRequest, station: Station, page: str, robot: dict[str, Any]) -> dict[str, Any]:

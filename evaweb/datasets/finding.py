@@ -15,10 +15,24 @@ from runtime.datasets import layout
 from runtime.datasets.reader import Dataset, open_dataset
 from runtime.recording.files import RecordingError
 
+_LONGEST_PART = 255  # bytes; no file system takes more
 DEPTH = 3  # folders below the data folder at which datasets are looked for
 # Of the lab itself: nothing in there is a dataset.
 _OWN = frozenset(
-    ("episodes", "previews", "exports", "labels", "quality", "reviews", "scores", "logs", "static", "media")
+    (
+        *(
+            "episodes",
+            "previews",
+            "exports",
+            "labels",
+            "quality",
+            "quarantine",
+            "reviews",
+            "scores",
+            "sessions",
+        ),
+        *("stations", "jobs", "broker", "unwritten", "pictures", "logs", "static", "media"),
+    )
 )
 
 
@@ -78,7 +92,9 @@ def folder_named(name: str) -> Path:
     wrong = (
         not parts or len(parts) > DEPTH or any(part in (".", "..") or part.startswith(".") for part in parts)
     )
-    if wrong or PurePosixPath(name).is_absolute() or "\x00" in name or parts[0] in _OWN:
+    long = any(len(part.encode("utf-8", "surrogatepass")) > _LONGEST_PART for part in parts)
+    own = parts == ("datasets",) or any(part in _OWN for part in parts[:1])
+    if wrong or long or own or PurePosixPath(name).is_absolute() or "\x00" in name:
         raise EvaError(
             f"{name!r:.120} names no dataset; allowed: a folder below the data folder such as datasets/cups, without "
             "leading dots"

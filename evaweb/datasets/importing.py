@@ -10,8 +10,8 @@ from uuid import UUID
 from evaweb.datasets.finding import folder_named
 from evaweb.datasets.orders import full_name
 from evaweb.episodes import services
+from evaweb.episodes.dataset_membership import places_read
 from evaweb.episodes.folders import data_dir, datasets_dir, episodes_dir
-from evaweb.episodes.placing import places_read
 from evaweb.errors import EvaError
 from runtime.datasets.identities import named_copy
 from runtime.datasets.importing import bring, whose

@@ -8,7 +8,7 @@ from typing import Any
 
 from evaweb.datasets.finding import dataset_found, folder_named
 from evaweb.datasets.orders import KIND
-from evaweb.episodes.placing import places_read
+from evaweb.episodes.dataset_membership import places_read
 from evaweb.errors import EvaError
 from evaweb.jobs.kinds import Work, job_kind
 from runtime.recording.files import RecordingError

@@ -18,9 +18,11 @@ from evaweb.episodes.folders import journal_folder
 from evaweb.episodes.models import EpisodeStatus
 from evaweb.episodes.selectors import episode_get
 from evaweb.errors import Conflict, EvaError, NotFound, StationGone
-from evaweb.stations.looks import facts_of
-from evaweb.stations.models import Station
-from evaweb.stations.wire import wire_to
+from evaweb.roles import Role, require
+from evaweb.stations.commands import issue
+from evaweb.stations.models import Command, Station
+from evaweb.stations.robot_geometry import facts_of
+from evaweb.stations.runtime_client import wire_to
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError
 from runtime.recording.reader import open_episode
@@ -83,8 +85,14 @@ class Offer:
         return self.recorded.joints if self.space == "joint" else self.recorded.poses
 
     @property
-    def set_up(self) -> str:
-        """The arguments of the set-up, as JSON."""
+    def asked(self) -> str:
+        """How the page asks for the set-up, as JSON."""
+        recorded = self.recorded
+        return json.dumps({"episode": recorded.source, "space": self.space, **_assumed(recorded)})
+
+    @property
+    def set_up(self) -> dict[str, Any]:
+        """The arguments of the set-up."""
         recorded = self.recorded
         policy: dict[str, Any] = {
             "kind": "replay",
@@ -97,7 +105,7 @@ class Offer:
             key = "action" if self.space == "joint" else "action_eef"
             policy["mapping"] = {key: recorded.columns[self.space]}
         args = {"policy": policy, "strategy": {"kind": "naive", "inference_rate": RATE}}
-        return json.dumps(args | ({"task": recorded.task[:2000]} if recorded.task else {}))
+        return args | ({"task": recorded.task[:2000]} if recorded.task else {})
 
     @property
     def run(self) -> str:
@@ -112,8 +120,40 @@ class Offer:
 
 def query(recorded: Recorded, space: str) -> str:
     """What an address says of it."""
-    assumed = {"robot": recorded.robot} if recorded.columns else {}
-    return urlencode({"replay": recorded.source, "space": space, **assumed})
+    return urlencode({"replay": recorded.source, "space": space, **_assumed(recorded)})
+
+
+def _assumed(recorded: Recorded) -> dict[str, str]:
+    return {"robot": recorded.robot} if recorded.columns else {}
+
+
+def replay_command(
+    *,
+    user: Any,
+    station: Station,
+    episode: str,
+    space: str = "joint",
+    robot: str = "",
+    kind: str,
+    args: Mapping[str, Any] | None = None,
+    **given: Any,
+) -> Command:
+    """Set a station up to play an episode, by its uuid or as DATASET:INDEX; `given` as in `issue`.
+
+    EvaError for other commands, Conflict where the station's robot is not the episode's.
+    """
+    require(user, Role.OPERATOR)
+    if kind != "setup":
+        raise EvaError(f"{kind} takes no replay: setup does")
+    found = offer(recorded_at(episode, robot), station, space)
+    if found.differences:
+        raise Conflict("; ".join(found.differences))
+    beside = dict(args or {})
+    doubled = sorted(found.set_up.keys() & beside.keys() - {"task"})
+    if doubled:
+        raise EvaError(f"args say {', '.join(doubled)} beside the replay, which has its own: leave it out")
+    args = {**found.set_up, **beside}
+    return issue(user=user, station=station, kind=kind, args=args, vouched=("policy",), **given)
 
 
 def recorded_at(source: str, robot: str = "") -> Recorded:

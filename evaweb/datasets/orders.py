@@ -15,6 +15,7 @@ from evaweb.errors import Conflict, EvaError
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import enqueue
 from evaweb.roles import Role, require
+from runtime.datasets.layout import INFO
 from runtime.datasets.operations import fingerprint
 from runtime.recording.files import RecordingError
 
@@ -168,6 +169,9 @@ def _new(to: str, parts: Sequence[str] | Mapping[str, Any]) -> str:
     name = to if "/" in to else f"datasets/{to}"
     for wanted in [f"{name}/{part}" for part in parts] or [name]:
         folder = folder_named(wanted)
+        around = next((above for above in folder.parents if (above / INFO).is_file()), None)
+        if around is not None:
+            raise Conflict(f"{wanted} would lie within the dataset {around.name}: choose another name")
         if folder.exists() and any(folder.iterdir()):
             raise Conflict(f"{wanted} is there already and not empty: choose another name")
     return name

@@ -18,7 +18,7 @@ import robots
 from evaweb.datasets.finding import camera_keys, opened
 from evaweb.datasets.listing import told_of
 from evaweb.errors import NotFound
-from evaweb.stations.looks import looks_of
+from evaweb.stations.robot_geometry import looks_of
 from runtime.datasets import layout
 from runtime.datasets.entries import EpisodeEntry, Span
 from runtime.datasets.reader import Dataset

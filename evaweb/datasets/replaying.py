@@ -12,6 +12,7 @@ from django.shortcuts import render
 from django.views.decorators.http import require_GET
 
 import robots
+from evaweb.blinding import sight_for
 from evaweb.datasets import playing
 from evaweb.datasets.on_robot import AFTER_S, SPACES, offer, recorded_at
 from evaweb.datasets.orders import full_name
@@ -25,7 +26,6 @@ from evaweb.episodes.robot import looks_in
 from evaweb.episodes.streaming import file_answer
 from evaweb.episodes.views import player
 from evaweb.errors import Conflict, EvaError, NotFound
-from evaweb.sight import sight_for
 from evaweb.stations.geometry import geometry
 from evaweb.stations.models import Station
 from runtime.recording.files import RecordingError
@@ -109,14 +109,12 @@ def picture(request: HttpRequest, name: str, index: int, camera: str) -> HttpRes
     if row >= episode.frames:
         raise NotFound(f"row {row}: the episode has rows 0 to {episode.frames - 1}")
     content, kind = _readable(lambda: still(episode, camera, row))
-    answer = HttpResponse(content, content_type=kind)
-    answer["Cache-Control"] = "private, max-age=600"
-    return answer
+    return HttpResponse(content, content_type=kind)
 
 
 @require_GET
 def curves(request: HttpRequest, name: str, index: int) -> HttpResponse:
-    """Joint curves, and the action streams where they lie beside it, as one message of evaweb.frames."""
+    """Joint curves, and the action streams where they lie beside it, as one message of evaweb.binary_frames."""
     episode = _episode(request, name, index)
     recording = _recording(episode)
     covered = recording is not None and sight_for(request).hides_episode(recording)
@@ -134,7 +132,7 @@ def shapes(request: HttpRequest, name: str, index: int) -> HttpResponse:
 
 @require_GET
 def poses(request: HttpRequest, name: str, index: int) -> HttpResponse:
-    """Where the robot's parts were from row ?first= on, as one message of evaweb.frames."""
+    """Where the robot's parts were from row ?first= on, as one message of evaweb.binary_frames."""
     episode = _episode(request, name, index)
     first = _number(request, "first")
     return _message(lambda: poses_of(as_recording(episode), first))
@@ -174,6 +172,4 @@ def _readable(make: Callable[[], Result]) -> Result:
 
 
 def _message(make: Callable[[], bytes]) -> HttpResponse:
-    answer = HttpResponse(_readable(make), content_type="application/octet-stream")
-    answer["Cache-Control"] = "private, no-cache"
-    return answer
+    return HttpResponse(_readable(make), content_type="application/octet-stream")

@@ -10,13 +10,13 @@ from uuid import UUID
 from django.urls import reverse
 
 import robots
+from evaweb.blinding import sight_for
 from evaweb.datasets.orders import full_name
 from evaweb.datasets.playing import Played, played
 from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import episode_get, stage_of
 from evaweb.episodes.views import replay_config
 from evaweb.errors import Conflict, NotFound
-from evaweb.sight import sight_for
 from runtime.recording.files import RecordingError
 
 

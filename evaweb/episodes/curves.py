@@ -11,10 +11,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from evaweb.binary_frames import Stream, encode
 from evaweb.episodes.chunks import chunks
 from evaweb.episodes.robot import looks_in, robot_in
 from evaweb.errors import NotFound
-from evaweb.frames import Stream, encode
 from runtime.recording.reader import Episode, open_episode
 from runtime.recording.summary import HELD
 
@@ -26,7 +26,7 @@ _OPEN_MARKS = ("command", "estopped", "released", "truth")
 
 
 def curves(folder: Path, *, covered: bool = False) -> bytes:
-    """One message of evaweb.frames; RecordingError names the file that is absent or damaged.
+    """One message of evaweb.binary_frames; RecordingError names the file that is absent or damaged.
 
     Times are seconds of the video: row k is at k / fps. Streams, vectors joint by joint (a row per joint):
     ticks, at the control rate: time f8 [M], measured, smoothed and executed f4 [D, M] (NaN where nothing was

@@ -12,13 +12,13 @@ from django.db.models.functions import Now
 from django.utils import timezone
 
 from evaweb.episodes import services, verifying
-from evaweb.episodes.beside import sides_of
+from evaweb.episodes.dataset_sidecars import sides_of
 from evaweb.episodes.folders import data_dir, datasets_dir, journal_folder, preview_folder, scores_file
+from evaweb.episodes.manifest import recorded_in
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.preview import make_preview
 from evaweb.episodes.publishing import dataset_name, success_of
 from evaweb.episodes.reconcile import reconcile
-from evaweb.episodes.recorded import recorded_in
 from evaweb.episodes.smoothness import Smoothness, smoothness_in
 from evaweb.jobs.kinds import Work, at_start, chore, job_kind
 from evaweb.jobs.services import enqueue
@@ -26,7 +26,8 @@ from runtime.datasets.published import never_published, publish
 from runtime.recording.export import export
 from runtime.recording.files import RecordingError
 from runtime.recording.labels import newest
-from runtime.recording.scrub import DamagedError, verify
+from runtime.recording.scrub import verify
+from runtime.recording.verdict import DamagedError
 
 _AT_ONCE = 20  # asked for in one look
 
@@ -76,7 +77,7 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
     try:
         return _published(work, episode, folder)
     except RecordingError:
-        verdict = verify(folder)
+        verdict = verifying.known_better(episode, verify(folder))
         if verdict.state != "damaged":
             raise
         verifying.found(verdict)
@@ -85,6 +86,8 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
 
 def _published(work: Work, episode: Episode, folder: Path) -> Mapping[str, Any]:
     recorded = recorded_in(folder)
+    if recorded.closed and (changed := services.another_than(episode, recorded.facts["seal"])):
+        raise RecordingError(f"{folder}: outcome.json {changed}")
     if recorded.closed and not recorded.facts["frames"]:
         return {"published": False, "why": "it has no rows: its run ended before the first"}
     why = never_published({name: recorded.facts.get(name) for name in ("mode", "kind")})

@@ -12,7 +12,7 @@ from evaweb.episodes.models import EpisodeStatus
 from runtime.recording.files import RecordingError, read_document
 from runtime.recording.layout import Layout
 from runtime.recording.scrub import require_sound
-from runtime.recording.sealing import MANIFEST, OUTCOME, read_outcome
+from runtime.recording.sealing import MANIFEST, OUTCOME, SEAL, read_outcome
 
 CLOSED = (EpisodeStatus.FINISHED, EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED)
 
@@ -83,6 +83,7 @@ def _end(path: Path, outcome: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "status": EpisodeStatus(outcome["status"]),
         "reason": _text(outcome, "reason"),
+        "seal": _text(outcome, SEAL, 64),
         "frames": frames,
         "duration_s": duration if isinstance(duration, int | float) else None,
         "control": _table(outcome, "control"),

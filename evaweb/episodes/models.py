@@ -69,6 +69,11 @@ class Episode(models.Model):
         blank=True,
         help_text="Files that are not what was recorded; it is not published.",
     )
+    seal = models.CharField(
+        max_length=64,
+        blank=True,
+        help_text="Of its outcome, when that was first read; it is never another one.",
+    )
     verified_at = models.DateTimeField(
         null=True, blank=True, help_text="When all of its files were last compared with their digests."
     )

@@ -6,17 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
+from evaweb.binary_frames import Stream, encode
 from evaweb.episodes.curves import vectors
 from evaweb.episodes.robot import looks_in
 from evaweb.errors import NotFound
-from evaweb.frames import Stream, encode
 from runtime.recording.reader import Episode, open_episode
 
 MOST_ROWS = 900  # of one answer: half a minute at 30 Hz
 
 
 def poses(folder: Path, first: int) -> bytes:
-    """One message of evaweb.frames with stream `poses`: f4 [rows, P, 16], column-major world <- part.
+    """One message of evaweb.binary_frames with stream `poses`: f4 [rows, P, 16], column-major world <- part.
 
     Rows `first` to at most `first` + MOST_ROWS - 1, from the measured joints. NotFound where there is no such
     robot or row; RecordingError names the file that is absent or damaged.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evaweb.episodes.recorded import Recorded
+from evaweb.episodes.manifest import Recorded
 from runtime.recording.files import RecordingError
 
 DATASET_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")

@@ -11,9 +11,9 @@ from uuid import UUID
 from django.db import DataError, IntegrityError
 
 from evaweb.episodes import services
+from evaweb.episodes.dataset_membership import places_read
 from evaweb.episodes.folders import episodes_dir, scores_dir, scores_file
 from evaweb.episodes.models import Episode
-from evaweb.episodes.placing import places_read
 from evaweb.episodes.publishing import read_scores
 from evaweb.errors import EvaError
 from runtime.recording.files import RecordingError

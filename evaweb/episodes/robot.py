@@ -7,7 +7,7 @@ from typing import Any
 
 import robots
 from evaweb.errors import NotFound
-from evaweb.stations.looks import Looks, groups_of, looks_of
+from evaweb.stations.robot_geometry import Looks, groups_of, looks_of
 
 
 def robot_in(manifest: Mapping[str, Any]) -> Mapping[str, Any]:

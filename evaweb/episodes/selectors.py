@@ -9,13 +9,13 @@ from uuid import UUID
 
 from django.db.models import F, Q, QuerySet
 
+from evaweb.blinding import EVERYTHING, Sight
 from evaweb.episodes.folders import journal_folder, preview_folder
+from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.episodes.recorded import CLOSED
 from evaweb.errors import NotFound
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import job_newest
-from evaweb.sight import EVERYTHING, Sight
 from runtime.recording.files import RecordingError, read_document
 from runtime.recording.layout import Layout
 from runtime.recording.tables import read_table, rows_schema

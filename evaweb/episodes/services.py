@@ -15,8 +15,8 @@ from django.utils import timezone
 
 from evaweb.episodes.exporting import exported, job_key
 from evaweb.episodes.folders import data_dir, journal_folder, preview_folder
+from evaweb.episodes.manifest import CLOSED, Recorded, recorded_in
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
-from evaweb.episodes.recorded import CLOSED, Recorded, recorded_in
 from evaweb.errors import EvaError
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import enqueue
@@ -24,6 +24,7 @@ from evaweb.stations.models import Station
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError
 from runtime.recording.quarantine import marked
+from runtime.recording.sealing import OUTCOME
 
 log = logging.getLogger(__name__)
 
@@ -108,9 +109,14 @@ def episode_missed(*, station: Station, uuid: UUID, **facts: Any) -> Episode:
 def episode_read(*, uuid: UUID, station: Station | None = None) -> Episode:
     """Make the row say what the folder says, and ask for a preview where there is something to play.
 
-    RecordingError where the folder is absent or damaged.
+    RecordingError where the folder is absent or damaged, or is not that of the recording that was closed: then the row
+    stays as it is, and is verified next.
     """
     recorded = recorded_in(journal_folder(uuid))
+    row = Episode.objects.filter(uuid=uuid, status__in=CLOSED).first()
+    if row is not None and (why := another_than(row, recorded.facts.get("seal"))):
+        Episode.objects.filter(uuid=uuid).update(verified_at=None)
+        raise RecordingError(f"{journal_folder(uuid)}: {OUTCOME} {why}")
     facts = dict(recorded.facts) | {
         "previewed_at": _previewed_at(uuid),
         "damage": marked(data_dir(), str(uuid)),
@@ -126,6 +132,18 @@ def episode_read(*, uuid: UUID, station: Station | None = None) -> Episode:
         episode.smoothness_detail = None  # what the folder lacked may be there now
         episode.save(update_fields=["smoothness_detail"])
     return episode
+
+
+def another_than(row: Episode, seal: str | None) -> str:
+    """What has become of the outcome of a row that is closed, to follow its name; "" where it is the same.
+
+    `seal` is that of the one that is there now: None where there is none, "" where it has none.
+    """
+    if seal is None:
+        return f"is absent, though the recording was closed as {row.status}"
+    if row.seal and seal != row.seal:
+        return "is not the one with which the recording was closed: nobody can say whether its files are as they were"
+    return ""
 
 
 def preview_asked(*, episode: Episode) -> Job:

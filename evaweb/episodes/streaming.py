@@ -58,7 +58,6 @@ def _answer(
         "Accept-Ranges": "bytes",
         "ETag": validators.etag,
         "Last-Modified": validators.last_modified,
-        "Cache-Control": "private, no-cache",
     }
     if not_modified(headers.get("If-None-Match"), headers.get("If-Modified-Since"), validators):
         return HttpResponse(status=304, headers=common)

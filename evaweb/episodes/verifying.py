@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from datetime import timedelta
+from pathlib import Path
 from typing import Any
 from uuid import UUID
 
 from django.db.models import F, Q, QuerySet
 from django.utils import timezone
 
-from evaweb.episodes.folders import journal_folder
+from evaweb.episodes.folders import data_dir, journal_folder
+from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode
-from evaweb.episodes.recorded import CLOSED
+from evaweb.episodes.services import another_than
 from evaweb.jobs.kinds import Work
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import enqueue
 from runtime.recording.files import RecordingError
-from runtime.recording.quarantine import keep
-from runtime.recording.scrub import Verdict, verify
+from runtime.recording.quarantine import keep, marked
+from runtime.recording.scrub import verify
+from runtime.recording.sealing import MANIFEST, OUTCOME, SECOND
+from runtime.recording.verdict import Damage, Verdict
 
 log = logging.getLogger(__name__)
 
@@ -45,8 +50,7 @@ def scrubbed(work: Work) -> Mapping[str, Any]:
             break
         work.tell(f"{sum(counts.values())} verified, {len(damaged)} damaged")
         try:
-            verdict = verify(journal_folder(uuid))
-            found(verdict)
+            verdict = found(_looked_at(journal_folder(uuid)))
         except RecordingError as error:
             problems.append(str(error))
             Episode.objects.filter(uuid=uuid).update(verified_at=timezone.now())
@@ -57,14 +61,36 @@ def scrubbed(work: Work) -> Mapping[str, Any]:
     return {**counts, "bytes": read, "found": damaged, "problems": problems}
 
 
-def found(verdict: Verdict) -> None:
-    """Keep what was found of an episode of this lab: on the disk, and in its row."""
+def found(verdict: Verdict) -> Verdict:
+    """Keep what was found of an episode of this lab, on the disk and in its row; as it then stands."""
+    row = Episode.objects.filter(uuid=UUID(verdict.path.name)).first()
+    verdict = known_better(row, verdict) if row else verdict
     if verdict.state == "damaged":
         log.error("episode %s is damaged: %s", verdict.path.name, verdict.text)
     keep(verdict)
-    Episode.objects.filter(uuid=UUID(verdict.path.name)).update(
-        damage=verdict.document()["damage"], verified_at=timezone.now()
-    )
+    facts: dict[str, Any] = {"damage": marked(data_dir(), verdict.path.name), "verified_at": timezone.now()}
+    if verdict.state == "sound" and not facts["damage"]:
+        facts["seal"] = verdict.seal
+    Episode.objects.filter(uuid=UUID(verdict.path.name)).update(**facts)
+    return verdict
+
+
+def known_better(row: Episode, verdict: Verdict) -> Verdict:
+    """A closed recording that lost its outcome, or has another one than that with which it was closed, is damaged."""
+    if row.status not in CLOSED or verdict.state == "damaged":
+        return verdict
+    why = another_than(row, None if verdict.state == "open" else verdict.seal)
+    if not why:
+        return verdict
+    return replace(verdict, state="damaged", damage=(Damage(OUTCOME, why),), seal=row.seal)
+
+
+def _looked_at(folder: Path) -> Verdict:
+    """A folder that has nothing left by which it is an episode is that of a closed one all the same."""
+    lost = [Damage(name, "is absent") for name in (MANIFEST, OUTCOME) if not (folder / name).exists()]
+    if folder.is_dir() and len(lost) == 2 and not (folder / SECOND).exists():
+        return Verdict(folder, "damaged", tuple(lost))
+    return verify(folder)
 
 
 def _due() -> QuerySet[Episode]:

@@ -16,6 +16,7 @@ from django.urls import reverse
 from django.views.decorators.http import require_GET, require_POST
 
 import robots
+from evaweb.blinding import sight_for
 from evaweb.episodes import selectors, services
 from evaweb.episodes.curves import curves
 from evaweb.episodes.exporting import CONTENT_TYPE, table_file, table_of
@@ -27,7 +28,6 @@ from evaweb.episodes.selectors import episode_get, stage_of
 from evaweb.episodes.streaming import file_answer
 from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.roles import Role, require
-from evaweb.sight import sight_for
 from evaweb.stations.geometry import geometry
 from evaweb.stations.models import Station
 from runtime.recording.base import IMPORTED
@@ -166,7 +166,7 @@ async def _known(uuid: UUID) -> Episode:
 
 @require_GET
 def episode_curves(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Joint curves and events, as one message of evaweb.frames."""
+    """Joint curves and events, as one message of evaweb.binary_frames."""
     covered = sight_for(request).hides_episode(episode_get(uuid=uuid))
     return _message(lambda: curves(journal_folder(uuid), covered=covered))
 
@@ -186,7 +186,7 @@ def episode_geometry(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 @require_GET
 def episode_poses(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Where the robot's parts were from row ?first= on, as one message of evaweb.frames."""
+    """Where the robot's parts were from row ?first= on, as one message of evaweb.binary_frames."""
     episode_get(uuid=uuid)
     first = request.GET.get("first", "0")
     if not (first.isascii() and first.isdecimal()) or len(first) > 9:
@@ -199,6 +199,4 @@ def _message(make: Callable[[], bytes]) -> HttpResponse:
         content = make()
     except RecordingError as error:
         raise Conflict(str(error)) from None
-    answer = HttpResponse(content, content_type="application/octet-stream")
-    answer["Cache-Control"] = "private, no-cache"
-    return answer
+    return HttpResponse(content, content_type="application/octet-stream")

@@ -35,7 +35,7 @@ def only_one(data_dir: Path) -> Iterator[None]:
         yield
 
 
-def require_free(host: str, port: int) -> None:
+def require_free(host: str, port: int, option: str = "--port") -> None:
     """LabError where nothing can listen there; whatever holds the port is left alone."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -43,7 +43,7 @@ def require_free(host: str, port: int) -> None:
             probe.bind((host, port))
         except OSError as error:
             raise LabError(
-                f"cannot listen on {host}:{port}: {error.strerror}; name another port with --port"
+                f"cannot listen on {host}:{port}: {error.strerror}; name another port with {option}"
             ) from None
 
 

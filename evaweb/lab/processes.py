@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from evaweb.errors import EvaError
+from runtime.core.environment import without_secrets
 
 log = logging.getLogger(__name__)
 _MOST_RESTARTS, _RESTART_WINDOW_S = 5, 60.0
@@ -46,6 +47,8 @@ class Program:
     again: Callable[[Mapping[str, Any]], tuple[str, ...]] | None = None
     patience_s: float = 5.0  # to end by itself
     nice: int = 0  # above 0: gives way to the stations of this machine
+    descriptors: tuple[int, ...] = ()  # of our files that it has too, under the same numbers
+    of_web: bool = False  # gets the web's secrets; no other program has them in its environment
 
 
 @dataclass
@@ -121,8 +124,9 @@ class Processes:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE if heard else output,
             stderr=output,
-            env=self._environment,
+            env=self._environment if program.of_web else without_secrets(self._environment),
             cwd=self._folder,
+            pass_fds=program.descriptors,
             start_new_session=True,  # Ctrl-C reaches us alone; we end them in order
         )
         return process, output

@@ -20,13 +20,31 @@ def web(host: str, port: int) -> Program:
         return (_MANAGE, "serve", "--host", host, "--port", str(where))
 
     return Program(
-        "web", arguments(port), announces=True, again=lambda found: arguments(_port(found)), nice=5
+        "web",
+        arguments(port),
+        announces=True,
+        again=lambda found: arguments(port_of(found)),
+        patience_s=10.0,  # it gives requests that are under way 4 s, once it has heard
+        nice=5,
+        of_web=True,
+    )
+
+
+def stops(descriptor: int, web_port: str) -> Program:
+    """E-stop, stop and halt of the web's pages, on a socket that listens; the web gives way to it."""
+    return Program(
+        "stops",
+        (_MANAGE, "stops", "--descriptor", str(descriptor), "--web-port", web_port),
+        announces=True,
+        patience_s=10.0,  # as the web's
+        descriptors=(descriptor,),
+        of_web=True,
     )
 
 
 def worker(queues: Sequence[str]) -> Program:
     """What turns finished episodes into datasets; what it was about to do is done at the next start."""
-    return Program("worker", (_MANAGE, "worker", "--queues", ",".join(queues)), patience_s=20.0)
+    return Program("worker", (_MANAGE, "worker", "--queues", ",".join(queues)), patience_s=20.0, of_web=True)
 
 
 def station(deployment: str, assignments: Sequence[str]) -> Program:
@@ -79,7 +97,7 @@ def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> Prog
         return ("-m", "runtime.sim.serve", *_serving(name, robot, options, port))
 
     return Program(
-        f"policy-{name}", arguments(port), announces=True, again=lambda found: arguments(_port(found))
+        f"policy-{name}", arguments(port), announces=True, again=lambda found: arguments(port_of(found))
     )
 
 
@@ -104,7 +122,8 @@ def lockstep(
     return Program(f"station-{_stem(deployment)}", arguments, announces=True, patience_s=15.0)
 
 
-def _port(found: Mapping[str, Any]) -> str:
+def port_of(found: Mapping[str, Any]) -> str:
+    """The port in what a program announced."""
     return str(found["url"]).rstrip("/").rpartition(":")[2]
 
 

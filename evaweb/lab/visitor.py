@@ -25,8 +25,8 @@ from urllib.request import (
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection, connect
 
+from evaweb.binary_frames import decode
 from evaweb.errors import EvaError
-from evaweb.frames import decode
 from evaweb.lab.patience import NoReply, Patience, VisitFailed
 
 _RENEW_S = 1.0

@@ -13,11 +13,11 @@ from django.db import transaction
 from django.db.models import Max, OuterRef, Subquery
 
 from evaweb.errors import Conflict, NotAllowed
-from evaweb.plans import blinding
+from evaweb.plans import commitment as blinding
+from evaweb.plans.blinding_rules import has_looked
 from evaweb.plans.canonical import digest
 from evaweb.plans.documents import checkpoint_of, scene_of
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState, Slot
-from evaweb.plans.sight import has_looked
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
 from evaweb.trials import lifecycle

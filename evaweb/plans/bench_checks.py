@@ -12,14 +12,14 @@ from django.contrib.auth.models import User
 from django.db import transaction
 from django.utils import timezone
 
-from evaweb.episodes.lines import text
+from evaweb.episodes.jsonl import text
 from evaweb.errors import Conflict, EvaError
 from evaweb.plans import pictures
-from evaweb.plans.handing import hand_out
+from evaweb.plans.allocation import hand_out
 from evaweb.plans.models import Achieved, CameraCheck, Handout, Plan, PlanState, Reference
 from evaweb.roles import Role, require
-from evaweb.stations.looks import facts_of
 from evaweb.stations.models import Station
+from evaweb.stations.robot_geometry import facts_of
 from evaweb.trials.models import Position, Trial, TrialStatus
 from evaweb.trials.services import declare_check
 from evaweb.trials.verdicts import LONGEST_NOTE
@@ -97,7 +97,7 @@ def references_take(*, user: User, station: Station, position: Position | None) 
 
 
 def next_trial(*, user: User, station: Station, plan: Plan) -> Handout:
-    """The next trial of a plan, for who has looked at the cameras; see evaweb.plans.handing."""
+    """The next trial of a plan, for who has looked at the cameras; see evaweb.plans.allocation."""
     require(user, Role.OPERATOR)
     if cameras_confirmed(user=user, station=station) is None:
         raise Conflict(

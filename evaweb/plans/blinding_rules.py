@@ -11,10 +11,10 @@ from typing import Any
 
 from django.db import transaction
 
+from evaweb.blinding import EVERYTHING, Sight, declare, masked
 from evaweb.errors import NotAllowed
 from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState
 from evaweb.roles import Role, role_of
-from evaweb.sight import EVERYTHING, Sight, declare, masked
 from evaweb.trials.models import Checkpoint
 from evaweb.trials.selectors import UNFINISHED
 
@@ -51,7 +51,7 @@ def may_look(plan: Plan, user: Any) -> bool:
 
 
 def hidden_from(user: Any) -> Sight:
-    """What plans hide from this user now; see evaweb.sight."""
+    """What plans hide from this user now; see evaweb.blinding."""
     plans = Plan.objects.filter(blind=True, state__in=(PlanState.FROZEN, PlanState.CLOSED))
     if user.pk is not None:
         plans = plans.exclude(looks__user=user)

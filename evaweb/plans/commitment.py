@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 from evaweb.errors import EvaError
 from evaweb.plans.canonical import digest
-from evaweb.plans.chance import KEY_BYTES, Chance
 from evaweb.plans.schedule import Unit
+from evaweb.plans.seeded_draws import KEY_BYTES, Chance
 
 _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"  # without 0 and O, 1 and I: they are read aloud across a bench
 _LENGTH = 5

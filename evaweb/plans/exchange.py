@@ -13,7 +13,6 @@ refused, with the differences, where one was. All of a file is taken, or nothing
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
@@ -32,6 +31,7 @@ from evaweb.plans.references import packed, reference_tables, take_references
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
+from runtime.core import bounded_documents as bounded
 
 _Row = TypeVar("_Row", bound=models.Model)
 
@@ -154,9 +154,9 @@ def imported(*, user: User, text: str, pictures: Mapping[str, bytes] | None = No
 
 def _read(text: str) -> File:
     try:
-        return File.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise EvaError(f"this is not TOML: {error}") from None
+        return File.model_validate(bounded.toml(text, "the file"))
+    except bounded.Unreadable as error:
+        raise EvaError(str(error)) from None
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))

@@ -20,13 +20,13 @@ from django.conf import settings
 
 from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.stations.models import Station
-from evaweb.stations.wire import wire_to
-from runtime.bus import CodecError, Subscriber
+from evaweb.stations.runtime_client import wire_to
+from runtime.ipc.bus import CodecError, Subscriber
 
 WIDTH, HEIGHT = (
     64,
     48,
-)  # to which both pictures are brought before they are compared; static/console/match.js does too
+)  # to which both pictures are brought before they are compared; static/console/trial/match.js does too
 _TURN_S = 0.1
 
 

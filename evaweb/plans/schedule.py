@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from evaweb.errors import EvaError
-from evaweb.plans.chance import Chance
+from evaweb.plans.seeded_draws import Chance
 
 MOST = 20_000  # trials of one plan: more is a mistake in the form
 

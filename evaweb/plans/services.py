@@ -7,12 +7,12 @@ from django.db import transaction
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
-from evaweb.plans import blinding
+from evaweb.plans import commitment as blinding
 from evaweb.plans.canonical import difference, digest
-from evaweb.plans.chance import new_key
 from evaweb.plans.documents import conditions_of, document_of
 from evaweb.plans.models import Plan, PlanEvent, PlanState, Slot, StoppingRule
 from evaweb.plans.schedule import Unit, schedule
+from evaweb.plans.seeded_draws import new_key
 from evaweb.roles import Role, require, role_of
 from evaweb.trials.lifecycle import OPEN
 from evaweb.trials.models import Evaluation, Trial, TrialStatus

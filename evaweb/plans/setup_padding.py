@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from evaweb.plans.chance import Chance
 from evaweb.plans.models import Handout
-from evaweb.trials.bench import declare_least
+from evaweb.plans.seeded_draws import Chance
 from evaweb.trials.models import Trial
+from evaweb.trials.station_commands import declare_least
 
 NEWEST = 5  # set-ups of a checkpoint that count: the first of a server may have compiled for a minute
 LONGER = 1.25

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from evaweb.blinding import sight_of
 from evaweb.preflights.models import Preflight
 from evaweb.roles import Role, role_of
-from evaweb.sight import sight_of
 from evaweb.trials.models import Checkpoint
 
 _TOLD = ("verdict", "stage", "advice", "ok")  # of a report, to everybody

@@ -17,7 +17,7 @@ LONGEST_S = 3600.0
 def preflight(work: Work) -> Mapping[str, Any]:
     """Ask the checkpoint's server by the deployment file of the station; args: preflight."""
     row: Preflight = preflight_get(id=work.args["preflight"])
-    from runtime.preflight.child import fly  # web processes know this kind too, and never do it
+    from runtime.station.preflight_child import fly  # web processes know this kind too, and never do it
 
     if row.status != PreflightStatus.RUNNING:
         return {"verdict": row.verdict}

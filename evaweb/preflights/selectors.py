@@ -6,9 +6,9 @@ from uuid import UUID
 
 from django.db.models import QuerySet
 
+from evaweb.blinding import EVERYTHING, Sight
 from evaweb.errors import NotFound
 from evaweb.preflights.models import Preflight
-from evaweb.sight import EVERYTHING, Sight
 from evaweb.trials.models import Checkpoint
 
 

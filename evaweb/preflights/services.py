@@ -15,20 +15,21 @@ from uuid import uuid4
 from django.db import transaction
 from django.utils import timezone
 
+from evaweb.binary_frames import plain
 from evaweb.errors import Conflict, StationGone
-from evaweb.frames import plain
 from evaweb.jobs.models import JobStatus
 from evaweb.jobs.selectors import job_newest
 from evaweb.jobs.services import enqueue
 from evaweb.preflights.models import Preflight, PreflightStatus
-from evaweb.roles import Role, require
+from evaweb.roles import Role, require, role_of
+from evaweb.stations.commands import TABLES
 from evaweb.stations.models import Station
+from evaweb.stations.runtime_client import NoAnswer, wire_to
 from evaweb.stations.selectors import station_list
-from evaweb.stations.wire import NoAnswer, wire_to
 from evaweb.trials.models import Checkpoint
-from runtime import deployment
-from runtime.deployment import ConfigurationError, server_of
-from runtime.messages import Command
+from runtime.config import loader as deployment
+from runtime.config.loader import ConfigurationError, server_of
+from runtime.ipc.messages import Command
 
 log = logging.getLogger(__name__)
 _AT_WORK = ("setting_up", "running", "holding")
@@ -117,7 +118,9 @@ def _first_station() -> Station:
 
 def _server_of_station(station: Station, checkpoint: Checkpoint) -> str:
     """The server that a preflight there would ask; "" where the table does not fit, which the report will say."""
-    ack = wire_to(station.name).request(Command(str(uuid4()), "policy_server", {"policy": checkpoint.policy}))
+    args = {"policy": checkpoint.policy}
+    asked = Command(str(uuid4()), "policy_server", args, role=Role.OPERATOR, vouched=list(TABLES))
+    ack = wire_to(station.name).request(asked)
     return str(ack.data["server"]) if ack.status == "done" else ""
 
 
@@ -144,7 +147,8 @@ def _of_station(row: Preflight) -> Preflight:
     checkpoint = {"id": row.checkpoint_id, "name": row.checkpoint.name}
     args = {"id": str(row.pk), "policy": row.policy, "checkpoint": checkpoint}
     username = row.user.get_username() if row.user else ""
-    command = Command(str(uuid4()), "preflight", args, user=username, holder=username)
+    said = {"user": username, "holder": username, "role": role_of(row.user) if row.user else ""}
+    command = Command(str(uuid4()), "preflight", args, vouched=list(TABLES), **said)
     try:
         ack = wire_to(row.station.name).request(command)
     except NoAnswer:

@@ -10,12 +10,12 @@ from django.shortcuts import render
 from django.utils import timezone
 from django.views.decorators.http import require_GET
 
+from evaweb.blinding import sight_for
 from evaweb.preflights import services
+from evaweb.preflights.blinding_rules import shown
 from evaweb.preflights.models import Preflight, PreflightStatus
 from evaweb.preflights.reading import ago, read
 from evaweb.preflights.selectors import preflight_get, preflight_newest
-from evaweb.preflights.sight import shown
-from evaweb.sight import sight_for
 from evaweb.trials.selectors import checkpoint_get
 
 

@@ -10,8 +10,8 @@ class ResultsConfig(AppConfig):
     default_auto_field = "django.db.models.BigAutoField"
 
     def ready(self) -> None:
-        from evaweb.guards import keep
-        from evaweb.results import restoring  # noqa: F401  it declares itself to those that reconcile
+        from evaweb.append_only import keep
         from evaweb.results.guarded import GUARDS
+        from evaweb.results.ratings import restoring  # noqa: F401  it declares itself to those that reconcile
 
         keep(self, GUARDS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evaweb.guards import Guard
+from evaweb.append_only import Guard
 
 GUARDS = (
     Guard(

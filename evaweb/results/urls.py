@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from django.urls import path
 
-from evaweb.results import views, views_judging, views_lab
+from evaweb.results.pages import views, views_judging, views_lab
 
 _PLAN = "result/plans/<slug:name>/<int:version>/"
 urlpatterns = [

@@ -10,8 +10,9 @@ class ReviewsConfig(AppConfig):
     default_auto_field = "django.db.models.BigAutoField"
 
     def ready(self) -> None:
-        from evaweb.guards import keep
-        from evaweb.reviews import beside, restoring  # noqa: F401  they declare themselves to apps below
+        from evaweb.append_only import keep
+        from evaweb.reviews import dataset_sidecars as beside  # noqa: F401  they declare themselves to apps below
+        from evaweb.reviews import restoring  # noqa: F401  they declare themselves to apps below
         from evaweb.reviews.guarded import GUARDS
 
         keep(self, GUARDS)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from uuid import UUID
 
-from evaweb.episodes.beside import gives_sides
+from evaweb.episodes.dataset_sidecars import gives_sides
 from evaweb.reviews.kept import KeptReview, Line, kept_lines, segments_of
 
 

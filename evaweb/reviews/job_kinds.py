@@ -16,7 +16,7 @@ from evaweb.episodes.models import Episode
 from evaweb.jobs.kinds import Work, chore, job_kind
 from evaweb.jobs.services import enqueue
 from evaweb.reviews import selectors, services
-from evaweb.reviews.beside import said_of, written
+from evaweb.reviews.dataset_sidecars import said_of, written
 from evaweb.reviews.folders import bounds_file, report_file
 from evaweb.reviews.models import Standing
 from runtime.datasets.sides import attach

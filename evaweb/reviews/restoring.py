@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
+from uuid import UUID
 
 from django.db import transaction
 
@@ -49,8 +50,10 @@ def _checked(episode: Episode) -> None:
 
 
 def _reviews(episode: Episode, lines: Sequence[KeptReview]) -> int:
+    last = {line.uuid: line for line in lines}  # of one that was given twice
     there = set(Review.objects.filter(episode=episode).values_list("uuid", flat=True))
-    absent = [line for line in lines if line.uuid not in there]
+    absent = [line for uuid, line in last.items() if uuid not in there]
+    _require_free(Review, [line.uuid for line in absent])
     for line in absent:
         Review.objects.create(
             uuid=line.uuid,
@@ -66,6 +69,13 @@ def _reviews(episode: Episode, lines: Sequence[KeptReview]) -> int:
     return len(absent)
 
 
+def _require_free(model: type[Review] | type[Segment], uuids: Collection[UUID]) -> None:
+    """EvaError where one of them is of another episode."""
+    other = model.objects.filter(uuid__in=uuids).first()
+    if other is not None:
+        raise EvaError(f"its {model.__name__.lower()} {other.uuid} is of episode {other.episode_id}")
+
+
 def _segments(episode: Episode, lines: Sequence[Line]) -> int:
     """Bring the rows up to what the lines say; a segment is as its newest line."""
     wanted = {line.uuid: line for line in segments_of(lines)}
@@ -75,6 +85,7 @@ def _segments(episode: Episode, lines: Sequence[Line]) -> int:
                 f"its segment {line.uuid} ends at frame {line.last}, before its first {line.first}"
             )
     rows = {row.uuid: row for row in Segment.objects.filter(episode=episode)}
+    _require_free(Segment, wanted.keys() - rows.keys())
     changed = 0
     for uuid, line in wanted.items():
         facts: Mapping[str, Any] = {

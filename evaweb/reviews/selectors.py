@@ -8,8 +8,8 @@ from uuid import UUID
 
 from django.db.models import F, Q, QuerySet
 
+from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.episodes.recorded import CLOSED
 from evaweb.errors import Conflict, NotFound
 from evaweb.reviews.folders import report_file
 from evaweb.reviews.models import Review, Segment, Standing

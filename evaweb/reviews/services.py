@@ -11,7 +11,7 @@ from django.db import transaction
 from django.db.models.functions import Now
 from django.utils import timezone
 
-from evaweb.episodes.lines import append_line, text
+from evaweb.episodes.jsonl import append_line, text
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job

@@ -7,28 +7,29 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
-from datetime import timedelta
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime, timedelta
 from typing import Any
-from uuid import UUID, uuid4
+from uuid import UUID, uuid4, uuid5
 
 from django.conf import settings
 from django.contrib.auth import get_user_model
 from django.db import Error, IntegrityError, transaction
 from django.utils import timezone
 
-from evaweb.errors import Conflict, EvaError, StationGone
-from evaweb.frames import plain
-from evaweb.lock_wait import lock_wait
-from evaweb.roles import Role, require
+from evaweb.binary_frames import plain
+from evaweb.errors import Conflict, EvaError, NotAllowed, StationGone
+from evaweb.roles import Role, require, role_of
 from evaweb.stations.holders import holder_of
-from evaweb.stations.models import Command, CommandStatus, Station
+from evaweb.stations.models import CARRIED_OUT, Command, CommandStatus, Station
+from evaweb.stations.notes import Notes
+from evaweb.stations.runtime_client import NoAnswer, wire_to
 from evaweb.stations.selectors import station_get
-from evaweb.stations.stops import Answer, answer_of, estop, spoken, stopped
+from evaweb.stations.stops import Answer, answer_of, ask, press, spoken
 from evaweb.stations.unwritten import Unwritten
-from evaweb.stations.wire import NoAnswer, wire_to
-from runtime import messages
-from runtime.bus import CodecError
+from runtime.ipc import messages
+from runtime.ipc.bus import CodecError
 
 log = logging.getLogger(__name__)
 STOPPING = ("stop", "halt", "estop")  # never stale; the runtime has the same list
@@ -38,9 +39,9 @@ KINDS = (
     *("tune", "step", "commit", "cancel", "move", "gripper", "approach"),
     *COLLECTING,
 )
+TABLES = ("policy", "checkpoint")  # arguments of whom a station asks, and as whom it writes that down
 _UNANSWERED = (CommandStatus.PRESSED, CommandStatus.UNKNOWN)
 _ANSWER = ("status", "reason", "allowed", "data", "answered_at")
-_NOTE_S = 0.5  # for which the answer to a stopping command is kept by its row; then the row is written later
 _LONG_AGO = 0.0  # on the runtime's clock: a command that must not be carried out any more
 
 
@@ -71,10 +72,12 @@ def issue(
     boot: str = "",
     sequence: int = 0,
     uuid: UUID | str | None = None,
+    vouched: Sequence[str] = (),
 ) -> Command:
     """Give a command and return its row with the answer; the same uuid again returns the first one's.
 
-    `boot` and `sequence` are those of the snapshot that the page showed. Never call it within a transaction:
+    `boot` and `sequence` are those of the snapshot that the page showed. `vouched` names arguments that were not taken
+    from the user, but from what an administrator wrote, or the lab recorded. Never call it within a transaction:
     nobody else could write until the station has answered. Raises NotAllowed, Conflict for a uuid that is
     another command's, NotSent where the database does not take the row.
     """
@@ -91,23 +94,60 @@ def issue(
     )
     if kind not in KINDS:
         raise EvaError(f"command {kind!r:.40} is unknown; allowed: {', '.join(KINDS)}")
-    if kind != "estop":
-        require(user, Role.OPERATOR)
-    return _stop(row) if kind in STOPPING else _give(row)
+    if kind == "estop":
+        return _stop(row)
+    role = require(user, Role.OPERATOR)
+    if kind in STOPPING:
+        return _stop(row)
+    _require_no_table(row, role, vouched)
+    return _give(row, _message(row, role, vouched))
 
 
-def estop_noted(*, user: Any, station: Station, why: str, uuid: UUID | str, answer: Answer) -> Command:
-    """The row of an e-stop that was pressed; of `station` the name is enough, where the database does not say more."""
-    row = Command(uuid=identity_of(uuid), station=station, user=user, kind="estop", args={"why": spoken(why)})
+def _require_no_table(row: Command, role: Role, vouched: Sequence[str]) -> None:
+    """An operator names what an administrator wrote; the station looks at it once more."""
+    given = [key for key in TABLES if row.args.get(key) is not None and key not in vouched]
+    if given and role is not Role.ADMIN:
+        raise NotAllowed(
+            f"{row.kind}: args say {' and '.join(given)}, and {row.user} is {role.a}: tables are for administrators; "
+            "allowed: a checkpoint, or a recorded episode (replay), by its name beside args"
+        )
+
+
+def estop_noted(
+    *,
+    user: Any,
+    station: Station,
+    why: str,
+    uuid: UUID | str,
+    answer: Answer,
+    at: datetime,
+    unverified: str = "",
+) -> Command:
+    """The row of an e-stop that was pressed `at` a time, written down soon, whenever the database takes it.
+
+    Of `station` and `user` the names are enough. `unverified` is why it is not known who pressed.
+    """
+    args = {"why": spoken(why)} | ({"unverified": unverified} if unverified else {})
+    row = Command(uuid=identity_of(uuid), station=station, user=user, kind="estop", args=args, issued_at=at)
+    if str(row.uuid) != answer.uuid and answer.data.get("latched") == "anew":  # which another press did
+        answer = replace(answer, data={**answer.data, "latched": "already"})
     return _noted(row, answer)
 
 
 def stop_noted(
-    *, user: Any, station: Station, kind: str, page: str, epoch: int, uuid: UUID | str, answer: Answer
+    *,
+    user: Any,
+    station: Station,
+    kind: str,
+    page: str,
+    epoch: int,
+    uuid: UUID | str,
+    answer: Answer,
+    at: datetime,
 ) -> Command:
-    """The row of a stop or halt that was given."""
-    holder = holder_of(user.get_username(), page)
-    row = Command(uuid=identity_of(uuid), station=station, user=user, kind=kind, holder=holder, epoch=epoch)
+    """The row of a stop or halt that was given `at` a time, written down soon, whenever the database takes it."""
+    given = {"station": station, "user": user, "kind": kind, "epoch": epoch, "issued_at": at}
+    row = Command(uuid=identity_of(uuid), holder=holder_of(user.get_username(), page), **given)
     return _noted(row, answer)
 
 
@@ -122,7 +162,8 @@ def settle(*, row: Command) -> Command:
     if row.kind in STOPPING or row.status not in _UNANSWERED or age < timedelta(seconds=_patience_s()):
         return row
     try:
-        answer = answer_of(wire_to(row.station.name).request(_message(row, valid_until=_LONG_AGO)))
+        late = _message(row, role_of(row.user) if row.user else "", TABLES, valid_until=_LONG_AGO)
+        answer = answer_of(wire_to(row.station.name).request(late))
     except StationGone:
         return row
     _put(row, answer)
@@ -149,11 +190,11 @@ def unsettled(*, station: Station) -> list[Command]:
     )
 
 
-def _give(row: Command) -> Command:
+def _give(row: Command, command: messages.Command) -> Command:
     first = _first(row)
     if first is not None:
         return settle(row=first)
-    _require_sendable(row)
+    _require_sendable(command)
     pressed = time.monotonic()
     try:
         with transaction.atomic(durable=True):
@@ -168,26 +209,26 @@ def _give(row: Command) -> Command:
         raise NotSent(
             f"{row.kind} was not sent: the database does not take it now ({error}); stopping works"
         ) from error
-    _put(row, _asked(row, waited=time.monotonic() - pressed))
+    _put(row, _asked(row, command, waited=time.monotonic() - pressed))
     _update(row)
     return row
 
 
-def _require_sendable(row: Command) -> None:
+def _require_sendable(command: messages.Command) -> None:
     """Before it is a row that would be asked about for an hour."""
     try:
-        messages.encode(_message(row))
+        messages.encode(command)
     except CodecError as error:
-        raise EvaError(f"{row.kind} cannot be sent with these args: {error}") from None
+        raise EvaError(f"{command.kind} cannot be sent with these args: {error}") from None
 
 
-def _asked(row: Command, waited: float) -> Answer:
+def _asked(row: Command, command: messages.Command, waited: float) -> Answer:
     """What the runtime says to a command whose row took `waited` seconds to be written."""
     if waited > settings.EVA_COMMAND_TIMEOUT_S:
         late = f"not sent: the database took {waited:.0f} s to write it down; look at the robot, press again"
         return Answer(CommandStatus.FAILED, late)
     try:
-        return answer_of(wire_to(row.station.name).request(_message(row), expires=True))
+        return answer_of(wire_to(row.station.name).request(command, expires=True))
     except NoAnswer as fault:
         return Answer(CommandStatus.UNKNOWN, str(fault))
     except StationGone as fault:
@@ -195,41 +236,79 @@ def _asked(row: Command, waited: float) -> Answer:
 
 
 def _stop(row: Command) -> Command:
-    if row.kind == "estop":
-        why, username = str(row.args.get("why", "pressed")), row.user.get_username()
-        return _noted(row, estop(station=row.station.name, username=username, why=why, uuid=row.uuid))
-    return _noted(row, stopped(_message(row), row.station.name))
+    if row.kind != "estop":
+        return _noted(row, ask(_message(row), row.station.name).result())
+    why, username = str(row.args.get("why", "pressed")), row.user.get_username()
+    return _noted(row, press(station=row.station.name, username=username, why=why, uuid=row.uuid).result())
 
 
 def _noted(row: Command, answer: Answer) -> Command:
-    """Write down what has been done already, whenever the database takes it."""
+    """Have written down what has been done already."""
     _put(row, answer)
-    try:
-        with lock_wait(_NOTE_S):
-            return _written(row)
-    except Error as error:
-        log.warning("%s (%s) is written down later: %s", row, row.uuid, error)
-        unwritten.keep(row)
-        return row
+    notes.note(row)
+    return row
 
 
 def _written(row: Command) -> Command:
-    """The row as it is in the database: this one, or the first of that uuid."""
+    """The row as it is in the database: this one, or the first of that uuid with what this one knows better.
+
+    A press whose uuid is that of something else has a row of its own.
+    """
     _resolve(row)
     try:
-        first = _first(row)
-        if first is None:
-            with transaction.atomic():
-                row.save(force_insert=True)
-        elif first.status in _UNANSWERED:
-            row.save(
-                update_fields=_ANSWER, force_update=True
-            )  # not the object that was read: it would be inserted
-        else:
-            return first
+        return _merged(row)
     except IntegrityError:  # pressed twice in the same moment: the other one has written it
-        return _first(row) or row
-    return row
+        return _merged(row)
+
+
+def _merged(row: Command) -> Command:
+    first = _first_or_own(row)
+    if first is None:
+        with transaction.atomic():
+            row.save(force_insert=True)
+        return row
+    better = _better(row, first)
+    if better:
+        row.save(
+            update_fields=better, force_update=True
+        )  # not the object that was read: it would be inserted
+    return _first(row) or row
+
+
+def _better(row: Command, first: Command) -> list[str]:
+    """The fields of a stop that came another way as well, where its answer was heard or its user was known there."""
+    carried_out = row.status in CARRIED_OUT and first.status not in CARRIED_OUT
+    latched = row.data.get("latched") == "anew" and first.data.get("latched") == "before"
+    answer = _ANSWER if first.status in _UNANSWERED or carried_out or latched else ()
+    known = ("user", "args") if first.user_id is None and row.user_id is not None else ()
+    return [*answer, *known]
+
+
+def _first_or_own(row: Command) -> Command | None:
+    """The row that has this uuid already, where it is this command; a press otherwise gets a uuid of its own.
+
+    That follows from what was pressed: whoever writes it, and however often, it is one row.
+    """
+    try:
+        first = _first(row)
+    except Conflict as conflict:
+        if row.kind != "estop":
+            raise
+        repeat = str(conflict)
+    else:
+        if first is None or not _latched_again(row, first):
+            return first
+        repeat = "pressed again, or a late copy: this uuid was carried out before"
+    user = row.user.get_username() if row.user else ""
+    row.data = {**row.data, "sent_uuid": str(row.uuid), "repeat": repeat}
+    row.uuid = uuid5(row.uuid, f"{row.station.name} {user} {row.data.get('carried_out_at', '')}")
+    return _first(row)
+
+
+def _latched_again(row: Command, first: Command) -> bool:
+    """Whether a press latched anew, and not when the first of its uuid was carried out."""
+    at = first.data.get("carried_out_at")
+    return row.data.get("latched") == "anew" and at not in (None, row.data["carried_out_at"])
 
 
 def _resolve(row: Command) -> None:
@@ -241,12 +320,20 @@ def _resolve(row: Command) -> None:
 
 
 unwritten = Unwritten(_written)
+notes = Notes(lambda row: unwritten.keep(row))
 
 
 def _first(row: Command) -> Command | None:
     """The row that has this uuid already; raises Conflict where it is another command."""
     first = Command.objects.select_related("station", "user").filter(uuid=row.uuid).first()
-    if first and (first.station_id, first.user_id, first.kind) != (row.station_id, row.user_id, row.kind):
+    if first is None:
+        return None
+    unverified = row.kind == "estop" and None in (
+        first.user_id,
+        row.user_id,
+    )  # by one of the ways that it came
+    same_user = first.user_id == row.user_id or unverified
+    if (first.station_id, first.kind) != (row.station_id, row.kind) or not same_user:
         raise Conflict(f"uuid {row.uuid} is that of another command ({first}); each needs one of its own")
     return first
 
@@ -267,7 +354,10 @@ def _update(row: Command) -> None:
         )
 
 
-def _message(row: Command, valid_until: float = float("inf")) -> messages.Command:
+def _message(
+    row: Command, role: str = "", vouched: Sequence[str] = (), valid_until: float = float("inf")
+) -> messages.Command:
+    """`role` is what the station is told of the user's, "" for stops, which need none and wait for no database."""
     return messages.Command(
         str(row.uuid),
         row.kind,
@@ -278,6 +368,8 @@ def _message(row: Command, valid_until: float = float("inf")) -> messages.Comman
         boot=row.boot,
         sequence=row.sequence,
         valid_until=valid_until,
+        role=role,
+        vouched=list(vouched),
     )
 
 

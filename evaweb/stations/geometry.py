@@ -9,8 +9,8 @@ import numpy as np
 from django.urls import reverse
 from numpy.typing import NDArray
 
-from evaweb.stations.looks import Looks, looks_of, tip_of
 from evaweb.stations.meshes import mesh_in
+from evaweb.stations.robot_geometry import Looks, looks_of, tip_of
 from evaweb.stations.surroundings import BENCH, surroundings
 from robots import Group
 from robots.capsules import capsules

@@ -17,11 +17,11 @@ from django.db.models import Max
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
-from evaweb.roles import Role, require
+from evaweb.roles import Role, require, role_of
 from evaweb.stations.holders import holder_of, readable, who
 from evaweb.stations.models import Lease, LeaseRequest, Station
-from evaweb.stations.wire import wire_to
-from runtime import messages
+from evaweb.stations.runtime_client import wire_to
+from runtime.ipc import messages
 
 _ECHO = timedelta(seconds=3)  # for which an old snapshot may still be under way
 
@@ -35,7 +35,7 @@ def claim(*, user: Any, station: Station, page: str) -> Lease:
     if held["holder"] not in ("", holder):
         raise Conflict(f"{who(held['holder'])} has {station}: ask for it, and it can be handed over")
     epoch = held["epoch"] if held["holder"] else _next_epoch(station, held)
-    return _grant(station, holder, epoch, end_reason="expired")
+    return _grant(user, station, holder, epoch, end_reason="expired")
 
 
 def renew(*, username: str, page: str, station: str, epoch: int) -> messages.Ack:
@@ -90,7 +90,8 @@ def hand_over(*, user: Any, station: Station, page: str, request: int) -> Lease:
     held = _held(station)
     if (held["holder"], held["epoch"]) != (own.holder, own.epoch):
         raise Conflict(f"the lease has ended: {who(held['holder']) or 'nobody'} has {station} now")
-    return _grant(station, asked.holder, _next_epoch(station, held), f"handed over to {asked.user}")
+    epoch = _next_epoch(station, held)
+    return _grant(asked.user, station, asked.holder, epoch, f"handed over to {asked.user}")
 
 
 def move(*, user: Any, station: Station, page: str) -> Lease:
@@ -102,10 +103,10 @@ def move(*, user: Any, station: Station, page: str) -> Lease:
     _require_active(station)
     holder, held = holder_of(user.get_username(), page), _held(station)
     if held["holder"] == holder:
-        return _grant(station, holder, held["epoch"], end_reason="expired")
+        return _grant(user, station, holder, held["epoch"], end_reason="expired")
     if not held["holder"].startswith(holder_of(user.get_username(), "")):
         raise Conflict(f"{who(held['holder']) or 'nobody'} has {station}, no other page of yours")
-    return _grant(station, holder, _next_epoch(station, held), "moved to another page")
+    return _grant(user, station, holder, _next_epoch(station, held), "moved to another page")
 
 
 def take(*, user: Any, station: Station, page: str, reason: str) -> Lease:
@@ -115,7 +116,7 @@ def take(*, user: Any, station: Station, page: str, reason: str) -> Lease:
         raise EvaError("taking a station from somebody needs a reason; it is written down and shown")
     holder = holder_of(user.get_username(), page)
     epoch = _next_epoch(station, _held(station))
-    return _grant(station, holder, epoch, f"taken by {user.get_username()}: {reason.strip()}"[:240])
+    return _grant(user, station, holder, epoch, f"taken by {user.get_username()}: {reason.strip()}"[:240])
 
 
 def notice(*, station: Station, boot: str, held: Mapping[str, Any]) -> bool:
@@ -162,19 +163,19 @@ def _next_epoch(station: Station, held: Mapping[str, Any]) -> int:
     return 1 + max(int(held["epoch"]), station.leases.aggregate(newest=Max("epoch"))["newest"] or 0)
 
 
-def _tell(station: str, kind: str, holder: str, epoch: int) -> messages.Ack:
-    """A lease command to the runtime."""
+def _tell(station: str, kind: str, holder: str, epoch: int, role: str = "") -> messages.Ack:
+    """A lease command to the runtime; who keeps or ends a lease needs no role for it."""
     user = who(holder)
-    command = messages.Command(str(uuid4()), kind, user=user, holder=holder, epoch=epoch)
+    command = messages.Command(str(uuid4()), kind, user=user, holder=holder, epoch=epoch, role=role)
     return wire_to(station).request(command)
 
 
-def _grant(station: Station, holder: str, epoch: int, end_reason: str) -> Lease:
-    """Have the runtime accept the lease, then write it down; raises Conflict where somebody was faster.
+def _grant(user: Any, station: Station, holder: str, epoch: int, end_reason: str) -> Lease:
+    """Have the runtime accept the lease of `user`, then write it down; raises Conflict where somebody was faster.
 
     Whoever gets the station has got what they asked for.
     """
-    ack = _tell(station.name, "lease_claim", holder, epoch)
+    ack = _tell(station.name, "lease_claim", holder, epoch, role_of(user))
     if ack.status == "refused":
         raise Conflict(f"{station} was not given: {readable(ack.reason)}")
     with transaction.atomic():

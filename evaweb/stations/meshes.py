@@ -8,7 +8,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from evaweb.errors import NotFound
-from evaweb.stations.looks import looks_of
+from evaweb.stations.robot_geometry import looks_of
 
 
 @dataclass(frozen=True, slots=True)

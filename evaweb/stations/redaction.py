@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from evaweb.sight import Sight
+from evaweb.blinding import Sight
 
 # Of a snapshot: the robot, the bench, who commands; nothing of the policy, its times and its chunks.
 _SHOWN = (

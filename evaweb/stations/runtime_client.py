@@ -17,11 +17,13 @@ from uuid import uuid4
 import zmq
 from django.conf import settings
 
+from evaweb.binary_frames import plain
 from evaweb.errors import NotFound, StationGone
-from evaweb.frames import plain
 from evaweb.stations.models import STATION_NAME
-from runtime.bus import CodecError, CommandClient, Endpoints, TransportError
-from runtime.messages import Ack, Command
+from runtime.ipc.bus import CodecError, CommandClient, Endpoints, Key, TransportError
+from runtime.ipc.estop_client import NoAnswer as Unanswered
+from runtime.ipc.estop_client import NotSent, urgent
+from runtime.ipc.messages import Ack, Command
 
 _CLOCK_KNOWN_S = 60.0  # how long the difference of two computers' clocks is believed
 
@@ -39,7 +41,9 @@ class StationWire:
         if not re.fullmatch(STATION_NAME, name):
             raise NotFound(f"station {name!r:.80}: letters, digits, '.', '_' and '-' make a name")
         self.name = name
-        self.endpoints = Endpoints(settings.DATA_DIR / "stations" / name)
+        folder = settings.DATA_DIR / "stations" / name
+        self.endpoints = Endpoints(folder)
+        self._key = Key(folder)  # what is given in a person's name is signed with it
         self._lock = threading.Lock()
         self._client: CommandClient | None = None
         self._endpoint = ""
@@ -70,11 +74,17 @@ class StationWire:
 
         `process` and `key` name the socket: main's "commands", the guard's "estop".
         """
-        client = CommandClient(zmq.Context.instance(), self.address(process, key))
         try:
-            return self._ask(client, command, time.monotonic() + timeout)
-        finally:
-            client.close()
+            context = zmq.Context.instance()
+            return urgent(context, self.endpoints, (process, key), command, timeout, self._key)
+        except CodecError as error:
+            raise self._unreadable(command, error) from error
+        except Unanswered as error:
+            raise NoAnswer(f"{self._silence(command)}{error.why}") from None
+        except NotSent as error:
+            raise StationGone(f"{self.name}: {error}") from None
+        except TransportError:
+            raise self._not_running() from None
 
     def status(self, timeout: float | None = None) -> dict[str, Any]:
         """The newest snapshot, as JSON may carry it; raises StationGone."""
@@ -91,14 +101,19 @@ class StationWire:
         try:
             return str(self.endpoints.read(process)[key])
         except (TransportError, KeyError):
-            raise StationGone(f"{self.name} is not running: its runtime has to be started") from None
+            raise self._not_running() from None
+
+    def _not_running(self) -> StationGone:
+        return StationGone(f"{self.name} is not running: its runtime has to be started")
 
     def _connected(self) -> CommandClient:
         endpoint = self.address("main", "commands")
         if self._client is None or endpoint != self._endpoint:
             if self._client is not None:
                 self._client.close()
-            self._client, self._endpoint = CommandClient(zmq.Context.instance(), endpoint), endpoint
+            owner = self.endpoints.owner
+            self._client = CommandClient(zmq.Context.instance(), endpoint, self._key, owner)
+            self._endpoint = endpoint
             self._ahead_known = -float("inf")
         return self._client
 
@@ -117,15 +132,27 @@ class StationWire:
         try:
             return client.request(command, max(0.0, deadline - time.monotonic()))
         except TransportError:
-            unknown = "" if command.kind == "status" else ": outcome unknown, look at the robot"
-            raise NoAnswer(f"{self.name} has not answered {command.kind} in time{unknown}") from None
+            raise self._silent(command) from None
         except CodecError as error:
-            raise NoAnswer(
-                f"{self.name} answered {command.kind} with what cannot be read: {error}"
-            ) from error
+            raise self._unreadable(command, error) from error
+
+    def _silent(self, command: Command) -> NoAnswer:
+        return NoAnswer(self._silence(command))
+
+    def _silence(self, command: Command) -> str:
+        unknown = "" if command.kind == "status" else ": outcome unknown, look at the robot"
+        return f"{self.name} has not answered {command.kind} in time{unknown}"
+
+    def _unreadable(self, command: Command, error: CodecError) -> NoAnswer:
+        return NoAnswer(f"{self.name} answered {command.kind} with what cannot be read: {error}")
+
+
+def wire_to(name: str) -> StationWire:
+    """This process's wire to the station; raises NotFound for what cannot be a station's name."""
+    wire = StationWire(name)
+    return _kept(name) if (settings.DATA_DIR / "stations" / name).is_dir() else wire
 
 
 @cache
-def wire_to(name: str) -> StationWire:
-    """This process's wire to the station; raises NotFound for what cannot be a station's name."""
+def _kept(name: str) -> StationWire:
     return StationWire(name)

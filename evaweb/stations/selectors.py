@@ -7,6 +7,7 @@ from uuid import UUID
 from django.db.models import QuerySet
 
 from evaweb.errors import NotFound
+from evaweb.refusals import is_text
 from evaweb.stations.models import NOT_CARRIED_OUT, Command, Lease, LeaseRequest, Station
 
 
@@ -17,7 +18,7 @@ def station_list(*, all_of_them: bool = False) -> QuerySet[Station]:
 
 def station_get(*, name: str) -> Station:
     """The station of that name; NotFound lists those that there are."""
-    found = Station.objects.filter(name=name).first()
+    found = Station.objects.filter(name=name).first() if is_text(name) else None
     if found is None:
         known = ", ".join(Station.objects.values_list("name", flat=True)) or "none yet"
         raise NotFound(f"station {name!r:.80} does not exist; there are: {known}")

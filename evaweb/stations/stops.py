@@ -1,33 +1,45 @@
-"""Stop, halt and e-stop: straight to the station, without the database; and what a station's answer comes to."""
+"""Stop, halt and e-stop: straight to the station, without the database; and what a station's answer comes to.
+
+`press` and `ask` never wait: each station has threads of its own, and who comes while the same is under way shares its
+answer.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 from uuid import UUID
 
 from django.conf import settings
 
+from evaweb.binary_frames import plain
 from evaweb.errors import StationGone
-from evaweb.frames import plain
+from evaweb.stations.flights import Flights, TooMany
 from evaweb.stations.holders import holder_of, readable
 from evaweb.stations.models import CommandStatus
-from evaweb.stations.wire import NoAnswer, wire_to
-from runtime import messages
+from evaweb.stations.runtime_client import NoAnswer, wire_to
+from runtime.ipc import estop_requests as pressing
+from runtime.ipc import messages
 
 HARDWARE_STOP = "USE THE HARDWARE STOP"
 _ESTOP_S = 1.0  # what a person waits for before the page turns red
-_LONGEST_WHY = 240  # characters
+_MOST_STOPS = 32  # of different leases that one station is asked at once
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What became of a command; `allowed` names the commands that would be accepted now."""
+    """What became of a command; `allowed` names the commands that would be accepted now.
+
+    `uuid` is that of the press that was answered, which may be another one that was under way.
+    """
 
     status: CommandStatus
     reason: str = ""
     allowed: list[str] = field(default_factory=list)
     data: dict[str, Any] = field(default_factory=dict)
+    uuid: str = ""
 
 
 def answer_of(ack: messages.Ack) -> Answer:
@@ -37,14 +49,41 @@ def answer_of(ack: messages.Ack) -> Answer:
 
 def spoken(why: str) -> str:
     """The beginning of it, with nothing in it that cannot be sent or kept: no press is lost for its words."""
-    return why[:_LONGEST_WHY].encode("utf-8", "replace").decode().replace("\x00", "")
+    return pressing.kept(why)
+
+
+_presses: Flights[Answer] = Flights("e-stop")
+_stops: Flights[Answer] = Flights("stop", _MOST_STOPS)
+
+
+def press(*, station: str, username: str, why: str, uuid: UUID | str) -> Future[Answer]:
+    """What comes of pressing the e-stop; a press that is under way answers it, and one more is made all the same."""
+    work = partial(estop, station=station, username=username, why=why, uuid=uuid)
+    return _presses.ask(station, work, identity=str(uuid), shared=True)
+
+
+def ask(command: messages.Command, station: str) -> Future[Answer]:
+    """What comes of a stop or halt; those of one lease that come while one is under way are one more."""
+    key = (command.kind, command.holder, command.epoch)
+    try:
+        return _stops.ask(station, partial(stopped, command, station), key=key, identity=command.uuid)
+    except TooMany as fault:
+        answer: Future[Answer] = Future()
+        answer.set_result(Answer(CommandStatus.FAILED, f"{fault}; the e-stop goes another way"))
+        return answer
+
+
+def refused_to_a_viewer(username: str) -> str:
+    """Why a viewer's stop or halt goes nowhere."""
+    return f"{username} is a viewer; this needs an operator: ask an administrator, or press the e-stop"
 
 
 def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
     """Press the e-stop of the station of that name; for any user, and without the database."""
     command = messages.Command(str(uuid), "estop", {"why": spoken(why)}, user=username, holder=username)
     try:
-        answer = answer_of(wire_to(station).urgent(command, "guard", "estop", _estop_s()))
+        ack = wire_to(station).urgent(command, "guard", "estop", _estop_s())
+        answer = replace(answer_of(ack), uuid=str(uuid))
         said = answer.data.get("station", station)
         if said != station:  # its socket is where another station's was before that one was killed
             reason = f"the station {said} answered instead of {station}, and was stopped"
@@ -58,11 +97,10 @@ def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
     return answer
 
 
-def stop(*, kind: str, station: str, username: str, page: str, epoch: int, uuid: UUID | str) -> Answer:
-    """Stop or halt, without the database: the runtime itself knows who has the lease."""
+def order(*, kind: str, username: str, page: str, epoch: int, uuid: UUID | str) -> messages.Command:
+    """A stop or halt as it is sent: the runtime itself knows who has the lease."""
     holder = holder_of(username, page)
-    command = messages.Command(str(uuid), kind, user=username, holder=holder, epoch=epoch)
-    return stopped(command, station)
+    return messages.Command(str(uuid), kind, user=username, holder=holder, epoch=epoch)
 
 
 def stopped(command: messages.Command, station: str) -> Answer:

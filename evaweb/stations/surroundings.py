@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evaweb.stations.looks import Looks
+from evaweb.stations.robot_geometry import Looks
 from robots import urdf
 from robots.visuals import Visual
 

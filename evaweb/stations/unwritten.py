@@ -1,13 +1,15 @@
 """Commands that were carried out and that the database did not take: they wait for it as files in DATA/unwritten.
 
-A file each, so that a restart loses none, and any process may write any of them. Where the disk does not take them
-either, as when it is full, this process keeps the newest.
+A file each, so that a restart loses none, and any process may write any of them. Of one command each process that
+carried it out has a file of its own: none overwrites, or removes, what another one heard of it. Where the disk does
+not take them either, as when it is full, this process keeps the newest.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -35,7 +37,7 @@ class Unwritten:
     """Those that wait, and the thread that goes on trying to have them written by `write`.
 
     `write` raises a database's Error where it has to be tried again; IntegrityError, DataError or any other where
-    that is no use: the log then has the command, and its file stays as UUID.refused.
+    that is no use: the log then has the command, and its file stays as UUID.PID.refused.
     """
 
     def __init__(self, write: Callable[[Command], object]) -> None:
@@ -47,7 +49,7 @@ class Unwritten:
 
     def keep(self, row: Command) -> None:
         """Have it written when the database takes it; its station and user may be known by name alone."""
-        name, content = str(row.uuid), json.dumps(_document(row)).encode()
+        name, content = f"{row.uuid}.{os.getpid()}", json.dumps(_document(row)).encode()
         try:
             _folder().mkdir(parents=True, exist_ok=True)
             write_whole(_path(name), content)
@@ -95,7 +97,9 @@ class Unwritten:
             connection.close()
 
     def _waiting(self) -> Iterator[str]:
-        yield from (path.stem for path in sorted(_folder().glob("*.json")) if path.is_file())
+        yield from (
+            path.name.removesuffix(".json") for path in sorted(_folder().glob("*.json")) if path.is_file()
+        )
         yield from list(self._kept)
 
     def _attempt(self, name: str) -> None:
@@ -107,7 +111,7 @@ class Unwritten:
                 raise
             log.error("a command is not in the database: %r; it was %.9999r", refused, content)
             if _path(name).exists():
-                _path(name).replace(_path(name).with_suffix(".refused"))
+                _path(name).replace(_folder() / f"{name}.refused")
         _path(name).unlink(missing_ok=True)
         self._kept.pop(name, None)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 from django import forms
@@ -10,6 +9,7 @@ from django.contrib import admin, messages
 from django.core.exceptions import ValidationError
 from django.db import models
 from django.db.models import Count, QuerySet
+from django.forms.fields import InvalidJSONInput
 from django.http import HttpRequest
 from django.urls import reverse
 from django.utils.html import format_html
@@ -24,7 +24,9 @@ from evaweb.trials.models import (
     Score,
     Trial,
 )
+from runtime.core import bounded_documents as bounded
 
+LONGEST_TABLE = 64 * 1024  # characters; a station takes no more
 _SHORT = {models.TextField: {"widget": forms.Textarea(attrs={"rows": 2, "cols": 80})}}
 
 
@@ -34,16 +36,27 @@ class Table(forms.JSONField):
     widget = forms.Textarea(attrs={"rows": 3, "cols": 60, "spellcheck": "false", "class": "mono"})
 
     def to_python(self, value: Any) -> Any:
-        """The table; ValidationError with line and column."""
+        """The table; ValidationError with line and column, or with the bound."""
         if isinstance(value, str) and value.strip():
             try:
-                json.loads(value)
-            except json.JSONDecodeError as error:
+                self._read(value)
+            except bounded.Unreadable as error:
                 raise ValidationError(
-                    f"This is not JSON: {error.msg} in line {error.lineno}, column {error.colno}. "
-                    'Keys and texts stand in double quotes, as in {"url": "ws://127.0.0.1:8000"}.'
+                    f'{error}. Keys and texts stand in double quotes, as in {{"url": "ws://127.0.0.1:8000"}}.'
                 ) from None
         return super().to_python(value)
+
+    def bound_data(self, data: Any, initial: Any) -> Any:
+        """What is shown again: as it was given, where it cannot be read."""
+        if data is None:
+            return None
+        try:
+            return self._read(data)
+        except bounded.Unreadable:
+            return InvalidJSONInput(data)
+
+    def _read(self, value: str) -> Any:
+        return bounded.from_json(value, "The table", LONGEST_TABLE)
 
 
 class PositionForm(forms.ModelForm):

@@ -19,9 +19,9 @@ from django.utils import timezone
 
 from evaweb.episodes import services as episodes
 from evaweb.episodes.folders import journal_folder
+from evaweb.episodes.manifest import CLOSED, recorded_in
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import Kept, restores
-from evaweb.episodes.recorded import CLOSED, recorded_in
 from evaweb.episodes.selectors import unrecorded_because
 from evaweb.errors import EvaError
 from evaweb.roles import known_person
@@ -197,7 +197,10 @@ def _end(episode: Episode) -> tuple[datetime | None, Mapping[str, Any] | None]:
 
 def _scores(trial: Trial, lines: Sequence[KeptScore]) -> int:
     """Add the scores that are not there."""
-    there = set(Score.objects.filter(uuid__in=[line.uuid for line in lines]).values_list("uuid", flat=True))
+    known = Score.objects.filter(uuid__in=[line.uuid for line in lines])
+    if other := known.exclude(trial=trial).first():
+        raise EvaError(f"its score {other.uuid} is of trial {other.trial_id}")
+    there = set(known.values_list("uuid", flat=True))
     absent = [line for line in lines if line.uuid not in there]
     for line in absent:
         _score(trial, line)

@@ -14,10 +14,10 @@ from django.db.models.functions import Cast
 from django.utils import timezone
 from django.utils.dateparse import parse_date, parse_datetime
 
+from evaweb.blinding import EVERYTHING, Sight
 from evaweb.episodes.models import Episode
 from evaweb.errors import EvaError, NotFound
-from evaweb.remembered import Kept, steady
-from evaweb.sight import EVERYTHING, Sight
+from evaweb.memo import Kept, steady
 from evaweb.stations.models import Command, Station
 from evaweb.statistics.proportions import Summary, summary
 from evaweb.trials import lifecycle

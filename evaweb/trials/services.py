@@ -13,7 +13,7 @@ from django.db import IntegrityError, transaction
 from django.db.models import Max
 from django.utils import timezone
 
-from evaweb.episodes.lines import text
+from evaweb.episodes.jsonl import text
 from evaweb.episodes.selectors import unrecorded_because
 from evaweb.episodes.services import publish_asked
 from evaweb.errors import Conflict, EvaError, NotFound
@@ -21,7 +21,6 @@ from evaweb.roles import Role, require
 from evaweb.stations.commands import identity_of
 from evaweb.stations.models import Station
 from evaweb.trials import journal, lifecycle
-from evaweb.trials.following import run_changed
 from evaweb.trials.lifecycle import Move
 from evaweb.trials.models import (
     Checkpoint,
@@ -34,6 +33,7 @@ from evaweb.trials.models import (
     TrialStatus,
 )
 from evaweb.trials.selectors import trial_open
+from evaweb.trials.station_events import run_changed
 from evaweb.trials.verdicts import LONGEST_FAILURE, LONGEST_NOTE, Verdict, verdict
 
 __all__ = [

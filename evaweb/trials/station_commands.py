@@ -12,19 +12,19 @@ from uuid import UUID
 from django.contrib.auth.models import User
 from django.db import transaction
 
+from evaweb.binary_frames import plain
+from evaweb.blinding import sight_of
 from evaweb.errors import Conflict, EvaError
-from evaweb.frames import plain
 from evaweb.roles import Role, require
-from evaweb.sight import sight_of
-from evaweb.stations.commands import identity_of, issue
+from evaweb.stations.commands import TABLES, identity_of, issue
 from evaweb.stations.models import CARRIED_OUT, NOT_CARRIED_OUT, Command
+from evaweb.stations.runtime_client import wire_to
 from evaweb.stations.selectors import last_set_up
-from evaweb.stations.wire import wire_to
 from evaweb.trials import lifecycle
 from evaweb.trials.facts import trial_facts
-from evaweb.trials.following import run_begun
 from evaweb.trials.models import Checkpoint, Trial, TrialStatus
 from evaweb.trials.services import checked
+from evaweb.trials.station_events import run_begun
 
 
 def trial_command(
@@ -74,7 +74,9 @@ def checkpoint_command(
         raise EvaError("args say policy or checkpoint beside the checkpoint that is named: give one of them")
     if not checkpoint.active:
         raise Conflict(f"checkpoint {checkpoint.name} is switched off: choose another one")
-    return issue(user=user, kind=kind, args={**(args or {}), **_policy_args(checkpoint)}, **given)
+    return issue(
+        user=user, kind=kind, args={**(args or {}), **_policy_args(checkpoint)}, vouched=TABLES, **given
+    )
 
 
 def _policy_args(checkpoint: Checkpoint) -> dict[str, Any]:
@@ -125,7 +127,7 @@ def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
     if first is not None:
         _require_same(first, trial, trial.setup == first.pk or _asked(first.args) == _asked(plain(args)))
         args = first.args
-    row = issue(**given, args=args)
+    row = issue(**given, args=args, vouched=TABLES)
     if row.status not in NOT_CARRIED_OUT:
         with transaction.atomic():
             held = _held(trial)

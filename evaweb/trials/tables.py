@@ -12,7 +12,7 @@ from typing import Any, get_args
 import pydantic
 from django.core.exceptions import ValidationError
 
-from runtime.config import PolicyConfig
+from runtime.config.schema import PolicyConfig
 
 _TAG = re.compile(r"[A-Za-z0-9_.:/+-]{1,40}")
 _PLACES = {"block": ("x", "y", "yaw in degrees"), "plate": ("x", "y")}

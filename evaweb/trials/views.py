@@ -12,10 +12,10 @@ from django.http import HttpRequest, HttpResponse
 from django.shortcuts import redirect, render
 from django.views.decorators.http import require_GET, require_POST
 
+from evaweb.blinding import Sight, sight_for
 from evaweb.episodes.selectors import stage_of
 from evaweb.errors import EvaError
 from evaweb.roles import Role, role_of
-from evaweb.sight import Sight, sight_for
 from evaweb.stations.selectors import station_list
 from evaweb.trials import lifecycle, selectors, services
 from evaweb.trials.figures import scene_figures

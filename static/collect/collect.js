@@ -1,6 +1,6 @@
 // The Collect page: a session opened or resumed, episodes armed, recorded, labelled, discarded; the queue and the dataset.
 
-import { config } from "../console/config.js";
+import { config } from "../console/live/config.js";
 import { post, RequestFailed } from "../site/api.js";
 import { armWords, big, discarding, leaderWords, subject, Twice, whyNotDiscard, whyNotLabel, whyNotStart } from "./moments.js";
 import { gamepads } from "./pads.js";

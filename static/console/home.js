@@ -2,7 +2,7 @@
 
 import { get, RequestFailed } from "../site/api.js";
 import { quietFragments } from "../site/fragments.js";
-import { words } from "./words.js";
+import { words } from "./live/words.js";
 
 const EVERY_MS = 4000;
 

@@ -4,28 +4,29 @@ import { CollectPanel } from "../collect/collect.js";
 import { drafts } from "../site/drafts.js";
 import { quietFragments } from "../site/fragments.js";
 import { pageId } from "../site/identity.js";
-import { byHand } from "./by_hand.js";
-import { Cameras } from "./cameras.js";
-import { Commands } from "./commands.js";
-import { config } from "./config.js";
-import { curvePane } from "./curve_controls.js";
-import { figures } from "./debug.js";
-import { draw, panes } from "./drawing.js";
-import { EStop } from "./estop.js";
-import { Events } from "./events.js";
-import { keyboard } from "./keys.js";
-import { LeaseControls } from "./lease.js";
-import { preflights } from "./preflight.js";
-import { resetAid } from "./reset_aid.js";
-import { scenePane } from "./scene_pane.js";
-import { setUp } from "./setup.js";
-import { LiveSocket } from "./socket.js";
-import { statusBar } from "./status.js";
-import { current, mark } from "./steps.js";
-import { Store } from "./store.js";
-import { TrialPanel } from "./trial.js";
-import { veil } from "./veil.js";
-import { CLOSED } from "./words.js";
+import { byHand } from "./manual/by_hand.js";
+import { Cameras } from "./live/cameras.js";
+import { Commands } from "./commands/commands.js";
+import { config } from "./live/config.js";
+import { curvePane } from "./curves/curve_controls.js";
+import { figures } from "./debug/debug.js";
+import { draw, panes } from "./live/drawing.js";
+import { EStop } from "./commands/estop.js";
+import { Events } from "./live/events.js";
+import { keyboard } from "./commands/keys.js";
+import { LeaseControls } from "./commands/lease.js";
+import { preflights } from "./trial/preflight.js";
+import { resetAid } from "./trial/reset_aid.js";
+import { scenePane } from "./scene/scene_pane.js";
+import { setUp } from "./trial/setup.js";
+import { LiveSocket } from "./live/socket.js";
+import { StopWay } from "./commands/stop_way.js";
+import { statusBar } from "./live/status.js";
+import { current, mark } from "./trial/steps.js";
+import { Store } from "./live/store.js";
+import { TrialPanel } from "./trial/trial.js";
+import { veil } from "./trial/veil.js";
+import { CLOSED } from "./live/words.js";
 
 const OF_SESSIONS = ["collect", "episode", "job"];
 
@@ -62,12 +63,14 @@ async function start() {
   const events = new Events();
   const cameras = new Cameras(store);
   const parts = {};
+  const way = new StopWay(config.stops, config.api);
   const socket = new LiveSocket(`${config.socket}?page=${store.page}`, {
     told: listen(store, { events, estop: () => parts.estop, commands: () => parts.commands, lease: () => parts.lease, trial: () => parts.trial, hand: () => parts.hand, collect: () => parts.collect }),
     draw: (frame) => draw(frame, store, cameras),
     changed: (open, code) => {
       store.open = open;
       if (!open) store.closed = CLOSED[code] ?? null;
+      if (open) parts.estop.ask();
       if (!open) store.link = { ok: false, reason: "" };
       store.tell("open");
     },
@@ -77,10 +80,10 @@ async function start() {
     },
     expected: () => store.link.ok,
   });
-  parts.estop = new EStop(store, socket); // first of all that can be pressed
+  parts.estop = new EStop(store, socket, way); // first of all that can be pressed
   keyboard();
   statusBar(store);
-  const commands = new Commands(store, socket);
+  const commands = new Commands(store, socket, way);
   parts.commands = commands;
   parts.lease = new LeaseControls(store, socket, commands);
   if (config.page === "eval") {

@@ -1,7 +1,7 @@
 // The pane of the curves: which joint, what its values are at the clock, and the plot.
 
-import { Legend } from "../console/curve_legend.js";
-import { jointOptions } from "../console/joint_names.js";
+import { Legend } from "../console/curves/curve_legend.js";
+import { jointOptions } from "../console/manual/joint_names.js";
 import { last } from "../site/ascending.js";
 import { Chunks } from "./chunks.js";
 import { joint, message } from "./data.js";

@@ -1,6 +1,6 @@
 // The binary messages of an episode.
 
-import { decode } from "../console/frame.js";
+import { decode } from "../console/live/frame.js";
 
 /** The message at `address`; throws with the server's sentence. */
 export async function message(address) {

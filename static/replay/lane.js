@@ -1,6 +1,6 @@
 // The strip over the curves that says which chunk owns which steps, with the hairlines and bands that go with it.
 
-import { css } from "../console/curve_kinds.js";
+import { css } from "../console/curves/curve_kinds.js";
 
 export const LANE = 20; // px, over the plot
 const LEAST = 4; // px that a chunk takes on average, for its own tint

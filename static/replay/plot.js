@@ -1,6 +1,6 @@
 // The curves of one joint over the whole episode, with what happened drawn behind and over them.
 
-import { KINDS, axes, blank, css, series, spread } from "../console/curve_kinds.js";
+import { KINDS, axes, blank, css, series, spread } from "../console/curves/curve_kinds.js";
 import { LANE, Lane } from "./lane.js";
 
 const LINES = KINDS.filter((kind) => kind.name !== "raw"); // raw is drawn chunk by chunk

@@ -1,7 +1,7 @@
 // The robot in 3D on the clock: poses come in parts of some hundred rows, when they are needed.
 
 import { get } from "../site/api.js";
-import { Scene3D } from "../console/scene3d.js";
+import { Scene3D } from "../console/scene/scene3d.js";
 import { message } from "./data.js";
 import { viewer as loaded } from "./viewer.js";
 

@@ -1,6 +1,6 @@
 // The curves of one joint of one or several episodes: state drawn through, executed dashed, a colour for each episode.
 
-import { axes, css, spread } from "../console/curve_kinds.js";
+import { axes, css, spread } from "../console/curves/curve_kinds.js";
 
 export class SharedPlot {
   #plot;

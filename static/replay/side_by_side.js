@@ -1,6 +1,6 @@
 // Several episodes on one clock: cameras of each in a column, curves of one joint over each other or below each.
 
-import { jointOptions } from "../console/joint_names.js";
+import { jointOptions } from "../console/manual/joint_names.js";
 import { cameras } from "./cameras.js";
 import { Clock, Shifted } from "./clock.js";
 import { message } from "./data.js";

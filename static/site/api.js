@@ -34,15 +34,18 @@ async function bodyOf(response) {
   }
 }
 
-/** Send `content` as JSON; resolves to the answer's JSON, throws RequestFailed. */
-export async function post(address, content, { timeout = TIMEOUT_MS } = {}) {
+/**
+ * Send `content` as JSON; resolves to the answer's JSON, throws RequestFailed. `simple`: without the CSRF token, as no
+ * browser first asks another port whether it may.
+ */
+export async function post(address, content, { timeout = TIMEOUT_MS, simple = false } = {}) {
   let response;
   try {
     response = await fetch(address, {
       method: "POST",
-      headers: { "Content-Type": "application/json", "X-CSRFToken": token() },
+      headers: simple ? { "Content-Type": "text/plain" } : { "Content-Type": "application/json", "X-CSRFToken": token() },
       body: JSON.stringify(content),
-      credentials: "same-origin",
+      credentials: "include", // also to the process for stops, at another port of ours
       redirect: "manual",
       signal: AbortSignal.timeout(timeout),
     });
@@ -65,7 +68,7 @@ export async function post(address, content, { timeout = TIMEOUT_MS } = {}) {
 export async function get(address) {
   let response;
   try {
-    response = await fetch(address, { credentials: "same-origin", signal: AbortSignal.timeout(TIMEOUT_MS) });
+    response = await fetch(address, { credentials: "include", signal: AbortSignal.timeout(TIMEOUT_MS) });
   } catch {
     throw new RequestFailed("the server cannot be reached");
   }

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import TypeVar
 
-from evaweb.results.outcomes import Interruption, Outcome, Pair, by_checkpoint, paired
+from evaweb.results.analysis.outcomes import Interruption, Outcome, Pair, by_checkpoint, paired
 from evaweb.statistics import strata
 from evaweb.statistics.base import LEVEL, Interval, StatisticsError
 from evaweb.statistics.difference import Difference, ExactTest, barnard, newcombe, probability_better

@@ -12,12 +12,12 @@ from typing import Any
 
 from django.db.models import Count, Max, Q, Sum
 
+from evaweb.memo import Kept, steady
 from evaweb.plans.models import Plan
-from evaweb.remembered import Kept, steady
-from evaweb.results.analysis import Analysis, analyse
-from evaweb.results.filters import Chosen
-from evaweb.results.gathering import interruptions_of_plan, outcomes_of_plan
-from evaweb.results.outcomes import Interruption, Outcome
+from evaweb.results.analysis.analysis import Analysis, analyse
+from evaweb.results.analysis.filters import Chosen
+from evaweb.results.analysis.load_outcomes import interruptions_of_plan, outcomes_of_plan
+from evaweb.results.analysis.outcomes import Interruption, Outcome
 from evaweb.trials.models import Scene, Trial, TrialStatus
 
 

@@ -8,7 +8,7 @@ from typing import TypeVar
 from urllib.parse import urlencode
 
 from evaweb.errors import EvaError
-from evaweb.results.outcomes import Interruption, Outcome
+from evaweb.results.analysis.outcomes import Interruption, Outcome
 
 Run = TypeVar("Run", Outcome, Interruption)
 

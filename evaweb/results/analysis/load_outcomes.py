@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from django.db.models import QuerySet
 
 from evaweb.plans.models import Plan
-from evaweb.results.outcomes import Interruption, Outcome
+from evaweb.results.analysis.outcomes import Interruption, Outcome
 from evaweb.trials.models import MilestoneOutcome, Trial, TrialStatus
 
 _FIELDS = (

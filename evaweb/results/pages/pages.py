@@ -8,16 +8,16 @@ from typing import Any
 
 from evaweb.errors import EvaError
 from evaweb.plans.models import Plan, StoppingRule
-from evaweb.results import caching
-from evaweb.results.addresses import compare_address, trials_address
-from evaweb.results.analysis import Analysis
-from evaweb.results.drawings import conditions, courses, rates
-from evaweb.results.drawings.svg import Drawing
-from evaweb.results.facts import comparison_facts, comparison_sentence, missed_words, primary_of
-from evaweb.results.filters import Chosen, choices
-from evaweb.results.listings import MOST_PAIRS, arm_rows, pair_rows, scene_rows
-from evaweb.results.outcomes import by_checkpoint
-from evaweb.results.wording import evidence_words
+from evaweb.results.analysis import caching
+from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.filters import Chosen, choices
+from evaweb.results.analysis.outcomes import by_checkpoint
+from evaweb.results.presentation.addresses import compare_address, trials_address
+from evaweb.results.presentation.drawings import conditions, courses, rates
+from evaweb.results.presentation.drawings.svg import Drawing
+from evaweb.results.presentation.facts import comparison_facts, comparison_sentence, missed_words, primary_of
+from evaweb.results.presentation.listings import MOST_PAIRS, arm_rows, pair_rows, scene_rows
+from evaweb.results.presentation.wording import evidence_words
 
 
 def summary_page(plan: Plan, only: Chosen) -> dict[str, Any]:

@@ -15,18 +15,21 @@ from django.shortcuts import redirect, render
 from django.urls import reverse
 from django.views.decorators.http import require_GET, require_POST
 
+from evaweb.blinding import sight_for
 from evaweb.errors import EvaError
 from evaweb.plans import services
+from evaweb.plans.blinding_rules import look, may_look
 from evaweb.plans.models import Plan, PlanState
-from evaweb.plans.sight import look, may_look
-from evaweb.results import caching, listings, pages, selectors
-from evaweb.results.agreement import agreement_of, preferences_of
-from evaweb.results.filters import chosen
-from evaweb.results.reporting import write_report
-from evaweb.results.seen import has_results, require_seen, sealing, why_sealed
+from evaweb.results import selectors
+from evaweb.results.analysis import caching
+from evaweb.results.analysis.agreement import agreement_of, preferences_of
+from evaweb.results.analysis.filters import chosen
+from evaweb.results.pages import pages
+from evaweb.results.presentation import listings
+from evaweb.results.ratings.unblinding import has_results, require_seen, sealing, why_sealed
+from evaweb.results.reports.reporting import write_report
 from evaweb.results.selectors import Question
 from evaweb.roles import Role, role_of
-from evaweb.sight import sight_for
 from evaweb.trials.models import TrialStatus
 
 PER_PAGE = 50

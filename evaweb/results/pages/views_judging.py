@@ -13,9 +13,9 @@ from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import stage_of
 from evaweb.errors import EvaError
 from evaweb.plans.models import Handout
-from evaweb.results import judging
 from evaweb.results.models import Preference
-from evaweb.results.seeing import seen
+from evaweb.results.ratings import judging
+from evaweb.results.ratings.video_available import seen
 from evaweb.results.selectors import plan_get
 from evaweb.roles import Role, role_of
 

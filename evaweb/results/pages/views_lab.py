@@ -8,12 +8,12 @@ from django.http import HttpRequest, HttpResponse
 from django.shortcuts import render
 from django.views.decorators.http import require_GET
 
+from evaweb.blinding import Sight, sight_for
 from evaweb.errors import EvaError
 from evaweb.plans.models import PlanState
 from evaweb.results import selectors
-from evaweb.results.planner import question_of, table_of
-from evaweb.results.seen import why_sealed
-from evaweb.sight import Sight, sight_for
+from evaweb.results.analysis.planner import question_of, table_of
+from evaweb.results.ratings.unblinding import why_sealed
 
 RUNNING = 12  # plans on one page; all of them are in the list
 RECENT = 12

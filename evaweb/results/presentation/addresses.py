@@ -9,8 +9,8 @@ from urllib.parse import urlencode
 from django.urls import reverse
 
 from evaweb.plans.models import Plan
-from evaweb.results.analysis import Comparison
-from evaweb.results.filters import Chosen
+from evaweb.results.analysis.analysis import Comparison
+from evaweb.results.analysis.filters import Chosen
 from evaweb.results.selectors import Question
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from evaweb.plans.models import Plan
-from evaweb.results.addresses import compare_address
-from evaweb.results.analysis import Analysis, Comparison
-from evaweb.results.drawings import rates
-from evaweb.results.filters import Chosen
-from evaweb.results.wording import evidence_words, missed, points, probability, verdict
+from evaweb.results.analysis.analysis import Analysis, Comparison
+from evaweb.results.analysis.filters import Chosen
+from evaweb.results.presentation.addresses import compare_address
+from evaweb.results.presentation.drawings import rates
+from evaweb.results.presentation.wording import evidence_words, missed, points, probability, verdict
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,12 +9,12 @@ from typing import Any
 from django.urls import reverse
 
 from evaweb.plans.models import Plan
-from evaweb.results import caching
-from evaweb.results.addresses import beside_address, trials_address
-from evaweb.results.analysis import Analysis, Arm
-from evaweb.results.filters import Chosen, choices
-from evaweb.results.outcomes import Outcome, paired
-from evaweb.results.wording import ends
+from evaweb.results.analysis import caching
+from evaweb.results.analysis.analysis import Analysis, Arm
+from evaweb.results.analysis.filters import Chosen, choices
+from evaweb.results.analysis.outcomes import Outcome, paired
+from evaweb.results.presentation.addresses import beside_address, trials_address
+from evaweb.results.presentation.wording import ends
 from evaweb.statistics.proportions import Proportion
 from evaweb.trials.figures import average_words
 from evaweb.trials.models import Trial

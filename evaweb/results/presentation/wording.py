@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evaweb.results.analysis import Comparison
+from evaweb.results.analysis.analysis import Comparison
 from evaweb.statistics.base import Interval
 from evaweb.statistics.difference import Difference
 from evaweb.statistics.planning import POWER, detectable

@@ -13,15 +13,15 @@ from django.contrib.auth.models import User
 from django.db import IntegrityError, transaction
 from django.db.models import Exists, OuterRef, QuerySet
 
-from evaweb.episodes.lines import text
+from evaweb.episodes.jsonl import text
 from evaweb.episodes.models import EpisodeStatus
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
-from evaweb.plans.chance import Chance
+from evaweb.plans.blinding_rules import has_looked
 from evaweb.plans.models import Handout, Plan, PlanState
-from evaweb.plans.sight import has_looked
-from evaweb.results import journal
+from evaweb.plans.seeded_draws import Chance
 from evaweb.results.models import Preference, Rating
-from evaweb.results.seeing import coming, require_seen_on_video, seen
+from evaweb.results.ratings import journal
+from evaweb.results.ratings.video_available import coming, require_seen_on_video, seen
 from evaweb.roles import Role, require
 from evaweb.trials.journal import append
 from evaweb.trials.models import Score, Trial, TrialStatus

@@ -9,8 +9,8 @@ from django.db import transaction
 from evaweb.episodes.reconcile import Kept, restores
 from evaweb.errors import EvaError
 from evaweb.plans.models import Plan
-from evaweb.results.journal import KeptPreference, KeptRating, kept_judgement
 from evaweb.results.models import Preference, Rating
+from evaweb.results.ratings.journal import KeptPreference, KeptRating, kept_judgement
 from evaweb.roles import known_person
 from evaweb.trials.kept import KeptTrial
 from evaweb.trials.models import Trial

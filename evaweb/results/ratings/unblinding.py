@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from evaweb.blinding import Sight, masked, sight_of
 from evaweb.errors import NotAllowed
+from evaweb.plans.blinding_rules import sealed_for
 from evaweb.plans.models import Plan, PlanState
-from evaweb.plans.sight import sealed_for
-from evaweb.sight import Sight, masked, sight_of
 
 
 def why_sealed(plan: Plan, user: Any, sight: Sight | None = None) -> str:

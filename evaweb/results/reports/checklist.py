@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from django.db.models import Count, F, Min
 
 from evaweb.plans.models import Look, Plan, StoppingRule
-from evaweb.results.analysis import Analysis
+from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.models import Rating
 from evaweb.trials.models import Score, Trial, TrialStatus
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from evaweb.results.analysis import Analysis, Arm, Comparison
+from evaweb.results.analysis.analysis import Analysis, Arm, Comparison
 from evaweb.statistics.base import Interval
 from evaweb.statistics.difference import Difference
 from evaweb.statistics.means import Average

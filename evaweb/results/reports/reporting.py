@@ -13,18 +13,20 @@ from django.contrib.staticfiles import finders
 from django.template.loader import render_to_string
 from django.utils import timezone
 
-from evaweb.cells import csv_lines
 from evaweb.errors import EvaError
 from evaweb.plans.models import Plan, PlanState
-from evaweb.results import caching, facts, laid_out, listings
-from evaweb.results.agreement import agreement_of, preferences_of
-from evaweb.results.analysis import Analysis
-from evaweb.results.checklist import checklist
-from evaweb.results.document import analysis_document
-from evaweb.results.drawings import conditions, courses, rates
-from evaweb.results.filters import Chosen
+from evaweb.results.analysis import caching
+from evaweb.results.analysis.agreement import agreement_of, preferences_of
+from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.filters import Chosen
 from evaweb.results.models import Rating
-from evaweb.results.tables import COLUMNS, outcome_pages
+from evaweb.results.presentation import facts, listings
+from evaweb.results.presentation.drawings import conditions, courses, rates
+from evaweb.results.reports import bench_photos as laid_out
+from evaweb.results.reports.checklist import checklist
+from evaweb.results.reports.document import analysis_document
+from evaweb.results.reports.tables import COLUMNS, outcome_pages
+from evaweb.tabular_export import csv_lines
 from evaweb.trials.models import Score
 
 _STYLES = ("css/tokens.css", "css/base.css", "result/result.css", "result/figures.css", "result/plans.css")

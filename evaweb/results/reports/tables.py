@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 from django.db.models import QuerySet
 
 from evaweb.plans.models import Plan
-from evaweb.results.filters import Chosen
+from evaweb.results.analysis.filters import Chosen
 from evaweb.trials.models import MilestoneOutcome, Trial
 
 

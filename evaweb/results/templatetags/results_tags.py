@@ -12,9 +12,9 @@ from django.utils.html import format_html, format_html_join
 from django.utils.safestring import SafeString
 
 from evaweb.plans.models import Plan, PlanState
-from evaweb.results import wording
-from evaweb.results.filters import Chosen
-from evaweb.results.outcomes import Outcome
+from evaweb.results.analysis.filters import Chosen
+from evaweb.results.analysis.outcomes import Outcome
+from evaweb.results.presentation import wording
 from evaweb.statistics.proportions import Proportion
 
 register = template.Library()

@@ -1,11 +1,11 @@
 // Commands: pressed at once, then accepted or done, refused with the reason, or outcome unknown.
 
-import { post, RequestFailed } from "../site/api.js";
-import { uuid } from "../site/identity.js";
-import { config } from "./config.js";
+import { post, RequestFailed } from "../../site/api.js";
+import { uuid } from "../../site/identity.js";
+import { config } from "../live/config.js";
 import { refusal } from "./reasons.js";
 import { answered, STOPPING, Stops } from "./stops.js";
-import { verb } from "./words.js";
+import { verb } from "../live/words.js";
 
 const AT_THE_DESK = ["score", "session"]; // what no robot is needed for
 const STOP_ADVICE = "Press it again; if the robot still moves, press E-STOP.";
@@ -16,11 +16,14 @@ export class Commands {
   #pending = new Set();
   #givers = new Map(); // kind -> function that says its arguments
   #stops;
+  #newest = new Map(); // kind of a stop -> uuid of the one that was pressed last
+  #unknown = ""; // uuid of the stop whose unknown outcome the line says
 
-  constructor(store, socket) {
+  constructor(store, socket, way) {
     this.#store = store;
     this.#stops = new Stops({
       send: (message) => socket.send(message),
+      beside: (command) => way.post(command),
       post: (command) => post(config.api.commands, command),
       late: (ack) => this.#late(ack),
     });
@@ -35,8 +38,8 @@ export class Commands {
     this.#givers.set(kind, args);
   }
 
-  /** Send one command, for a trial, a session or the checkpoint of that id where one is given; resolves to the answer, or null where it was not accepted (and says why on the page). */
-  async give(kind, args = {}, { trial = null, checkpoint = "", session = "" } = {}) {
+  /** Send one command, for a trial, a session, an episode to replay or the checkpoint of that id where one is given; resolves to the answer, or null where it was not accepted (and says why on the page). */
+  async give(kind, args = {}, { trial = null, checkpoint = "", session = "", replay = null } = {}) {
     const name = verb(kind);
     this.say(`${name}: pressed …`, "pressed");
     const command = { uuid: uuid(), kind, args, page: this.#store.page, epoch: this.#store.epoch };
@@ -44,12 +47,16 @@ export class Commands {
     if (trial) command.trial = Number(trial);
     if (checkpoint) command.checkpoint = Number(checkpoint);
     if (session) command.session = session;
+    if (replay) command.replay = replay;
+    const stops = STOPPING.includes(kind);
+    if (stops) this.#newest.set(kind, command.uuid);
     try {
-      const answer = await (STOPPING.includes(kind) ? this.#stops.give(command) : post(config.api.commands, command));
-      this.say(`${name}: ${answer.status}`, "accepted");
+      const answer = await (stops ? this.#stops.give(command) : post(config.api.commands, command));
+      if (!stops || this.#newest.get(kind) === command.uuid) this.say(`${name}: ${answer.status}`, "accepted");
       return answer;
     } catch (error) {
-      this.fail(name, error, STOPPING.includes(kind) ? STOP_ADVICE : undefined);
+      this.fail(name, error, stops ? STOP_ADVICE : undefined);
+      if (stops && error.unknown) this.#unknown = command.uuid;
       return null;
     }
   }
@@ -59,9 +66,9 @@ export class Commands {
     this.#stops.acknowledged(ack);
   }
 
-  /** An answer after the page had given up, or has been answered by post: said only where it was not known. */
+  /** An answer after the page had given up, or has been answered by post: said only where its own is said to be unknown. */
   #late(ack) {
-    if (document.getElementById("outcome").dataset.kind !== "unknown") return;
+    if (ack.uuid !== this.#unknown) return;
     const name = verb(ack.kind);
     try {
       this.say(`${name}: ${answered(ack).status}, answered late`, "accepted");
@@ -81,6 +88,7 @@ export class Commands {
   /** The one line in which answers stand. */
   say(text, kind) {
     const line = document.getElementById("outcome");
+    this.#unknown = "";
     line.textContent = text;
     line.dataset.kind = kind;
   }
@@ -110,7 +118,7 @@ export class Commands {
   async #clicked(event) {
     const button = event.target.closest("[data-command]");
     if (!button) return;
-    const { command: kind, trial, checkpoint } = button.dataset;
+    const { command: kind, trial, checkpoint, replay } = button.dataset;
     if (button.getAttribute("aria-disabled") === "true") {
       this.say(`${verb(kind)}: ${button.title}`, "refused");
       return;
@@ -118,7 +126,7 @@ export class Commands {
     if (this.#pending.has(kind) && !STOPPING.includes(kind)) return;
     this.#pending.add(kind);
     button.dataset.pressed = "";
-    const beside = { trial, checkpoint: checkpoint && document.querySelector(checkpoint).value };
+    const beside = { trial, checkpoint: checkpoint && document.querySelector(checkpoint).value, replay: replay && JSON.parse(replay) };
     await this.give(kind, { ...this.#givers.get(kind)?.(), ...argsOf(button) }, beside);
     delete button.dataset.pressed;
     this.#pending.delete(kind);

@@ -1,5 +1,5 @@
 // The e-stop before the page's modules run, and where they never do: a page that looks as if it could stop the
-// robot must be able to. By plain HTTP; a classic script, because a module that fails takes all others with it.
+// robot must be able to. By plain HTTP, to the web and to the process for stops at once; a classic script, because a module that fails takes all others with it.
 (() => {
   const LATE_MS = 8000; // by then the modules have taken over, or something is wrong with them
   const TIMEOUT_MS = 2500;
@@ -14,23 +14,35 @@
     note.textContent = text;
   }
 
+  function uuid() {
+    const digits = Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0"));
+    return digits.join("");
+  }
+
+  async function post(origin, content) {
+    const answer = await fetch(origin + area.dataset.address, {
+      method: "POST",
+      headers: { "Content-Type": "text/plain" }, // which no browser asks another port about first
+      body: JSON.stringify(content),
+      credentials: "include",
+      redirect: "error",
+      signal: AbortSignal.timeout(TIMEOUT_MS),
+    });
+    const { status } = await answer.json();
+    if (!answer.ok || !["accepted", "done"].includes(status)) throw new Error(`HTTP ${answer.status}, ${status}`);
+  }
+
   async function press(why) {
+    const content = { uuid: uuid(), why: `${why} on the page, before it had started` };
+    const last = () => area.dataset.early === content.uuid; // an answer counts for the last press alone
+    area.dataset.early = content.uuid;
     say("pressed", "E-stop pressed …");
     try {
-      const token = document.querySelector('input[name="csrfmiddlewaretoken"]').value;
-      const answer = await fetch(area.dataset.address, {
-        method: "POST",
-        headers: { "Content-Type": "application/json", "X-CSRFToken": token },
-        body: JSON.stringify({ why: `${why} on the page, before it had started` }),
-        redirect: "error",
-        signal: AbortSignal.timeout(TIMEOUT_MS),
-      });
-      const { status } = await answer.json();
-      if (!answer.ok || !["accepted", "done"].includes(status)) throw new Error(`HTTP ${answer.status}, ${status}`);
-      say("stopped", "E-stop acknowledged: the robot is held.");
-    } catch (error) {
-      console.error(error);
-      say("failed", "USE THE HARDWARE STOP");
+      await Promise.any([...new Set([area.dataset.stops, ""])].map((origin) => post(origin, content)));
+      if (last()) say("stopped", "E-stop acknowledged: the robot is held.");
+    } catch ({ errors }) {
+      for (const error of errors) console.error(error);
+      if (last()) say("failed", "USE THE HARDWARE STOP");
     }
   }
 

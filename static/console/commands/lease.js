@@ -1,7 +1,7 @@
 // Who commands: taken, renewed each second while this page is visible, requested, handed over, given up.
 
-import { post } from "../site/api.js";
-import { config } from "./config.js";
+import { post } from "../../site/api.js";
+import { config } from "../live/config.js";
 
 const RENEW_MS = 1000;
 const NAMES = {

@@ -1,7 +1,7 @@
 // Why a command cannot be given now, in a sentence. Whether it can is the station's own word: snapshot.allowed.
 
 import { STOPPING } from "./stops.js";
-import { verb, words } from "./words.js";
+import { verb, words } from "../live/words.js";
 
 const AT_WORK = ["setting_up", "running", "holding"];
 

@@ -1,7 +1,7 @@
-// Stop and pause: over the open socket first, which needs no database; by post under the same uuid where the
-// socket is closed or silent. The station carries out a uuid once, whichever way it came.
+// Stop and pause: over the open socket, which needs no database, and to the process for stops at once; by post under the
+// same uuid where the socket is closed or both say nothing. The station carries out a uuid once, whichever way it came.
 
-import { RequestFailed } from "../site/api.js";
+import { RequestFailed } from "../../site/api.js";
 
 const ACK_MS = 500;
 const CARRIED_OUT = ["accepted", "done"];
@@ -18,26 +18,33 @@ export function answered(ack) {
 
 export class Stops {
   #send;
+  #beside;
   #post;
   #late;
   #waiting = new Map(); // uuid -> function that takes the acknowledgement
 
-  /** `send(message)` is false where the socket is closed; `late(ack)` hears of answers nobody waits for any more. */
-  constructor({ send, post, late }) {
+  /**
+   * `send(message)` is false where the socket is closed, `beside(command)` null where there is no process for stops;
+   * `late(ack)` hears of answers nobody waits for any more.
+   */
+  constructor({ send, beside = () => null, post, late }) {
     this.#send = send;
+    this.#beside = beside;
     this.#post = post;
     this.#late = late;
   }
 
-  /** Give `command`; resolves to what was said of it first, whichever way; throws RequestFailed. */
+  /** Give `command`; resolves to what was said of it first, whichever way; throws RequestFailed where all have failed. */
   async give(command, ackMs = ACK_MS) {
     const { kind, uuid, epoch } = command;
-    const ack = new Promise((resolve) => this.#waiting.set(uuid, resolve));
+    const ack = new Promise((resolve) => this.#waiting.set(uuid, resolve)).then(answered);
     try {
-      if (!this.#send({ type: kind, uuid, epoch })) return await this.#post(command);
-      const said = await Promise.race([ack, silence(ackMs)]);
-      if (said) return answered(said);
-      return await Promise.race([ack.then(answered), this.#post(command)]);
+      const sent = this.#send({ type: kind, uuid, epoch });
+      const beside = [this.#beside(command)].filter(Boolean);
+      if (!sent) return await firstOf([this.#post(command), ...beside]);
+      const said = await Promise.race([firstOf([ack, ...beside]), silence(ackMs)]);
+      if (said) return said;
+      return await Promise.race([ack, firstOf([this.#post(command), ...beside])]);
     } finally {
       this.#waiting.delete(uuid);
     }
@@ -49,6 +56,13 @@ export class Stops {
     if (take) take(ack);
     else this.#late(ack);
   }
+}
+
+/** What the first of them resolves to, or the first one's failure where none does. */
+function firstOf(ways) {
+  return Promise.any(ways).catch(({ errors }) => {
+    throw errors[0];
+  });
 }
 
 function silence(ms) {

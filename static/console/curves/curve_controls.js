@@ -1,13 +1,13 @@
 // Which joint is drawn, and whether it stands still; a sentence in its place where uPlot is not installed.
 
-import { config } from "./config.js";
+import { config } from "../live/config.js";
 import { Legend } from "./curve_legend.js";
 import { Curves } from "./curves.js";
-import { jointOptions } from "./joint_names.js";
-import { GHOSTS } from "./scene_ghosts.js";
+import { jointOptions } from "../manual/joint_names.js";
+import { GHOSTS } from "../scene/scene_ghosts.js";
 import { MarkLegend } from "./mark_legend.js";
-import { Tags } from "./tags.js";
-import { duration } from "./words.js";
+import { Tags } from "../scene/tags.js";
+import { duration } from "../live/words.js";
 
 const KEY = `eva-joint-${config.station}`;
 

@@ -1,7 +1,7 @@
 // Bands, hairlines and ticks on the canvas of the curves.
 
 import { css } from "./curve_kinds.js";
-import { GHOSTS } from "./scene_ghosts.js";
+import { GHOSTS } from "../scene/scene_ghosts.js";
 
 const TICK = 7; // px high
 const STRIP = 4; // px high

@@ -1,6 +1,6 @@
 // Curves of one joint over the last seconds: where it is, what the policy wants, what was planned, what was sent.
 
-import { last } from "../site/ascending.js";
+import { last } from "../../site/ascending.js";
 import { KINDS, axes, series, spread } from "./curve_kinds.js";
 import { marks } from "./curve_marks.js";
 import { Paint } from "./curve_paint.js";

@@ -1,9 +1,9 @@
 // The Debug page: figures of the station as the runtime measures them.
 
-import { summary, trouble } from "./camera_words.js";
+import { summary, trouble } from "../live/camera_words.js";
 import { Distribution } from "./distribution.js";
-import { reachWords } from "./reach.js";
-import { age, figure } from "./words.js";
+import { reachWords } from "../scene/reach.js";
+import { age, figure } from "../live/words.js";
 
 const TELL_MS = 500; // figures that flicker cannot be read
 const NO_ANSWER = "no answer yet";

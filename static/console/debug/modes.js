@@ -1,6 +1,6 @@
 // The modes of a run in words: what each does, what can be pressed in it next, what it is doing just now.
 
-import { words } from "./words.js";
+import { words } from "../live/words.js";
 
 /** In the order of the keys that choose them. */
 export const MODES = {

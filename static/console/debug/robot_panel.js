@@ -1,6 +1,6 @@
 // Grippers with their state, and what the drives say of themselves.
 
-import { digitsOf, withUnit } from "./units.js";
+import { digitsOf, withUnit } from "../curves/units.js";
 
 const KEYS = [
   { open: ",", close: ".", lock: "-" },

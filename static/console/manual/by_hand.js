@@ -1,13 +1,13 @@
 // The controls of the Debug page, put together.
 
 import { Aim } from "./aim.js";
-import { config } from "./config.js";
+import { config } from "../live/config.js";
 import { ManualPanel } from "./manual_panel.js";
-import { ModePanel } from "./mode_panel.js";
-import { panels } from "./panels.js";
-import { robotPanel } from "./robot_panel.js";
+import { ModePanel } from "../debug/mode_panel.js";
+import { panels } from "../debug/panels.js";
+import { robotPanel } from "../debug/robot_panel.js";
 import { groups } from "./targets.js";
-import { TuningPanel } from "./tuning_panel.js";
+import { TuningPanel } from "../debug/tuning_panel.js";
 
 /** Returns {aimed(answer)}, which hears what the station says of targets. */
 export function byHand(store, socket, commands) {

@@ -1,7 +1,7 @@
 // A slider and a number for each joint of a group, within its limits.
 
 import { within } from "./targets.js";
-import { digitsOf, shortUnit, stepOf } from "./units.js";
+import { digitsOf, shortUnit, stepOf } from "../curves/units.js";
 
 export class JointRows {
   #list = document.getElementById("joints");

@@ -1,6 +1,6 @@
 // Moving by hand: a target made with sliders, numbers, named poses and steps of the hand, shown as a ghost, and sent.
 
-import { config } from "./config.js";
+import { config } from "../live/config.js";
 import { groupButtons } from "./group_buttons.js";
 import { JointRows } from "./joint_rows.js";
 import { arrived, groups, handAt, jog, start, verdict } from "./targets.js";

@@ -1,7 +1,7 @@
 // Where a person wants the robot to go: joints by group, within their limits, and what the station said of it.
 
 import { labelled, parted } from "./joint_names.js";
-import { digitsOf } from "./units.js";
+import { digitsOf } from "../curves/units.js";
 
 const ENDLESS = 2 * Math.PI; // a joint without a limit is offered one turn each way
 

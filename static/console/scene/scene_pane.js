@@ -1,8 +1,8 @@
 // The pane of the 3D scene: its buttons, what is drawn beside the robot, and a sentence where it cannot be drawn.
 
-import { get, RequestFailed } from "../site/api.js";
+import { get, RequestFailed } from "../../site/api.js";
 import { aimGhost } from "./aim_ghost.js";
-import { config } from "./config.js";
+import { config } from "../live/config.js";
 import { Scene3D } from "./scene3d.js";
 import { GHOSTS } from "./scene_ghosts.js";
 import { ShownChunk } from "./shown_chunk.js";

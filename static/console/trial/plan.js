@@ -1,7 +1,7 @@
 // Trials of a plan: handed out one by one, given back with a reason, cameras confirmed, milestones ticked as they come.
 
-import { post, RequestFailed } from "../site/api.js";
-import { config } from "./config.js";
+import { post, RequestFailed } from "../../site/api.js";
+import { config } from "../live/config.js";
 
 const PRESSED = "[data-next], [data-return], [data-give-back], [data-confirm-cameras], [data-override], [data-take-reference]";
 

@@ -1,9 +1,9 @@
 // Preflights: the chosen checkpoint's server is asked without the robot, and what was last found stands below the button.
 
-import { post } from "../site/api.js";
-import { setReason } from "./commands.js";
-import { config } from "./config.js";
-import { whyNoPreflight } from "./reasons.js";
+import { post } from "../../site/api.js";
+import { setReason } from "../commands/commands.js";
+import { config } from "../live/config.js";
+import { whyNoPreflight } from "../commands/reasons.js";
 
 const TIMEOUT_MS = 15000; // other stations are asked first which server they use
 

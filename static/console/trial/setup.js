@@ -1,6 +1,6 @@
 // The set-up: its stages while it goes on, and which one failed.
 
-import { duration, words } from "./words.js";
+import { duration, words } from "../live/words.js";
 
 const MARKS = { done: "✓", active: "▸", waiting: "·", failed: "✕", skipped: "–" };
 

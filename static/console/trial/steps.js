@@ -1,6 +1,6 @@
 // Which of the numbered steps is the one to do now; its button alone is the primary one.
 
-import { step } from "../collect/moments.js";
+import { step } from "../../collect/moments.js";
 
 /** The step that `panel` (data of the fragment) and the live state ask for. */
 export function current({ panel, status, setUp }, snapshot) {

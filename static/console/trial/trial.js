@@ -1,10 +1,10 @@
 // The Eval page: a trial chosen, prepared and set up with one press, run, and scored.
 
-import { post, RequestFailed } from "../site/api.js";
-import { uuid } from "../site/identity.js";
-import { config } from "./config.js";
+import { post, RequestFailed } from "../../site/api.js";
+import { uuid } from "../../site/identity.js";
+import { config } from "../live/config.js";
 import { PlanControls, times } from "./plan.js";
-import { duration } from "./words.js";
+import { duration } from "../live/words.js";
 
 export class TrialPanel {
   #store;

@@ -7,7 +7,7 @@ from typing import Any
 from django.contrib.auth.models import User
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
-from evaweb.api.tokens import token_create
+from evaweb.api.tokens import DAYS, MOST_DAYS, token_create
 from evaweb.errors import EvaError
 
 
@@ -20,6 +20,9 @@ class Command(BaseCommand):
         """Whose, and what for."""
         parser.add_argument("user", help="the username whose rights the token has")
         parser.add_argument("name", help="what uses it, e.g. nightly-export")
+        parser.add_argument(
+            "--days", type=int, default=DAYS, help=f"how long it is good, 1 to {MOST_DAYS}; otherwise {DAYS}"
+        )
 
     def handle(self, *args: Any, **options: Any) -> None:
         """Print the token and nothing else."""
@@ -28,6 +31,6 @@ class Command(BaseCommand):
             known = ", ".join(User.objects.values_list("username", flat=True)) or "none yet"
             raise CommandError(f"user {options['user']!r} does not exist; there are: {known}")
         try:
-            self.stdout.write(token_create(user=user, name=options["name"]))
+            self.stdout.write(token_create(user=user, name=options["name"], days=options["days"]))
         except EvaError as fault:
             raise CommandError(str(fault)) from None

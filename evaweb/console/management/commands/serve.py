@@ -22,9 +22,11 @@ class Command(BaseCommand):
     def handle(self, *args: Any, host: str, port: int, lifeline: bool, **options: Any) -> None:
         from evaweb.asgi import application  # not before models are there
         from evaweb.console import server
+        from evaweb.console.event_ingest import Chronicle
+        from evaweb.listening import PortTaken, listen
 
         try:
-            listener = server.listen(host, port)
-        except server.PortTaken as error:
+            listener = listen(host, port)
+        except PortTaken as error:
             raise CommandError(str(error)) from None
-        server.serve(application, listener, lifeline=lifeline)
+        server.serve(application, listener, beside=Chronicle(), lifeline=lifeline)

@@ -13,10 +13,10 @@ from evaweb.datasets import work
 from evaweb.datasets.finding import folder_named, overviews
 from evaweb.datasets.importing import imported
 from evaweb.datasets.orders import full_name
+from evaweb.episodes.dataset_membership import places_read
 from evaweb.episodes.folders import data_dir
 from evaweb.episodes.job_kinds import publish_episode
 from evaweb.episodes.models import Episode
-from evaweb.episodes.placing import places_read
 from evaweb.errors import EvaError
 from evaweb.jobs.kinds import Work
 from runtime.datasets.__main__ import add_commands, renamed

@@ -16,8 +16,8 @@ from django.conf import settings
 from django.core.management.base import BaseCommand, CommandError
 
 import robots
+from evaweb.binary_frames import plain
 from evaweb.errors import EvaError
-from evaweb.frames import plain
 from evaweb.lab import evaluate, lifetime, programs, seed
 from evaweb.lab.lab import Bench, Lab, a_lab
 from evaweb.lab.lifetime import Ended
@@ -25,8 +25,8 @@ from evaweb.lab.once import Choice, perform, report
 from evaweb.lab.seed import Login
 from evaweb.lab.visitor import Visitor
 from evaweb.plans.models import Plan
-from evaweb.results.analysis import Analysis, Comparison, analyse
-from evaweb.results.gathering import outcomes_of_plan
+from evaweb.results.analysis.analysis import Analysis, Comparison, analyse
+from evaweb.results.analysis.load_outcomes import outcomes_of_plan
 from evaweb.roles import Role
 from evaweb.trials.models import Checkpoint
 
@@ -54,6 +54,9 @@ class Command(BaseCommand):
     def add_arguments(self, parser: ArgumentParser) -> None:
         parser.add_argument("--host", default="127.0.0.1", help="address that the web listens on")
         parser.add_argument("--port", type=int, default=8000, help="port of the web; 0 takes a free one")
+        parser.add_argument(
+            "--stop-port", type=int, help="port of the process for stops; the one after that of the web"
+        )
         parser.add_argument("--once", action="store_true", help="run, score and publish one trial, then end")
         parser.add_argument(
             "--evaluate",
@@ -88,7 +91,7 @@ class Command(BaseCommand):
         _check(options)
         deployment = _deployment(options["robot"])
         try:
-            with a_lab(options["host"], options["port"]) as lab:
+            with a_lab(options["host"], options["port"], options["stop_port"]) as lab:
                 url, logins = self._up(lab, deployment, options)
                 if options["ready_file"]:
                     _announce(options["ready_file"], url, logins, lab.processes.pids())

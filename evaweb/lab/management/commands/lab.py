@@ -32,11 +32,14 @@ class Command(BaseCommand):
         )
         parser.add_argument("--host", default="127.0.0.1", help="address that the web listens on")
         parser.add_argument("--port", type=int, default=8000, help="port of the web; 0 takes a free one")
+        parser.add_argument(
+            "--stop-port", type=int, help="port of the process for stops; the one after that of the web"
+        )
 
     def handle(self, *args: Any, **options: Any) -> None:
         benches = [Bench(path.absolute()) for path in options["deployments"]]
         try:
-            with a_lab(options["host"], options["port"]) as lab:
+            with a_lab(options["host"], options["port"], options["stop_port"]) as lab:
                 url = lab.up(benches)
                 self.stdout.write(
                     f"EVA Web is at {url}   (data in {settings.DATA_DIR})\nCtrl-C ends everything."

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from evaweb.results.analysis import Arm
-from evaweb.results.drawings.svg import (
+from evaweb.results.analysis.analysis import Arm
+from evaweb.results.presentation.drawings.svg import (
     LINE,
     Drawing,
     Scale,
@@ -18,7 +18,7 @@ from evaweb.results.drawings.svg import (
     words,
     wrapped,
 )
-from evaweb.results.wording import rate_words
+from evaweb.results.presentation.wording import rate_words
 
 _LABELS = 180
 _LETTERS = 22  # of a condition or a failure in a line
@@ -52,7 +52,7 @@ def grid(arms: Sequence[Arm], links: Mapping[tuple[str, str], str]) -> Drawing |
                 continue
             cell = element(
                 "rect", x=x + 1, y=float(y + 1), width=column - 2, height=float(_CELL - 2), class_="cell",
-                style=f"--share:{found.rate:.3f}",
+                fill_opacity=f"{0.55 * found.rate:.3f}",
             )  # fmt: skip
             cell += words(x + column / 2, y + 20, f"{found.successes}/{found.n}", "middle", "strong")
             title = f"{arm.checkpoint} at {condition}: {rate_words(found)}"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from evaweb.results.analysis import Arm, Funnel
-from evaweb.results.drawings.svg import (
+from evaweb.results.analysis.analysis import Arm, Funnel
+from evaweb.results.presentation.drawings.svg import (
     LINE,
     Drawing,
     Scale,
@@ -24,7 +24,7 @@ from evaweb.results.drawings.svg import (
     words,
     wrapped,
 )
-from evaweb.results.wording import evidence_words, rate_words
+from evaweb.results.presentation.wording import evidence_words, rate_words
 from evaweb.statistics.sequential import Evidence
 
 WIDTH = 600

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from evaweb.results.analysis import Arm, Comparison
-from evaweb.results.drawings.svg import (
+from evaweb.results.analysis.analysis import Arm, Comparison
+from evaweb.results.presentation.drawings.svg import (
     LINE,
     Drawing,
     Scale,
@@ -21,7 +21,7 @@ from evaweb.results.drawings.svg import (
     words,
     wrapped,
 )
-from evaweb.results.wording import points, rate_words
+from evaweb.results.presentation.wording import points, rate_words
 from evaweb.statistics.proportions import Proportion
 
 WIDTH = 600

@@ -31,8 +31,8 @@ def drawing(width: float, height: float, title: str, words: str, *parts: str, ki
     name = f"drawing-{next(_numbers)}"
     inner = "".join(parts)
     text = (
-        f'<svg class="drawing {escape(kind)}" viewBox="0 0 {_n(width)} {_n(height)}" role="img" '
-        f'aria-labelledby="{name}-t {name}-d" style="max-width:{_n(width)}px">'
+        f'<svg class="drawing {escape(kind)}" viewBox="0 0 {_n(width)} {_n(height)}" width="{_n(width)}" '
+        f'role="img" aria-labelledby="{name}-t {name}-d">'
         f'<title id="{name}-t">{escape(title)}</title><desc id="{name}-d">{escape(words)}</desc>{inner}</svg>'
     )
     found = Drawing(text)

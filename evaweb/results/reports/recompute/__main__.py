@@ -151,7 +151,7 @@ def _drawn(shown: Any, drawn: Drawn) -> str:
 if __name__ == "__main__":
     try:
         code = main()
-        sys.stdout.flush()
+        print(end="", flush=True)  # also where there is no standard output (`>&-`)
     except BrokenPipeError:  # `... | head -1`; this program stands alone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 141

@@ -1,0 +1,292 @@
+"""What stops a robot over REST, answered before Django is asked for anything: no database, no thread of a page.
+
+E-stop, stop and halt of a station, and whether this way to them stands. Everything else goes on to the application;
+evaweb.api.stations describes all of it. It stands before the web, and alone in the process for stops (`stops_alone`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import re
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from io import BytesIO
+from typing import Any
+from uuid import uuid4
+
+from django.conf import settings
+from django.core.exceptions import DisallowedHost
+from django.core.handlers.asgi import ASGIRequest
+from django.http import parse_cookie
+from django.utils import timezone
+from ninja.utils import check_csrf
+from pydantic import ValidationError
+
+from evaweb import audit
+from evaweb.api.stations import HTTP_OF, CommandIn, EStopIn
+from evaweb.api.tokens import UNKNOWN
+from evaweb.callers import address_of
+from evaweb.credentials import SESSION, TOKEN, UNVERIFIED, Login, Unverifiable, credentials
+from evaweb.errors import EvaError, NotAllowed
+from evaweb.headers import BARE
+from evaweb.origins import is_ours
+from evaweb.roles import Role
+from evaweb.stations import commands, stops
+from evaweb.stations import redaction as veil
+from evaweb.stations.models import Station
+from runtime.ipc import estop_requests as pressing
+
+log = logging.getLogger(__name__)
+_PATH = re.compile(r"/api/v1/stations/([^/]+)/(estop|commands)")
+_LARGEST = 64 * 1024  # bytes of a stop; what is longer is another command, but for a press
+_ASKED = {
+    ("POST", "estop"),
+    ("POST", "commands"),
+    ("GET", "estop"),
+    ("OPTIONS", "estop"),
+    ("OPTIONS", "commands"),
+}
+_PREFLIGHT = [  # what a browser may send from the web's port to another one, and for how long it need not ask again [s]
+    (b"access-control-allow-methods", b"GET, POST"),
+    (b"access-control-allow-headers", b"content-type, x-csrftoken"),
+    (b"access-control-max-age", b"7200"),
+]
+_NOT_LOGGED_IN = "not logged in: log in, or send Authorization: Bearer TOKEN"
+_Receive = Callable[[], Awaitable[Any]]
+_Headers = Sequence[tuple[bytes, bytes]]
+Answered = tuple[int, dict[str, Any]]
+
+
+class Refused(EvaError):
+    """With its HTTP status."""
+
+    def __init__(self, sentence: str, status: int) -> None:
+        super().__init__(sentence)
+        self.status = status
+
+
+class StopDoor:
+    """An ASGI application in front of another one; `web_port` where it is in a process of its own beside the web's."""
+
+    def __init__(self, application: Callable[..., Awaitable[Any]], web_port: int | None = None) -> None:
+        self._application, self._web_port = application, web_port
+
+    async def __call__(self, scope: dict[str, Any], receive: _Receive, send: Any) -> None:
+        asked = _PATH.fullmatch(scope["path"])
+        if asked is None or (scope["method"], asked[2]) not in _ASKED:
+            await self._application(scope, receive, send)
+            return
+        body = await _body(receive)
+        if body is None:
+            return
+        told = self._told_browsers(scope)
+        if scope["method"] == "OPTIONS":
+            await _send(send, 200, {}, [*told, *_PREFLIGHT])
+            return
+        try:
+            answered = await self._answered(scope, asked, body)
+        except EvaError as fault:
+            answered = (fault.status, {"error": str(fault)})
+        except Exception as fault:  # whatever it is: who stops must be told
+            log.exception("a stop at %s was not answered", scope["path"][:200])
+            answered = (500, {"error": f"{stops.HARDWARE_STOP}: {fault.__class__.__name__}"})
+        if answered is None:
+            await self._application(scope, _again(body, receive), send)
+        else:
+            await _send(send, *answered, told)
+
+    async def _answered(self, scope: dict[str, Any], asked: re.Match[str], body: bytes) -> Answered | None:
+        if scope["method"] == "GET":
+            return await self._ready(scope)
+        return await _answered(self._as_of_here(scope), asked[1], asked[2], body)
+
+    async def _ready(self, scope: dict[str, Any]) -> Answered:
+        """Whoever asks is known here from now on: their first press is not their first look-up."""
+        try:
+            user = (await _presser(scope)).username
+        except Unverifiable:
+            user = UNVERIFIED
+        return 200, {"user": user, "alone": self._web_port is not None}
+
+    def _told_browsers(self, scope: dict[str, Any]) -> _Headers:
+        """That a page of ours may read the answer, and no other."""
+        origin = _header(scope, b"origin")
+        if not is_ours(origin, _header(scope, b"host"), self._web_port):
+            return [(b"vary", b"origin")]
+        return [
+            (b"vary", b"origin"),
+            (b"access-control-allow-origin", origin.encode("latin-1")),
+            (b"access-control-allow-credentials", b"true"),
+        ]
+
+    def _as_of_here(self, scope: dict[str, Any]) -> dict[str, Any]:
+        """A request of the web's own pages at its other port as one of this port's: Django knows of one origin."""
+        host = _header(scope, b"host")
+        if self._web_port is None or not is_ours(_header(scope, b"origin"), host, self._web_port):
+            return scope
+        others = [(name, value) for name, value in scope["headers"] if name != b"origin"]
+        here = f"{scope['scheme']}://{host}".encode("latin-1")
+        return {**scope, "headers": [*others, (b"origin", here)]}
+
+
+def stops_alone(web_port: int) -> StopDoor:
+    """The application of the process for stops, for pages of the web at that port."""
+    said = f"this process answers stop, halt and e-stop alone; the web is at port {web_port}"
+
+    async def nothing_else(scope: dict[str, Any], receive: _Receive, send: Any) -> None:
+        await _send(send, 404, {"error": said})
+
+    return StopDoor(nothing_else, web_port)
+
+
+async def _answered(scope: dict[str, Any], station: str, what: str, body: bytes) -> Answered | None:
+    """Status and answer; None for a command that stops nothing."""
+    if what == "estop":
+        return await _estop(scope, station, _said(body))
+    press = pressing.in_json(body, "kind")
+    if press is not None:
+        return await _estop(scope, station, press)
+    said = _said(body) if len(body) <= _LARGEST else {}
+    return await _stop(scope, station, said, body) if said.get("kind") in commands.STOPPING else None
+
+
+async def _estop(scope: dict[str, Any], station: str, said: Mapping[str, Any]) -> Answered:
+    given, at = EStopIn(uuid=said.get("uuid"), why=pressing.why_in(said)), timezone.now()
+    unverified, username, user = "", UNVERIFIED, None
+    try:
+        login = await _presser(scope)
+    except Unverifiable as fault:
+        unverified = str(fault)
+        log.error("an e-stop of %s is obeyed, of nobody knows whom: %s", station, fault)
+    else:
+        username, user = login.username, login.account
+    uuid = given.uuid or uuid4()
+    press = stops.press(station=station, username=username, why=given.why, uuid=uuid)
+    answer = await asyncio.wrap_future(press)
+    place = Station(name=station)
+    commands.estop_noted(
+        user=user, station=place, why=given.why, uuid=uuid, answer=answer, at=at, unverified=unverified
+    )
+    return HTTP_OF[answer.status], _told(str(uuid), answer, answer.data)
+
+
+async def _stop(scope: dict[str, Any], station: str, said: Mapping[str, Any], body: bytes) -> Answered | None:
+    at = timezone.now()
+    kind, login = await _stopper(scope)
+    if kind == SESSION:
+        _require_csrf(scope, body)
+    if login.role is Role.VIEWER:
+        raise NotAllowed(stops.refused_to_a_viewer(login.username))
+    try:
+        given = CommandIn(**said)
+    except ValidationError:
+        return None  # which is said by the application, as of every command
+    named = {"kind": given.kind, "page": given.page, "epoch": given.epoch, "uuid": given.uuid}
+    order = stops.order(username=login.username, **named)
+    answer = await asyncio.wrap_future(stops.ask(order, station))
+    commands.stop_noted(user=login.account, station=Station(name=station), answer=answer, at=at, **named)
+    return HTTP_OF[answer.status], _told(str(given.uuid), answer, veil.answer(answer.data))
+
+
+def _told(uuid: str, answer: stops.Answer, data: Mapping[str, Any]) -> dict[str, Any]:
+    said = {"status": answer.status.value, "reason": answer.reason, "allowed": answer.allowed}
+    return {"uuid": uuid, **said, "data": data}
+
+
+async def _presser(scope: dict[str, Any]) -> Login:
+    """Whoever presses, by any credential; raises Refused, or Unverifiable where the database might know one of them."""
+    found = _credentials(scope)
+    for kind, secret in found:
+        login = await credentials.presser(kind, secret)
+        if login is not None:
+            return login
+    raise _nobodys(found, scope)
+
+
+async def _stopper(scope: dict[str, Any]) -> tuple[str, Login]:
+    """Who stops, by which kind of credential; raises Refused."""
+    found = _credentials(scope)
+    for kind, secret in found:
+        try:
+            login = await credentials.stopper(kind, secret)
+        except Unverifiable as fault:
+            raise Refused(f"{fault}: who may stop is not known; the e-stop works", 503) from None
+        if login is not None:
+            return kind, login
+    raise _nobodys(found, scope)
+
+
+def _nobodys(found: list[tuple[str, str]], scope: dict[str, Any]) -> Refused:
+    if all(kind != TOKEN for kind, _ in found):
+        return Refused(_NOT_LOGGED_IN, 401)
+    audit.token_refused(address_of(ASGIRequest(scope, BytesIO())), UNKNOWN)
+    return Refused(f"the token {UNKNOWN}: make one with manage.py api_token USER NAME", 401)
+
+
+def _credentials(scope: dict[str, Any]) -> list[tuple[str, str]]:
+    """Kinds and secrets, a token first: a proxy's own header, or another program's cookie, hides no session."""
+    given: dict[bytes, list[str]] = {}
+    for name, value in scope["headers"]:
+        given.setdefault(name, []).append(value.decode("latin-1"))
+    found = []
+    for header in given.get(b"authorization", ()):
+        scheme, _, secret = header.strip().partition(" ")
+        found.append((TOKEN, secret.strip() if scheme.lower() == "bearer" else header))
+    session = parse_cookie("; ".join(given.get(b"cookie", ()))).get(settings.SESSION_COOKIE_NAME)
+    if session:
+        found.append((SESSION, session))
+    if not found:
+        raise Refused(_NOT_LOGGED_IN, 401)
+    return found
+
+
+def _require_csrf(scope: dict[str, Any], body: bytes) -> None:
+    try:
+        refused = check_csrf(ASGIRequest(scope, BytesIO(body)))
+    except DisallowedHost as fault:
+        raise Refused(str(fault), 400) from None
+    if refused is not None:
+        raise Refused("CSRF check Failed", 403)
+
+
+def _said(body: bytes) -> dict[str, Any]:
+    try:
+        said = json.loads(body)
+    except (ValueError, RecursionError):
+        return {}
+    return said if isinstance(said, dict) else {}
+
+
+async def _body(receive: _Receive) -> bytes | None:
+    """The whole of it, which the server has received already; None where the client is gone."""
+    parts, more = [], True
+    while more:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            return None
+        parts.append(message.get("body", b""))
+        more = message.get("more_body", False)
+    return b"".join(parts)
+
+
+def _again(body: bytes, receive: _Receive) -> _Receive:
+    """What gives the application the body that was read, and then what comes."""
+    first = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def read() -> Any:
+        return first.pop() if first else await receive()
+
+    return read
+
+
+def _header(scope: dict[str, Any], wanted: bytes) -> str:
+    return next((value.decode("latin-1") for name, value in scope["headers"] if name == wanted), "")
+
+
+async def _send(send: Any, status: int, answer: Mapping[str, Any], more: _Headers = ()) -> None:
+    body = json.dumps(answer).encode()
+    headers = [(b"content-type", b"application/json; charset=utf-8"), (b"content-length", b"%d" % len(body))]
+    headers += [*BARE, *more]
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})

@@ -1,0 +1,40 @@
+"""What ends with a password: a user's tokens, as Django ends the sessions."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from typing import Any
+
+from django.contrib.auth.models import User
+from django.db.models.signals import pre_save
+from django.dispatch import receiver
+
+from evaweb.api.tokens import tokens_withdraw
+
+log = logging.getLogger(__name__)
+
+
+@receiver(pre_save, sender=User)
+def _ended(
+    sender: Any, instance: User, raw: bool, update_fields: Iterable[str] | None = None, **named: Any
+) -> None:
+    """Withdraw the tokens of an account whose password changes, or which is switched off."""
+    fields = {"password", "is_active"} if update_fields is None else set(update_fields)
+    if raw or instance.pk is None or not fields & {"password", "is_active"}:
+        return
+    before = User.objects.filter(pk=instance.pk).values("password", "is_active").first()
+    if before is None:
+        return
+    name = instance.get_username()
+    if instance.password != before["password"] and not _hashed_anew(instance, fields):
+        log.info("the password of %a is changed", name)
+        tokens_withdraw(user=instance, why="the password is changed")
+    if before["is_active"] and not instance.is_active:
+        log.info("%a is switched off", name)
+        tokens_withdraw(user=instance, why="the account is switched off")
+
+
+def _hashed_anew(user: User, fields: set[str]) -> bool:
+    """The same password, hashed by Django at a login as it hashes by now."""
+    return fields == {"password"} and user._password is None and user.has_usable_password()

@@ -1,0 +1,79 @@
+"""Who came, went and was refused, a line each in the log.
+
+Names are logged as Python writes them, so that no control character reaches a terminal. A name that nobody has is not
+logged: it may be a password in the wrong field.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from threading import Lock
+from typing import Any
+
+from axes.signals import user_locked_out
+from django.conf import settings
+from django.contrib.auth import get_user_model
+from django.contrib.auth.signals import user_logged_in, user_logged_out, user_login_failed
+from django.dispatch import receiver
+from django.http import HttpRequest
+
+from evaweb.callers import address_of
+
+log = logging.getLogger(__name__)
+_MOST = 1000  # addresses that are remembered
+_EVERY_S = 60.0
+_refused: dict[str, tuple[float, int]] = {}  # by address: when it was told last, and how many came since
+_lock = Lock()
+
+
+@receiver(user_logged_in)
+def _came(sender: Any, request: HttpRequest, user: Any, **named: Any) -> None:
+    log.info("%a has logged in from %s", user.get_username(), _where(request))
+
+
+@receiver(user_logged_out)
+def _went(sender: Any, request: HttpRequest, user: Any, **named: Any) -> None:
+    if user is not None:
+        log.info("%a has logged out from %s", user.get_username(), _where(request))
+
+
+@receiver(user_login_failed)
+def _failed(
+    sender: Any, credentials: dict[str, Any], request: HttpRequest | None = None, **named: Any
+) -> None:
+    log.warning("login of %s failed from %s", _named(credentials.get("username")), _where(request))
+
+
+@receiver(user_locked_out)
+def _locked(sender: Any, request: HttpRequest, username: str, ip_address: str | None, **named: Any) -> None:
+    minutes = settings.AXES_COOLOFF_TIME.total_seconds() / 60
+    log.warning(
+        "login of %s is locked from %s for up to %.0f minutes",
+        _named(username),
+        ip_address or "nowhere",
+        minutes,
+    )
+
+
+def token_refused(address: str | None, why: str) -> None:
+    """A token did not open anything; once a minute per address, with how many there were."""
+    where, now = address or "nowhere", time.monotonic()
+    with _lock:
+        told, count = _refused.pop(where, (-_EVERY_S, 0))
+        due = now - told >= _EVERY_S
+        _refused[where] = (now, 0) if due else (told, count + 1)
+        if len(_refused) > _MOST:
+            del _refused[next(iter(_refused))]
+    if due:
+        log.warning("a token from %s %s%s", where, why, f" ({count} before it)" if count else "")
+
+
+def _named(username: Any) -> str:
+    if get_user_model().objects.filter(username=username or "").exists():
+        return ascii(username)
+    return f"a name that nobody has ({len(username or '')} characters)"
+
+
+def _where(request: HttpRequest | None) -> str:
+    return (address_of(request) if request is not None else None) or "nowhere"

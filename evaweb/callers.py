@@ -1,0 +1,41 @@
+"""Where a request comes from: the other end of its connection, or what a declared proxy says it forwards."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network, ip_address
+
+from django.conf import settings
+from django.http import HttpRequest
+
+Address = IPv4Address | IPv6Address
+
+
+def address_of(request: HttpRequest) -> str | None:
+    """The address of who asks, None where there is none, as over a socket of the file system."""
+    named = request.META.get("HTTP_X_FORWARDED_FOR", "").split(",")
+    found = _caller(request.META.get("REMOTE_ADDR"), named, settings.EVA_PROXIES)
+    return None if found is None else str(found)
+
+
+def _caller(
+    peer: str | None, named: list[str], proxies: Iterable[IPv4Network | IPv6Network]
+) -> Address | None:
+    """The last of those named that a proxy of ours has seen itself; what stands before it anybody can write."""
+    here = _parsed(peer)
+    while named and here is not None and any(here in network for network in proxies):
+        before = _parsed(named.pop().strip())
+        if before is None:
+            return here
+        here = before
+    return here
+
+
+def _parsed(text: str | None) -> Address | None:
+    try:
+        found = ip_address(text or "")
+    except ValueError:
+        return None
+    if isinstance(found, IPv4Address):
+        return found
+    return found.ipv4_mapped or IPv6Address(int(found))  # without a zone, which no database takes

@@ -1,0 +1,153 @@
+"""Connections that have not sent a whole request yet, or wait for their next: so many, and not for ever.
+
+Where there are too many the oldest are closed, never the newest: whoever sends a request at once gets in, whatever
+else comes from the same address.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import daphne.server  # noqa: F401  first: it decides which reactor there is
+
+# isort: split
+from twisted.internet import reactor
+from twisted.internet.interfaces import IAddress
+from twisted.protocols.policies import ProtocolWrapper, WrappingFactory
+
+from evaweb.console.bodies import BoundedRequest, is_stop, stop_bound_of
+from evaweb.console.channel import Channel
+from evaweb.console.turns import Turns
+
+events: Any = reactor
+WHOLE_REQUEST_S = 15.0  # in which a connection sends its first request
+NEXT_REQUEST_S = 75.0  # in which it sends another one; Twisted itself closes one that says nothing for 60 s
+
+
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    peer: str
+    until: float
+    close: Callable[[], object]
+
+
+class Arrivals:
+    """At most `most` that wait, and `most_of_one` of one address; belongs to the event loop."""
+
+    def __init__(self, most: int, most_of_one: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._most, self._most_of_one, self._clock = most, most_of_one, clock
+        self._all: OrderedDict[int, _Waiting] = OrderedDict()  # the oldest first
+        self._of: dict[str, OrderedDict[int, None]] = {}
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+    def came(self, key: int, peer: str, seconds: float, close: Callable[[], object]) -> None:
+        """It has so long; `close` ends it."""
+        self.gone(key)
+        self._all[key] = _Waiting(peer, self._clock() + seconds, close)
+        of_one = self._of.setdefault(peer, OrderedDict())
+        of_one[key] = None
+        if len(of_one) > self._most_of_one:
+            self._end(next(iter(of_one)))
+        elif len(self._all) > self._most:
+            self._end(next(iter(self._all)))
+
+    def gone(self, key: int) -> None:
+        """It has sent a request, or was closed."""
+        found = self._all.pop(key, None)
+        if found is None:
+            return
+        of_one = self._of[found.peer]
+        del of_one[key]
+        if not of_one:
+            del self._of[found.peer]
+
+    def sweep(self) -> None:
+        """End those whose time is over."""
+        now = self._clock()
+        for key in [key for key, waiting in self._all.items() if waiting.until <= now]:
+            self._end(key)
+
+    def _end(self, key: int) -> None:
+        close = self._all[key].close
+        self.gone(key)
+        close()
+
+
+class Request(BoundedRequest):
+    """One that tells its connection when it is whole, or need not be soon, and when it is answered."""
+
+    def admitted(self) -> None:
+        self.channel.transport.sent()
+
+    def process(self) -> None:
+        """It is whole: what stops is done at once, all else in its turn."""
+        self.channel.transport.sent()
+        if is_stop(self.path):
+            super().process()
+        else:
+            self.channel.transport.factory.turns.take(self._in_turn)
+
+    def _in_turn(self) -> None:
+        if not self._disconnected:
+            super().process()
+
+    def finish(self) -> None:
+        if self.channel is not None:
+            self.channel.transport.answered()
+        super().finish()
+
+
+class StopRequest(Request):
+    """One to the process for stops: no long body, no websocket."""
+
+    bound_of = staticmethod(stop_bound_of)
+
+    def process(self) -> None:
+        self.requestHeaders.removeHeader(b"upgrade")
+        super().process()
+
+
+class _Connection(ProtocolWrapper):
+    def connectionMade(self) -> None:
+        self._wait(WHOLE_REQUEST_S, self.transport.abortConnection)
+        super().connectionMade()
+
+    def connectionLost(self, reason: object) -> None:
+        self.factory.arrivals.gone(id(self))
+        super().connectionLost(reason)
+
+    def sent(self) -> None:
+        """A whole request is here, or one whose sender is known."""
+        self.factory.arrivals.gone(id(self))
+
+    def answered(self) -> None:
+        """The next one may come over it."""
+        self._wait(NEXT_REQUEST_S, self.transport.loseConnection)
+
+    def _wait(self, seconds: float, close: Callable[[], object]) -> None:
+        self.factory.arrivals.came(id(self), str(getattr(self.getPeer(), "host", "")), seconds, close)
+
+
+class Entrance(WrappingFactory):
+    """Daphne's connections, looked after by `arrivals`."""
+
+    protocol = _Connection
+    noisy = False
+
+    def __init__(self, factory: Any, arrivals: Arrivals, request: type[Request] = Request) -> None:
+        super().__init__(factory)
+        factory.protocol = Channel
+        self.arrivals, self._request = arrivals, request
+        self.turns = Turns(partial(events.callLater, 0))
+
+    def buildProtocol(self, addr: IAddress) -> ProtocolWrapper:
+        made = super().buildProtocol(addr)
+        made.wrappedProtocol.requestFactory = self._request
+        return made

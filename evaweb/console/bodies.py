@@ -1,0 +1,200 @@
+"""How much of a request is read before somebody has looked at it.
+
+Twisted hands a request to daphne, and daphne to Django, when its body is here whole: a view can no longer refuse to
+read it. So what is too long is refused by its headers, or when it has become too long, and never kept.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+from urllib.parse import unquote_to_bytes
+
+import daphne.server  # noqa: F401  first: it decides which reactor there is
+
+# isort: split
+from daphne.http_protocol import WebRequest
+from django.conf import settings
+from django.db import connections
+from django.http import parse_cookie
+from twisted.internet import reactor
+from twisted.internet.threads import deferToThread
+
+from evaweb.console.channel import refusal, whole
+from evaweb.console.logins import role_now
+from evaweb.plans.references import LARGEST
+from evaweb.posts import post_at
+from evaweb.roles import Role
+from runtime.ipc import estop_requests as pressing
+
+log = logging.getLogger(__name__)
+STRANGER = 64 * 1024  # a login, or a press of the e-stop
+MEMBER = 2 * 1024 * 1024  # a form; what REST takes is in evaweb.posts
+_UPLOADS = {b"/admin/plans/plan/import/": LARGEST + STRANGER}  # files, from administrators
+_ESTOP = re.compile(rb"/api/v1/stations/[^/]+/estop")
+_STOPS = re.compile(rb"/api/v1/stations/[^/]+/(estop|commands)")
+_REST = b"/api/"
+_LINGER_S = 5.0  # for which a client that goes on sending is heard, so that it reads the answer
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """How many bytes a body may have, and what is answered to more; status 0: it is left out, the request goes on.
+
+    What is longer than `sure` is let in only where the session `key` is an administrator's. Where it `may_press`, the
+    first `largest` bytes of what is longer decide whether it is a press of the e-stop, of which the rest is left out.
+    """
+
+    largest: int
+    status: int
+    sentence: str
+    sure: int
+    key: str = ""
+    may_press: bool = False
+
+
+def bound_of(path: bytes, cookies: Iterable[bytes], authorized: bool) -> Bound:
+    """For a request with these headers, of known length; whether its session or token is good is not known yet."""
+    if _ESTOP.fullmatch(path):
+        return Bound(STRANGER, 0, "", STRANGER)
+    key = parse_cookie(b";".join(cookies).decode("latin-1")).get(settings.SESSION_COOKIE_NAME, "")
+    if key or authorized:
+        sure = post_at(path.decode("latin-1")).largest if path.startswith(_REST) else MEMBER
+        largest = _UPLOADS.get(path, sure) if key else sure
+        sentence = f"the body is too long; allowed here: {largest} bytes"
+        return Bound(largest, 413, sentence, sure, key, is_stop(path))
+    allowed = f"the body is too long; allowed without a login: {STRANGER} bytes"
+    return Bound(STRANGER, 401 if path.startswith(_REST) else 413, allowed, STRANGER)
+
+
+def is_stop(path: bytes) -> bool:
+    """Whether what is asked at that address may stop a robot."""
+    return _STOPS.fullmatch(path) is not None
+
+
+def stop_bound_of(path: bytes, cookies: Iterable[bytes], authorized: bool) -> Bound:
+    """The same in the process for stops, which has no long ones."""
+    if is_stop(path):
+        return bound_of(path, (), True)
+    return Bound(STRANGER, 413, f"the body is too long; allowed here: {STRANGER} bytes", STRANGER)
+
+
+class BoundedRequest(WebRequest):
+    """A request of daphne's that takes no more of its body than is allowed.
+
+    An e-stop whose sender dies before the end of it is pressed: where and by whom was said whole.
+    """
+
+    bound_of = staticmethod(bound_of)
+    _bound: Bound
+    _whole = False
+    _got = 0
+    _over = False
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        """As daphne makes it; Twisted would refuse forms that it cannot read, which is for the address to say."""
+        super().__init__(*given, parsePOSTFormSubmission=False, **named)
+
+    def gotLength(self, length: int | None) -> None:
+        """The headers are here."""
+        self._path = unquote_to_bytes(self.channel._path.partition(b"?")[0])
+        headers = self.requestHeaders
+        cookies = headers.getRawHeaders(b"cookie", [])
+        bound = self.bound_of(self._path, cookies, headers.hasHeader(b"authorization"))
+        self._bound = bound if length is not None else replace(bound, largest=bound.sure)
+        over = length is not None and length > bound.largest
+        super().gotLength(bound.largest if over and bound.may_press else 0 if over else length)
+        if over and not bound.may_press:
+            self._leave_out()
+        elif length is not None and length > bound.sure and not bound.may_press:
+            self._ask_who(bound.key)
+
+    def handleContentChunk(self, data: bytes) -> None:
+        """Some of the body."""
+        room = self._bound.largest - self._got
+        self._got += len(data)
+        if self._over:
+            return
+        if len(data) <= room or self._bound.may_press:
+            super().handleContentChunk(data[:room])
+        if len(data) > room:
+            self._too_long()
+
+    def requestReceived(self, command: bytes, path: bytes, version: bytes) -> None:
+        """All of it; to one that was refused there is nothing more to say."""
+        self._whole = True
+        if not (self._over and self._bound.status):
+            super().requestReceived(command, path, version)
+
+    def basic_error(self, status: int, status_text: bytes, body: str) -> None:
+        """What daphne itself says: of odd headers and addresses, and of faults."""
+        headers, said = refusal(status, body, self.path or b"")
+        self.handle_reply({"type": "http.response.start", "status": status, "headers": headers})
+        self.handle_reply({"type": "http.response.body", "body": said})
+
+    def connectionLost(self, reason: object) -> None:
+        """No more of it comes."""
+        headed = not self._whole and hasattr(self, "_bound")
+        presses = headed and (_ESTOP.fullmatch(self._path) or (self._over and not self._bound.status))
+        if presses and self.channel._command == b"POST":
+            self.requestReceived(self.channel._command, self.channel._path, self.channel._version)
+        super().connectionLost(reason)
+
+    def admitted(self) -> None:
+        """A long body of somebody who may send it: it takes its time."""
+
+    def _too_long(self) -> None:
+        if self._bound.may_press:
+            self.content.seek(0)
+            if pressing.in_json(self.content.read(), "kind") is not None:
+                self._bound, self._over = replace(self._bound, status=0), True
+                return
+        self._leave_out()
+
+    def _leave_out(self) -> None:
+        self._over = True
+        self.content.seek(0)
+        self.content.truncate()
+        self.requestHeaders.setRawHeaders(b"content-length", [b"0"])
+        if self._bound.status:
+            self.requestHeaders.removeHeader(b"expect")
+            self._refuse(self.channel.transport)
+
+    def _ask_who(self, key: str) -> None:
+        """Read nothing more until the database has said whose session it is."""
+        self.channel.transport.pauseProducing()
+        deferToThread(_role, key).addCallback(self._known).addErrback(self._unknown)
+
+    def _known(self, role: Role | None) -> None:
+        said = "log in first" if role is None else f"you are {role.a}; this needs {Role.ADMIN.a}"
+        self._go_on(0 if role is Role.ADMIN else 403, said)
+
+    def _unknown(self, failure: Any) -> None:
+        log.error("the database does not say who sends %s: %s", self._path, failure.value)
+        self._go_on(503, "the database does not answer: try again")
+
+    def _go_on(self, status: int, sentence: str) -> None:
+        if self._disconnected:
+            return
+        if status:
+            self._bound = replace(self._bound, status=status, sentence=sentence)
+            self._leave_out()
+        else:
+            self.admitted()
+        self.channel.transport.resumeProducing()
+
+    def _refuse(self, transport: Any) -> None:
+        transport.write(whole(self._bound.status, self._bound.sentence, self._path))
+        transport.loseWriteConnection()
+        events: Any = reactor
+        events.callLater(_LINGER_S, transport.abortConnection)
+
+
+def _role(key: str) -> Role | None:
+    try:
+        return role_now(key)
+    finally:
+        connections.close_all()

@@ -1,0 +1,62 @@
+"""What is refused before Django hears of it, said as Django says it: JSON, or the page of the lab."""
+
+from __future__ import annotations
+
+import json
+from http import HTTPStatus
+from typing import Any
+
+import daphne.server  # noqa: F401  first: it decides which reactor there is
+
+# isort: split
+from django.template.loader import render_to_string
+from twisted.web.http import HTTPChannel
+
+from evaweb.headers import BARE, PLAIN_PAGE
+
+_REST = b"/api/"
+Headers = list[tuple[bytes, bytes]]
+
+
+def refusal(status: int, sentence: str, path: bytes) -> tuple[Headers, bytes]:
+    """Headers and body for who asked for `path`."""
+    if path.startswith(_REST):
+        kind, body, policy = "application/json", json.dumps({"error": sentence}), {}
+    else:
+        kind, policy = "text/html; charset=utf-8", {b"content-security-policy": PLAIN_PAGE.encode()}
+        body = render_to_string("unavailable.html", {"sentence": sentence, "status": status})
+    said = body.encode()
+    described = {b"content-type": kind.encode(), b"content-length": b"%d" % len(said), **dict(BARE), **policy}
+    return list(described.items()), said
+
+
+def whole(status: int, sentence: str, path: bytes) -> bytes:
+    """The same as it goes over a connection that ends with it."""
+    headers, said = refusal(status, sentence, path)
+    lines = [f"HTTP/1.1 {status} {HTTPStatus(status).phrase}".encode()]
+    lines += [name.title() + b": " + value for name, value in headers]
+    return b"\r\n".join([*lines, b"Connection: close", b"", said])
+
+
+class Channel(HTTPChannel):  # type: ignore[misc]
+    """Twisted's, which ends a connection without a word where a line is too long, and says nothing of other faults."""
+
+    def lineLengthExceeded(self, line: bytes) -> None:
+        """The address, or one header."""
+        if self._receivedHeaderSize:
+            self._refuse(431, f"a header is too long; allowed: {self.MAX_LENGTH} bytes", self._path)
+        else:
+            path = line[: self.MAX_LENGTH].partition(b" ")[2]
+            self._refuse(414, f"the address is too long; allowed: {self.MAX_LENGTH} bytes", path)
+
+    def _respondToBadRequestAndDisconnect(self) -> None:
+        path = getattr(self, "_path", b"")
+        if self._receivedHeaderSize > self.totalHeadersSize or self._receivedHeaderCount > self.maxHeaders:
+            most = f"{self.maxHeaders} headers, {self.totalHeadersSize} bytes in all"
+            self._refuse(431, f"the headers are too long; allowed: {most}", path)
+        else:
+            self._refuse(400, "this is no request of HTTP", path)
+
+    def _refuse(self, status: int, sentence: str, path: Any) -> None:
+        self.transport.write(whole(status, sentence, bytes(path)))
+        self.loseConnection()

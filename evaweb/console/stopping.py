@@ -1,0 +1,114 @@
+"""What a page stops: at once where it is known who is there, and also where the database does not say who.
+
+Nothing here waits for the database, and no number of presses is too many.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
+from datetime import datetime
+from functools import partial
+from typing import Any
+from uuid import UUID
+
+from django.utils import timezone
+
+from evaweb.console.requests import EStop, Stop
+from evaweb.credentials import SESSION, UNVERIFIED, Login, Unverifiable, credentials
+from evaweb.roles import Role
+from evaweb.stations import commands, stops
+from evaweb.stations.models import CommandStatus, Station
+
+log = logging.getLogger(__name__)
+_MOST_UNANSWERED = 200  # of one page; what it says beyond is done, with no word of its own
+Say = Callable[[dict[str, Any]], None]
+GoOn = Callable[[Coroutine[Any, Any, None]], None]  # to the end, also when the page is closed
+
+
+class Stopping:
+    """The stops of one page at a station; belongs to the event loop. `login` is who is there, once that is known."""
+
+    def __init__(self, station: str, page: str, session: str, say: Say, go_on: GoOn) -> None:
+        self.login: Login | None = None
+        self._station, self._page, self._session = station, page, session
+        self._say, self._go_on = say, go_on
+        self._unanswered = 0
+
+    def heard(self, request: EStop | Stop) -> None:
+        """Do it; what came of it is said when it is known."""
+        at = timezone.now()
+        if self.login is None:
+            self._go_on(
+                self._press_of(request, at) if isinstance(request, EStop) else self._stop_of(request, at)
+            )
+        elif isinstance(request, EStop):
+            self._press(request, self.login, at)
+        else:
+            self._stop(request, self.login, at)
+
+    async def _press_of(self, request: EStop, at: datetime) -> None:
+        try:
+            login = await credentials.presser(SESSION, self._session)
+        except Unverifiable as fault:
+            log.error("an e-stop of %s is obeyed, of nobody knows whom: %s", self._station, fault)
+            self._press(request, None, at, str(fault))
+        else:
+            if login is not None:
+                self._press(request, login, at)
+
+    async def _stop_of(self, request: Stop, at: datetime) -> None:
+        try:
+            login = await credentials.stopper(SESSION, self._session)
+        except Unverifiable as fault:
+            reason = f"{fault}: who may stop is not known; the e-stop works"
+            self._acknowledge(request.kind, request.uuid, stops.Answer(CommandStatus.FAILED, reason))
+        else:
+            if login is not None:
+                self._stop(request, login, at)
+
+    def _press(self, request: EStop, login: Login | None, at: datetime, unverified: str = "") -> None:
+        why, uuid = request.why, request.uuid
+        username = login.username if login else UNVERIFIED
+        answer = stops.press(station=self._station, username=username, why=why, uuid=uuid)
+        user = login.account if login else None
+        note = partial(commands.estop_noted, user=user, why=why, uuid=uuid, at=at, unverified=unverified)
+        self._answer("estop", uuid, answer, note)
+
+    def _stop(self, request: Stop, login: Login, at: datetime) -> None:
+        """Of a viewer nothing is done, and nothing written down."""
+        if login.role is Role.VIEWER:
+            refused = stops.Answer(CommandStatus.REFUSED, stops.refused_to_a_viewer(login.username))
+            self._acknowledge(request.kind, request.uuid, refused)
+            return
+        given = {"kind": request.kind, "page": self._page, "epoch": request.epoch, "uuid": request.uuid}
+        answer = stops.ask(stops.order(username=login.username, **given), self._station)
+        self._answer(
+            request.kind,
+            request.uuid,
+            answer,
+            partial(commands.stop_noted, user=login.account, at=at, **given),
+        )
+
+    def _answer(
+        self, kind: str, uuid: UUID, answer: Future[stops.Answer], note: Callable[..., object]
+    ) -> None:
+        if self._unanswered < _MOST_UNANSWERED:
+            self._unanswered += 1
+            self._go_on(self._answered(kind, uuid, answer, note))
+
+    async def _answered(
+        self, kind: str, uuid: UUID, answer: Future[stops.Answer], note: Callable[..., object]
+    ) -> None:
+        try:
+            found = await asyncio.wrap_future(answer)
+        finally:
+            self._unanswered -= 1
+        self._acknowledge(kind, uuid, found)
+        note(station=Station(name=self._station), answer=found)
+
+    def _acknowledge(self, kind: str, uuid: UUID, answer: stops.Answer) -> None:
+        said = {"kind": kind, "uuid": str(uuid), "status": answer.status.value, "reason": answer.reason}
+        self._say({"type": "ack", **said})

@@ -1,0 +1,58 @@
+"""What browsers are told of every answer: where its parts may come from, and that it is not to be kept."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from csp.constants import NONCE, NONE, SELF
+from django.http import HttpRequest
+from django.http.response import HttpResponseBase
+from django.utils.deprecation import MiddlewareMixin
+
+# The style elements that the viewer's script makes when it is loaded: an empty one, which it fills by rules, and that
+# of its panel, which pages remove. tests/e2e/test_policy.py says what has changed where the script has.
+_VIEWER_STYLES = (
+    "'sha256-47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU='",
+    "'sha256-K7kXOYqP8pf16L5/PaLZ4u9Lt5q3nTyjCvyGtO/Af2k='",
+)
+
+NOTHING = "default-src 'none'"  # the policy of what is no page and is answered without Django
+PLAIN_PAGE = (
+    "default-src 'none'; style-src 'self'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
+)
+BARE = [  # the headers of such an answer
+    (b"cache-control", b"no-store"),
+    (b"content-security-policy", NOTHING.encode()),
+    (b"x-content-type-options", b"nosniff"),
+    (b"x-frame-options", b"DENY"),
+    (b"referrer-policy", b"same-origin"),
+    (b"cross-origin-opener-policy", b"same-origin"),
+]
+
+CONTENT_SECURITY_POLICY: dict[str, Any] = {
+    "DIRECTIVES": {
+        "default-src": [SELF],
+        "script-src": [SELF],
+        "style-src": [SELF, NONCE, *_VIEWER_STYLES],
+        "img-src": [SELF, "data:"],
+        "connect-src": [SELF],  # its websockets as well
+        "worker-src": [NONE],
+        "frame-src": [NONE],
+        "object-src": [NONE],
+        "base-uri": [NONE],
+        "form-action": [SELF],
+        "frame-ancestors": [NONE],
+    }
+}
+
+
+class HeadersMiddleware(MiddlewareMixin):
+    """Outermost: whatever answers has the headers of BARE where it says nothing else, redirects and static files too.
+
+    What is behind the login stays in no browser's cache: the next person at it may not be allowed to read it.
+    """
+
+    def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
+        for name, value in BARE:
+            response.headers.setdefault(name.decode().title(), value.decode())
+        return response

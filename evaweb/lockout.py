@@ -1,0 +1,37 @@
+"""What somebody is told whose name is locked at their address, on the login pages of the lab and of administration."""
+
+from __future__ import annotations
+
+from math import ceil
+from typing import Any
+
+from axes.models import AccessAttempt
+from django.conf import settings
+from django.db.models import Max
+from django.http import HttpRequest, HttpResponse
+from django.utils import timezone
+
+from evaweb.callers import address_of
+from evaweb.refusals import told
+
+
+def answer(request: HttpRequest, *given: Any) -> HttpResponse:
+    """429 with how long it lasts."""
+    seconds = _left(request)
+    minutes = ceil(seconds / 60)
+    sentence = (
+        f"The password was wrong {settings.AXES_FAILURE_LIMIT} times for this name from this computer. "
+        f"It can be tried again in {minutes} minute{'s' if minutes > 1 else ''}; "
+        "an administrator can unlock it before. Who is logged in already stays so."
+    )
+    response = told(request, sentence, 429, "registration/locked.html")
+    response["Retry-After"] = str(seconds)
+    return response
+
+
+def _left(request: HttpRequest) -> int:
+    """Until the newest failure no longer counts [s]."""
+    username = (getattr(request, "axes_credentials", None) or {}).get("username")
+    attempts = AccessAttempt.objects.filter(username=username, ip_address=address_of(request))
+    newest = attempts.aggregate(at=Max("attempt_time"))["at"] or timezone.now()
+    return max(1, ceil((newest + settings.AXES_COOLOFF_TIME - timezone.now()).total_seconds()))

@@ -1,0 +1,41 @@
+"""Which pages are our own: another site of the same machine, at another port, has the same cookies."""
+
+from __future__ import annotations
+
+import re
+from urllib.parse import urlsplit
+
+from django.conf import settings
+
+_PORT = re.compile(r":([0-9]{1,5})$")
+
+
+def is_ours(origin: str, host: str, web_port: int | None = None) -> bool:
+    """Whether pages of `origin` are the lab's, for who was asked as `host`.
+
+    Ours are that host and port, and the trusted origins: CSRF_TRUSTED_ORIGINS, without wildcards. For who listens
+    beside the web it is `web_port` of that host too, over plain HTTP: behind a proxy all have one origin.
+    """
+    try:
+        asked = urlsplit(origin)
+        asked_of = asked.netloc
+    except ValueError:
+        return False
+    if not asked_of:
+        return False
+    beside = (
+        web_port is not None and asked.scheme == "http" and _parts(asked_of) == (_parts(host)[0], web_port)
+    )
+    return beside or asked_of == host or origin in settings.CSRF_TRUSTED_ORIGINS
+
+
+def at_port(host: str, web_port: int, port: int) -> str:
+    """The origin beside the web's, over plain HTTP; "" where `host` is not the web's own port, but a proxy's."""
+    name, asked = _parts(host)
+    return f"http://{name}:{port}" if asked == web_port else ""
+
+
+def _parts(host: str) -> tuple[str, int]:
+    """Name and port of a Host header over plain HTTP."""
+    found = _PORT.search(host)
+    return (host[: found.start()], int(found[1])) if found else (host, 80)

@@ -1,0 +1,42 @@
+"""Changing one's own password: who guesses the old one is counted, and locked, as on the login pages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from axes.utils import reset
+from django.contrib.auth import authenticate
+from django.contrib.auth.forms import PasswordChangeForm
+from django.contrib.auth.views import PasswordChangeView
+from django.core.exceptions import ValidationError
+
+from evaweb.callers import address_of
+
+
+class OwnPasswordForm(PasswordChangeForm):
+    """Django's, with an old password that is checked as a login is."""
+
+    request: Any = None
+
+    def clean_old_password(self) -> str:
+        """The right one; ValidationError."""
+        given: str = self.cleaned_data["old_password"]
+        name = self.user.get_username()
+        if authenticate(self.request, username=name, password=given) != self.user:
+            raise ValidationError(self.error_messages["password_incorrect"], code="password_incorrect")
+        reset(username=name, ip=address_of(self.request))  # as a login forgets those before it
+        return given
+
+
+class OwnPasswordView(PasswordChangeView):
+    """On the lab's page."""
+
+    form_class = OwnPasswordForm
+    template_name = "registration/password.html"
+    success_url = "/"
+    extra_context = {"title": "Your password"}  # noqa: RUF012  Django's
+
+    def get_form(self, form_class: Any = None) -> Any:
+        form = super().get_form(form_class)
+        form.request = self.request
+        return form

@@ -1,0 +1,1 @@
+"""What a plan's trials show, in numbers."""

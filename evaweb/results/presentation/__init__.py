@@ -1,0 +1,1 @@
+"""How results are worded, listed and drawn, on pages and in reports."""

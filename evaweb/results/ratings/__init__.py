@@ -1,0 +1,1 @@
+"""Second ratings and preferences, and the judges' blindness."""

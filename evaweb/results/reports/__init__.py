@@ -1,0 +1,1 @@
+"""What of a plan's results leaves the lab: documents, tables, the program that recomputes them."""

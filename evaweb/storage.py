@@ -1,0 +1,27 @@
+"""What a database or a disk that takes nothing means for who asked: a sentence and an HTTP status."""
+
+from __future__ import annotations
+
+import errno
+
+from django.db import DatabaseError, Error, InterfaceError, InternalError, OperationalError
+
+_FULL = ("disk is full", "disk full", "no space left")
+_READ_ONLY = ("readonly", "read-only")
+
+
+def refusal_of(fault: BaseException | None) -> tuple[str, int] | None:
+    """507 where there is no room, 503 where database or disk cannot be written or reached; None for any other fault."""
+    if not isinstance(fault, Error | OSError):
+        return None
+    text = str(fault).lower()
+    if getattr(fault, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or any(word in text for word in _FULL):
+        return "the disk of the lab is full: nothing was changed. Make room there, and try again", 507
+    if getattr(fault, "errno", None) == errno.EROFS or any(word in text for word in _READ_ONLY):
+        return f"the lab's data cannot be written ({fault}): nothing was changed. Ask an administrator", 503
+    if isinstance(fault, OperationalError | InterfaceError | InternalError) or type(fault) is DatabaseError:
+        return (
+            "the database is busy or gone: nothing was changed, try again",
+            503,
+        )  # where it is, the log says
+    return None
