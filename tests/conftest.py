@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 _ALONE = [Path(__file__).parent / folder for folder in ("e2e", "crash")]  # whole labs, and what ends them
 _BEGAN = os.sched_getscheduler(0)
+hypothesis.settings.register_profile("eva", deadline=None)  # no test asserts timing: others share the machine
+hypothesis.settings.load_profile("eva")
+_SOCKETS = tempfile.mkdtemp(prefix="eva-")  # of every station that a test starts
 
 
 def pytest_configure() -> None:
     """Whatever started the tests, they are ordinary: else a busy one starves the real-time loops it looks at."""
     if _BEGAN != os.SCHED_OTHER:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    os.environ["XDG_RUNTIME_DIR"] = _SOCKETS
+
+
+def pytest_unconfigure() -> None:
+    """No socket of a test outlives the tests."""
+    shutil.rmtree(_SOCKETS, ignore_errors=True)
 
 
 def pytest_report_header() -> str:

@@ -1,7 +1,9 @@
 """Short forms of what `python -m benchmarks soak` does for as long as it is given."""
 
 import json
+import logging
 
+import numpy as np
 import pytest
 
 from benchmarks import soak
@@ -25,7 +27,7 @@ def test_what_a_request_declares_fixed_is_what_control_plans_for_these_steps(see
 
 def test_a_plan_that_is_another_one_than_was_declared_is_noticed(monkeypatch):
     """As before: the rows of the newest answer as it was given, whatever control has blended."""
-    monkeypatch.setattr("runtime.commitment._shares", lambda merged: {})
+    monkeypatch.setattr("runtime.processes.coordinator.inference.rtc_prefix._shares", lambda merged: {})
     found = [text for seed in range(4) for text in rtc_prefix.once(seed)]
     assert any("off in number" in text for text in found)
 
@@ -67,6 +69,30 @@ def test_what_leaks_and_grows_is_seen():
     before, kept = soak.held(), []
     kept.append(open(__file__))  # noqa: SIM115
     kept.append(b"x" * 40_000_000)
-    missed = {figure.name for figure in soak._grown(before, soak.held()) if figure.holds is False}
+    after = soak.held()
     kept[0].close()
-    assert missed == {"leaks.files", "growth.memory"}
+    missed = {figure.name for figure in soak._grown([before, after]) if figure.holds is False}
+    assert missed == {"leaks.files"}
+    assert after.memory_mb - before.memory_mb > 30
+
+
+@pytest.mark.parametrize(
+    ("leaked", "rounds", "holds"), [(0.0, 200, True), (0.1, 200, False), (0.1, 199, None)]
+)
+def test_what_comes_and_goes_is_no_growth_and_too_few_rounds_say_nothing(leaked, rounds, holds):
+    memory = 250.0 + np.random.default_rng(3).normal(0.0, 3.0, rounds) + leaked * np.arange(rounds)
+    figures = soak._grown([soak.Held(5, 1, 0, mb) for mb in memory])
+    assert {figure.name: figure.holds for figure in figures}["growth.memory"] is holds
+
+
+def test_warnings_that_scenarios_provoke_are_not_shown_and_errors_are(caplog):
+    log = logging.getLogger("runtime.policies.somewhere")
+
+    def provoking(seed):
+        log.warning("doubted")
+        log.error("broken")
+        return []
+
+    soak.measure(0.0, {"provoking": provoking}, 7)
+    log.warning("afterwards")
+    assert [record.getMessage() for record in caplog.records] == ["broken", "afterwards"]

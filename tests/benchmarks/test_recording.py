@@ -5,17 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from uuid import UUID, uuid4
 
 import numpy as np
 import pyarrow as pa
 import pytest
+from django.db import connection
 
 from benchmarks import __main__ as command_line
 from benchmarks import recording_busy
 from benchmarks.recording import figures
-from benchmarks.recording_kills import _loss
+from benchmarks.recording_kills import RUNNING, _loss
 from benchmarks.recording_pace import Frames, finish, give
 from benchmarks.recording_station import lost, published, to_disk
+from evaweb.jobs.models import Job, JobStatus
 from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.reader import Episode, open_episode
@@ -183,3 +186,14 @@ def test_long_is_refused_where_there_is_nothing_longer(
     with pytest.raises(SystemExit):
         command_line.main()
     assert "--long is for recording" in capsys.readouterr().err
+
+
+@pytest.mark.django_db
+def test_the_killer_of_workers_finds_a_job_that_runs_and_whose_it_is() -> None:
+    """The benchmark reads the table as it is, past Django."""
+    owner = uuid4()
+    Job.objects.create(kind="publish", key="mine", status=JobStatus.RUNNING, owner=owner)
+    Job.objects.create(kind="publish", key="waits")
+    with connection.cursor() as cursor:
+        found = cursor.execute(RUNNING).fetchall()
+    assert [(key, UUID(str(uuid))) for key, uuid in found] == [("mine", owner)]

@@ -8,10 +8,10 @@ import pytest
 from benchmarks.reference import Reference, answering, chunks_of
 from benchmarks.strategies import CHECKED, KINDS, Cell, _row, react, track
 from benchmarks.strategy_station import compare
-from runtime.plugins import variants
+from runtime.core.plugins import variants
+from runtime.core.types import Conditioning
 from runtime.strategies import overlap
 from runtime.strategies.base import StrategyParameters
-from runtime.types import Conditioning
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import robots
@@ -18,9 +18,9 @@ from benchmarks.wires_receiver import Receiving, source
 from benchmarks.wires_recording import record
 from benchmarks.wires_relay import Relay
 from benchmarks.wires_sender import Pace
-from runtime.clock import VirtualClock
-from runtime.errors import SetupError
-from runtime.plugins import variants
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import SetupError
+from runtime.core.plugins import variants
 from runtime.sim import camera_server
 from runtime.sim.pictures import Scene, frame_number
 
@@ -116,7 +116,6 @@ def test_a_hurried_sender_gives_up_what_does_not_arrive() -> None:
 
 
 @given(st.integers(0, 2**16))
-@settings(deadline=None)
 def test_a_pictures_number_is_in_what_a_tick_keeps_of_it(number: int) -> None:
     for picture in SCENE.draw(number, 0.0, PIPER.poses["home"]).values():
         assert (

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from robots import Robot
-from runtime.clock import MonotonicClock
-from runtime.plugins import variants
+from runtime.core.clock import MonotonicClock
+from runtime.core.plugins import variants
 from runtime.policies.base import Policy
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
@@ -108,11 +108,24 @@ WEBSOCKETS = {
         settings={"cameras": [camera.key for camera in FRANKA.cameras], "ping_every": None},
         first=1,  # a ping
     ),
+    "starvla-old": Served(
+        "starvla",
+        "ws",
+        lambda fault: StarvlaServer(FRANKA, Star(fault=fault, old=True)),
+        settings={
+            "cameras": [camera.key for camera in FRANKA.cameras],
+            "ping_every": None,
+            "statistics": {"low": list(FRANKA.lower), "high": list(FRANKA.upper)},
+        },
+        first=1,
+    ),
 }
 PROTOCOLS = WEBSOCKETS | {
     "gr00t-n1.5": _gr00t("n1.5"),
     "gr00t-n1.6": _gr00t("n1.6"),
     "gr00t-n1.7": _gr00t("n1.7"),
+    "gr00t-n1.7-early": _gr00t("n1.7-early"),
+    "gr00t-starvla": _gr00t("starvla"),
     "lerobot": Served("lerobot", "grpc", _lerobot, PIPER, _LEROBOT),
 }
 

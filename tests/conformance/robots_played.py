@@ -16,7 +16,8 @@ import pytest
 import zmq
 
 import robots
-from runtime.clock import MonotonicClock
+from runtime.core.clock import MonotonicClock
+from runtime.core.types import Observation
 from runtime.sim import arrays
 from runtime.transports import ros1, ros2
 from runtime.transports import zmq as node
@@ -25,7 +26,6 @@ from runtime.transports.ros import cdr, packed
 from runtime.transports.ros.messages import Image, JointState, Message
 from runtime.transports.ros.middleware import SENSOR_QUALITY, Middleware, Publish, Topic
 from runtime.transports.ros.topics import GroupTopics, Topics
-from runtime.types import Observation
 from tests.runtime.ros_master import PYTHON, absent
 
 ROBOT = robots.load("ur5e")

@@ -13,10 +13,10 @@ import psutil
 import pytest
 import zmq
 
-from runtime.channel.message import LARGEST
-from runtime.transitions import State
+from runtime.clients.channel.message import LARGEST
+from runtime.processes.coordinator.session.transitions import State
 from tests.processes import eventually
-from tests.runtime.channel.bench import Bench, Script
+from tests.runtime.clients.channel.bench import Bench, Script
 
 MESSAGES: dict[str, tuple[list[bytes], str]] = {
     "empty": ([b""], "recv failed: "),
@@ -144,7 +144,7 @@ def asked(script: Script) -> bool:
 def test_scripts_that_are_gone_before_their_answer_leave_nothing_behind(
     bench: Bench, script: Script, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("runtime.channel.scripts.KEPT", 5)
+    monkeypatch.setattr("runtime.clients.channel.scripts.KEPT", 5)
     assert script.query("status")["state"] == "idle"
     process = psutil.Process(os.getpid())
     before = len(process.net_connections("tcp"))
@@ -191,7 +191,7 @@ def test_of_two_operators_at_once_the_second_is_told_who_commands(bench: Bench, 
 def test_a_command_that_waited_too_long_is_stale_and_not_carried_out(
     bench: Bench, script: Script, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("runtime.channel.lane.LATE_S", -1.0)  # whoever asked has given up
+    monkeypatch.setattr("runtime.clients.channel.lane.LATE_S", -1.0)  # whoever asked has given up
     why = refused(lambda: script.cmd("setup"))
     assert why.startswith("it waited ")
     assert why.endswith(" behind others: not carried out")

@@ -14,12 +14,12 @@ import pytest
 import zmq
 
 import robots
-from runtime.clock import MonotonicClock
+from runtime.core.clock import MonotonicClock
+from runtime.core.types import RobotCommand
 from runtime.sim import arrays
 from runtime.sim.node import Node, parser, run
 from runtime.transports import zmq as link
 from runtime.transports.node_source import NodeSource
-from runtime.types import RobotCommand
 from tests.processes import eventually
 
 ROBOT = robots.load("ur5e")

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import robots
-from runtime import codecs
-from runtime.errors import CodecError
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.errors import CodecError
 from runtime.policies.async_inference import messages, pickles
 from runtime.policies.async_inference.tensors import Tensors
 from runtime.policies.groot import arrays as groot
@@ -143,7 +143,7 @@ def test_real_messages_are_read(name: str) -> None:
 
 
 @on_every_reader
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(payload=st.binary(max_size=200))
 def test_random_bytes_are_a_value_or_the_readers_own_error(name: str, payload: bytes) -> None:
     found = outcome(READERS[name].read, payload)
@@ -151,7 +151,7 @@ def test_random_bytes_are_a_value_or_the_readers_own_error(name: str, payload: b
 
 
 @on_every_reader
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(data=st.data())
 def test_cut_and_bent_messages_are_a_value_or_the_readers_own_error(name: str, data: st.DataObject) -> None:
     reader = READERS[name]
@@ -165,7 +165,7 @@ def test_cut_and_bent_messages_are_a_value_or_the_readers_own_error(name: str, d
 
 
 @pytest.mark.parametrize("name", ["node", "gate"])
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(data=st.data())
 def test_fields_of_any_kind_are_a_value_or_the_readers_own_error(name: str, data: st.DataObject) -> None:
     """Whole messages whose fields are something else."""

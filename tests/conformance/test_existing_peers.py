@@ -14,12 +14,12 @@ import pytest
 import zmq
 
 import robots
-from runtime.clock import MonotonicClock, VirtualClock
+from runtime.core.clock import MonotonicClock, VirtualClock
+from runtime.core.types import RobotCommand
 from runtime.sim.node import Node, parser
 from runtime.transports import zmq as link
 from runtime.transports.node_messages import MESSAGE_LIMIT, NodeMessages
 from runtime.transports.node_sink import NodeSink
-from runtime.types import RobotCommand
 from tests.processes import eventually
 
 ROBOT = robots.load("agilex_piper")

@@ -10,19 +10,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from websockets.exceptions import ConnectionClosed, ConnectionClosedOK
+from websockets.sync.server import ServerConnection
 
-from runtime.errors import (
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.errors import (
     ContradictionError,
     PolicyError,
     PolicyGone,
     PolicyLostError,
     PolicyTimeout,
 )
+from runtime.core.types import Conditioning
 from runtime.sim import faults
 from runtime.sim.faults import Fault
-from runtime.types import Conditioning
 from tests.conformance.policies_served import PROTOCOLS, WEBSOCKETS, Served, protocol
-from tests.runtime.policies.peers import seen
+from tests.processes import eventually
+from tests.runtime.policies.peers import seen, serving
 
 DEADLINE = 0.4  # s, where only a deadline ends the waiting; else what is wrong is noticed at once
 PATIENCE = 30.0  # s until a test gives up
@@ -69,6 +73,10 @@ GR00T: Faults = {
     "uneven": (PolicyError, "different numbers of rows: left_arm 49, right_arm 50"),
     "too_large": (PolicyGone, "sends no more than 67108864 bytes"),
 }
+STARVLA = {key: value for key, value in WEBSOCKET.items() if key != "exception"} | {
+    "refused": (PolicyError, "CUDA out of memory"),
+    "request_id": (PolicyError, "request"),
+}
 FAULTS: dict[str, Faults] = {
     "openpi": WEBSOCKET,
     "roboarena": WEBSOCKET,
@@ -77,15 +85,13 @@ FAULTS: dict[str, Faults] = {
         "exception": (PolicyError, "Internal inference error"),
         "not_loaded": (PolicyError, "Robot policy not available"),
     },
-    "starvla": {key: value for key, value in WEBSOCKET.items() if key != "exception"}
-    | {
-        "refused": (PolicyError, "CUDA out of memory"),
-        "request_id": (PolicyError, "request"),
-        "normalized": (PolicyError, "normali"),
-    },
+    "starvla": STARVLA | {"normalized": (PolicyError, "normali")},
+    "starvla-old": STARVLA | {"empty": (PolicyError, "normalized_actions is empty")},
     "gr00t-n1.5": {key: value for key, value in GR00T.items() if key != "two_batches"},
     "gr00t-n1.6": GR00T,
     "gr00t-n1.7": GR00T,
+    "gr00t-n1.7-early": GR00T,
+    "gr00t-starvla": GR00T,
     "lerobot": {
         "mute_on_connect": (PolicyLostError, "did not answer Ready within"),
         "mute_on_infer:0": (PolicyLostError, "did not answer GetActions within"),
@@ -109,6 +115,7 @@ FAULTS: dict[str, Faults] = {
 # Faults that a protocol cannot have, or that are none there; each with the reason.
 NONE: dict[str, dict[str, str]] = {
     "starvla": {"exception": "its server tells errors of a model as a map: refused"},
+    "starvla-old": {"exception": "its server tells errors of a model as a map: refused"},
     "gr00t-n1.5": {"two_batches": "its answers have no batch axis"},
     "lerobot": {
         "bad_array_dialect": "tensors are pickles of torch",
@@ -268,6 +275,30 @@ def test_a_port_where_nobody_listens_is_said_to_be_empty(name: str) -> None:
         pytest.raises(PolicyLostError, match=r"no policy server listens .*policy\.url"),
     ):
         policy.connect()
+
+
+@pytest.mark.parametrize("end", ["closed", "connected anew", "refused"])
+def test_a_server_is_left_with_a_close_frame(end: str) -> None:
+    """Else a server that reads until its client is gone ends in a traceback."""
+    ended: list[ConnectionClosed] = []
+
+    def converse(connection: ServerConnection) -> None:
+        connection.send(codecs.pack({"action_dim": 99} if end == "refused" else {}))
+        try:
+            while True:
+                connection.recv()
+        except ConnectionClosed as closed:
+            ended.append(closed)
+
+    with serving(converse) as url, protocol("openpi").policy(url) as policy:
+        with contextlib.suppress(ContradictionError):
+            policy.connect()
+        if end == "connected anew":
+            policy.connect()
+        if end == "closed":
+            policy.close()
+        eventually(lambda: ended, PATIENCE, "the end of the first conversation")
+    assert isinstance(ended[0], ConnectionClosedOK), ended[0]
 
 
 @on_every_protocol

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,17 +13,20 @@ import numpy as np
 import pytest
 import zmq
 
-from runtime import codecs
-from runtime.errors import CodecError, PolicyError, ServerSaysError, WrongProtocolError
+import robots
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.errors import CodecError, PolicyError, ServerSaysError, WrongProtocolError
+from runtime.core.types import Conditioning
 from runtime.policies.async_inference import messages, pickles
 from runtime.policies.groot import arrays as groot
 from runtime.policies.rtc.async_rtc import AsyncRtc
 from runtime.policies.rtc.prev_action import PrevAction
 from runtime.sim import arrays as stand_in
-from runtime.types import Conditioning
-from tests.conformance.policies_served import PROTOCOLS, WEBSOCKETS
+from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
+from tests.conformance.policies_served import PROTOCOLS, WEBSOCKETS, Served
 from tests.runtime.policies.peers import answering, seen, serving
 
+ARM = robots.load("agilex_piper", ["left_arm"])
 VECTORS = Path(__file__).parents[1] / "runtime" / "vectors"
 LIMIT = 2**20
 OPENPI = [
@@ -33,11 +37,13 @@ OPENPI = [
         "roboarena_infer_reply_dict",
     ),
     *("dreamzero_infer_request_4frames", "starvla_infer_request", "starvla_infer_reply"),
+    *("starvla_old_metadata", "starvla_old_infer_reply"),
     *("openpi_infer_request", "openpi_infer_reply", "rtc_a_request_next", "rtc_c_request"),
     *("rtc_d_request_raw", "rtc_d_request_jpeg_first", "rtc_d_reply"),
 ]
 NPY = ["gr00t_n16_get_action_request", "gr00t_n16_get_action_reply"]
 MNP = ["gr00t_n17_get_action_request_mnp", "gr00t_n17_get_action_reply_mnp"]
+CONFIGURATIONS = ["gr00t_n17_modality_config", "starvla_gr00t_contract"]
 PICKLED_ACTIONS = ["lerobot_timed_actions_clones", "lerobot_timed_actions_views", "lerobot_real_server_reply"]
 # What our client writes; tests/runtime/policies/async_inference holds that it does.
 PICKLED_REQUESTS = [
@@ -64,7 +70,15 @@ def same(one: Any, other: Any) -> bool:
 
 
 def test_every_recorded_message_is_among_these() -> None:
-    named = [*OPENPI, *NPY, *MNP, *PICKLED_ACTIONS, *PICKLED_REQUESTS]
+    named = [
+        *OPENPI,
+        *NPY,
+        *MNP,
+        *CONFIGURATIONS,
+        "starvla_gr00t_get_action_reply",
+        *PICKLED_ACTIONS,
+        *PICKLED_REQUESTS,
+    ]
     assert sorted(named) == sorted(path.stem for path in VECTORS.glob("*.bin"))
 
 
@@ -81,6 +95,7 @@ def test_openpis_arrays_are_read_and_written_the_same_by_the_clients_and_by_the_
 def test_gr00ts_arrays_are_the_same_in_both_forms(npy: str, mnp: str) -> None:
     read = groot.unpack(vector(npy), LIMIT)
     assert groot.pack(read) == vector(npy)
+    assert groot.pack(read, mnp=True) == vector(mnp)
     assert same(read, groot.unpack(vector(mnp), LIMIT))
 
 
@@ -269,6 +284,66 @@ def gr00t(reply: Callable[[bytes], bytes]) -> Iterator[str]:
     finally:
         over.set()
         thread.join()
+
+
+SINGLE_ARM = Served(
+    "gr00t",
+    "tcp",
+    lambda fault: Gr00tServer(ARM, Gr00tBehaviour(fault=fault)),
+    ARM,
+    {
+        "video": {"ego_view": "cam_high"},
+        "state": {"single_arm": [0, 1, 2, 3, 4, 5]},
+        "actions": {"single_arm": [0, 1, 2, 3, 4, 5], "gripper": [6]},
+    },
+)
+
+
+@pytest.mark.parametrize(
+    ("configuration", "request_", "reply"),
+    [
+        ("gr00t_n17_modality_config", *MNP),
+        ("starvla_gr00t_contract", NPY[0], "starvla_gr00t_get_action_reply"),
+    ],
+)
+def test_a_server_is_asked_in_the_form_that_its_configuration_says(
+    configuration: str, request_: str, reply: str
+) -> None:
+    asked: list[bytes] = []
+
+    def answer(request: bytes) -> bytes:
+        asked.append(request)
+        return vector(configuration if len(asked) == 1 else reply)
+
+    picture = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
+    joints = np.array([0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.0], np.float32)
+    shown = seen(ARM, qpos=joints, pictures={"cam_high": picture}, prompt="pick")
+    with gr00t(answer) as url, SINGLE_ARM.policy(url) as policy:
+        rows = policy.infer(shown).actions
+    assert asked[1] == vector(request_)
+    np.testing.assert_array_equal(rows[:, :6], np.arange(12, dtype=np.float32).reshape(2, 6) / 8)
+    np.testing.assert_array_equal(rows[:, 6], [1.0, 1.0])
+
+
+def test_a_starvla_server_of_before_may_2026_is_spoken_to() -> None:
+    statistics = {"low": [0.0] * 7, "high": [2.0] * 7}
+    served = dataclasses.replace(WEBSOCKETS["starvla"], robot=ARM, settings={"cameras": ["cam_high"]})
+
+    def answer(request: Any) -> object:
+        if request["type"] == "ping":
+            return {"status": "ok", "ok": True, "type": "ping", "request_id": request["request_id"]}
+        return codecs.unpack(vector("starvla_old_infer_reply")) | {"request_id": request["request_id"]}
+
+    asked: list[bytes] = []
+    with (
+        serving(answering(vector("starvla_old_metadata"), answer, asked)) as url,
+        served.policy(url, statistics=statistics) as policy,
+    ):
+        assert policy.connect().metadata == {"env": "simpler_env"}
+        rows = policy.infer(seen(ARM)).actions
+    expected = 1 + np.minimum(np.arange(14, dtype=np.float32).reshape(2, 7) / 8, 1)
+    np.testing.assert_allclose(rows, expected)
+    assert codecs.unpack(asked[1])["payload"].keys() == {"examples"}  # nobody said whose statistics there are
 
 
 def test_gr00ts_short_requests_are_the_recorded_ones() -> None:

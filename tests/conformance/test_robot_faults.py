@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 import psutil
 import pytest
 
-from runtime.errors import TransportError
+from runtime.core.errors import TransportError
+from runtime.core.types import Observation
 from runtime.transports.base import Source
-from runtime.types import Observation
 from tests.conformance.robots_played import TRANSPORTS, Played, mark_of, played
 from tests.processes import eventually
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 import robots
-from runtime.clock import MonotonicClock
+from runtime.core.clock import MonotonicClock
+from runtime.core.types import RobotCommand
 from runtime.transports import zmq as link
-from runtime.types import RobotCommand
 from tests.processes import eventually
 
 ROBOT = robots.load("ur5e")
@@ -53,7 +53,7 @@ def test_the_shown_deployment_is_one() -> None:
     assert config == link.Config(disabled_cameras=["cam_high"])
 
 
-def test_the_shown_node_is_seen_and_goes_where_it_is_told() -> None:
+def test_the_shown_node_stands_at_home_and_goes_where_it_is_told() -> None:
     goal = np.clip(np.full(7, 0.25, np.float32), ROBOT.lower, ROBOT.upper).astype(np.float32)
     ports = free_ports()
     endpoints = {"sub_endpoint": f"tcp://127.0.0.1:{ports[0]}", "pub_endpoint": f"tcp://127.0.0.1:{ports[1]}"}
@@ -62,6 +62,9 @@ def test_the_shown_node_is_seen_and_goes_where_it_is_told() -> None:
     with shown_node(ports), contextlib.closing(source), contextlib.closing(sink):
         source.connect()
         sink.connect()
+
+        first = eventually(lambda: source.receive(0.1), PATIENCE, "an observation")
+        np.testing.assert_allclose(first.qpos, ROBOT.poses["home"], atol=1e-3)
 
         def arrived() -> bool:
             sink.send(RobotCommand(goal, 0, MonotonicClock().now()))

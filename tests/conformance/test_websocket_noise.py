@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime import codecs
-from runtime.clock import MonotonicClock
-from runtime.errors import PolicyError
-from runtime.plugins import variants
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import PolicyError
+from runtime.core.plugins import variants
 from tests.conformance.policies_served import WEBSOCKETS
 from tests.runtime.policies.peers import FRANKA, serving
 
@@ -43,7 +43,7 @@ def _pieces() -> st.SearchStrategy[bytes]:
 
 
 @pytest.mark.parametrize("kind", ["openpi", "roboarena", "starvla"])
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(payload=_pieces())
 def test_bytes_without_sense_are_a_policy_error_and_never_a_crash(kind: str, payload: bytes) -> None:
     policy: Any = _unconnected(kind)
@@ -73,7 +73,7 @@ def _read(policy: Any, kind: str, payload: bytes) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["openpi", "roboarena", "starvla"])
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     metadata=st.dictionaries(
         st.sampled_from(

@@ -7,9 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from runtime.bus import Endpoints
-from runtime.client import StationClient
-from runtime.errors import RuntimeFault
+from runtime.clients.client import StationClient
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.bus import Endpoints
 from tests.processes import eventually
 
 ROOT = Path(__file__).parents[2]

@@ -5,7 +5,7 @@ import json
 import psutil
 import pytest
 
-from runtime.client import Refused
+from runtime.clients.client import Refused
 from runtime.recording.reader import open_episode
 from tests.processes import eventually
 

@@ -9,8 +9,8 @@ import time
 import numpy as np
 import pytest
 
-from runtime.client import Refused, StationClient
-from runtime.errors import TransportError
+from runtime.clients.client import Refused, StationClient
+from runtime.core.errors import TransportError
 from runtime.recording.reader import open_episode
 from tests.processes import eventually
 
@@ -118,7 +118,7 @@ def test_two_commanders_the_second_is_refused_and_told_who_holds_the_lease(lab):
         second.command("run")
     assert lab.client.status()["state"] == "ready"
     assert second.estop("anybody may").status == "done"
-    assert lab.reach("faulted")["reason"].startswith("e-stop by somebody else")
+    assert lab.reach("faulted")["reason"].startswith("e-stop by account:")
     second.close()
 
 

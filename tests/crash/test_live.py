@@ -11,7 +11,7 @@ import pytest
 import simplejpeg
 import zmq
 
-from runtime.bus import Endpoints, Subscriber
+from runtime.ipc.bus import Endpoints, Subscriber
 from tests.crash.lab import ROOT
 from tests.processes import eventually
 

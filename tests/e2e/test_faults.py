@@ -12,7 +12,7 @@ from uuid import UUID
 
 import pytest
 
-from runtime.client import StationClient
+from runtime.clients.client import StationClient
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import DEAD, STATION, WIDE
 from tests.e2e.remote import SKILLED, page_of, refusal, tidy, visitor

@@ -16,15 +16,15 @@ from evaweb.episodes.job_kinds import publish_episode
 from evaweb.episodes.models import Episode
 from evaweb.jobs.kinds import Work
 from evaweb.jobs.models import Job
-from evaweb.plans.handing import hand_out
+from evaweb.plans.allocation import hand_out
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_close, plan_freeze
 from evaweb.preflights.models import Preflight
 from evaweb.stations.models import Command
 from evaweb.trials import services as trials
 from evaweb.trials.models import Checkpoint, Trial
+from runtime.processes.coordinator.session.transitions import SessionEvent
 from runtime.recording.export import export
-from runtime.transitions import Happening
 from tests.evaweb.trials import builders
 from tests.runtime.recording.samples import resealed
 
@@ -154,7 +154,7 @@ class Lab:
     def failed(self):
         """The policy's server is lost."""
         self.runtime.say("policy_failed", ERROR)
-        self.runtime.enter(Happening.CONNECTED, ERROR)
+        self.runtime.enter(SessionEvent.CONNECTED, ERROR)
         Trial.objects.filter(pk=self.trial.pk).update(status="interrupted", reason=f"policy lost: {ERROR}")
         self._record()
 

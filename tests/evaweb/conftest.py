@@ -2,16 +2,45 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Iterator
 from uuid import uuid4
 
 import pytest
 from django.conf import settings
 from django.contrib.auth.models import Group, User
+from django.db import Error
 
-from evaweb.stations.models import Station
+from evaweb.errors import NotFound
+from evaweb.stations import commands
+from evaweb.stations.models import Command, Station
 from tests.evaweb.stand_in import StandIn
 from tests.evaweb.trials import builders
+
+
+@pytest.fixture(autouse=True)
+def _noted_in_the_tests_own_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Threads see nothing of a test's transaction. Within an event loop they are the real ones."""
+    note = commands.notes.note
+
+    def here(row: Command) -> None:
+        try:
+            asyncio.get_running_loop()
+        except RuntimeError:
+            _written(row)
+        else:
+            note(row)
+
+    monkeypatch.setattr(commands.notes, "note", here)
+
+
+def _written(row: Command) -> None:
+    try:
+        commands._written(row)
+    except Error:
+        commands.unwritten.keep(row)
+    except NotFound as fault:
+        commands.log.error("%s is not written down: %s", row, fault)
 
 
 def person(name: str, *groups: str) -> User:
@@ -80,7 +109,13 @@ def bench(db: None) -> builders.Bench:
 def wire(monkeypatch: pytest.MonkeyPatch) -> builders.Wire:
     """What stands where wires to runtimes stand."""
     made = builders.Wire()
-    places = ("stations.commands", "stations.stops", "stations.leases", "api.stations", "trials.bench")
+    places = (
+        "stations.commands",
+        "stations.stops",
+        "stations.leases",
+        "api.stations",
+        "trials.station_commands",
+    )
     for place in places:
         monkeypatch.setattr(f"evaweb.{place}.wire_to", lambda name: made)
     return made

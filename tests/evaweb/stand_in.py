@@ -13,12 +13,13 @@ from uuid import uuid4
 import numpy as np
 import zmq
 
-from runtime.bus import CommandServer, Endpoints, EventLog, Publisher
-from runtime.effects import Effects, Situation
-from runtime.lease import Lease
-from runtime.messages import Ack, Command, Event
-from runtime.session import LEASE_COMMANDS, Session
-from runtime.transitions import Happening, State
+from runtime.ipc.bus import CommandServer, Endpoints, EventLog, Key, Publisher
+from runtime.ipc.identity import forged, identified, lacking
+from runtime.ipc.messages import Ack, Command, Event
+from runtime.processes.coordinator.lease import Lease
+from runtime.processes.coordinator.session.effects import Effects, GuardFacts
+from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, SessionMachine
+from runtime.processes.coordinator.session.transitions import STOPPING, SessionEvent, State
 
 DIM = 14
 
@@ -26,7 +27,7 @@ DIM = 14
 class Effortless(Effects):
     """Everything succeeds at once and moves nothing; `situation` is what the test says it is."""
 
-    situation = Situation()
+    situation = GuardFacts()
 
     def _nothing(self, *arguments: Any) -> Mapping[str, Any]:
         return {}
@@ -56,6 +57,7 @@ class StandIn:
         self.aim_says = Ack("", "done", data={"joints": [0.2] * DIM, "reached": True})
         self.effects = Effortless()
         self._folder = data / "stations" / name
+        self.key = Key(self._folder)
         self._ended = threading.Event()
         self._do: list[Any] = []
         self.boot_up()
@@ -66,12 +68,12 @@ class StandIn:
         self.boot = str(uuid4())
         self.events = EventLog()
         self.lease = Lease(self.ttl)
-        self.session = Session(self.effects, self.lease, self.boot, time.monotonic)
+        self.session = SessionMachine(self.effects, self.lease, self.boot, time.monotonic)
         self._ended = threading.Event()
-        self._main = CommandServer(context, "127.0.0.1", 0)
-        self._guard = CommandServer(context, "127.0.0.1", 0)
-        self._streams = Publisher(context, "127.0.0.1", 0, 64)
-        self._cameras = Publisher(context, "127.0.0.1", 0, 16)
+        self._main = CommandServer(context, self._folder, "commands")
+        self._guard = CommandServer(context, self._folder, "estop")
+        self._streams = Publisher(context, self._folder, "state", 64)
+        self._cameras = Publisher(context, self._folder, "cameras", 16)
         endpoints = Endpoints(self._folder)
         endpoints.write("main", {"commands": self._main.endpoint, "state": self._streams.endpoint})
         endpoints.write("media", {"cameras": self._cameras.endpoint})
@@ -88,7 +90,7 @@ class StandIn:
         if tidy:
             Endpoints(self._folder).clear()
 
-    def enter(self, happening: Happening, reason: str = "") -> None:
+    def enter(self, happening: SessionEvent, reason: str = "") -> None:
         """Let something happen to the session; returns when it has."""
         self.do(lambda: self._happen(happening, reason))
 
@@ -98,10 +100,10 @@ class StandIn:
 
     def ready(self) -> None:
         """As after a set-up."""
-        self.enter(Happening.CONNECTED)
+        self.enter(SessionEvent.CONNECTED)
         self.do(lambda: self.session._enter(State.READY, "set up"))
 
-    def situated(self, situation: Situation) -> None:
+    def situated(self, situation: GuardFacts) -> None:
         """Let the guards of commands see this."""
         self.do(lambda: setattr(self.effects, "situation", situation))
 
@@ -129,6 +131,7 @@ class StandIn:
             "guarded": self.session.guarded(),
             "lease": {
                 "holder": held.holder if held else "",
+                "by": held.by if held else "",
                 "epoch": held.epoch if held else self.lease.epoch,
                 "expires_in": held.until - time.monotonic() if held else 0.0,
             },
@@ -137,7 +140,7 @@ class StandIn:
             "newest_event": self.events.newest,
         }
 
-    def _happen(self, happening: Happening, reason: str) -> None:
+    def _happen(self, happening: SessionEvent, reason: str) -> None:
         before = self.session.state
         if self.session.observe(happening, reason):
             text = f"{before} -> {self.session.state}: {reason}"
@@ -160,9 +163,12 @@ class StandIn:
 
     def _serve(self, server: CommandServer, answer: Any) -> None:
         while (received := server.receive()) is not None:
-            address, command = received
+            call, said = received
+            command = identified(said, call.payload, call.signature, call.uid, self.key)
             if not self.mute and command.kind not in self.swallows:
-                server.answer(address, answer(command))
+                refusal = "" if command.kind in STOPPING else forged(command) or lacking(command)
+                ack = Ack(command.uuid, "refused", refusal) if refusal else answer(command)
+                server.answer(call, ack)
 
     def _answer(self, command: Command) -> Ack:
         if command.kind == "status":

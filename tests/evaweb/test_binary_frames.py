@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from evaweb.frames import DTYPES, FrameError, Stream, decode, encode
+from evaweb.binary_frames import DTYPES, FrameError, Stream, decode, encode
 
 ARRAYS = st.sampled_from(DTYPES).flatmap(
     lambda dtype: arrays.arrays("<" + dtype, arrays.array_shapes(min_dims=1, max_dims=3, min_side=0))

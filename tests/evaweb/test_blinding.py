@@ -12,10 +12,10 @@ from django.test import Client
 from django.urls import reverse
 
 from evaweb.api.tokens import token_create
+from evaweb.blinding import sight_of
+from evaweb.plans.blinding_rules import look
 from evaweb.plans.guarded import GUARDS as of_plans
 from evaweb.plans.services import plan_reveal
-from evaweb.plans.sight import look
-from evaweb.sight import sight_of
 from evaweb.trials.guarded import GUARDS as of_trials
 from tests.evaweb.blind_lab import LATENCY, NAMES, SECRETS, Lab
 from tests.evaweb.crawling import QUERIES, crawled, leaks, told_apart, whispers
@@ -96,14 +96,14 @@ def test_an_administrator_who_has_run_a_trial_reads_it_in_no_page_of_administrat
 
 
 SEAMS = {
-    "evaweb.sight.Sight.label": lambda self, trial: trial.checkpoint.name,
-    "evaweb.sight.Sight.told": lambda self, text: text,
-    "evaweb.sight.Sight.policy_of": lambda self, episode: episode.checkpoint,
-    "evaweb.sight.Sight.hides_episode": lambda self, episode: False,
-    "evaweb.sight.Sight.require_episode": lambda self, episode: None,
-    "evaweb.sight.Sight.open": lambda self, rows, checkpoint="checkpoint": rows,
-    "evaweb.sight.Sight.veils": lambda self, station, snapshot: False,
-    "evaweb.stations.veil.answer": lambda data: dict(data),
+    "evaweb.blinding.Sight.label": lambda self, trial: trial.checkpoint.name,
+    "evaweb.blinding.Sight.told": lambda self, text: text,
+    "evaweb.blinding.Sight.policy_of": lambda self, episode: episode.checkpoint,
+    "evaweb.blinding.Sight.hides_episode": lambda self, episode: False,
+    "evaweb.blinding.Sight.require_episode": lambda self, episode: None,
+    "evaweb.blinding.Sight.open": lambda self, rows, checkpoint="checkpoint": rows,
+    "evaweb.blinding.Sight.veils": lambda self, station, snapshot: False,
+    "evaweb.stations.redaction.answer": lambda data: dict(data),
 }
 
 
@@ -123,7 +123,7 @@ def test_without_its_seam_a_filter_tells(lab, monkeypatch):
     client.force_login(lab.operator)
     for stage in ("handed", "running", "failed", "scored"):
         getattr(lab, stage)()
-    monkeypatch.setattr("evaweb.sight.Sight.open", SEAMS["evaweb.sight.Sight.open"])
+    monkeypatch.setattr("evaweb.blinding.Sight.open", SEAMS["evaweb.blinding.Sight.open"])
     assert any(told_apart(lab, client))
 
 
@@ -133,5 +133,5 @@ def test_without_one_seam_the_live_socket_tells(lab, monkeypatch):
     assert whispers(lab, lab.operator) == []
     for seam in ("veils", "veils_events"):
         with monkeypatch.context() as without:
-            without.setattr(f"evaweb.sight.Sight.{seam}", lambda self, *given: False)
+            without.setattr(f"evaweb.blinding.Sight.{seam}", lambda self, *given: False)
             assert whispers(lab, lab.operator) != [], seam

@@ -3,11 +3,12 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from django.core.exceptions import ImproperlyConfigured
 
-from evaweb import environment
+from evaweb import environment, private
 
 ROOT = Path(__file__).parents[2]
 
@@ -25,6 +26,8 @@ def test_a_flag_is_a_word(monkeypatch, given, found):
         (lambda: environment.seconds("EVA_X", 1.0), "0", "seconds above zero"),
         (lambda: environment.seconds("EVA_X", 1.0), "nan", "seconds above zero"),
         (lambda: environment.seconds("EVA_X", 1.0), "2 s", "seconds above zero"),
+        (lambda: environment.networks("EVA_X"), "10.0.0.1/24", "10.0.0.0/24"),
+        (lambda: environment.networks("EVA_X"), "proxy", "127.0.0.1"),
         (lambda: environment.log_level("EVA_X", "INFO"), "LOUD", "DEBUG, INFO, WARNING, ERROR, CRITICAL"),
         (lambda: environment.time_zone("EVA_X", "UTC"), "Mars", "UTC, Europe/Berlin"),
         (lambda: environment.time_zone("EVA_X", "UTC"), "Europe", "UTC, Europe/Berlin"),
@@ -81,6 +84,59 @@ def test_a_private_file_is_made_for_its_user_alone_and_left_as_it_is_where_it_is
     environment.private_file(path)
     assert database.execute("SELECT key FROM session").fetchall() == [(1,)]
     database.close()
+
+
+def test_what_was_copied_back_readable_by_all_is_its_users_alone_again(monkeypatch, tmp_path):
+    monkeypatch.delenv("EVA_SECRET_KEY", raising=False)
+    for name in ("eva.sqlite3", "eva.sqlite3-wal", "eva.sqlite3-shm", "secret_key", "other"):
+        (tmp_path / name).write_text("x")
+        (tmp_path / name).chmod(0o644)
+    environment.private_file(tmp_path / "eva.sqlite3")
+    environment.secret_key(tmp_path)
+    open_to_all = [file.name for file in tmp_path.iterdir() if environment.readable_by_others(file)]
+    assert open_to_all == ["other"]
+
+
+def test_a_new_data_folder_is_its_users_alone_and_one_that_is_there_stays_as_it_is(monkeypatch, tmp_path):
+    monkeypatch.setenv("EVA_DATA_DIR", str(tmp_path / "a" / "data"))
+    assert stat.S_IMODE(environment.data_dir(tmp_path).stat().st_mode) == 0o700
+    (tmp_path / "a" / "data").chmod(0o750)
+    assert stat.S_IMODE(environment.data_dir(tmp_path).stat().st_mode) == 0o750
+
+
+def test_what_others_can_read_is_named_at_the_start_with_what_to_do(monkeypatch, tmp_path):
+    database = {"ENGINE": "django.db.backends.sqlite3", "NAME": tmp_path / "eva.sqlite3"}
+    monkeypatch.setattr(
+        private, "settings", SimpleNamespace(DATA_DIR=tmp_path, DATABASES={"default": database})
+    )
+    wrong = {tmp_path: 0o755, tmp_path / "eva.sqlite3": 0o644, tmp_path / "eva.sqlite3-wal": 0o640}
+    for path in list(wrong)[1:]:
+        path.touch()
+    for path, mode in wrong.items():
+        path.chmod(mode)
+    told = private.data_is_private()
+    assert [one.msg for one in told] == [
+        f"{path} can be read by others: {mode:o}" for path, mode in wrong.items()
+    ]
+    assert [one.hint for one in told] == [
+        f"chmod {mode} {path}" for path, mode in zip(wrong, (700, 600, 600), strict=True)
+    ]
+    for path, mode in zip(wrong, (0o700, 0o600, 0o600), strict=True):
+        path.chmod(mode)
+    assert private.data_is_private() == []
+
+
+def test_a_proxy_that_nobody_has_declared_is_asked_for(settings):
+    assert private.proxy_is_declared() == []
+    settings.SESSION_COOKIE_SECURE = True
+    assert "EVA_PROXIES is not given" in private.proxy_is_declared()[0].msg
+    settings.EVA_PROXIES = ["127.0.0.1"]
+    assert private.proxy_is_declared() == []
+
+
+def test_networks_are_addresses_too(monkeypatch):
+    monkeypatch.setenv("EVA_X", "127.0.0.1, 10.0.0.0/24,::1")
+    assert [str(one) for one in environment.networks("EVA_X")] == ["127.0.0.1/32", "10.0.0.0/24", "::1/128"]
 
 
 def test_a_wrong_setting_ends_the_start_with_one_sentence(tmp_path):

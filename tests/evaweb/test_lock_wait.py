@@ -1,7 +1,9 @@
-import pytest
-from django.db import connection
+import threading
 
-from evaweb.lock_wait import lock_wait
+import pytest
+from django.db import connection, connections
+
+from evaweb.lock_wait import for_pages, hurried, lock_wait
 
 pytestmark = pytest.mark.django_db
 
@@ -30,3 +32,31 @@ def test_what_is_done_within_it_is_done():
     with lock_wait(0), connection.cursor() as cursor:
         cursor.execute("SELECT 1")
         assert cursor.fetchone() == (1,)
+
+
+def test_a_connection_that_is_opened_in_a_hurry_stays_so():
+    """Each request has a thread, and with it a connection, of its own."""
+    found = []
+
+    def request():
+        try:
+            with hurried(1.5):
+                found.append(patience())
+                with lock_wait(0.25):
+                    found.append(patience())
+                found.append(patience())
+        finally:
+            connection.close()
+
+    thread = threading.Thread(target=request)
+    thread.start()
+    thread.join()
+    sqlite = connection.vendor == "sqlite"
+    assert found == ([1500, 250, 1500] if sqlite else ["1500ms", "250ms", "1500ms"])
+
+
+def test_pages_do_not_wait_long_for_a_server_and_other_processes_do(monkeypatch):
+    options = {"connect_timeout": 10}
+    monkeypatch.setitem(connections.settings, "default", {"OPTIONS": options})
+    for_pages()
+    assert options == {"connect_timeout": 2}

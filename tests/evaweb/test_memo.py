@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import random
 
-from evaweb.remembered import Kept, steady
+from evaweb.memo import Kept, steady
 
 
 def test_what_was_made_is_kept_until_its_fingerprint_changes():

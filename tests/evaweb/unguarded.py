@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from django.db import connection
 
-from evaweb.guards import Guard, install, removal
+from evaweb.append_only import Guard, install, removal
 
 
 @contextmanager

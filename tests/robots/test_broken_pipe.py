@@ -19,11 +19,11 @@ from tests.runtime.datasets.small import record
 ROOT = Path(__file__).parents[2]
 # What has its own standard output, or none: the processes of a station, of a tunnel, of a benchmark, ROS's Python.
 NOT_OF_A_TERMINAL = {
-    "runtime.control",
-    "runtime.guard",
-    "runtime.main",
-    "runtime.media",
-    "runtime.reception",
+    "runtime.processes.control.process",
+    "runtime.processes.guard.process",
+    "runtime.processes.coordinator.process",
+    "runtime.processes.media.process",
+    "runtime.processes.reception.process",
     "runtime.policies.tunnel.bound",
     "runtime.transports.ros.rospy_node.__main__",
     "benchmarks.first_chunk",
@@ -34,7 +34,7 @@ NOT_OF_A_TERMINAL = {
     "benchmarks.results_pages",
     "benchmarks.sleeper",
     "benchmarks.wires_receiver",
-    "evaweb.results.recompute.__main__",  # stands alone in a report
+    "evaweb.results.reports.recompute.__main__",  # stands alone in a report
 }
 
 
@@ -60,7 +60,7 @@ def nobody_reads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_the_help_of_every_program_may_be_read_in_part(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
     module = importlib.import_module(program)
     name = "manage.py" if program == "manage" else program
-    if program in ("runtime.headless", "benchmarks.wires_sender"):  # they have no words of their own
+    if program in ("runtime.clients.headless", "benchmarks.wires_sender"):  # they have no words of their own
         assert module.main.__wrapped__
         return
     with nobody_reads(monkeypatch), monkeypatch.context() as patch:
@@ -100,7 +100,7 @@ def test_what_commands_print_may_be_read_in_part(
 
 @pytest.mark.parametrize(
     "words",
-    [["-m", "robots", "list"], ["-m", "runtime.config_reference"], ["manage.py", "help"]],
+    [["-m", "robots", "list"], ["-m", "runtime.config.reference"], ["manage.py", "help"]],
     ids=lambda words: words[-1],
 )
 def test_a_process_whose_output_nobody_reads_says_nothing_at_its_end(words: list[str]) -> None:
@@ -144,6 +144,43 @@ def test_the_break_of_any_other_pipe_is_an_error() -> None:
 
     with pytest.raises(BrokenPipeError, match="the robot has gone"):
         main()
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["manage.py", "help"], 0),
+        (["manage.py", "nonsense"], 1),
+        (["-m", "robots", "check", "nobody"], 1),
+    ],
+    ids=lambda given: " ".join(given) if isinstance(given, list) else "",
+)
+def test_a_stream_that_was_closed_goes_nowhere(words: list[str], code: int, closed: str) -> None:
+    ended = subprocess.run(
+        ["sh", "-c", f'exec "$0" "$@" {closed}', sys.executable, *words],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == code
+    assert "Traceback" not in ended.stderr + ended.stdout
+    if closed == "2>&-" and code:
+        assert ended.stdout == ""
+
+
+def test_what_is_opened_takes_no_number_of_a_stream_and_children_have_them_too() -> None:
+    program = (
+        "import os, subprocess, sys; from robots.broken_pipe import unread_ends\n"
+        "@unread_ends\n"
+        "def main():\n"
+        "    child = 'import os; [os.fstat(number) for number in range(3)]'\n"
+        "    return subprocess.run([sys.executable, '-c', child]).returncode or 10 * (os.open('.', 0) > 2)\n"
+        "sys.exit(main())"
+    )
+    words = ["sh", "-c", 'exec "$0" "$@" <&- >&- 2>&-', sys.executable, "-c", program]
+    assert subprocess.run(words, cwd=ROOT, check=False).returncode == 10
 
 
 def test_a_command_without_standard_output_ends_as_it_would(monkeypatch: pytest.MonkeyPatch) -> None:

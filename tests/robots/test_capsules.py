@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import robots
@@ -55,7 +55,6 @@ def depth(points: Float64, capsule: Capsule) -> Float64:
     return np.asarray(capsule.radius - np.linalg.norm(points - nearest, axis=1))
 
 
-@settings(deadline=None)
 @given(st.lists(shapes(), min_size=1, max_size=4))
 def test_one_capsule_covers_every_shape_whole(shown: list[Shape]) -> None:
     capsule = around(shown)
@@ -63,7 +62,6 @@ def test_one_capsule_covers_every_shape_whole(shown: list[Shape]) -> None:
         assert depth(surface(shape), capsule).min() > -1e-9
 
 
-@settings(deadline=None)
 @given(st.lists(shapes(), min_size=1, max_size=5))
 def test_the_capsules_of_a_link_cover_each_of_its_shapes_and_are_few(shown: list[Shape]) -> None:
     made = about(shown)

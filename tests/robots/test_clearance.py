@@ -66,7 +66,7 @@ def sampled(name: str, one: str, other: str, q: Float64) -> float:
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10**6))
 @pytest.mark.parametrize("name", ["agilex_piper", "ur5e"])
 def test_distances_are_those_of_many_points_along_the_capsules(name: str, seed: int) -> None:

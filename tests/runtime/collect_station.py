@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from runtime import deployment, family
-from runtime.clock import Clock
-from runtime.errors import PolicyLostError
-from runtime.leaders.base import Leader
+from runtime.config import loader as deployment
+from runtime.core.clock import Clock
+from runtime.core.errors import PolicyLostError
+from runtime.core.types import Float64, Observation
+from runtime.station import spec as family
+from runtime.teleoperators.base import Leader
 from runtime.transports.base import Capabilities
-from runtime.types import Float64, Observation
-from tests.runtime.station import MOVED, STANDS, Station, StubPlan, StubRobot, on_time, plan
+from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, StubRobot, on_time, plan
 
 
 class HeldLeader(Leader):

@@ -9,8 +9,8 @@ import numpy as np
 
 import robots
 from robots import Robot
-from runtime.collision import Collisions
-from runtime.types import Float64
+from runtime.core.types import Float64
+from runtime.safety.collision import Collisions
 
 MARGIN = 0.005
 GRIPPERS = [6, 13]

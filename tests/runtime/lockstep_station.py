@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from runtime import deployment, family
-from runtime.errors import PolicyError
-from runtime.family import Plan
-from runtime.lockstep import Lockstep
+from runtime.config import loader as deployment
+from runtime.core.errors import PolicyError
+from runtime.core.types import ActionChunk, Conditioning, Float64, Observation, RobotCommand, Space
 from runtime.policies.base import Policy, PolicyInfo
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.transitions import State
+from runtime.station import spec as family
+from runtime.station.spec import StationSpec
 from runtime.transports.base import Capabilities, Sink, Source
-from runtime.types import ActionChunk, Conditioning, Float64, Observation, RobotCommand, Space
 from tests.runtime.recording.samples import numbered
 
 DIM = 14
@@ -129,7 +130,7 @@ def on_time(observation: Observation, number: int) -> Float64:
 
 
 @dataclass(frozen=True, slots=True)
-class StubPlan(Plan):
+class StubPlan(StationSpec):
     """A plan whose transport and policy are the test's; it keeps what it has built."""
 
     built: dict[str, Any]

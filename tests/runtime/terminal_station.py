@@ -3,7 +3,7 @@
 import math
 from copy import deepcopy
 
-from runtime.messages import Ack
+from runtime.ipc.messages import Ack
 
 STATUS = {
     "boot": "boot-1",

@@ -4,10 +4,10 @@ import os
 import pytest
 
 from runtime import ctl
-from runtime.client import Refused
-from runtime.errors import TransportError
-from runtime.terminal import settling
-from runtime.terminal.keys import NoKeys
+from runtime.clients.client import Refused
+from runtime.clients.terminal import settling
+from runtime.clients.terminal.keys import NoKeys
+from runtime.core.errors import TransportError
 from tests.runtime.terminal_station import AIM, Script, event, status
 
 
@@ -15,7 +15,7 @@ from tests.runtime.terminal_station import AIM, Script, event, status
 def run(monkeypatch):
     """Runs a command line against a script; nobody is at the terminal, and waits take no time."""
     monkeypatch.setattr(settling.time, "sleep", lambda _: None)
-    monkeypatch.setattr("runtime.terminal.attendance.keys", NoKeys)
+    monkeypatch.setattr("runtime.clients.terminal.attendance.keys", NoKeys)
     monkeypatch.setenv("EVA_DATA_DIR", "/var/eva")
 
     def run(script, *words):

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from runtime.clock import VirtualClock
-from runtime.config import Answer
-from runtime.execution import Strategy, strategy
-from runtime.messages import (
+from runtime.config.schema import Answer
+from runtime.core.clock import VirtualClock
+from runtime.core.types import Float64, Observation, RobotCommand
+from runtime.ipc.messages import (
     ChunkMerged,
     Event,
     LockGrippers,
@@ -23,14 +23,14 @@ from runtime.messages import (
     decode,
     encode,
 )
-from runtime.page import EStop, Page, PageLayout
-from runtime.safety import Limits, SafetyFilter, SafetySettings
-from runtime.switching import Switch
-from runtime.tick import Tick, TickSettings
-from runtime.timeline import Dims
+from runtime.ipc.shared_state import EStop, SharedState, SharedStateLayout
+from runtime.motion.timeline import DimensionKinds
+from runtime.processes.control.chunk_execution import Strategy, strategy
+from runtime.processes.control.tick import Tick, TickSettings
+from runtime.safety.filter import Limits, SafetyFilter, SafetySettings
+from runtime.safety.workspace import Workspace
+from runtime.spaces.binary_grippers import Switch
 from runtime.transports.base import Sink
-from runtime.types import Float64, Observation, RobotCommand
-from runtime.workspace import Workspace
 
 PERIOD = 1 / 30
 NO = np.zeros(2, bool)
@@ -78,7 +78,7 @@ class Bench:
         self,
         chosen: dict[str, Any] | None = None,
         limits: Limits = TWO_JOINTS,
-        dims: Dims | None = None,
+        dims: DimensionKinds | None = None,
         starvation: Answer = "slow",
         seen: bool = True,
         workspace: Workspace | None = None,
@@ -87,12 +87,12 @@ class Bench:
     ) -> None:
         self.limits, self.workspace = limits, workspace
         self.dim = len(limits.names)
-        layout = PageLayout(self.dim, 8, ("cam",), 300)
-        shared = mmap.mmap(-1, Page.size(layout))
-        self.page, self.clock, self.sink = Page(layout, shared), VirtualClock(100.0), RecordingSink()
+        layout = SharedStateLayout(self.dim, 8, ("cam",), 300)
+        shared = mmap.mmap(-1, SharedState.size(layout))
+        self.page, self.clock, self.sink = SharedState(layout, shared), VirtualClock(100.0), RecordingSink()
         self.page.set_estop(EStop.CLEAR)
         self.step, self.order, self.sequence = 0, 0, 0
-        self.dims = dims or Dims()
+        self.dims = dims or DimensionKinds()
         self.chosen: Strategy = strategy(chosen or {"kind": "async"}, self.dims)
         self.safety = SafetySettings(**safety)
         self.starvation: Answer = starvation

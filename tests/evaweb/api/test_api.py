@@ -121,9 +121,18 @@ def test_a_busy_database_is_a_sentence_and_503(rest, monkeypatch):
     monkeypatch.setattr("evaweb.trials.selectors.trial_list", locked)
     status, body = rest.get("trials")
     assert status == 503
-    assert "database is locked" in body["error"]
+    assert "database is busy or gone" in body["error"]
 
 
 def test_no_page_of_the_interface_fetches_anything_from_elsewhere(rest):
     assert rest.get("openapi.json")[1]["info"]["title"] == "EVA Web"
     assert Client().get("/api/v1/docs").status_code == 404
+
+
+@pytest.mark.parametrize("text", ['"a\\ud800"', '"a\\u0000"', '"a\xed\xa0\x80"'])
+def test_what_is_no_text_is_refused_by_name(rest, text):
+    content = f'{{"checkpoint": {text}}}'.encode("latin-1")
+    headers = {"Authorization": f"Bearer {rest.token}"}
+    answer = Client().post("/api/v1/preflights", content, content_type="application/json", headers=headers)
+    assert answer.status_code in (400, 422)
+    assert answer.json()["error"].startswith(("checkpoint = 'a\\", "the body: is not valid JSON"))

@@ -10,7 +10,7 @@ from evaweb.api.tokens import token_create
 from evaweb.errors import StationGone
 from evaweb.stations import commands
 from evaweb.stations.models import Command, Lease, Station
-from evaweb.stations.wire import NoAnswer
+from evaweb.stations.runtime_client import NoAnswer
 from evaweb.trials.models import Checkpoint, Trial
 from tests.evaweb.api.conftest import Rest
 from tests.evaweb.trials.builders import BOOT
@@ -138,10 +138,11 @@ def test_an_e_stop_that_nobody_confirms_says_what_to_do(rest, bench, wire):
 
 
 def test_an_e_stop_works_without_the_database(rest, bench, wire, monkeypatch):
-    def locked(**_):
+    def locked(row):
         raise OperationalError("database is locked")
 
-    monkeypatch.setattr("evaweb.stations.commands.estop_noted", locked)
+    monkeypatch.setattr(commands, "_written", locked)
+    monkeypatch.setattr(commands.unwritten, "look", lambda: None)
     status, answer = rest.post("stations/bench-1/estop")
     assert (status, answer["status"]) == (200, "accepted")
     assert [given.kind for given in wire.heard] == ["estop"]
@@ -163,8 +164,8 @@ def test_who_stops_with_a_token_is_not_kept_by_a_locked_database(locked, bench, 
     rest = Rest(token_create(user=bench.operator, name="never used"))
     identity = str(uuid4())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(commands, "_NOTE_S", 0)
         patch.setattr(commands.unwritten, "look", lambda: None)
+        patch.setattr(commands.notes, "note", commands.unwritten.keep)
         locked()
         if kind == "estop":
             answer = rest.post("stations/bench-1/estop", uuid=identity)
@@ -185,7 +186,6 @@ def test_an_e_stop_is_written_down_later_where_the_database_does_not_say_which_s
         raise OperationalError("the server closed the connection unexpectedly")
 
     with monkeypatch.context() as patch:
-        patch.setattr("evaweb.api.stations.Station.objects.filter", away)
         patch.setattr(commands, "_written", away)
         patch.setattr(commands.unwritten, "look", lambda: None)
         status, answer = rest.post("stations/bench-1/estop", why="smoke")

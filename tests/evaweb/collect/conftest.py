@@ -12,7 +12,8 @@ from uuid import uuid4
 import pytest
 from django.contrib.auth.models import User
 
-from evaweb.collect import following, services
+from evaweb.collect import services
+from evaweb.collect import station_events as following
 from evaweb.collect.models import CollectSession, Demonstration
 from evaweb.episodes import services as episodes
 from evaweb.stations.models import Station
@@ -45,7 +46,7 @@ def at(monkeypatch: pytest.MonkeyPatch) -> Wire:
     """What stands where wires to runtimes stand: a station that collects, and that nobody commands."""
     made = Wire()
     made.snapshot = {**made.snapshot, "collect": collecting(), "lease": {"holder": "", "epoch": 0}}
-    for place in ("stations.commands", "collect.services", "collect.bench"):
+    for place in ("stations.commands", "collect.services", "collect.station_commands"):
         monkeypatch.setattr(f"evaweb.{place}.wire_to", lambda name: made)
     return made
 

@@ -9,14 +9,14 @@ import pytest
 from django.contrib.auth.models import User
 
 from evaweb.collect import services
-from evaweb.collect.bench import session_command
 from evaweb.collect.models import CollectSession, Demonstration
-from evaweb.console.chronicle import events_written
+from evaweb.collect.station_commands import session_command
+from evaweb.console.event_ingest import events_written
 from evaweb.console.feed import History
 from evaweb.episodes.models import Episode
 from evaweb.errors import Conflict, EvaError
 from evaweb.stations.models import Command, CommandStatus, Station
-from runtime import messages
+from runtime.ipc import messages
 from tests.evaweb.collect.conftest import SETUP, collecting
 from tests.evaweb.trials.builders import Wire
 

@@ -9,13 +9,14 @@ import pytest
 from django.contrib.auth.models import User
 from django.db import connection
 
-from evaweb.collect import following, services
+from evaweb.append_only import install, removal
+from evaweb.collect import services
+from evaweb.collect import station_events as following
 from evaweb.collect.guarded import GUARDS
 from evaweb.collect.kept import session_file
 from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import reconcile
-from evaweb.guards import install, removal
 from tests.evaweb.collect.conftest import SETUP, Demonstrate, labelled
 
 pytestmark = pytest.mark.django_db

@@ -13,7 +13,7 @@ from django.test import Client
 from evaweb.collect import services
 from evaweb.collect.models import CollectSession, Demonstration
 from evaweb.console import changes
-from evaweb.console.chronicle import Scribe, events_written
+from evaweb.console.event_ingest import Scribe, events_written
 from evaweb.console.feed import Feeds, History
 from evaweb.jobs.models import Job
 from evaweb.reviews.models import Standing

@@ -7,9 +7,9 @@ from typing import Any, get_args
 
 import pytest
 
-from runtime.messages import Mode
-from runtime.plugins import variants
-from runtime.session import COMMANDS
+from runtime.core.plugins import variants
+from runtime.ipc.messages import Mode
+from runtime.processes.coordinator.session.machine import COMMANDS
 from runtime.strategies.base import StrategyParameters
 from tests.evaweb.console.test_modules import NODE, run
 
@@ -21,7 +21,7 @@ MODES = get_args(Mode)
 
 
 def test_every_mode_of_the_runtime_is_offered_with_a_line() -> None:
-    lines = run("modes.js", "return m.MODES")
+    lines = run("debug/modes.js", "return m.MODES")
 
     assert set(lines) == set(MODES)
     assert all(line.endswith(".") for line in lines.values())
@@ -45,13 +45,13 @@ def test_there_is_one_big_button_at_each_moment(state: str, mode: str, chunk: in
     proposal = {"chunk": chunk} if chunk else {}
     given = {"state": state, "mode": mode, "proposal": proposal}
 
-    assert run("modes.js", "return m.primary(given)", given) == button
+    assert run("debug/modes.js", "return m.primary(given)", given) == button
 
 
 def test_the_mode_that_is_shown_is_that_of_the_open_run_whatever_was_chosen() -> None:
     body = "return given.map(([station, chosen]) => m.shown(station, chosen))"
     shown = run(
-        "modes.js",
+        "debug/modes.js",
         body,
         [
             [{"open": True, "mode": "sim", "offered": MODES}, "manual"],
@@ -68,7 +68,7 @@ def test_the_mode_that_is_shown_is_that_of_the_open_run_whatever_was_chosen() ->
 def test_what_the_run_does_is_said_in_words() -> None:
     body = "return given.map((snapshot) => m.phase(snapshot))"
     said = run(
-        "modes.js",
+        "debug/modes.js",
         body,
         [
             {"state": "running", "phase": "executing", "control": {"remaining": 45}, "rate": 30},
@@ -85,7 +85,9 @@ def test_what_the_run_does_is_said_in_words() -> None:
 def test_a_proposed_chunk_is_described_with_how_far_it_begins() -> None:
     proposal = {"chunk": 4, "rows": 50, "distance": 0.312, "joint": "left_arm.joint1", "age_s": 3.2}
 
-    assert run("modes.js", "return [m.proposed(given), m.proposed({}), m.proposed(null)]", proposal) == [
+    assert run(
+        "debug/modes.js", "return [m.proposed(given), m.proposed({}), m.proposed(null)]", proposal
+    ) == [
         "Chunk 4: 50 steps, begins 0.31 rad away (left_arm.joint1), shown for 3 s.",
         "",
         "",
@@ -98,7 +100,7 @@ def test_a_proposed_chunk_is_described_with_how_far_it_begins() -> None:
 def refusals(kind: str, *stores: dict[str, Any]) -> list[str]:
     """What the page says to `kind` in each of these situations."""
     found: list[str] = run(
-        "reasons.js", f"return given.map((store) => m.refusal({kind!r}, store))", list(stores)
+        "commands/reasons.js", f"return given.map((store) => m.refusal({kind!r}, store))", list(stores)
     )
     return found
 
@@ -155,7 +157,7 @@ def test_every_command_has_a_reason_wherever_the_station_does_not_allow_it() -> 
         "return given[0].flatMap((kind) => given[1].filter((one) => !m.refusal(kind, one)).map(() => kind))"
     )
 
-    assert run("reasons.js", body, [list(COMMANDS), situations]) == []
+    assert run("commands/reasons.js", body, [list(COMMANDS), situations]) == []
 
 
 # --- strategy ----------------------------------------------------------------------------------------------
@@ -163,7 +165,7 @@ def test_every_command_has_a_reason_wherever_the_station_does_not_allow_it() -> 
 
 def test_the_parameters_shown_are_those_that_strategies_use() -> None:
     used = set().union(*(module.USES for module in variants("runtime.strategies").values()))
-    shown = run("tuning.js", "return Object.keys(m.PARAMETERS)")
+    shown = run("debug/tuning.js", "return Object.keys(m.PARAMETERS)")
 
     assert used <= set(shown) <= set(StrategyParameters.model_fields)
 
@@ -175,8 +177,8 @@ def test_a_field_left_alone_stands_for_what_is_in_force() -> None:
     return m.changes(given.kind, fields, given, Object.keys(m.PARAMETERS));
     """
 
-    assert run("tuning.js", body, section) == {"changes": {}, "error": ""}
-    assert run("tuning.js", body, section | {"blend_window": "all", "k_max": 3}) == {
+    assert run("debug/tuning.js", body, section) == {"changes": {}, "error": ""}
+    assert run("debug/tuning.js", body, section | {"blend_window": "all", "k_max": 3}) == {
         "changes": {},
         "error": "",
     }
@@ -189,7 +191,7 @@ def test_only_what_was_edited_is_sent_and_an_empty_field_means_none() -> None:
     """
     in_force = {"kind": "async", "execution_horizon": None, "blend_window": 8, "k_max": 3}
 
-    assert run("tuning.js", body, in_force)["changes"] == {
+    assert run("debug/tuning.js", body, in_force)["changes"] == {
         "kind": "naive",
         "execution_horizon": 16,
         "blend_window": "all",
@@ -209,11 +211,11 @@ def test_only_what_was_edited_is_sent_and_an_empty_field_means_none() -> None:
 def test_what_cannot_be_is_said_before_it_is_sent(name: str, typed: str, sentence: str) -> None:
     body = "return m.changes('async', { [given[0]]: given[1] }, { kind: 'async' }, [given[0]])"
 
-    assert run("tuning.js", body, [name, typed]) == {"changes": {}, "error": sentence}
+    assert run("debug/tuning.js", body, [name, typed]) == {"changes": {}, "error": sentence}
 
 
 def test_the_cost_of_a_window_is_said_in_time() -> None:
-    cost = run("tuning.js", "return m.cost('async', { blend_window: 15 }, 30)")
+    cost = run("debug/tuning.js", "return m.cost('async', { blend_window: 15 }, 30)")
 
     assert "15 steps = 500 ms" in cost
 
@@ -221,7 +223,7 @@ def test_the_cost_of_a_window_is_said_in_time() -> None:
 def test_every_strategy_has_its_cost() -> None:
     kinds = list(variants("runtime.strategies"))
     given = [kinds, StrategyParameters().model_dump()]
-    costs = run("tuning.js", "return given[0].map((kind) => m.cost(kind, given[1], 30))", given)
+    costs = run("debug/tuning.js", "return given[0].map((kind) => m.cost(kind, given[1], 30))", given)
 
     assert all(cost.endswith(".") for cost in costs)
     assert not any("undefined" in cost or "NaN" in cost for cost in costs)
@@ -239,7 +241,7 @@ FACTS = {
 
 
 def test_joints_come_in_the_robots_groups_with_their_limits() -> None:
-    groups = run("targets.js", "return m.groups(given)", FACTS)
+    groups = run("manual/targets.js", "return m.groups(given)", FACTS)
 
     assert [group["name"] for group in groups] == ["left_arm", "right_arm", "joints"]
     assert groups[0]["joints"][1] == {
@@ -273,13 +275,13 @@ def test_joints_come_in_the_robots_groups_with_their_limits() -> None:
     ],
 )
 def test_a_joints_label_is_as_short_as_tells_it_from_others(joints: list[str], labels: list[str]) -> None:
-    assert run("joint_names.js", "return m.labels(given)", joints) == labels
+    assert run("manual/joint_names.js", "return m.labels(given)", joints) == labels
 
 
 def test_a_value_beyond_a_limit_is_clipped_and_said() -> None:
     body = "const [joint] = m.groups(given)[0].joints; return [m.within(joint, 9), m.within(joint, 1)]"
 
-    assert run("targets.js", body, FACTS) == [
+    assert run("manual/targets.js", body, FACTS) == [
         {"value": 2.6, "said": "left_arm.joint0 ends at 2.600"},
         {"value": 1, "said": ""},
     ]
@@ -288,7 +290,7 @@ def test_a_value_beyond_a_limit_is_clipped_and_said() -> None:
 def test_arrow_keys_go_by_round_steps() -> None:
     body = "return given.map(([lower, upper]) => m.stepOf({ lower, upper }))"
 
-    steps = run("units.js", body, [[-2.618, 2.618], [0, 0.1], [-6.28, 6.28], [0, 100], [0, 1]])
+    steps = run("curves/units.js", body, [[-2.618, 2.618], [0, 0.1], [-6.28, 6.28], [0, 100], [0, 1]])
 
     assert steps == pytest.approx([0.01, 0.0001, 0.01, 0.1, 0.001])
 
@@ -303,13 +305,13 @@ def test_numbers_have_the_digits_of_their_steps() -> None:
         {"lower": 0, "upper": 1000, "unit": ""},
     ]
 
-    assert run("units.js", "return given.map((one) => m.digitsOf(one))", ranges) == [3, 3, 4, 1, 3, 0]
+    assert run("curves/units.js", "return given.map((one) => m.digitsOf(one))", ranges) == [3, 3, 4, 1, 3, 0]
 
 
 def test_a_long_unit_stands_elsewhere() -> None:
     body = "return given.map((unit) => [m.shortUnit(unit), m.withUnit('0.5', unit)])"
 
-    assert run("units.js", body, ["rad", "%", "", "opening, 0 to 1"]) == [
+    assert run("curves/units.js", body, ["rad", "%", "", "opening, 0 to 1"]) == [
         ["rad", "0.5 rad"],
         ["%", "0.5 %"],
         ["", "0.5"],
@@ -342,7 +344,7 @@ def test_how_poses_were_met_is_said_in_words() -> None:
         {"rows": 50, "over": 1, "limit": 0, "velocity": 1, "worst_mm": None, "worst_deg": None},
     ]
 
-    assert run("reach.js", "return given.map((ik) => m.reachWords(ik))", chunks) == [
+    assert run("scene/reach.js", "return given.map((ik) => m.reachWords(ik))", chunks) == [
         "",
         "50 poses reached, worst 0.012 mm and 0.003°",
         "50 poses reached, worst 0.000 mm and below 0.001°",
@@ -355,7 +357,7 @@ def test_the_target_begins_where_the_robot_is_told_to_be_else_where_it_is() -> N
     joints = {"measured": [1, 2], "commanded": [1.1, 2.1]}
     body = "return [m.start({ ...given, engaged: true }), m.start({ ...given, engaged: false }), m.start()]"
 
-    assert run("targets.js", body, joints) == [[1.1, 2.1], [1, 2], None]
+    assert run("manual/targets.js", body, joints) == [[1.1, 2.1], [1, 2], None]
 
 
 def test_the_verdict_on_a_target_says_distance_time_and_what_is_wrong() -> None:
@@ -374,7 +376,9 @@ def test_the_verdict_on_a_target_says_distance_time_and_what_is_wrong() -> None:
         {"ok": False, "reason": "no pose is called nest"},
     ]
 
-    assert run("targets.js", "return given.map((answer) => m.verdict(answer, 0.25).text)", answers) == [
+    assert run(
+        "manual/targets.js", "return given.map((answer) => m.verdict(answer, 0.25).text)", answers
+    ) == [
         "0.50 rad from the robot, 4.0 s.",
         "0.50 rad from the robot, 4.0 s. Limited: left_arm.joint1.",
         "Out of reach: the nearest is 31 mm and 2.1° off.",
@@ -393,8 +397,8 @@ def test_a_step_of_the_hand_is_in_metres_and_radians() -> None:
         "mm": 20,
         "degrees": 90,
     }
-    step = run("targets.js", "return m.jog(given)", asked)
-    turn = run("targets.js", "return m.jog(given)", asked | {"turned": True})
+    step = run("manual/targets.js", "return m.jog(given)", asked)
+    turn = run("manual/targets.js", "return m.jog(given)", asked | {"turned": True})
 
     assert step == {"arm": "left_arm", "frame": "tool", "translation": [0, -0.02, 0]}
     assert turn["rotation"] == pytest.approx([0, -1.5708, 0], abs=1e-4)
@@ -403,7 +407,9 @@ def test_a_step_of_the_hand_is_in_metres_and_radians() -> None:
 def test_the_hand_is_said_in_millimetres() -> None:
     poses = [0.1, -0.2, 0.3, 1, 0, 0, 0, 0.05, 0.4, 0.5, 0.6, 1, 0, 0, 0, 0.0]
 
-    assert run("targets.js", "return [m.handAt(given, 1), m.handAt(given, 2), m.handAt(null, 0)]", poses) == [
+    assert run(
+        "manual/targets.js", "return [m.handAt(given, 1), m.handAt(given, 2), m.handAt(null, 0)]", poses
+    ) == [
         "x 400  y 500  z 600 mm",
         "",
         "",
@@ -429,7 +435,7 @@ def test_a_slider_that_runs_asks_the_newest_place_alone() -> None:
     aim.clear();
     return { sent: sent.map(({ id, args }) => [id, args.joints[0]]), heard, told };
     """
-    found = run("aim.js", AIM + body, {"open": True})
+    found = run("manual/aim.js", AIM + body, {"open": True})
 
     assert found["sent"] == [[1, 1], [2, 4]]
     assert found["told"] == [1, 2, None]
@@ -445,13 +451,16 @@ def test_an_answer_that_comes_after_the_target_was_dropped_shows_no_ghost() -> N
     return { told, ok: (await asked).ok };
     """
 
-    assert run("aim.js", AIM + body, {"open": True}) == {"told": [None], "ok": True}
+    assert run("manual/aim.js", AIM + body, {"open": True}) == {"told": [None], "ok": True}
 
 
 def test_without_a_connection_a_target_has_no_answer_but_a_sentence() -> None:
     body = "const { ok, reason } = await aim.ask({ pose: 'home' }); return { ok, reason }"
 
-    assert run("aim.js", AIM + body, {"open": False}) == {"ok": False, "reason": "no connection to the lab"}
+    assert run("manual/aim.js", AIM + body, {"open": False}) == {
+        "ok": False,
+        "reason": "no connection to the lab",
+    }
 
 
 # --- set-up, robot, keys -----------------------------------------------------------------------------------
@@ -468,7 +477,7 @@ def test_stages_are_shown_while_they_go_on_and_after_one_failed() -> None:
         {"state": "idle"},
     ]
 
-    assert run("setup.js", "return given.map((snapshot) => m.unfinished(snapshot))", snapshots) == [
+    assert run("trial/setup.js", "return given.map((snapshot) => m.unfinished(snapshot))", snapshots) == [
         True,
         True,
         False,
@@ -485,19 +494,24 @@ def test_a_stage_says_how_long_it_took() -> None:
         {"state": "skipped", "seconds": 0.0},
     ]
 
-    assert run("setup.js", "return given.map((stage) => m.spent(stage))", stages) == ["0.2 s", "1:15", "", ""]
+    assert run("trial/setup.js", "return given.map((stage) => m.spent(stage))", stages) == [
+        "0.2 s",
+        "1:15",
+        "",
+        "",
+    ]
 
 
 def test_drives_and_grippers_say_what_is_the_matter() -> None:
     drives = [{}, {"enabled": True, "faults": []}, {"enabled": False, "faults": []}]
     drives.append({"enabled": False, "faults": ["overheated"]})
-    words = run("robot_panel.js", "return given.map((drives) => m.driveWords(drives))", drives)
+    words = run("debug/robot_panel.js", "return given.map((drives) => m.driveWords(drives))", drives)
     grippers = [{"locked": True, "at": 0.05}, {"locked": False, "at": 0.1}, {"locked": False, "at": None}]
 
     assert [one["weight"] for one in words] == ["", "good", "warn", "bad"]
     assert words[3]["text"] == "Fault: overheated"
     assert run(
-        "robot_panel.js",
+        "debug/robot_panel.js",
         "return given.map((one) => m.gripperWords(one, { unit: 'm', lower: 0, upper: 0.1 }))",
         grippers,
     ) == [
@@ -506,9 +520,9 @@ def test_drives_and_grippers_say_what_is_the_matter() -> None:
         "not known",
     ]
     body = "return m.gripperWords({ at: 57.31 }, { unit: '%', lower: 0, upper: 100 })"
-    assert run("robot_panel.js", body) == "at 57.3 %"
+    assert run("debug/robot_panel.js", body) == "at 57.3 %"
     body = "return m.gripperWords({ at: 0.5 }, { unit: 'opening, 0 to 1', lower: 0, upper: 1 })"
-    assert run("robot_panel.js", body) == "at opening 0.500"
+    assert run("debug/robot_panel.js", body) == "at opening 0.500"
 
 
 def test_a_key_with_shift_is_its_own_and_else_the_key_without() -> None:
@@ -521,7 +535,7 @@ def test_a_key_with_shift_is_its_own_and_else_the_key_without() -> None:
         {"key": "Enter", "ctrlKey": True, "shiftKey": True},
     ]
 
-    assert run("keys.js", "return given.map((event) => m.namesOf(event))", pressed) == [
+    assert run("commands/keys.js", "return given.map((event) => m.namesOf(event))", pressed) == [
         ["s"],
         ["shift+s", "s"],
         ["s"],
@@ -534,7 +548,7 @@ def test_a_key_with_shift_is_its_own_and_else_the_key_without() -> None:
 def test_keys_are_written_as_they_stand_on_a_keyboard() -> None:
     keys = ["s", "shift+i", "shift+pageup", "ctrl+enter", ","]
 
-    assert run("keys.js", "return given.map((key) => m.label(key))", keys) == [
+    assert run("commands/keys.js", "return given.map((key) => m.label(key))", keys) == [
         "S",
         "⇧I",
         "⇧PgUp",

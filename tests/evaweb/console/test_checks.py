@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from importlib.metadata import PackageNotFoundError
+
 from django.core.checks import run_checks
 
+from evaweb import settings
 from evaweb.console import checks
 
 
@@ -17,3 +20,11 @@ def test_scripts_that_are_absent_are_warned_of_with_what_brings_them(monkeypatch
 
 def test_the_viewer_is_installed():
     assert checks.finders.find("meshcat/main.min.js")
+
+
+def test_where_meshcat_is_not_installed_there_is_no_folder_of_it(monkeypatch):
+    def absent(name):
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(settings, "files", absent)
+    assert settings._viewer() is None

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evaweb.binary_frames import decode
 from evaweb.console import parts
 from evaweb.console.chunks import GHOSTS, chunk_part
-from evaweb.frames import decode
 from evaweb.stations.geometry import geometry
-from evaweb.stations.looks import looks_of
+from evaweb.stations.robot_geometry import looks_of
 
 LOOKS = looks_of("agilex_piper")
 

@@ -16,12 +16,17 @@ from django.db import OperationalError, connections
 from django.test import Client
 
 from evaweb.asgi import application
+from evaweb.binary_frames import decode
 from evaweb.console import consumers
 from evaweb.console import hub as hubs
-from evaweb.frames import decode
+from evaweb.credentials import credentials
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
-from runtime.transitions import Happening, State
+from evaweb.stations.runtime_client import StationWire
+from runtime.processes.coordinator.session.transitions import SessionEvent, State
+from tests import presses
+from tests.evaweb.noted import settled
+from tests.processes import eventually
 
 pytestmark = pytest.mark.django_db(transaction=True)
 ALL = ["state", "joints", "poses", "camera/cam_high"]
@@ -40,7 +45,7 @@ class Page:
         self.frames = []
 
     async def connected(self):
-        if self._user.is_authenticated:
+        if self._user.is_authenticated and len(self._headers) < 3:
             cookie = await asyncio.to_thread(_cookie, self._user)
             self._headers.append((b"cookie", f"{settings.SESSION_COOKIE_NAME}={cookie}".encode()))
         self._socket = WebsocketCommunicator(application, self._path, self._headers)
@@ -261,19 +266,40 @@ def test_a_viewer_presses_the_estop_and_it_is_written_down(live, vera, runtime):
             "reason": "every tick now sends the measured position",
         }
         await page.close()
-        await _written()
+        await _written(uuid)
 
     run(scenario())
     row = Command.objects.get(pk=uuid)
     assert (row.kind, row.user, row.status, row.args) == ("estop", vera, CommandStatus.DONE, {"why": "smoke"})
 
 
-async def _written():
-    """What goes on when pages are closed is finished."""
-    from evaweb.console import consumers
-
+async def _written(*uuids):
+    """What goes on when pages are closed is finished, and these commands are in the database."""
     while consumers._under_way:
         await asyncio.gather(*consumers._under_way)
+    await asyncio.to_thread(_in_the_database, uuids)
+
+
+def _in_the_database(uuids):
+    try:
+        settled()
+        eventually(lambda: Command.objects.filter(pk__in=uuids).count() == len(uuids), 20, "they are written")
+    finally:
+        connections.close_all()
+
+
+def test_whatever_is_wrong_with_a_press_of_a_page_it_is_pressed_in_text_and_in_bytes(live, ann, runtime):
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        for text in presses.in_json("type").values():
+            await page._socket.send_to(text_data=text)
+            assert (await page.told("ack"))["status"] == "done"
+            await page._socket.send_to(bytes_data=text.encode())
+            assert (await page.told("ack"))["status"] == "done"
+        await page.close()
+
+    run(scenario())
+    assert {command.kind for command in runtime.pressed} == {"estop"}
 
 
 def test_an_estop_is_pressed_although_the_page_is_closed_at_once(live, vera, runtime):
@@ -389,6 +415,54 @@ def test_a_page_outlasts_a_database_that_does_not_say_who_is_logged_in(live, ann
     run(scenario())
 
 
+@pytest.mark.parametrize("loaded_anew", [False, True])
+def test_a_run_goes_on_for_a_minute_without_the_database_and_stops_work_for_longer(
+    live, ann, runtime, monkeypatch, loaded_anew
+):
+    now, away, look = [1000.0], threading.Event(), credentials.look
+
+    def gone(kind, secret):
+        if away.is_set():
+            raise OperationalError("gone")
+        return look(kind, secret)
+
+    monkeypatch.setattr(credentials, "look", gone)
+    monkeypatch.setattr(credentials, "_clock", lambda: now[0])
+    lease = leases.claim(user=ann, station=live, page="p1")
+
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        await page.told("hello")
+        away.set()
+        now[0] += 59
+        if loaded_anew:
+            await page.close()
+            assert await page.connected()
+        else:
+            await page.say(type="aim", id=1, args={"pose": "home"})
+            assert (await page.told("aimed"))["ok"]
+        await page.say(type="renew", epoch=lease.epoch)
+        assert (await page.told("renewed"))["ok"]
+        now[0] += 2
+        if not loaded_anew:
+            await page.say(type="aim", id=2, args={"pose": "home"})
+            assert "has not said for 60 s whose login" in (await page.told("aimed"))["reason"]
+            await page.say(type="renew", epoch=lease.epoch)
+            refused = await page.told("renewed")
+            assert (refused["ok"], refused["lost"], refused["reason"]) == (False, False, consumers._NOT_SAID)
+        await page.say(type="halt", uuid=str(uuid4()), epoch=lease.epoch)
+        assert (await page.told("ack"))["status"] == "accepted"
+        await page.say(type="estop", uuid=str(uuid4()), why="smoke")
+        assert (await page.told("ack"))["status"] == "done"
+        away.clear()
+        await page.close()
+        await _written()
+
+    runtime.ready()
+    runtime.do(lambda: runtime.session._enter(State.RUNNING, ""))
+    run(scenario())
+
+
 @pytest.mark.parametrize(("kind", "state"), [("stop", "ready"), ("halt", "holding")])
 def test_the_holder_stops_over_the_socket_and_it_is_written_down_later(live, ann, bob, runtime, kind, state):
     lease = leases.claim(user=ann, station=live, page="p1")
@@ -408,7 +482,7 @@ def test_the_holder_stops_over_the_socket_and_it_is_written_down_later(live, ann
         ack = await page.told("ack")
         assert (ack["kind"], ack["uuid"], ack["status"]) == (kind, uuid, "accepted")
         await page.close()
-        await _written()
+        await _written(uuid)
 
     run(scenario())
     assert runtime.session.state == state
@@ -444,7 +518,7 @@ def test_events_come_without_gaps_over_a_restart(live, ann, runtime):
         assert [row["text"] for row in (await page.told("events"))["events"]] == ["now"]
         runtime.end()
         runtime.boot_up()
-        runtime.enter(Happening.CONNECTED)
+        runtime.enter(SessionEvent.CONNECTED)
         told = await page.told("events")
         assert (told["boot"], [row["number"] for row in told["events"]]) == (runtime.boot, [1])
         await page.close()
@@ -593,3 +667,126 @@ def test_the_chunk_and_every_sample_of_the_joints_are_shown(live, ann, runtime):
         await page.close()
 
     run(scenario())
+
+
+def test_a_flood_of_presses_at_a_dead_station_is_two_and_another_station_is_stopped_meanwhile(
+    ann, vera, make_stand_in
+):
+    dead, alive = make_stand_in(), make_stand_in()
+    for one in (dead, alive):
+        Station.objects.create(name=one.name, robot="agilex_piper")
+    dead.mute = True
+    presses = []
+    urgent = StationWire.urgent
+
+    def counted(self, command, *given):
+        presses.append(self.name)
+        return urgent(self, command, *given)
+
+    async def scenario():
+        flooding = await Page(dead.name, vera).open()
+        await flooding.told("hello")
+        page = await Page(alive.name, ann).open()
+        await page.told("hello")
+        for _ in range(1500):
+            await flooding.say(type="estop", uuid=str(uuid4()))
+        await page.say(type="estop", uuid=str(uuid4()))
+        assert (await page.told("ack"))["status"] == "done"
+        assert (await flooding.told("ack"))["reason"].startswith("USE THE HARDWARE STOP")
+        await page.close()
+        await flooding.close()
+        await _written()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(StationWire, "urgent", counted)
+        run(scenario())
+    # Those of 1500 that came while the first was out are one more; what came later still makes another pair.
+    assert presses.count(alive.name) == 1
+    assert 1 <= presses.count(dead.name) < 20
+    rows = Command.objects.filter(station__name=dead.name)
+    assert 1 <= rows.count() < 20
+
+
+@pytest.mark.parametrize("kind", ["stop", "halt"])
+def test_a_viewers_stop_is_refused_before_anything_is_done(live, vera, runtime, kind):
+    uuid = str(uuid4())
+
+    async def scenario():
+        page = await Page(live.name, vera).open()
+        await page.told("hello")
+        for _ in range(50):
+            await page.say(type=kind, uuid=uuid, epoch=1)
+        ack = await page.told("ack")
+        assert (ack["uuid"], ack["status"]) == (uuid, "refused")
+        assert "vera is a viewer; this needs an operator" in ack["reason"]
+        await page.close()
+        await _written()
+
+    run(scenario())
+    assert runtime.commands == []
+    assert not Command.objects.exists()
+
+
+def test_a_page_that_floods_is_told_once_and_closed_and_its_presses_are_obeyed(
+    live, ann, runtime, monkeypatch
+):
+    monkeypatch.setattr("evaweb.console.quota.PER_SECOND", 0.0)
+    monkeypatch.setattr("evaweb.console.quota.AT_ONCE", 5.0)
+
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        page.draws = False
+        for _ in range(50):
+            await page.say(type="credit")
+        await page.say(type="estop", uuid=str(uuid4()), why="at last")
+        while (said := await page.next()).get("type") != "websocket.close":
+            pass
+        assert said["code"] == 4429
+        assert [text["type"] for text in page.texts].count("error") == 1
+        await page.close()
+        await asyncio.to_thread(eventually, lambda: runtime.pressed, 20, "the press is obeyed")
+        await _written()
+
+    run(scenario())
+    assert [command.args["why"] for command in runtime.pressed] == ["at last"]
+
+
+@pytest.mark.parametrize("remembered", [True, False])
+def test_a_page_that_opens_while_the_database_is_away_can_stop(live, ann, runtime, monkeypatch, remembered):
+    """By whom is known where this process has seen the login before."""
+    lease = leases.claim(user=ann, station=live, page="p1")
+    runtime.ready()
+    runtime.do(lambda: runtime.session._enter(State.RUNNING, ""))
+    away = threading.Event()
+    look = credentials.look
+
+    def gone(kind, secret):
+        if away.is_set():
+            raise OperationalError("gone")
+        return look(kind, secret)
+
+    monkeypatch.setattr(credentials, "look", gone)
+    monkeypatch.setattr(consumers, "_AGAIN_S", 0.02)
+
+    async def scenario():
+        page = Page(live.name, ann)
+        if remembered:
+            first = await page.open()
+            await first.told("hello")
+            await first.close()
+        away.set()
+        assert await page.connected()
+        await page.say(type="halt", uuid=str(uuid4()), epoch=lease.epoch)
+        halted = await page.told("ack")
+        assert halted["status"] == ("accepted" if remembered else "failed")
+        await page.say(type="estop", uuid=str(uuid4()), why="smoke")
+        assert (await page.told("ack"))["status"] == "done"
+        away.clear()
+        assert (await page.told("hello"))["user"] == "ann"
+        await page.close()
+        await _written()
+
+    run(scenario())
+    assert [command.user for command in runtime.pressed] == ["ann" if remembered else "unverified"]
+    row = Command.objects.get(kind="estop")
+    assert (row.user, "unverified" in row.args) == ((ann, False) if remembered else (None, True))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evaweb.binary_frames import decode
 from evaweb.console import parts
 from evaweb.console.encoder import Encoder
-from evaweb.frames import decode
-from evaweb.stations.looks import looks_of
+from evaweb.stations.robot_geometry import looks_of
 
 Q = np.full(14, 0.1, np.float32)
 

@@ -8,12 +8,12 @@ import threading
 import pytest
 from django.db import OperationalError, connection
 
-from evaweb.console import chronicle
-from evaweb.console.chronicle import Chronicle, Scribe, events_written
+from evaweb.console import event_ingest as chronicle
+from evaweb.console.event_ingest import Chronicle, Scribe, events_written
 from evaweb.console.feed import Feeds, History
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Command, CommandStatus, Lease, Station
-from runtime.transitions import Happening
+from runtime.processes.coordinator.session.transitions import SessionEvent
 from tests.processes import eventually
 
 
@@ -128,7 +128,7 @@ def until(reached):
 
 @pytest.mark.django_db(transaction=True)
 def test_a_scribe_hears_and_writes_down(scribe, live, runtime, services, ann):
-    runtime.enter(Happening.CONNECTED)
+    runtime.enter(SessionEvent.CONNECTED)
     scribe.start()
     services.wait(lambda: services.trials == [(runtime.boot, 1, "state")])
     runtime.say("episode_closed", uuid="e1")

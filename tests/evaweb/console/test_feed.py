@@ -8,7 +8,7 @@ import pytest
 from django.conf import settings
 
 from evaweb.console.feed import EVENTS_KEPT, Feed, History, Link
-from runtime.transitions import Happening
+from runtime.processes.coordinator.session.transitions import SessionEvent
 
 
 class Ear:
@@ -67,7 +67,7 @@ def test_a_restarted_runtime_is_found_and_its_events_begin_anew(ear, runtime):
     ear.wait(lambda stream, content: stream == "events" and content.newest == 1)
     runtime.end()
     runtime.boot_up()
-    runtime.enter(Happening.CONNECTED)
+    runtime.enter(SessionEvent.CONNECTED)
     _, history = ear.wait(lambda stream, content: stream == "events" and content.boot == runtime.boot)
     assert [row["kind"] for row in history.rows] == ["state"]
     ear.wait(lambda stream, content: stream == "state" and content["boot"] == runtime.boot)

@@ -6,8 +6,8 @@ import asyncio
 
 import pytest
 
+from evaweb.blinding import EVERYTHING
 from evaweb.console import hub as hubs
-from evaweb.sight import EVERYTHING
 
 
 @pytest.mark.django_db(transaction=True)

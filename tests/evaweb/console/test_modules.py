@@ -55,7 +55,7 @@ def test_a_frame_of_the_server_is_read_with_every_number_and_picture() -> None:
         1.25,
     )
     read = run(
-        "frame.js",
+        "live/frame.js",
         """
         const bytes = Buffer.from(given, "base64");
         const frame = m.decode(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.length));
@@ -85,7 +85,7 @@ def test_a_frame_of_the_server_is_read_with_every_number_and_picture() -> None:
 @pytest.mark.parametrize("message", [b"", b"\x01", b"\xff\xff\xff\x7f{}"])
 def test_what_is_no_frame_is_refused(message: bytes) -> None:
     said = run(
-        "frame.js",
+        "live/frame.js",
         """
         const bytes = Uint8Array.from(given);
         try { m.decode(bytes.buffer); return "read"; }
@@ -102,7 +102,7 @@ def test_a_spike_survives_decimation() -> None:
     flat = [0.0] * 20_000
     flat[12_345], flat[777] = 9.0, -9.0
     calm = [float(index % 2) for index in range(20_000)]
-    kept = run("decimate.js", "return m.keep(given, 1200)", [flat, calm])
+    kept = run("curves/decimate.js", "return m.keep(given, 1200)", [flat, calm])
 
     assert len(kept) <= 1200
     assert {777, 12_345} <= set(kept)
@@ -110,12 +110,12 @@ def test_a_spike_survives_decimation() -> None:
 
 
 def test_few_points_are_all_kept() -> None:
-    assert run("decimate.js", "return m.keep(given, 1000)", [[1.0, 2.0, 3.0]]) == [0, 1, 2]
+    assert run("curves/decimate.js", "return m.keep(given, 1000)", [[1.0, 2.0, 3.0]]) == [0, 1, 2]
 
 
 def test_a_gap_stays_a_gap() -> None:
     kept = run(
-        "decimate.js",
+        "curves/decimate.js",
         "return m.keep([Array.from({length: 900}, (_, i) => i > 300 && i < 600 ? NaN : i)], 90)",
     )
 
@@ -124,7 +124,7 @@ def test_a_gap_stays_a_gap() -> None:
 
 def test_the_trace_keeps_the_newest_rows_and_knows_what_did_not_come() -> None:
     found = run(
-        "trace.js",
+        "curves/trace.js",
         """
         const trace = new m.Trace({ dim: 2, kinds: ["measured", "commanded"], rows: 4 });
         for (let t = 1; t <= 6; t += 1) trace.add(t, { measured: [t, 10 * t], commanded: t > 4 ? [0, t] : undefined });
@@ -143,7 +143,7 @@ def test_the_trace_keeps_the_newest_rows_and_knows_what_did_not_come() -> None:
 
 def test_a_copy_of_the_trace_stays_when_the_trace_goes_on() -> None:
     found = run(
-        "trace.js",
+        "curves/trace.js",
         """
         const trace = new m.Trace({ dim: 1, kinds: ["state"], rows: 3 });
         for (let t = 1; t <= 3; t += 1) trace.add(t, { state: [t] }, { chunk: t, limited: t === 2 });
@@ -166,7 +166,7 @@ def marks(chunk: list[int], **columns: list[int]) -> Any:
     const { seams, bands, limits, simulations } = found;
     return { seams, bands: bands.flat(), limits, simulations: simulations.flat() };
     """
-    found = run("curve_marks.js", body, given)
+    found = run("curves/curve_marks.js", body, given)
     return {name: [round(10 * time, 1) for time in times] for name, times in found.items()}
 
 
@@ -213,7 +213,10 @@ def test_the_sample_at_the_cursor_is_the_last_that_began() -> None:
 def test_the_seam_of_a_chunk_is_its_first_row_that_is_executed(
     chunk: dict[str, Any], seam: int, looks: str
 ) -> None:
-    assert run("scene_chunk.js", "return m.rowsOf(given)", chunk) == {"seam": seam, "looks": looks.split()}
+    assert run("scene/scene_chunk.js", "return m.rowsOf(given)", chunk) == {
+        "seam": seam,
+        "looks": looks.split(),
+    }
 
 
 def test_the_film_of_a_chunk_takes_as_long_as_the_chunk_and_begins_again() -> None:
@@ -222,7 +225,7 @@ def test_the_film_of_a_chunk_takes_as_long_as_the_chunk_and_begins_again() -> No
       [from, to, Math.round(100 * share) / 100]);
     """
 
-    assert run("scene_preview.js", body) == [
+    assert run("scene/scene_preview.js", body) == [
         [0, 1, 0],
         [0, 1, 0.25],
         [0, 1, 0.88],
@@ -240,7 +243,7 @@ def test_everything_that_has_to_be_in_view_is(direction: list[float], lower: flo
     corners = [[(low, top)[bits >> axis & 1][axis] for axis in range(3)] for bits in range(8)]
     body = "return m.eyeFor(given.corners, given.direction, given.wide, given.high, given.lower)"
     given = {"corners": corners, "direction": direction, "wide": wide, "high": high, "lower": lower}
-    found = run("scene_views.js", body, given)
+    found = run("scene/scene_views.js", body, given)
 
     eye, back = np.array(found["eye"]), np.array(direction) / np.linalg.norm(direction)
     assert np.allclose(np.cross(eye - found["target"], back), 0, atol=1e-9)
@@ -256,12 +259,12 @@ def test_everything_that_has_to_be_in_view_is(direction: list[float], lower: flo
 
 
 def test_a_film_of_one_row_stands_still() -> None:
-    assert run("scene_preview.js", "return m.moment([0], 0.1, 5)") == {"from": 0, "to": 0, "share": 0}
+    assert run("scene/scene_preview.js", "return m.moment([0], 0.1, 5)") == {"from": 0, "to": 0, "share": 0}
 
 
 def test_the_preview_is_between_its_keyframes() -> None:
     found = run(
-        "scene_preview.js",
+        "scene/scene_preview.js",
         """
         const preview = new m.Preview();
         const before = preview.at(0);
@@ -278,12 +281,12 @@ def test_the_preview_is_between_its_keyframes() -> None:
 @given(
     st.lists(st.lists(st.integers(0, 60), min_size=1, max_size=60), min_size=1, max_size=20), st.booleans()
 )
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 def test_every_value_of_a_distribution_is_in_one_bar_between_its_ends(
     many: list[list[int]], whole: bool
 ) -> None:
     found = run(
-        "distribution.js",
+        "debug/distribution.js",
         "return given[0].map((values) => m.bars(values, given[1]))",
         [many, {"whole": whole}],
     )
@@ -296,13 +299,13 @@ def test_every_value_of_a_distribution_is_in_one_bar_between_its_ends(
 
 
 def test_each_whole_number_has_a_bar_of_its_own() -> None:
-    found = run("distribution.js", "return m.bars([3, 3, 5, 4, 3], { whole: true })")
+    found = run("debug/distribution.js", "return m.bars([3, 3, 5, 4, 3], { whole: true })")
 
     assert found == {"low": 3, "high": 5, "counts": [3, 1, 1]}
 
 
 def test_equal_values_are_no_spread() -> None:
-    found = run("distribution.js", "return m.bars([80, 80], { narrow: 10 })")
+    found = run("debug/distribution.js", "return m.bars([80, 80], { narrow: 10 })")
 
     assert (found["low"], found["high"], max(found["counts"])) == (75, 85, 2)
 
@@ -311,17 +314,19 @@ def test_equal_values_are_no_spread() -> None:
     st.lists(st.lists(st.floats(0, 1000), min_size=1, max_size=30), min_size=1, max_size=20),
     st.integers(0, 100),
 )
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 def test_quantiles_are_those_of_numpy(many: list[list[float]], percent: int) -> None:
     found = run(
-        "distribution.js", "return given[0].map((values) => m.quantile(values, given[1]))", [many, percent]
+        "debug/distribution.js",
+        "return given[0].map((values) => m.quantile(values, given[1]))",
+        [many, percent],
     )
 
     assert found == pytest.approx([np.percentile(values, percent) for values in many])
 
 
 def test_of_nothing_there_is_no_quantile() -> None:
-    assert run("distribution.js", "return Number.isNaN(m.quantile([], 50))") is True
+    assert run("debug/distribution.js", "return Number.isNaN(m.quantile([], 50))") is True
 
 
 @pytest.mark.parametrize(
@@ -342,7 +347,7 @@ def test_of_nothing_there_is_no_quantile() -> None:
     ],
 )
 def test_the_step_to_do_now_follows_trial_and_state(panel: dict[str, str], state: str, step: str) -> None:
-    assert run("steps.js", "return m.current(given[0], given[1])", [panel, {"state": state}]) == step
+    assert run("trial/steps.js", "return m.current(given[0], given[1])", [panel, {"state": state}]) == step
 
 
 def test_an_identity_is_a_random_uuid_of_version_four() -> None:
@@ -370,7 +375,7 @@ const said = stops
 
 def test_a_stop_that_the_socket_answers_is_not_posted() -> None:
     found = run(
-        "stops.js",
+        "commands/stops.js",
         STOPS
         + """
         stops.acknowledged({ uuid: "u1", kind: "stop", status: "done", reason: "" });
@@ -384,7 +389,7 @@ def test_a_stop_that_the_socket_answers_is_not_posted() -> None:
 
 def test_a_stop_goes_by_post_under_the_same_uuid_where_the_socket_is_closed() -> None:
     given = {"open": False, "patience": 10_000, "post": {"status": "accepted"}}
-    found = run("stops.js", STOPS + "return { said: await said, posted };", given)
+    found = run("commands/stops.js", STOPS + "return { said: await said, posted };", given)
 
     assert found["said"] == "accepted"
     assert [order["uuid"] for order in found["posted"]] == ["u1"]
@@ -392,9 +397,9 @@ def test_a_stop_goes_by_post_under_the_same_uuid_where_the_socket_is_closed() ->
 
 def test_a_stop_that_nobody_acknowledges_is_posted_too_and_the_first_answer_counts() -> None:
     given = {"open": True, "patience": 5, "post": {"status": "done"}}
-    posted_first = run("stops.js", STOPS + "return { said: await said, sent, posted };", given)
+    posted_first = run("commands/stops.js", STOPS + "return { said: await said, sent, posted };", given)
     acknowledged_first = run(
-        "stops.js",
+        "commands/stops.js",
         STOPS
         + """
         while (!posted.length) await new Promise((resolve) => setTimeout(resolve, 1));
@@ -409,6 +414,35 @@ def test_a_stop_that_nobody_acknowledges_is_posted_too_and_the_first_answer_coun
     assert acknowledged_first == "accepted"
 
 
+BESIDE = STOPS.replace(
+    "  post:",
+    "beside: async () => { if (given.fault) throw new Error(given.fault); return given.beside; },\n  post:",
+)
+
+
+@pytest.mark.parametrize("open_", [True, False])
+def test_a_stop_goes_to_the_process_for_stops_at_once_whose_answer_counts_where_it_is_the_first(
+    open_: bool,
+) -> None:
+    given = {"open": open_, "patience": 10_000, "beside": {"status": "accepted"}}
+    assert run("commands/stops.js", BESIDE + "return { said: await said, sent };", given) == {
+        "said": "accepted",
+        "sent": [{"type": "stop", "uuid": "u1", "epoch": 4}] if open_ else [],
+    }
+
+
+def test_a_process_for_stops_that_fails_is_told_only_where_all_ways_have_failed() -> None:
+    acknowledge = 'stops.acknowledged({ uuid: "u1", kind: "stop", status: given.status, reason: "why" });'
+    given = {"open": True, "patience": 10_000, "fault": "it is gone"}
+    found = [
+        run("commands/stops.js", BESIDE + acknowledge + "return await said;", {**given, "status": status})
+        for status in ("done", "refused")
+    ]
+    assert found == ["done", ["why", False]]
+    left = {**given, "patience": 5, "post": {"status": "done"}}
+    assert run("commands/stops.js", BESIDE + "return await said;", left) == "done"
+
+
 def test_a_stop_that_was_not_carried_out_is_never_called_done() -> None:
     body = """
     return given.map((status) => {
@@ -416,7 +450,7 @@ def test_a_stop_that_was_not_carried_out_is_never_called_done() -> None:
       catch (error) { return [error.message, error.unknown]; }
     });
     """
-    found = run("stops.js", body, ["accepted", "done", "refused", "failed", "unknown", "pressed"])
+    found = run("commands/stops.js", body, ["accepted", "done", "refused", "failed", "unknown", "pressed"])
 
     assert found[:2] == ["accepted", "done"]
     assert found[2:] == [["because", False], ["because", False], ["because", True], ["because", True]]
@@ -424,7 +458,7 @@ def test_a_stop_that_was_not_carried_out_is_never_called_done() -> None:
 
 def test_an_answer_after_the_page_was_told_is_passed_on() -> None:
     found = run(
-        "stops.js",
+        "commands/stops.js",
         STOPS + 'await said; stops.acknowledged({ uuid: "u1", status: "done" }); return late;',
         {"open": False, "patience": 10_000, "post": {"status": "done"}},
     )
@@ -442,18 +476,18 @@ def test_the_page_knows_whether_it_or_another_of_the_same_person_commands() -> N
     """
     holders = ["", "web:ada:p1", "web:ada:p2", "web:adam:p1", "terminal"]
 
-    assert run("store.js", body, holders) == ["free", "mine", "elsewhere", "other", "other"]
+    assert run("live/store.js", body, holders) == ["free", "mine", "elsewhere", "other", "other"]
 
 
 def test_curves_have_one_word_and_one_colour_each() -> None:
-    kinds = run("curve_kinds.js", "return m.KINDS")
+    kinds = run("curves/curve_kinds.js", "return m.KINDS")
 
     assert [kind["name"] for kind in kinds] == ["raw", "smoothed", "state", "executed"]
     assert len({kind["colour"] for kind in kinds}) == len(kinds)
 
 
 def test_no_value_is_a_gap_to_the_plot() -> None:
-    assert run("curve_kinds.js", "return m.blank([1, NaN, 2])") == [1, None, 2]
+    assert run("curves/curve_kinds.js", "return m.blank([1, NaN, 2])") == [1, None, 2]
 
 
 def test_an_event_is_said_in_words_with_its_weight() -> None:
@@ -480,7 +514,7 @@ def test_an_event_is_said_in_words_with_its_weight() -> None:
     ]
     body = "return given.map((event) => [m.kindWords(event.kind), m.sentence(event), m.weight(event)])"
 
-    assert run("event_words.js", body, events) == [
+    assert run("live/event_words.js", body, events) == [
         ["state", "setting up → ready: 50 rows", ""],
         ["state", "running → holding: halted", "warn"],
         ["state", "running → faulted: e-stop", "bad"],
@@ -508,11 +542,12 @@ const source = (await import("node:fs")).readFileSync(new URL(given.module), "ut
 const listeners = {}, posted = [];
 const part = (id) => ({ dataset: {}, innerHTML: "at rest", addEventListener: (kind, act) => (listeners[id] = act) });
 const parts = Object.fromEntries(["estop-area", "estop-note", "estop", "outcome"].map((id) => [id, part(id)]));
-parts["estop-area"].dataset.address = "/estop";
+Object.assign(parts["estop-area"].dataset, { address: "/estop", stops: given.stops ?? "" });
 const document = { getElementById: (id) => parts[id], querySelector: () => ({ value: "token" }) };
 const window = { addEventListener: (kind, act) => (listeners[kind] = act) };
 const fetch = async (address, { body }) => {
   posted.push([address, JSON.parse(body).why]);
+  if (given.dead === address) throw new TypeError("refused");
   return { ok: given.status === 200, status: given.status, json: async () => ({ status: given.said }) };
 };
 const quiet = { error() {} };
@@ -523,7 +558,7 @@ const shown = () => [parts["estop-area"].dataset.kind, parts["estop-note"].textC
 
 
 def test_the_e_stop_works_before_and_without_the_modules() -> None:
-    given = {"module": (MODULES / "estop_early.js").as_uri(), "status": 200, "said": "accepted"}
+    given = {"module": (MODULES / "commands/estop_early.js").as_uri(), "status": 200, "said": "accepted"}
     body = """
     listeners.estop();
     await settled();
@@ -534,7 +569,7 @@ def test_the_e_stop_works_before_and_without_the_modules() -> None:
     listeners.estop();
     return { first, posted, rest: parts["estop-note"].dataset.rest };
     """
-    found = run("words.js", EARLY + body, given)
+    found = run("live/words.js", EARLY + body, given)
 
     assert found["first"] == ["stopped", "E-stop acknowledged: the robot is held."]
     assert found["posted"] == [
@@ -546,10 +581,91 @@ def test_the_e_stop_works_before_and_without_the_modules() -> None:
 
 @pytest.mark.parametrize(("status", "said"), [(409, "failed"), (200, "unknown"), (403, None)])
 def test_an_early_e_stop_that_failed_says_to_use_the_hardware_stop(status: int, said: str | None) -> None:
-    given = {"module": (MODULES / "estop_early.js").as_uri(), "status": status, "said": said}
-    found = run("words.js", EARLY + "listeners.estop(); await settled(); return shown();", given)
+    given = {"module": (MODULES / "commands/estop_early.js").as_uri(), "status": status, "said": said}
+    found = run("live/words.js", EARLY + "listeners.estop(); await settled(); return shown();", given)
 
     assert found == ["failed", "USE THE HARDWARE STOP"]
+
+
+@pytest.mark.parametrize("dead", ["/estop", "http://lab:8001/estop", ""])
+def test_an_early_e_stop_goes_both_ways_and_one_is_enough(dead: str) -> None:
+    given = {
+        "module": (MODULES / "commands/estop_early.js").as_uri(),
+        "status": 200,
+        "said": "done",
+        "dead": dead,
+    }
+    body = (
+        EARLY + "listeners.estop(); await settled(); return [shown()[0], posted.map(([address]) => address)];"
+    )
+    found = run("live/words.js", body, {**given, "stops": "http://lab:8001"})
+    assert found == ["stopped", ["http://lab:8001/estop", "/estop"]]
+
+
+PRESSED = """
+const element = () => ({
+  dataset: {}, classList: [], title: "", textContent: "", addEventListener() {}, append() {}, toggleAttribute() {},
+});
+const elements = Object.fromEntries(["estop", "estop-note", "estop-area"].map((id) => [id, element()]));
+const kinds = [];
+elements["estop-area"].dataset = new Proxy({}, {
+  set: (target, key, value) => Boolean((target[key] = value) || true) && (key !== "kind" || kinds.push(value) > 0),
+});
+elements.config = { textContent: JSON.stringify({ page: "eval", api: { estop: "/estop" } }) };
+globalThis.document = { getElementById: (id) => elements[id], createElement: element, querySelector: () => null };
+globalThis.window = { addEventListener() {} };
+const posted = [], sent = [];
+globalThis.fetch = async (address, { body, headers }) => {
+  posted.push([address, JSON.parse(body).uuid === sent[0]?.uuid, headers["Content-Type"]]);
+  if (given.dead.includes(address)) throw new TypeError("refused");
+  if (given.silent.includes(address)) await new Promise(() => {});
+  return { ok: true, status: 200, text: async () => JSON.stringify({ status: "done" }) };
+};
+const { EStop } = await import(given.module);
+const way = { there: Boolean(given.way), estop: given.way, ask: async () => true };
+const socket = { send: (message) => { sent.push(message); return given.open; } };
+const estop = new EStop({ on() {} }, socket, way);
+const kind = () => elements["estop-area"].dataset.kind;
+const until = async (reached) => { while (!reached()) await new Promise((resolve) => setTimeout(resolve, 5)); };
+estop.press("button");
+const ack = (status) => estop.acknowledged({ uuid: sent[0].uuid, status, reason: "" });
+"""
+STOPS_AT = "http://lab:8001/estop"
+
+
+def pressed(body: str, **given: Any) -> Any:
+    known = {
+        "module": (MODULES / "commands/estop.js").as_uri(),
+        "open": True,
+        "way": STOPS_AT,
+        "dead": [],
+        "silent": [],
+    }
+    return run("live/words.js", PRESSED + body, known | given)
+
+
+def test_a_press_goes_both_ways_at_once_under_one_uuid_and_the_first_answer_counts() -> None:
+    ends = 'await until(() => kind() === "stopped"); return posted;'
+    once = [[STOPS_AT, True, "text/plain"]]
+    assert pressed(ends) == once
+    assert pressed('ack("done"); ' + ends, silent=[STOPS_AT]) == once
+    assert pressed('ack("failed"); ' + ends) == once, "one way's failure is no failure"
+
+
+def test_a_press_without_a_socket_goes_to_both_processes_and_one_without_a_way_as_ever() -> None:
+    ends = 'await until(() => kind() === "stopped"); return posted.map(([address]) => address);'
+    assert pressed(ends, open=False, dead=[STOPS_AT]) == [STOPS_AT, "/estop"]
+    assert pressed('ack("done"); ' + ends, way="") == []
+    assert pressed(ends, way="", open=False) == ["/estop"]
+
+
+def test_a_press_that_fails_both_ways_says_so_and_what_is_left_is_tried() -> None:
+    told = 'await until(() => kind() === "stopped"); return [kinds, posted.map(([address]) => address)];'
+    once_more = [["pressed", "failed", "stopped"], [STOPS_AT, "/estop"]]
+    assert pressed(told, silent=[STOPS_AT]) == once_more, "half a second of silence"
+    assert pressed('ack("failed"); ' + told, dead=[STOPS_AT]) == once_more
+    dead = 'ack("failed"); await until(() => posted.length === 2 && kinds.length === 3); return kinds;'
+    assert pressed(dead, dead=[STOPS_AT, "/estop"]) == ["pressed", "failed", "failed"]
 
 
 def camera(
@@ -573,7 +689,7 @@ def test_a_camera_of_the_stations_own_is_named_with_what_is_wrong() -> None:
     body = (
         "return Object.fromEntries(Object.entries(given).map(([name, told]) => [name, m.trouble(told, 16)]))"
     )
-    assert run("camera_words.js", body, cameras) == {
+    assert run("live/camera_words.js", body, cameras) == {
         "live": None,
         "absent": {"word": "no picture yet", "reason": refused},
         "lost": {"word": "reconnecting, lost 3.5 s ago", "reason": refused},
@@ -586,14 +702,14 @@ def test_a_camera_of_the_stations_own_is_named_with_what_is_wrong() -> None:
 def test_all_cameras_of_the_stations_own_are_told_in_a_line() -> None:
     cameras = {"cam_high": camera("live", losses=2), "cam_wrist": camera("opening", "404", age=None)}
     body = "return [m.summary(given, 16), m.summary(undefined, 16), m.summary({}, 16)]"
-    assert run("camera_words.js", body, cameras) == [
+    assert run("live/camera_words.js", body, cameras) == [
         "cam_high: rtsp from rtsp://10.0.0.7:554/one: newest picture 40 ms old, lost 2 times; "
         "cam_wrist: no picture yet (404)",
         "",
         "",
     ]
     once = {"a": camera("live", losses=1, age=None)}
-    assert run("camera_words.js", "return m.summary(given, 16)", once) == (
+    assert run("live/camera_words.js", "return m.summary(given, 16)", once) == (
         "a: rtsp from rtsp://10.0.0.7:554/one: no picture yet, lost once"
     )
 
@@ -601,7 +717,7 @@ def test_all_cameras_of_the_stations_own_are_told_in_a_line() -> None:
 def test_what_happens_to_cameras_is_weighed() -> None:
     kinds = ["camera_absent", "camera_lost", "camera_ended", "camera_is_a_video", "camera_back"]
     body = "return given.map((kind) => [m.kindWords(kind), m.weight({kind, text: ''})])"
-    assert run("event_words.js", body, kinds) == [
+    assert run("live/event_words.js", body, kinds) == [
         ["camera absent", "warn"],
         ["camera lost", "warn"],
         ["video is over", "warn"],

@@ -8,13 +8,13 @@ import threading
 import numpy as np
 import pytest
 
-from evaweb.console import aims
-from evaweb.console.aims import Aims, aimed
+from evaweb.console import pose_queries as aims
+from evaweb.console.pose_queries import Aims, aimed
 from evaweb.console.requests import Aim
 from evaweb.roles import Role
-from evaweb.stations.looks import looks_of
 from evaweb.stations.models import Station
-from runtime.messages import Ack
+from evaweb.stations.robot_geometry import looks_of
+from runtime.ipc.messages import Ack
 
 Q = [0.1] * 14
 PIPER = looks_of("agilex_piper")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from evaweb.binary_frames import decode
 from evaweb.console import parts
 from evaweb.console.recent import SAMPLES, Recent
-from evaweb.frames import decode
 
 NOTHING = np.full(3, np.nan, np.float32)
 

@@ -18,8 +18,10 @@ from evaweb.console.requests import (
     Renew,
     Stop,
     Watch,
+    may_stop,
     parse,
 )
+from tests import presses
 
 CAMERAS = ("cam_high", "cam_left_wrist")
 
@@ -47,7 +49,7 @@ def test_requests_are_read():
     [
         (
             {"type": "jump"},
-            "type 'jump' is unknown; allowed: watch, credit, renew, estop, stop, halt, events, aim",
+            "type 'jump' is unknown; allowed: watch, estop, credit, renew, stop, halt, events, aim",
         ),
         ({"type": "watch", "streams": "state"}, "streams = 'state'; allowed: a list of state, joints"),
         ({"type": "watch", "streams": ["camera/none"]}, "camera/cam_left_wrist"),
@@ -67,8 +69,27 @@ def test_what_means_nothing_is_refused_with_what_is_allowed(message, sentence):
 
 
 def test_a_text_that_is_nested_too_deeply_is_a_bad_request():
-    with pytest.raises(BadRequest, match="is no JSON"):
+    with pytest.raises(BadRequest, match="tables or lists within each other; allowed: at most 40"):
         parse("[" * 60_000, ())
+
+
+@pytest.mark.parametrize("rest", ['"why": ' + "[" * 60_000, '"why": ', ""])
+def test_a_press_of_the_e_stop_is_one_also_where_the_rest_cannot_be_read(rest):
+    assert isinstance(parse('{"type" : "estop", ' + rest, ()), EStop)
+
+
+@pytest.mark.parametrize("name", presses.in_json("type"))
+def test_whatever_is_wrong_with_a_press_it_is_one(name):
+    text = presses.in_json("type")[name]
+    pressed = parse(text, CAMERAS)
+    assert isinstance(pressed, EStop)
+    assert 0 < len(pressed.why) <= 240
+    assert may_stop(text), "also from a page that floods"
+
+
+@given(presses.json_texts("type"))
+def test_any_mutation_of_a_press_that_still_names_it_is_one(text):
+    assert isinstance(parse(text, CAMERAS), EStop)
 
 
 @pytest.mark.parametrize("extra", [{}, {"uuid": 7, "why": 3}, {"uuid": "x", "why": "y" * 999}])

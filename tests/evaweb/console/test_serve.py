@@ -4,28 +4,35 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
+import urllib.error
 import urllib.request
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
 
-from evaweb.console.server import PortTaken, _address, listen
+from evaweb.console.server import _address
+from evaweb.listening import PortTaken, listen
+from tests.processes import eventually
 
 MANAGE = Path(__file__).parents[3] / "manage.py"
 
 
 @contextmanager
-def served(folder, *options):
-    """A web process on a free port and what it announced; killed where the test forgot it."""
+def served(folder, *options, path=None, command="serve"):
+    """A web process on a free port, or that for stops, and what it announced; killed where the test forgot it."""
     environment = os.environ | {"EVA_DATA_DIR": str(folder), "DJANGO_SETTINGS_MODULE": "evaweb.settings"}
+    if path is not None:
+        environment["PYTHONPATH"] = str(path)
     subprocess.run([sys.executable, MANAGE, "migrate", "-v0"], env=environment, check=True)
     process = subprocess.Popen(
-        [sys.executable, MANAGE, "serve", "--port", "0", *options],
+        [sys.executable, MANAGE, command, "--port", "0", *options],
         env=environment,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -75,3 +82,114 @@ def test_it_ends_when_it_is_told(tmp_path):
         assert address["port"] > 0
         process.send_signal(signal.SIGTERM)
         assert process.wait(20) == 0
+
+
+@pytest.mark.slow
+def test_connections_that_ask_for_nothing_keep_nobody_out_and_are_closed(tmp_path):
+    """Twice as many as the process had files for before its limit was raised."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 4096), hard))
+    limited = f"import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (256, {min(hard, 2048)}))"
+    (tmp_path / "sitecustomize.py").write_text(limited)
+    half_open = []
+    try:
+        with served(tmp_path, path=tmp_path) as (_, address):
+            for _ in range(1100):
+                half_open.append(socket.create_connection(("127.0.0.1", address["port"]), timeout=20))
+                half_open[-1].sendall(b"POST /api/v1/stations/bench/estop HTTP/1.1\r\nHost: ")
+            request = urllib.request.Request(
+                f"{address['url']}/api/v1/stations/bench/estop", b"{}", method="POST"
+            )
+            with pytest.raises(urllib.error.HTTPError) as refused:
+                urllib.request.urlopen(request, timeout=60)
+            assert (refused.value.code, "error" in json.load(refused.value)) == (401, True)
+            with pytest.raises(ConnectionResetError):  # the oldest has made place
+                half_open[0].recv(1)
+    finally:
+        for one in half_open:
+            one.close()
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+@pytest.mark.slow
+def test_the_process_for_stops_answers_says_where_it_is_and_ends_with_its_lifeline(tmp_path):
+    with served(tmp_path, "--web-port", "8000", "--lifeline", command="stops") as (process, address):
+        said = tmp_path / "stops.json"
+        assert json.loads(said.read_bytes()) == {"port": address["port"], "web_port": 8000}
+        estop = f"{address['url']}/api/v1/stations/bench/estop"
+        upgrade = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Key": "x"}
+        asked = ((estop, {}, 401), (f"{address['url']}/login/", {}, 404), (address["url"], upgrade, 404))
+        for url, headers, status in asked:
+            with pytest.raises(urllib.error.HTTPError) as refused:
+                urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=60)
+            assert (refused.value.code, list(json.load(refused.value))) == (status, ["error"])
+        process.stdin.close()
+        assert process.wait(20) == 0
+        assert not said.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["serve", "stops"])
+def test_an_e_stop_whose_sender_dies_in_the_middle_of_its_body_is_pressed(tmp_path, command):
+    (tmp_path / "stations" / "bench").mkdir(parents=True)  # else its presses are not written down
+    with served(tmp_path, command=command) as (_, address):
+        token = _token_of(tmp_path)
+        head = "POST /api/v1/stations/bench/{} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {}\r\n"
+        body = b'Content-Length: 99\r\n\r\n{"why": "half of'
+        for path in ("commands", "estop"):
+            with socket.create_connection(("127.0.0.1", address["port"]), 20) as dies:
+                dies.sendall(head.format(path, token).encode() + body)
+        eventually(lambda: _presses(tmp_path) == [("estop", {"why": "pressed"})], 20, "it is pressed")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["serve", "stops"])
+def test_no_type_and_no_length_of_its_body_refuses_a_press(tmp_path, command):
+    forms = ("multipart/form-data", "multipart/form-data; boundary=x", "application/x-www-form-urlencoded")
+    short, long = b'{"kind": "estop"}', b'{"kind": "%b", "args": {"why": "' + b"x" * 300_000 + b'"}}'
+    sent = [(path, form, short) for path in ("estop", "commands") for form in forms]
+    sent += [(path, "application/json", long % b"estop") for path in ("estop", "commands")]
+    with served(tmp_path, command=command) as (_, address):
+        token = _token_of(tmp_path)
+        described = [_asked_as(token, address["url"], *one) for one in sent]
+        chunked = _asked_as(token, address["url"], "commands", "text/plain", iter([long % b"estop"]))
+        other = _asked_as(token, address["url"], "commands", "application/json", long % b"home")
+    assert all(b'"uuid"' in said and status not in (400, 413) for status, said in [*described, chunked])
+    assert other[0] == 413
+
+
+def _asked_as(token, url, path, kind, body):
+    headers = {"Authorization": f"Bearer {token}", "Content-Type": kind}
+    where = f"{url}/api/v1/stations/bench/{path}"
+    try:
+        with urllib.request.urlopen(urllib.request.Request(where, body, headers), timeout=60) as answer:
+            return answer.status, answer.read()
+    except urllib.error.HTTPError as refused:
+        with refused:
+            return refused.code, refused.read()
+
+
+def _token_of(folder):
+    made = subprocess.run(
+        [sys.executable, MANAGE, "shell", "-v0", "-c", _TOKEN],
+        env=os.environ | {"EVA_DATA_DIR": str(folder), "DJANGO_SETTINGS_MODULE": "evaweb.settings"},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    return made.stdout.strip()
+
+
+_TOKEN = """
+from django.contrib.auth.models import User
+from evaweb.api.tokens import token_create
+from evaweb.stations.models import Station
+Station.objects.create(name="bench", robot="agilex_piper")
+print(token_create(user=User.objects.create(username="ann"), name="tests"))
+"""
+
+
+def _presses(folder):
+    with closing(sqlite3.connect(folder / "eva.sqlite3")) as database:
+        rows = database.execute("SELECT kind, args FROM stations_command").fetchall()
+    return [(kind, json.loads(args)) for kind, args in rows]

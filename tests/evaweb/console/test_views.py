@@ -14,10 +14,10 @@ from django.test.utils import CaptureQueriesContext
 from django.urls import reverse
 from django.utils import timezone
 
+from evaweb.blinding import EVERYTHING
 from evaweb.console import selectors
 from evaweb.episodes.models import Episode
 from evaweb.roles import Role
-from evaweb.sight import EVERYTHING
 from evaweb.stations.commands import COLLECTING, KINDS
 from evaweb.stations.models import Command, Lease, LeaseRequest, Station
 from evaweb.trials.models import (
@@ -53,7 +53,7 @@ def station() -> Station:
 @pytest.fixture
 def ada() -> User:
     user = User.objects.create_user("ada", password="secret")
-    user.groups.add(Group.objects.get(name=Role.OPERATOR))
+    user.groups.add(Group.objects.get_or_create(name=Role.OPERATOR)[0])
     return user
 
 
@@ -563,7 +563,7 @@ def test_the_e_stop_of_a_station_needs_no_module(browser: Client, ada: User, sta
     html = text_of(browser, "/stations/bench-1/debug/")
 
     assert 'data-address="/api/v1/stations/bench-1/estop"' in html
-    script = re.search(r'<script src="[^"]*console/estop_early.js"></script>', html)
+    script = re.search(r'<script src="[^"]*console/commands/estop_early.js"></script>', html)
     assert script
     assert html.index('id="estop"') < script.start() < html.index("console/station.js")
 

@@ -17,13 +17,13 @@ from django.test import Client
 from django.urls import reverse
 
 import robots
+from evaweb.binary_frames import decode
 from evaweb.datasets.importing import imported
 from evaweb.datasets.job_kinds import dataset as run_order
 from evaweb.datasets.on_robot import recorded_at
 from evaweb.episodes.job_kinds import preview, publish_episode
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import reconcile
-from evaweb.frames import decode
 from evaweb.jobs.kinds import Work
 from evaweb.jobs.models import Job
 from evaweb.reviews.job_kinds import look_for_outdated, look_for_unchecked, quality, sides
@@ -31,12 +31,12 @@ from evaweb.reviews.models import Standing
 from evaweb.reviews.selectors import report_get
 from evaweb.reviews.services import review_add, segment_put
 from evaweb.stations.models import Station
-from runtime.clock import VirtualClock
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import PolicyError, RecordingError
 from runtime.datasets.consistency import check
 from runtime.datasets.journal import read_journal
 from runtime.datasets.operations import convert
 from runtime.datasets.reader import open_dataset
-from runtime.errors import PolicyError, RecordingError
 from runtime.policies import replay
 from runtime.recording.layout import VECTOR_STREAMS
 from tests.evaweb.conftest import person

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import pytest
 from django.contrib.auth.models import User
@@ -24,6 +26,7 @@ from evaweb.stations.models import Station
 from runtime.datasets.consistency import check
 from runtime.datasets.reader import open_dataset
 from tests.evaweb.conftest import person
+from tests.evaweb.trials import builders
 
 pytestmark = pytest.mark.django_db
 Foreign = Callable[..., Path]
@@ -262,7 +265,8 @@ def test_the_stations_page_sets_up_what_the_address_names(
     page = browser.get(reverse("station-debug", args=["bench"]), {"replay": "cups:1", "robot": "ur5e"})
     offer = page.context["replay"]
     assert offer.differences == ()
-    args = json.loads(offer.set_up)
+    args = offer.set_up
+    assert json.loads(offer.asked) == {"episode": "datasets/cups:1", "space": "joint", "robot": "ur5e"}
     assert args["policy"] == {
         "kind": "replay",
         "path": str(data / "datasets" / "cups"),
@@ -278,3 +282,69 @@ def test_the_stations_page_sets_up_what_the_address_names(
     ).context["replay"]
     assert len(poses.differences) == 1
     assert "replay_problem" in browser.get(reverse("station-debug", args=["bench"]), {"replay": "x"}).context
+
+
+def own_folders() -> list[str]:
+    """The folders of the lab, as administrators are told of them."""
+    page = (Path(__file__).parents[3] / "docs" / "administrator.md").read_text("utf-8")
+    table = page.partition("## The data folder")[2].partition("\n\nA trial's")[0]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    return sorted({name for row in rows for name in re.findall(r"`([a-z_]+)/`", row)} - {"datasets"})
+
+
+@pytest.mark.parametrize("folder", own_folders())
+def test_no_dataset_is_written_into_a_folder_of_the_lab(foreign: Foreign, root: User, folder: str) -> None:
+    foreign("cups")
+    for to in (f"{folder}/bench", f"{folder}/bench/ssh", f"./{folder}/x", f"{folder}//x"):
+        with pytest.raises(EvaError, match="names no dataset"):
+            orders.asked(user=root, given={"what": "convert", "dataset": "cups", "to": to, "version": "v3.0"})
+    assert not Job.objects.exists()
+
+
+def test_the_folders_of_the_lab_were_found() -> None:
+    assert {"stations", "jobs", "episodes", "unwritten", "pictures"} <= set(own_folders())
+
+
+@pytest.mark.parametrize("to", ["datasets/", "datasets/cups/data", "datasets/cups/more", "./datasets"])
+def test_no_dataset_is_written_around_or_into_others(foreign: Foreign, root: User, to: str) -> None:
+    foreign("cups")
+    with pytest.raises(EvaError):
+        orders.asked(user=root, given={"what": "convert", "dataset": "cups", "to": to, "version": "v3.0"})
+    assert not Job.objects.exists()
+
+
+def test_an_operator_sets_up_an_episode_by_its_name_and_no_path_of_theirs(
+    operator: Client, foreign: Foreign, data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    foreign("cups", widths={"observation.state": 7, "action": 7})
+    Station.objects.create(name="bench", robot="ur5e", title="Bench")
+    wire = builders.Wire()
+    monkeypatch.setattr("evaweb.stations.commands.wire_to", lambda name: wire)
+
+    def asked(**given: Any) -> Any:
+        body = {"uuid": str(uuid4()), "kind": "setup", "page": "p1", **given}
+        return operator.post("/api/v1/stations/bench/commands", body, content_type="application/json")
+
+    named = {"episode": "cups:1", "robot": "ur5e"}
+    assert asked(replay=named, args={"policy": {"path": "/etc"}}).status_code == 400
+    assert asked(replay=named, kind="run").status_code == 400
+    assert asked(replay=named | {"robot": "agilex_piper"}).status_code == 409
+    assert not wire.heard
+    assert asked(replay=named).status_code == 200
+    (heard,) = wire.heard
+    assert (heard.args["policy"]["path"], heard.args["task"]) == (str(data / "datasets" / "cups"), "task 1")
+    assert (heard.role, heard.vouched) == ("operator", ["policy"])
+
+
+@pytest.mark.parametrize("uuid", ["../stations", "../episodes", ".", "", "/tmp", 7, None])
+def test_an_import_of_episodes_that_are_called_like_folders_touches_none(
+    foreign: Foreign, data: Path, done: Done, uuid: object
+) -> None:
+    latch = data / "stations" / "bench" / "latch.json"
+    latch.parent.mkdir(parents=True)
+    latch.write_text("{}", "utf-8")
+    told = foreign("cups") / "meta" / "eva_episodes.jsonl"
+    told.write_text(json.dumps({"episode_index": 0, "uuid": uuid}) + "\n", "utf-8")
+    refused = done(what="import", dataset="cups")
+    assert (refused["done"], "eva_episodes.jsonl has a line of no episode" in refused["why"]) == (False, True)
+    assert latch.is_file()

@@ -15,8 +15,8 @@ from asgiref.sync import async_to_sync
 from django.test import AsyncClient, Client
 from django.urls import reverse
 
+from evaweb.binary_frames import decode
 from evaweb.episodes.models import Episode
-from evaweb.frames import decode
 from evaweb.stations.models import Station
 from runtime.datasets.operations import convert
 from runtime.datasets.published import publish

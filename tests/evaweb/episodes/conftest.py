@@ -17,8 +17,8 @@ from evaweb.jobs.models import Job
 from evaweb.jobs.services import work
 from evaweb.stations.models import Station
 from runtime.recording.export import export
-from tests.runtime.station import Station as Bench
-from tests.runtime.station import plan
+from tests.runtime.lockstep_station import Station as Bench
+from tests.runtime.lockstep_station import plan
 
 FRAMES = 24
 HELD = 6

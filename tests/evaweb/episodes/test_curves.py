@@ -10,17 +10,17 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from evaweb.binary_frames import decode
 from evaweb.episodes import poses as posing
 from evaweb.episodes.curves import curves, held_spans
 from evaweb.episodes.poses import poses
 from evaweb.errors import NotFound
-from evaweb.frames import decode
-from evaweb.stations.looks import looks_of
+from evaweb.stations.robot_geometry import looks_of
 from runtime.recording.files import RecordingError
 from runtime.recording.reader import open_episode
 from runtime.recording.tables import write_table
+from tests.runtime.lockstep_station import STANDS, Station, column, plan
 from tests.runtime.recording.test_tables import old_raw
-from tests.runtime.station import STANDS, Station, column, plan
 
 
 @pytest.fixture(scope="module")

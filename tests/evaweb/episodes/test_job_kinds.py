@@ -174,6 +174,7 @@ def test_an_interrupted_episode_is_published_only_where_it_was_scored(closed: Cl
 def test_an_episode_without_rows_is_no_failure_and_in_no_dataset(closed: Closed, data: Path) -> None:
     episode = closed()
     unsealed(data / "episodes" / str(episode.uuid), frames=0)
+    Episode.objects.update(seal="")
     score(data, episode, False)
     job = publish(episode)
     assert job.status == JobStatus.DONE
@@ -198,6 +199,7 @@ def test_an_episode_that_is_still_being_written_is_tried_again(closed: Closed, d
     outcome = data / "episodes" / str(episode.uuid) / "outcome.json"
     content = outcome.read_bytes()
     outcome.unlink()
+    Episode.objects.update(status="recording")
     job = publish(episode)
     assert job.status == JobStatus.QUEUED
     assert "has no outcome.json" in job.error
@@ -215,6 +217,7 @@ def test_a_robot_whose_name_leads_out_of_the_folder_is_refused(closed: Closed, d
     manifest["robot"]["name"] = "../../outside"
     path.write_text(json.dumps(manifest))
     resealed(path.parent)
+    Episode.objects.update(seal="")
     assert "robot.name is '../../outside'" in publish(episode).error
 
 
@@ -304,6 +307,7 @@ def sim_manifest(data: Path, episode: Episode) -> None:
     path = data / "episodes" / str(episode.uuid) / "manifest.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"mode": "sim"}))
     resealed(path.parent)
+    Episode.objects.update(seal="")
 
 
 def test_a_run_with_a_simulated_robot_is_not_even_queued(closed: Closed, data: Path) -> None:

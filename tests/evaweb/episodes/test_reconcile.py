@@ -198,6 +198,7 @@ def test_a_station_that_is_gone_is_known_to_be_simulated_from_its_recordings(
     manifest["configuration"]["transport"] = {"kind": "zmq", "simulated": True}
     (folder / "manifest.json").write_text(json.dumps(manifest))
     resealed(folder)
+    Episode.objects.update(seal="")
     reconcile()
     assert Station.objects.get().simulated is True
 

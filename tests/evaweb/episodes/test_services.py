@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import uuid
 from collections.abc import Callable
 from datetime import timedelta
@@ -18,6 +17,7 @@ from evaweb.errors import EvaError
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Station
 from runtime.recording.repair import repair
+from tests.runtime.recording.samples import unended, unsealed
 
 pytestmark = pytest.mark.django_db
 
@@ -104,7 +104,7 @@ def test_an_event_that_names_no_episode_is_refused(station: Station, given: obje
 
 def test_a_repaired_recording_is_closed_without_an_event(put: Callable[..., Path], station: Station) -> None:
     folder = put()
-    (folder / "outcome.json").unlink()
+    unended(folder)
     opened(station, folder.name)
     assert services.catch_up() == 0
     repair(folder)
@@ -118,7 +118,7 @@ def test_a_recording_closed_with_an_unusable_outcome_fails_with_the_file_named(
 ) -> None:
     folder = put()
     opened(station, folder.name)
-    (folder / "outcome.json").write_text(json.dumps({"status": "fine", "frames": 2}))
+    unsealed(folder, status="fine", frames=2)
     assert services.catch_up() == 0
     episode = Episode.objects.get()
     assert episode.status == EpisodeStatus.FAILED

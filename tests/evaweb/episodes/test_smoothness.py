@@ -17,7 +17,7 @@ from evaweb.jobs.models import Job
 from evaweb.jobs.services import work
 from evaweb.statistics.smoothness import sparc
 from runtime.recording.reader import open_episode
-from tests.runtime.station import STANDS
+from tests.runtime.lockstep_station import STANDS
 
 RATE = 30.0
 

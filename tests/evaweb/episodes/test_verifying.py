@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
@@ -21,8 +22,9 @@ from evaweb.errors import Conflict
 from evaweb.jobs import services as jobs
 from evaweb.jobs.models import Job, JobStatus
 from runtime.recording.quarantine import marked
-from runtime.recording.scrub import UNSEALED
-from tests.runtime.recording.samples import unsealed
+from runtime.recording.repair import repair
+from runtime.recording.verdict import UNSEALED
+from tests.runtime.recording.samples import unended, unsealed
 
 pytestmark = pytest.mark.django_db
 
@@ -158,6 +160,7 @@ def test_figures_of_damaged_rows_are_not_measured(old: Episode, data: Path) -> N
 
 def test_an_older_recording_is_published_and_said_to_have_no_digests(old: Episode, data: Path) -> None:
     unsealed(folder_of(data, old))
+    Episode.objects.update(seal="")
     assert scrubbed().result["unsealed"] == 1
     job = services.publish_asked(episode=old)
     jobs.work("lab")
@@ -171,3 +174,76 @@ def test_a_recording_that_is_gone_keeps_none_of_the_others(old: Episode, data: P
     assert (job.status, job.result["sound"]) == (JobStatus.DONE, 0)
     assert "is no episode" in job.result["problems"][0]
     assert not look_for_unverified()
+
+
+# --- an outcome that is lost ---------------------------------------------------------------------------------
+
+
+def again() -> Job:
+    """The next look, a month later."""
+    jobs.work("lab")
+    Episode.objects.update(verified_at=None, created_at=timezone.now() - timedelta(days=7))
+    return scrubbed()
+
+
+def test_a_closed_recording_that_lost_its_outcome_is_damaged_until_it_is_back(
+    old: Episode, data: Path
+) -> None:
+    folder = folder_of(data, old)
+    (folder / "outcome.json").unlink()
+    (problem,) = reconcile().problems
+    assert "outcome.json is absent, though the recording was closed as finished" in problem
+    for _ in range(2):
+        job = again()
+        assert (job.result["damaged"], job.result["open"]) == (1, 0)
+        assert "outcome.json is absent, though" in job.result["found"][0]["why"]
+        old.refresh_from_db()
+        assert (old.status, old.damage) == ("finished", marked(data, str(old.uuid)))
+    assert repair(folder).verdict == "restored"
+    assert again().result["sound"] == 1
+    old.refresh_from_db()
+    assert (old.damage, marked(data, str(old.uuid))) == ([], [])
+
+
+def test_one_that_lost_both_is_marked_and_then_not_sealed_by_repair(old: Episode, data: Path) -> None:
+    folder = folder_of(data, old)
+    unended(folder)
+    assert again().result["damaged"] == 1
+    assert repair(folder).verdict == "damaged"
+    assert not (folder / "outcome.json").exists()
+    old.refresh_from_db()
+    assert old.damage
+
+
+def test_one_that_was_sealed_anew_before_anybody_looked_is_damaged_and_not_published(
+    old: Episode, data: Path
+) -> None:
+    folder = folder_of(data, old)
+    aside = {name: (folder / name).read_bytes() for name in ("outcome.json", "sealed.json", "rows.arrow")}
+    unended(folder)
+    shutil.rmtree(data / "exports")
+    (folder / "rows.arrow").write_bytes(aside["rows.arrow"][:-20])
+    assert repair(folder).verdict == "repaired"
+    publication = services.publish_asked(episode=old)
+    jobs.work("lab")
+    publication.refresh_from_db()
+    said = "outcome.json is not the one with which the recording was closed"
+    assert publication.result["published"] is False
+    assert said in publication.result["why"]
+    (problem,) = reconcile().problems
+    assert said in problem
+    assert said in again().result["found"][0]["why"]
+    old.refresh_from_db()
+    assert (old.status, [one["file"] for one in old.damage]) == ("finished", ["outcome.json"])
+    for name, content in aside.items():
+        (folder / name).write_bytes(content)
+    assert again().result["sound"] == 1
+    assert reconcile().problems == ()
+    assert marked(data, str(old.uuid)) == []
+
+
+def test_a_folder_with_nothing_by_which_it_is_an_episode_is_damaged(old: Episode, data: Path) -> None:
+    unended(folder_of(data, old))
+    (folder_of(data, old) / "manifest.json").unlink()
+    assert again().result["damaged"] == 1
+    assert [one["file"] for one in marked(data, str(old.uuid))] == ["manifest.json", "outcome.json"]

@@ -17,9 +17,9 @@ from django.test import AsyncClient, Client
 from django.urls import reverse
 
 import robots
+from evaweb.binary_frames import decode
 from evaweb.episodes import streaming
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.frames import decode
 from evaweb.jobs import services as jobs
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Station
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.django_db
 @pytest.fixture
 def user() -> User:
     made = User.objects.create_user("ann")
-    made.groups.add(Group.objects.get(name="operator"))
+    made.groups.add(Group.objects.get_or_create(name="operator")[0])
     return made
 
 

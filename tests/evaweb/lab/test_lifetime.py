@@ -4,6 +4,7 @@ import socket
 import pytest
 
 from evaweb.lab import lifetime
+from evaweb.lab.lab import a_lab
 from evaweb.lab.processes import LabError
 
 
@@ -17,6 +18,18 @@ def test_a_taken_port_names_the_option_and_leaves_its_holder_alone():
         ):
             lifetime.require_free("127.0.0.1", port)
         assert other.fileno() > 0
+
+
+def test_a_port_that_stops_cannot_have_ends_a_lab_before_anything_starts(tmp_path, settings):
+    settings.DATA_DIR = tmp_path
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        for ports in ((0, port), (port - 1, None)):
+            with pytest.raises(LabError, match=rf":{port}: .* with --stop-port"), a_lab("127.0.0.1", *ports):
+                pass
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_free_port_stays_free_after_the_look():

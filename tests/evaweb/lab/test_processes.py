@@ -1,13 +1,24 @@
 import os
 import signal
+import socket
 import sys
 from pathlib import Path
 
 import pytest
 
+from evaweb.lab import programs
 from evaweb.lab.processes import LabError, Processes, Program, processor_s
+from evaweb.listening import PortTaken, listen
 from tests.processes import alive, eventually
 
+ANSWERS = """
+import socket, sys
+listener = socket.socket(fileno=int(sys.argv[1]))
+listener.setblocking(True)
+print("{}", flush=True)
+while True:
+    listener.accept()[0].sendall(b"here")
+"""
 WAITS = "import sys\nsys.stdin.read()\n"
 SAYS = 'import sys\nprint(\'{"url": "here %s"}\' % sys.argv[1], flush=True)\nsys.stdin.read()\n'
 STUBBORN = "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\ntime.sleep(600)\n"
@@ -37,6 +48,21 @@ def test_what_dies_is_started_again_where_it_was(processes):
     assert processes.pids()["one"] != before
     written = processes._logs / "one.log"
     eventually(lambda: "here here first" in written.read_text(), 20, "it announces itself again")
+
+
+def test_a_port_of_ours_is_never_free_and_who_calls_is_answered_by_the_next_process(processes):
+    with listen("127.0.0.1", 0) as listener:
+        descriptor, address = listener.fileno(), listener.getsockname()
+        arguments = ("-c", ANSWERS, str(descriptor))
+        processes.start(Program("one", arguments, announces=True, patience_s=0.1, descriptors=(descriptor,)))
+        before = processes.pids()["one"]
+        os.kill(before, signal.SIGKILL)
+        eventually(lambda: not alive(before), 20, "its end")
+        with pytest.raises(PortTaken, match="cannot listen"):
+            listen(*address)
+        with socket.create_connection(address, 20) as caller:
+            processes.watch()
+            assert caller.recv(4) == b"here"
 
 
 def test_what_dies_too_often_rests_and_takes_nobody_with_it(processes, caplog):
@@ -117,3 +143,28 @@ def test_they_end_with_us_even_when_we_are_killed(tmp_path):
     parent.wait()
     eventually(lambda: not alive(int(written.read_text())), 20, "the end of the child")
     assert parent.returncode == -signal.SIGKILL
+
+
+_OF_WEB = (programs.web("h", 1), programs.worker(["lab"]), programs.stops(2, "1"))
+
+
+def test_the_process_for_stops_has_a_socket_of_the_labs_and_gives_way_to_nobody():
+    stops = programs.stops(7, "8000")
+    assert (stops.announces, stops.nice, stops.descriptors) == (True, 0, (7,))
+    assert stops.arguments[1:] == ("stops", "--descriptor", "7", "--web-port", "8000")
+
+
+def test_the_webs_secrets_reach_the_web_and_nobody_else(tmp_path):
+    says = "import json, os, sys\nprint(json.dumps(dict(os.environ)), flush=True)\nsys.stdin.read()\n"
+    secrets = {"EVA_SECRET_KEY": "canary", "HF_TOKEN": "canary"}
+    made = Processes(tmp_path, tmp_path / "logs", os.environ | secrets)
+    try:
+        web = made.start(Program("web", ("-c", says), announces=True, of_web=True))
+        station = made.start(Program("station", ("-c", says), announces=True))
+        assert {name: web[name] for name in secrets} == secrets
+        assert not secrets.keys() & station.keys()
+        assert "canary" not in Path(f"/proc/{made.pids()['station']}/environ").read_text()
+        assert [p.of_web for p in _OF_WEB] == [True] * len(_OF_WEB)
+        assert not programs.station("d.toml", ()).of_web
+    finally:
+        made.end()

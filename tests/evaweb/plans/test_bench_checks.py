@@ -1,7 +1,7 @@
 import pytest
 
 from evaweb.errors import Conflict, EvaError, NotFound
-from evaweb.plans import bench as looking
+from evaweb.plans import bench_checks as looking
 from evaweb.plans import pictures
 from evaweb.plans.models import Achieved, CameraCheck, Plan, Reference
 from evaweb.plans.services import plan_close, plan_freeze, plan_reveal

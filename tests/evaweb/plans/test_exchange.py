@@ -71,7 +71,8 @@ def test_a_frozen_plan_is_not_changed_by_a_file(draft, owner, admin):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[[scene", "this is not TOML"),
+        ("[[scene", "the file: is not valid TOML"),
+        ("[" + ".".join("a" * 20_000) + "]", "allowed: at most 40"),
         (
             "[[scene]]\nname='a'\ntitle='A'\ninstruction='go'\ncolour='red'\n[[scene.position]]\nnumber=1",
             "colour",

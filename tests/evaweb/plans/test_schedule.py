@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaweb.errors import EvaError
-from evaweb.plans.blinding import codes, commitment, verified
 from evaweb.plans.canonical import canonical, difference, digest
-from evaweb.plans.chance import Chance, new_key
+from evaweb.plans.commitment import codes, commitment, verified
 from evaweb.plans.schedule import Condition, schedule
+from evaweb.plans.seeded_draws import Chance, new_key
 
 KEY = bytes(range(32))
 JSON = st.recursive(

@@ -3,17 +3,17 @@ from collections import Counter
 import pytest
 from django.db import IntegrityError, transaction
 
+from evaweb.blinding import sight_of
 from evaweb.errors import Conflict, EvaError, NotAllowed
-from evaweb.plans.blinding import commitment, schedule_digest
+from evaweb.plans.allocation import give_back, hand_out, progress
+from evaweb.plans.blinding_rules import look, sealed_for
 from evaweb.plans.canonical import digest
+from evaweb.plans.commitment import commitment, schedule_digest
 from evaweb.plans.documents import conditions_of
 from evaweb.plans.guarded import GUARDS
-from evaweb.plans.handing import give_back, hand_out, progress
 from evaweb.plans.models import Look, Plan, PlanState
 from evaweb.plans.schedule import schedule
 from evaweb.plans.services import plan_amend, plan_close, plan_freeze, plan_reveal
-from evaweb.plans.sight import look, sealed_for
-from evaweb.sight import sight_of
 from evaweb.stations.models import Station
 from evaweb.trials import services as trials
 from evaweb.trials.models import Trial

@@ -2,12 +2,12 @@
 
 import pytest
 
-from evaweb.plans import pacing
-from evaweb.plans.handing import hand_out
+from evaweb.plans import setup_padding as pacing
+from evaweb.plans.allocation import hand_out
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_freeze
-from evaweb.trials.bench import setup_args, trial_command
 from evaweb.trials.models import Trial
+from evaweb.trials.station_commands import setup_args, trial_command
 from tests.evaweb.trials import builders
 
 
@@ -72,7 +72,7 @@ def test_how_long_it_took_is_kept_when_the_run_is_asked_for_and_a_repeated_set_u
 ):
     trial = bench.prepare()
     draws = iter((5.0, 6.0, 7.0))
-    monkeypatch.setattr("evaweb.trials.bench._least", [lambda trial: {"warm_up_s": next(draws)}])
+    monkeypatch.setattr("evaweb.trials.station_commands._least", [lambda trial: {"warm_up_s": next(draws)}])
     order = {"user": bench.operator, "page": "p1", "epoch": 3, "boot": builders.BOOT, "sequence": 5}
     row = trial_command(trial=trial, kind="setup", **order)
     assert row.args["least"] == {"warm_up_s": 5.0}

@@ -9,7 +9,7 @@ import pytest
 from evaweb.errors import StationGone
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint
-from runtime.messages import Ack, Command
+from runtime.ipc.messages import Ack, Command
 from tests.evaweb.trials import builders
 
 OK = {
@@ -81,7 +81,7 @@ class Runtime:
         if self.gone is not None:
             raise self.gone
         if command.kind in self.lost:
-            from evaweb.stations.wire import NoAnswer
+            from evaweb.stations.runtime_client import NoAnswer
 
             raise NoAnswer(f"no answer to {command.kind}")
         if command.kind == "policy_server":

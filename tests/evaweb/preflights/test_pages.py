@@ -7,13 +7,13 @@ from django.test import Client
 from django.urls import reverse
 from django.utils import timezone
 
+from evaweb.plans.blinding_rules import look
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_freeze, plan_reveal
-from evaweb.plans.sight import look
+from evaweb.preflights.blinding_rules import shown
 from evaweb.preflights.models import Preflight
 from evaweb.preflights.reading import STAGES, ago, read
 from evaweb.preflights.services import preflight_ask
-from evaweb.preflights.sight import shown
 from evaweb.trials.models import Checkpoint
 from runtime.preflight.verdict import Stage
 from tests.evaweb.preflights.conftest import CLOSED, OK
@@ -238,7 +238,7 @@ def test_the_console_has_its_button_where_a_checkpoint_is_chosen(operator, bench
 
 
 def test_the_chronicle_fetches_what_nobody_looks_at(bench, checkpoint, runtime):
-    from evaweb.console.chronicle import Scribe
+    from evaweb.console.event_ingest import Scribe
     from evaweb.console.feed import Feeds, Link
 
     row = preflight_ask(user=bench.operator, checkpoint=checkpoint, station=bench.station)

@@ -13,7 +13,7 @@ from evaweb.preflights import job_kinds
 from evaweb.preflights.models import Preflight, PreflightStatus, Verdict
 from evaweb.preflights.services import preflight_ask, preflight_settled, preflights_settled
 from evaweb.stations.models import Station
-from evaweb.stations.wire import NoAnswer
+from evaweb.stations.runtime_client import NoAnswer
 from runtime.preflight import verdict as runtimes_own
 from tests.evaweb.preflights.conftest import CLOSED, OK, Runtime
 from tests.evaweb.trials import builders
@@ -162,7 +162,7 @@ def resting(other, tmp_path):
 def test_where_the_station_does_not_run_the_worker_asks(ask, resting, checkpoint, monkeypatch):
     asked = []
     monkeypatch.setattr(
-        "runtime.preflight.child.fly", lambda line, longest: asked.append(line) or dict(CLOSED)
+        "runtime.station.preflight_child.fly", lambda line, longest: asked.append(line) or dict(CLOSED)
     )
     row = ask(station=resting)
     assert (row.by, row.status) == ("worker", "running")
@@ -177,7 +177,9 @@ def test_where_the_station_does_not_run_the_worker_asks(ask, resting, checkpoint
 
 def test_a_job_that_is_done_twice_asks_once(ask, resting, monkeypatch):
     asked = []
-    monkeypatch.setattr("runtime.preflight.child.fly", lambda line, longest: asked.append(line) or dict(OK))
+    monkeypatch.setattr(
+        "runtime.station.preflight_child.fly", lambda line, longest: asked.append(line) or dict(OK)
+    )
     row = ask(station=resting)
     done = job_kinds.Work({"preflight": str(row.pk)}, lambda text: None)
     assert job_kinds.preflight(done) == job_kinds.preflight(done) == {"verdict": "ok"}

@@ -1,10 +1,10 @@
 import pytest
 
 from evaweb.episodes.folders import preview_folder
-from evaweb.plans.handing import hand_out
+from evaweb.plans.allocation import hand_out
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
-from evaweb.results import caching
+from evaweb.results.analysis import caching
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint
 from tests.evaweb.trials import builders

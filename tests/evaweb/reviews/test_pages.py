@@ -105,7 +105,7 @@ SPANS = st.lists(
 
 
 @needs_node
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(SPANS)
 def test_segments_that_overlap_lie_below_each_other(spans):
     segments = [{"first": first, "last": last} for first, last in sorted(spans)]

@@ -5,9 +5,9 @@ import json
 import pytest
 from django.contrib.auth.models import User
 
+from evaweb.append_only import removal
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import reconcile
-from evaweb.guards import removal
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import work
 from evaweb.reviews import services
@@ -89,6 +89,28 @@ def test_a_torn_line_never_counted_and_a_wrong_one_is_named(spoken, data):
     path.write_text(json.dumps({"kind": "review", "uuid": str(spoken.uuid), "verdict": "perhaps"}) + "\n")
     (problem,) = reconcile().problems
     assert "line 1 of its reviews: review.verdict is 'perhaps'" in problem
+
+
+def test_a_line_that_is_there_twice_is_one_review_and_the_last_counts(spoken, data):
+    path = data / "reviews" / f"{spoken.uuid}.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join([lines[0].replace(b'"pass"', b'"fail"'), *lines, *lines]))
+    before = everything()
+    lose()
+    report = reconcile()
+    assert (report.problems, report.restored) == ((), 3)
+    assert everything() == before
+    assert reconcile().restored == 0
+
+
+@pytest.mark.parametrize("kind", ["review", "segment"])
+def test_what_is_said_of_another_episode_is_named(spoken, data, closed, kind):
+    other = closed("interrupted")
+    lines = (data / "reviews" / f"{spoken.uuid}.jsonl").read_text().splitlines(keepends=True)
+    line = next(line for line in lines if f'"kind":"{kind}"' in line)
+    (data / "reviews" / f"{other.uuid}.jsonl").write_text(line)
+    (problem,) = reconcile().problems
+    assert f"its {kind} {json.loads(line)['uuid']} is of episode {spoken.uuid}" in problem
 
 
 def test_a_damaged_report_is_named(spoken, data):

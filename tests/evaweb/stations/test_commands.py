@@ -7,14 +7,15 @@ from uuid import uuid4
 
 import pytest
 from django.db import OperationalError
+from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.stations import commands, leases, stops
 from evaweb.stations.commands import NotSent, issue, settle
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.stations.stops import HARDWARE_STOP
-from runtime.effects import Situation
-from runtime.transitions import COMMANDS, STOPPING
+from runtime.processes.coordinator.session.effects import GuardFacts
+from runtime.processes.coordinator.session.transitions import COMMANDS, STOPPING
 
 pytestmark = pytest.mark.django_db
 
@@ -54,13 +55,13 @@ def test_an_accepted_command_is_a_row_with_its_answer(held, runtime):
 @pytest.mark.parametrize(
     ("kind", "args", "situation"),
     [
-        ("tune", {"strategy": {"kind": "sync"}, "task": "wave"}, Situation()),
-        ("step", {}, Situation(mode="step")),
-        ("commit", {}, Situation(mode="preview", proposed=True)),
-        ("cancel", {}, Situation(mode="manual")),
-        ("move", {"joints": [0.1] * 14, "speed": 0.5}, Situation(mode="manual")),
-        ("gripper", {"arm": "left_arm", "action": "lock"}, Situation()),
-        ("approach", {}, Situation(mode="preview", proposed=True)),
+        ("tune", {"strategy": {"kind": "sync"}, "task": "wave"}, GuardFacts()),
+        ("step", {}, GuardFacts(mode="step")),
+        ("commit", {}, GuardFacts(mode="preview", proposed=True)),
+        ("cancel", {}, GuardFacts(mode="manual")),
+        ("move", {"joints": [0.1] * 14, "speed": 0.5}, GuardFacts(mode="manual")),
+        ("gripper", {"arm": "left_arm", "action": "lock"}, GuardFacts()),
+        ("approach", {}, GuardFacts(mode="preview", proposed=True)),
     ],
 )
 def test_what_a_run_by_hand_is_steered_with_arrives_with_its_arguments(held, runtime, kind, args, situation):
@@ -74,7 +75,7 @@ def test_what_a_run_by_hand_is_steered_with_arrives_with_its_arguments(held, run
 @pytest.mark.parametrize(("kind", "args"), [("tune", {"task": "x"}), ("gripper", {"action": "open"})])
 def test_nobody_changes_what_a_trial_measures(held, runtime, kind, args):
     issue(kind="run", **held, **seen(runtime))
-    runtime.situated(Situation(mode="continuous", trial=True))
+    runtime.situated(GuardFacts(mode="continuous", trial=True))
     row = issue(kind=kind, args=args, **held, **seen(runtime))
     assert row.status == CommandStatus.REFUSED
     assert "the open run is one of a trial" in row.reason
@@ -160,6 +161,21 @@ def test_a_viewer_presses_the_estop(live, vera, runtime):
     row = issue(user=vera, station=live, kind="estop", args={"why": "smoke"})
     assert Command.objects.get(pk=row.pk).status == CommandStatus.DONE
     assert [(c.user, c.args) for c in runtime.pressed] == [("vera", {"why": "smoke"})]
+
+
+@pytest.mark.parametrize(("answered", "how"), [("mine", "anew"), ("another's", "already")])
+def test_a_press_that_shared_anothers_answer_does_not_say_that_it_latched(
+    live, ann, monkeypatch, answered, how
+):
+    noted, uuid = [], uuid4()
+    monkeypatch.setattr(commands.notes, "note", noted.append)
+    said = {"latched": "anew", "carried_out_at": 10.0}
+    answer = stops.Answer(CommandStatus.DONE, data=said, uuid=str(uuid) if answered == "mine" else "x")
+    at = timezone.now() - timedelta(seconds=3)
+    commands.estop_noted(user=ann, station=live, why="smoke", uuid=uuid, answer=answer, at=at)
+    (row,) = noted
+    assert (row.data["latched"], row.data["carried_out_at"]) == (how, 10.0)
+    assert row.issued_at == at, "when it was pressed, not when it was noted"
 
 
 def test_a_kind_that_there_is_not_names_those_that_there_are(live, ann):

@@ -10,8 +10,8 @@ import pytest
 import robots
 from evaweb.errors import NotFound
 from evaweb.stations.geometry import geometry
-from evaweb.stations.looks import looks_of
 from evaweb.stations.models import Station
+from evaweb.stations.robot_geometry import looks_of
 from evaweb.stations.surroundings import BENCH
 
 

@@ -13,8 +13,8 @@ from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.stations import leases
 from evaweb.stations.holders import who
 from evaweb.stations.models import Lease, LeaseRequest
+from evaweb.stations.runtime_client import wire_to
 from evaweb.stations.selectors import lease_open, request_list
-from evaweb.stations.wire import wire_to
 
 pytestmark = pytest.mark.django_db
 
@@ -254,7 +254,7 @@ def test_a_restart_ends_all_leases_before_it(live, runtime, ann):
 
 
 def test_the_lease_of_a_terminal_is_written_down(live, runtime):
-    leases._tell(live.name, "lease_claim", "terminal:eve@bench", 0)
+    leases._tell(live.name, "lease_claim", "terminal:eve@bench", 0, "operator")
     assert notice(live, runtime)
     lease = lease_open(station=live)
     assert (lease.holder, lease.user) == ("terminal:eve@bench", None)
@@ -264,7 +264,7 @@ def test_the_lease_of_a_terminal_is_written_down(live, runtime):
 def test_a_terminal_that_took_a_free_station_ends_the_row_of_the_one_before(live, runtime, ann):
     mine = claim(ann, live)
     leases._tell(live.name, "lease_give_up", mine.holder, mine.epoch)
-    leases._tell(live.name, "lease_claim", "terminal:eve@bench", 0)
+    leases._tell(live.name, "lease_claim", "terminal:eve@bench", 0, "operator")
     assert notice(live, runtime)
     mine.refresh_from_db()
     assert mine.end_reason == "expired: it was not renewed"

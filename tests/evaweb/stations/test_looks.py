@@ -7,8 +7,8 @@ import pytest
 
 import robots
 from evaweb.errors import NotFound
-from evaweb.stations import looks as looks_module
-from evaweb.stations.looks import Looks, facts_of, groups_of, looks_of
+from evaweb.stations import robot_geometry as looks_module
+from evaweb.stations.robot_geometry import Looks, facts_of, groups_of, looks_of
 from runtime.kinematics.base import KinematicsError
 from runtime.sim.bench import tip_in_world
 

@@ -10,7 +10,7 @@ import pytest
 
 import robots
 from evaweb.errors import NotFound
-from evaweb.stations import looks
+from evaweb.stations import robot_geometry as looks
 from evaweb.stations.geometry import geometry
 from evaweb.stations.meshes import mesh_content
 

@@ -8,9 +8,9 @@ import pytest
 from evaweb.stations import stops
 from evaweb.stations.holders import readable
 from evaweb.stations.models import CommandStatus
+from evaweb.stations.runtime_client import StationWire
 from evaweb.stations.stops import HARDWARE_STOP
-from evaweb.stations.wire import StationWire
-from runtime.messages import Ack
+from runtime.ipc.messages import Ack
 
 
 def test_an_estop_without_answer_says_use_the_hardware_stop(runtime):
@@ -45,7 +45,8 @@ def test_an_estop_is_obeyed(runtime):
 def test_a_refused_stop_names_who_has_the_lease(runtime, kind):
     runtime.ready()
     runtime.do(lambda: runtime.lease.claim("web:ann:p1", 3, time.monotonic()))
-    answer = stops.stop(kind=kind, station=runtime.name, username="bob", page="p2", epoch=1, uuid=uuid4())
+    order = stops.order(kind=kind, username="bob", page="p2", epoch=1, uuid=uuid4())
+    answer = stops.ask(order, runtime.name).result()
     assert (answer.status, answer.reason) == (CommandStatus.REFUSED, "ann holds the lease")
 
 

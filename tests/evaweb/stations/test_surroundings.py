@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import robots
-from evaweb.stations.looks import looks_of
+from evaweb.stations.robot_geometry import looks_of
 from evaweb.stations.surroundings import AREA, BENCH, bounds, surroundings
 from robots.visuals import Visual
 from runtime.sim.bench import Bench

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
+from copy import copy
 from datetime import timedelta
 from uuid import UUID, uuid4
 
@@ -10,7 +12,7 @@ import pytest
 from django.db import OperationalError, connection
 from django.utils import timezone
 
-from evaweb.errors import NotFound
+from evaweb.errors import Conflict, NotFound
 from evaweb.stations import commands, leases, unwritten
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.stations.unwritten import Unwritten
@@ -54,7 +56,7 @@ def test_a_halt_during_a_locked_database_is_carried_out_and_written_when_the_loc
     live, ann, runtime, monkeypatch, folder
 ):
     monkeypatch.setattr(unwritten, "_AGAIN_S", 0.01)
-    monkeypatch.setattr(commands, "_NOTE_S", 0.0)
+    monkeypatch.setattr(commands.notes, "note", commands.unwritten.keep)
     tried = []
     written = commands._written
 
@@ -94,7 +96,7 @@ def test_another_process_writes_what_one_that_has_ended_left(halted, ann, folder
     row.issued_at = timezone.now() - timedelta(minutes=5)
     Unwritten(away).keep(row)
     assert Unwritten(away).attempt() is True
-    assert [path.name for path in folder.iterdir()] == [f"{row.uuid}.json"]
+    assert [path.name for path in folder.iterdir()] == [f"{row.uuid}.{os.getpid()}.json"]
     later = Unwritten(commands._written)
     assert later.attempt() is False
     found = Command.objects.get()
@@ -159,7 +161,7 @@ def test_what_the_database_refuses_for_good_keeps_nothing_else_waiting(halted, f
     assert one.attempt() is False
     assert rows == [row.uuid]
     assert {path.suffix for path in folder.iterdir()} == {".refused"}
-    assert f"{refused.uuid}.refused" in {path.name for path in folder.iterdir()}
+    assert f"{refused.uuid}.{os.getpid()}.refused" in {path.name for path in folder.iterdir()}
     assert "station 'gone' does not exist" in caplog.text
 
 
@@ -186,7 +188,7 @@ def test_a_number_that_no_database_has_keeps_nothing_else_waiting(halted, folder
         one.keep(each)
     assert one.attempt() is False
     assert Command.objects.get().uuid == row.uuid
-    assert [path.name for path in folder.iterdir()] == [f"{refused.uuid}.refused"]
+    assert [path.name for path in folder.iterdir()] == [f"{refused.uuid}.{os.getpid()}.refused"]
 
 
 @pytest.mark.usefixtures("asleep")
@@ -199,8 +201,100 @@ def test_a_file_that_the_disk_does_not_give_is_tried_again_and_the_others_are_wr
     (folder / "0.json").mkdir()
     path = unwritten._path
     with monkeypatch.context() as patch:
-        patch.setattr(unwritten, "_path", lambda name: folder if name == str(rows[0].uuid) else path(name))
+        patch.setattr(
+            unwritten, "_path", lambda name: folder if name.startswith(str(rows[0].uuid)) else path(name)
+        )
         assert one.attempt() is True
     assert set(Command.objects.values_list("uuid", flat=True)) == {row.uuid for row in rows[1:]}
     assert one.attempt() is False
     assert Command.objects.count() == 3
+
+
+@pytest.fixture
+def pressed(halted, ann, bob):
+    """One press as a process heard of it."""
+    uuid, station = uuid4(), halted().station
+
+    def heard(status=CommandStatus.DONE, user=ann, kind="estop", **given):
+        return Command(uuid=uuid, station=station, user=user, kind=kind, status=status, **given)
+
+    return heard
+
+
+@pytest.mark.usefixtures("asleep")
+def test_two_processes_that_carried_out_one_press_have_a_file_each_and_it_is_one_row(
+    pressed, folder, monkeypatch
+):
+    web, stops = Unwritten(commands._written), Unwritten(commands._written)
+    web.keep(pressed(CommandStatus.FAILED, reason="the station is gone"))
+    monkeypatch.setattr(os, "getpid", lambda: 1)
+    stops.keep(pressed())
+    assert len(list(folder.iterdir())) == 2
+    assert [one.attempt() for one in (web, stops)] == [False, False]
+    assert list(folder.iterdir()) == []
+    assert (Command.objects.get().status, Command.objects.get().reason) == ("done", "")
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_whichever_way_is_written_first_the_row_has_what_was_done_and_by_whom(pressed, ann, order):
+    ways = [pressed(), pressed(CommandStatus.UNKNOWN, None, args={"unverified": "the database hung"})]
+    for number in order:
+        commands._written(ways[number])
+    row = Command.objects.get()
+    assert (row.status, row.user, row.args) == ("done", ann, {})
+
+
+def latched(at, how="anew"):
+    return {"latched": how, "carried_out_at": at}
+
+
+def test_a_press_that_latched_anew_with_the_uuid_of_an_earlier_one_has_a_row_of_its_own(pressed, ann):
+    first, again = pressed(data=latched(10.0)), pressed(data=latched(20.0))
+    for row in (first, again, again, first):  # each may be tried more than once
+        commands._written(copy(row))
+    kept, late = Command.objects.order_by("answered_at", "issued_at")
+    assert (kept.uuid, kept.data) == (first.uuid, latched(10.0))
+    assert late.uuid != first.uuid
+    assert (late.user, late.status, late.issued_at) == (ann, "done", again.issued_at)
+    assert late.data["carried_out_at"] == 20.0
+    assert late.data["sent_uuid"] == str(first.uuid)
+    assert late.data["repeat"] == "pressed again, or a late copy: this uuid was carried out before"
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0)])
+def test_the_answer_to_an_earlier_press_is_no_row_more_and_hides_not_that_it_latched(pressed, order):
+    ways = [
+        pressed(data=latched(10.0)),
+        pressed(data=latched(10.0, "before")),
+        pressed(CommandStatus.UNKNOWN, None),
+    ]
+    for number in order:
+        commands._written(ways[number])
+    assert Command.objects.get().data == latched(10.0)
+
+
+@pytest.mark.parametrize("how", ["anew", "already", "before"])
+def test_a_press_with_the_uuid_of_another_persons_has_a_row_of_its_own(pressed, ann, bob, how):
+    commands._written(pressed(data=latched(10.0)))
+    for _ in range(2):  # both ways
+        commands._written(pressed(user=bob, data=latched(10.0 if how == "before" else 11.0, how)))
+    rows = {row.user: row for row in Command.objects.all()}
+    assert len(rows) == Command.objects.count() == 2
+    assert rows[bob].data["sent_uuid"] == str(rows[ann].uuid)
+    assert rows[bob].data["latched"] == how
+    assert "another command" in rows[bob].data["repeat"]
+
+
+@pytest.mark.parametrize("user", ["ann", None])
+def test_a_press_with_the_uuid_of_a_run_has_a_row_of_its_own(pressed, ann, user):
+    run = pressed(kind="run")
+    run.save(force_insert=True)
+    commands._written(pressed(user=ann if user else None, data=latched(10.0)))
+    row = Command.objects.get(kind="estop")
+    assert (row.user, row.data["sent_uuid"]) == (ann if user else None, str(run.uuid))
+
+
+def test_a_uuid_is_still_no_other_commands(pressed):
+    commands._written(pressed())
+    with pytest.raises(Conflict):
+        commands._written(pressed(kind="halt"))

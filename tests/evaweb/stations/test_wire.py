@@ -10,8 +10,8 @@ import pytest
 from django.conf import settings
 
 from evaweb.errors import NotFound, StationGone
-from evaweb.stations.wire import NoAnswer, wire_to
-from runtime.messages import Command
+from evaweb.stations.runtime_client import NoAnswer, wire_to
+from runtime.ipc.messages import Command
 
 
 def test_status_is_the_snapshot_as_json_may_carry_it(runtime):
@@ -58,7 +58,7 @@ def test_a_restarted_runtime_is_found_at_its_new_address(runtime):
 
 def test_a_command_that_expires_is_void_when_nobody_waits_for_it_any_more(runtime):
     runtime.ready()
-    command = Command(str(uuid4()), "run", boot=runtime.boot)
+    command = Command(str(uuid4()), "run", boot=runtime.boot, role="operator")
     wire_to(runtime.name).request(command, timeout=0.5, expires=True)
     (arrived,) = runtime.commands
     assert time.monotonic() < arrived.valid_until < time.monotonic() + 0.6
@@ -80,6 +80,19 @@ def test_what_is_urgent_does_not_wait_behind_what_hangs(runtime):
             wire.status(timeout=0.05)
     finally:
         wire._lock.release()
+
+
+def test_what_is_urgent_follows_its_socket_to_another_place(runtime):
+    """The folder of a session goes, and the station listens elsewhere a second later."""
+    wire, nowhere = wire_to(runtime.name), "ipc:///tmp/nobody-listens-here"
+    there = wire.endpoints.read("guard")
+    wire.endpoints.write("guard", {"estop": nowhere})
+    listening = threading.Thread(target=lambda: (time.sleep(0.5), wire.endpoints.write("guard", there)))
+    listening.start()
+    press = Command(str(uuid4()), "estop", {"why": "test"})
+    assert wire.urgent(press, "guard", "estop", 30.0).uuid == press.uuid
+    listening.join()
+    assert [command.uuid for command in runtime.pressed] == [press.uuid]
 
 
 def test_threads_share_a_wire_and_each_gets_its_own_answer(runtime):

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaweb.results.recompute import means
+from evaweb.results.reports.recompute import means
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.means import average
 

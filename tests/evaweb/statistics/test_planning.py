@@ -3,7 +3,7 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
@@ -26,7 +26,6 @@ def test_the_published_numbers_of_trials():
     assert approximate_power(50, 0.5, 0.75) == pytest.approx(0.740, abs=5e-4)
 
 
-@settings(deadline=None)
 @given(st.integers(5, 95), st.integers(5, 95))
 def test_so_many_trials_have_the_power_and_one_less_has_not(one, other):
     p1, p2 = one / 100, other / 100

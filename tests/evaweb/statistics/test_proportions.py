@@ -2,7 +2,7 @@ import subprocess
 import sys
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evaweb.statistics.means import average
@@ -44,7 +44,6 @@ def test_wilson_of_eight_and_of_ten_out_of_ten():
     assert wilson(0, 10).low == 0.0
 
 
-@settings(deadline=None)  # the first call imports scipy
 @given(COUNTS, LEVELS)
 def test_both_intervals_are_those_of_scipy(counts, level):
     from scipy.stats import binomtest
@@ -57,7 +56,6 @@ def test_both_intervals_are_those_of_scipy(counts, level):
         assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=1e-9)
 
 
-@settings(deadline=None)  # the first call imports scipy
 @given(COUNTS, LEVELS)
 def test_an_interval_lies_within_0_and_1_and_holds_the_rate(counts, level):
     x, n = counts

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evaweb.statistics.base import StatisticsError
@@ -40,7 +40,6 @@ def test_without_cut_off_trials_the_restricted_mean_is_the_mean():
     assert restricted_mean([2.0, 4.0, 6.0], [True] * 3, until=3.0).value == pytest.approx(2 + 2 / 3)
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(0.5, 60), st.booleans()), min_size=1, max_size=40))
 def test_a_restricted_mean_is_the_area_under_the_curve(trials):
     durations, succeeded = zip(*trials, strict=True)

@@ -82,7 +82,7 @@ def test_barnard_refuses_counts_that_cannot_be():
         barnard(6, 5, 0, 5)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(COUNTS, COUNTS)
 def test_the_probability_to_be_better_is_that_of_the_posteriors(one, other):
     from scipy.integrate import quad

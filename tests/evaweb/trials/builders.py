@@ -14,7 +14,7 @@ from evaweb.episodes.models import Episode
 from evaweb.stations.models import Station
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene, Trial
-from runtime.messages import Ack, Command
+from runtime.ipc.messages import Ack, Command
 
 BOOT = "boot-1"
 

@@ -79,7 +79,7 @@ def test_an_admin_adds_a_scene_with_its_positions_and_milestones(admin):
     ("given", "sentence"),
     [
         ({"positions-TOTAL_FORMS": "0"}, "at least 1"),
-        ({"positions-0-bench": "{block: 1}"}, "This is not JSON"),
+        ({"positions-0-bench": "{block: 1}"}, "The table: is not valid JSON"),
         ({"positions-0-bench": '{"cup": [0, 0]}'}, "cup: unknown key; allowed: block, plate"),
         ({"time_limit_s": "0"}, "greater than or equal to 1"),
         ({"milestones-0-points": "0"}, "greater than or equal to 1"),
@@ -94,7 +94,9 @@ def test_a_scene_that_cannot_be_is_refused_with_a_sentence(admin, given, sentenc
 @pytest.mark.parametrize(
     ("policy", "sentence"),
     [
-        ('{"url": ', "This is not JSON: Expecting value in line 1, column 9"),
+        ('{"url": ', "The table: is not valid JSON: Expecting value: line 1 column 9"),
+        ('{"a":' * 5000, "allowed: at most 40"),
+        (json.dumps({"url": "x" * 65_536}), "allowed: at most 65536"),
         ('{"kind": "gpt"}', "allowed: gr00t, lerobot, mock, openpi"),
         ('["ws://x"]', "allowed: a table such as"),
     ],

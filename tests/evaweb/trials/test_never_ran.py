@@ -5,21 +5,21 @@ from collections import namedtuple
 
 import pytest
 
-from evaweb.console.chronicle import events_written
+from evaweb.blinding import sight_of
+from evaweb.console.event_ingest import events_written
 from evaweb.console.feed import History
 from evaweb.episodes.models import Episode
 from evaweb.errors import Conflict
 from evaweb.jobs.models import Job
-from evaweb.plans import bench as looking
-from evaweb.plans.handing import hand_out, progress
+from evaweb.plans import bench_checks as looking
+from evaweb.plans.allocation import hand_out, progress
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_freeze
-from evaweb.sight import sight_of
 from evaweb.stations.models import Command, Station
 from evaweb.trials import services
-from evaweb.trials.bench import trial_command
 from evaweb.trials.models import Checkpoint, Trial
 from evaweb.trials.selectors import statistics
+from evaweb.trials.station_commands import trial_command
 from tests.evaweb.trials import builders
 from tests.evaweb.trials.test_restoring import Direct, lab
 

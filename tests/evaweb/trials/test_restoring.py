@@ -12,6 +12,7 @@ from django.contrib.auth.models import User
 from django.db import OperationalError
 
 from evaweb.api.trials import TrialDetail
+from evaweb.blinding import EVERYTHING
 from evaweb.episodes import reconcile as reconciling
 from evaweb.episodes.folders import journal_folder
 from evaweb.episodes.models import Episode, EpisodeStatus
@@ -19,10 +20,8 @@ from evaweb.episodes.reconcile import reconcile
 from evaweb.episodes.services import episode_closed
 from evaweb.jobs import doorbell
 from evaweb.jobs.models import Job
-from evaweb.sight import EVERYTHING
 from evaweb.stations.models import Command, Station
 from evaweb.trials import journal, restoring, services
-from evaweb.trials.bench import trial_command
 from evaweb.trials.guarded import GUARDS
 from evaweb.trials.models import (
     Checkpoint,
@@ -35,11 +34,12 @@ from evaweb.trials.models import (
     Trial,
 )
 from evaweb.trials.selectors import statistics, trial_get, trial_list
+from evaweb.trials.station_commands import trial_command
 from runtime.recording.export import export
 from tests.evaweb.trials import builders
 from tests.evaweb.unguarded import unguarded
-from tests.runtime.station import Station as Lockstep
-from tests.runtime.station import plan
+from tests.runtime.lockstep_station import Station as Lockstep
+from tests.runtime.lockstep_station import plan
 
 pytestmark = pytest.mark.django_db
 
@@ -71,7 +71,7 @@ def lab(tmp_path, monkeypatch, db):
     """A lab around a whole station in lockstep."""
     monkeypatch.setattr(doorbell, "ring", lambda queue: True)
     made = Lab(builders.bench("bench"), Lockstep(plan(tmp_path, simulated=True)))
-    for place in ("evaweb.stations.commands", "evaweb.stations.stops", "evaweb.trials.bench"):
+    for place in ("evaweb.stations.commands", "evaweb.stations.stops", "evaweb.trials.station_commands"):
         monkeypatch.setattr(f"{place}.wire_to", lambda name: Direct(made.station))
     return made
 
@@ -374,6 +374,18 @@ def test_a_trial_that_runs_is_none_of_ours_yet(lab):
     assert (reconcile().restored, Trial.objects.count()) == (0, 0)
     outcome.write_bytes(kept)
     assert (reconcile().restored, Trial.objects.get().uuid) == (1, trial.uuid)
+
+
+def test_a_score_of_another_trial_is_named(lab):
+    first = lab.run()
+    lab.score(first, True, True, True)
+    second = lab.run()
+    line = json.loads(journal.path_of(first.episode_id).read_text())
+    told = line | {"trial": line["trial"] | {"uuid": str(second.uuid), "id": second.pk}}
+    journal.path_of(second.episode_id).write_text(json.dumps(told) + "\n")
+    (problem,) = reconcile().problems
+    assert f"its score {line['uuid']} is of trial {first.pk}" in problem
+    assert Trial.objects.get(pk=second.pk).status != "scored"
 
 
 def test_a_line_cut_in_half_is_left_out_and_told(lab):

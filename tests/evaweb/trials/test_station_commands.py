@@ -5,10 +5,10 @@ import pytest
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.stations.models import Command
-from evaweb.stations.wire import NoAnswer
+from evaweb.stations.runtime_client import NoAnswer
 from evaweb.trials import services
-from evaweb.trials.bench import trial_command
 from evaweb.trials.models import Checkpoint, Trial
+from evaweb.trials.station_commands import trial_command
 from tests.evaweb.trials import builders
 from tests.evaweb.trials.builders import BOOT
 

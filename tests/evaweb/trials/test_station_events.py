@@ -7,8 +7,8 @@ from evaweb.episodes.services import episode_opened
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Command
 from evaweb.trials import services
-from evaweb.trials.bench import run_args
 from evaweb.trials.models import Trial
+from evaweb.trials.station_commands import run_args
 from tests.evaweb.trials.builders import BOOT
 
 
@@ -232,7 +232,7 @@ def test_an_episode_whose_name_was_lost_is_asked_for_and_bound_to_its_trial(benc
         row.data = {"episode": uuid}
         return row
 
-    monkeypatch.setattr("evaweb.trials.following.settle", settled)
+    monkeypatch.setattr("evaweb.trials.station_events.settle", settled)
     assert bench.event("episode_closed", uuid=str(uuid4()), status="finished") is None
     found = bench.event("episode_closed", "", 109.0, uuid=uuid, status="finished", reason="stopped")
     assert (found.pk, str(found.episode_id), found.status) == (trial.pk, uuid, "ended")

@@ -112,7 +112,7 @@ def test_names_and_notes_are_text_and_never_markup(bench, browser):
 
 
 def test_a_trial_shows_its_facts_scores_commands_and_attempts(bench, browser, wire):
-    from evaweb.trials.bench import trial_command
+    from evaweb.trials.station_commands import trial_command
 
     trial = bench.prepare()
     order = {"user": bench.operator, "page": "p", "epoch": 1, "boot": builders.BOOT, "sequence": 1}

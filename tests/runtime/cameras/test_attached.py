@@ -7,10 +7,10 @@ import pytest
 
 from runtime.cameras.attached import Attached
 from runtime.cameras.base import Camera, Condition, Health, Shot
-from runtime.clock import VirtualClock
-from runtime.messages import Event
+from runtime.core.clock import VirtualClock
+from runtime.core.types import Observation
+from runtime.ipc.messages import Event
 from runtime.transports.base import Source
-from runtime.types import Observation
 
 OURS = np.full((4, 4, 3), 7, np.uint8)
 THEIRS = np.zeros((2, 2, 3), np.uint8)

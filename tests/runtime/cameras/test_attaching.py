@@ -5,19 +5,20 @@ from typing import Any
 
 import pytest
 
-from runtime import deployment, family
 from runtime.cameras.attached import Attached
 from runtime.cameras.attaching import attached
 from runtime.cameras.live import LiveCamera
-from runtime.clock import MonotonicClock, VirtualClock
-from runtime.errors import ConfigurationError, SetupError
-from runtime.family import Plan
+from runtime.config import loader as deployment
+from runtime.core.clock import MonotonicClock, VirtualClock
+from runtime.core.errors import ConfigurationError, SetupError
+from runtime.station import spec as family
+from runtime.station.spec import StationSpec
 from runtime.transports.node_source import NodeSource
 
 HIGH = {"kind": "mjpeg", "url": "http://127.0.0.1:1/x"}
 
 
-def planned(tmp_path: Path, cameras: dict[str, Any], **transport: Any) -> Plan:
+def planned(tmp_path: Path, cameras: dict[str, Any], **transport: Any) -> StationSpec:
     tree = {
         "station": "bench",
         "robot": "agilex_piper",
@@ -29,7 +30,7 @@ def planned(tmp_path: Path, cameras: dict[str, Any], **transport: Any) -> Plan:
     return family.plan(deployment.resolve(tree, {}, "test.toml"))
 
 
-def waits_for(plan: Plan) -> set[str]:
+def waits_for(plan: StationSpec) -> set[str]:
     """The cameras that the transport itself must deliver."""
     source = plan.source(MonotonicClock())
     inner = source._source if isinstance(source, Attached) else source

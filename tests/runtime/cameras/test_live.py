@@ -9,7 +9,7 @@ import numpy as np
 from runtime.cameras import rtsp, v4l2
 from runtime.cameras.base import Condition
 from runtime.cameras.live import LiveCamera
-from runtime.clock import MonotonicClock
+from runtime.core.clock import MonotonicClock
 from runtime.sim.rtsp_server import RtspServer
 from tests.runtime.cameras.movies import until
 from tests.runtime.cameras.watched import CLOCK, both, live, looking, watched

@@ -1,7 +1,7 @@
 import pytest
 
 from runtime.cameras.places import checked, with_password
-from runtime.errors import ConfigurationError
+from runtime.core.errors import ConfigurationError
 
 
 @pytest.mark.parametrize("url", ["rtsp://10.0.0.7/stream", "rtsps://camera.lab:8554/a/b?c=1"])

@@ -8,7 +8,7 @@ import pytest
 from runtime.cameras.base import Condition, Shot
 from runtime.cameras.file import Config
 from runtime.cameras.playing import FileCamera
-from runtime.clock import Clock, MonotonicClock, VirtualClock
+from runtime.core.clock import Clock, MonotonicClock, VirtualClock
 from tests.runtime.cameras.movies import movie, number_of, until
 
 

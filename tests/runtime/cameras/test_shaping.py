@@ -3,7 +3,7 @@ import pytest
 
 from runtime.cameras.base import CameraError, CameraSettings
 from runtime.cameras.shaping import Shaping
-from runtime.errors import ConfigurationError
+from runtime.core.errors import ConfigurationError
 
 PICTURE = np.arange(16 * 20 * 3, dtype=np.uint32).reshape(16, 20, 3).astype(np.uint8)
 

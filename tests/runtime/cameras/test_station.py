@@ -10,14 +10,14 @@ import av
 import numpy as np
 import pytest
 
-from runtime.lockstep import Lockstep
+from runtime.processes.coordinator.session.machine import State
+from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.session import State
 from runtime.sim import demo
 from runtime.sim.rtsp_server import RtspServer
 from tests.runtime.cameras.movies import movie, number_of
+from tests.runtime.lockstep_station import column
 from tests.runtime.sim.tabletop_station import served
-from tests.runtime.station import column
 
 CAMERA = "cam_high"
 RECORDED = ["recording.enabled=true", "recording.min_free_bytes=0"]

@@ -12,7 +12,7 @@ import pytest
 from runtime.cameras import mjpeg, rtsp
 from runtime.cameras.base import Condition
 from runtime.cameras.live import LiveCamera
-from runtime.clock import MonotonicClock
+from runtime.core.clock import MonotonicClock
 from runtime.sim.camera_server import CameraServer
 from runtime.sim.mjpeg_server import MjpegServer
 from runtime.sim.rtsp_server import RtspServer

@@ -3,17 +3,15 @@ import threading
 import pytest
 import zmq
 
-from runtime.bus import CommandServer, Endpoints, Publisher
-from runtime.client import Refused, StationClient
-from runtime.errors import TransportError
-from runtime.lease import Lease
-from runtime.messages import Ack, Command
-from runtime.requests import RunRequest
-from runtime.session import Session
-from runtime.transitions import State
-from tests.runtime.test_session import Recorded
-
-HOST = "127.0.0.1"
+from runtime.clients.client import Refused, StationClient
+from runtime.core.errors import TransportError
+from runtime.ipc.bus import CommandServer, Endpoints, Publisher
+from runtime.ipc.command_arguments import RunRequest
+from runtime.ipc.messages import Ack, Command
+from runtime.processes.coordinator.lease import Lease
+from runtime.processes.coordinator.session.machine import SessionMachine
+from runtime.processes.coordinator.session.transitions import State
+from tests.runtime.processes.coordinator.session.test_machine import Recorded
 
 
 class Station:
@@ -23,7 +21,7 @@ class Station:
         self.folder, self.time, self.boot = folder, 1000.0, "boot-1"
         self.received, self.mute = [], False
         self.context = zmq.Context()
-        self._server = CommandServer(self.context, HOST, 0)
+        self._server = CommandServer(self.context, folder, "commands")
         self.restart("boot-1")
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -31,7 +29,7 @@ class Station:
 
     def restart(self, boot, state=State.READY):
         self.boot, self.effects, self.lease = boot, Recorded(), Lease(5.0)
-        self.session = Session(self.effects, self.lease, boot, lambda: self.time)
+        self.session = SessionMachine(self.effects, self.lease, boot, lambda: self.time)
         self.session.state = state
         Endpoints(self.folder).write("main", {"commands": self._server.endpoint})
 
@@ -199,7 +197,7 @@ def test_a_station_that_does_not_run_is_named(tmp_path):
 
 def test_a_station_that_moved_to_other_sockets_is_found_again(client, station):
     client.status()
-    moved = CommandServer(station.context, HOST, 0)
+    moved = CommandServer(station.context, station.folder, "commands")
     old, station._server = station._server, moved
     Endpoints(station.folder).write("main", {"commands": moved.endpoint})
     assert client.status()["boot"] == "boot-1"
@@ -222,7 +220,7 @@ def test_events_are_asked_for_by_number(client):
 
 
 def test_the_live_streams_are_found_in_the_folder(client, station):
-    publisher = Publisher(station.context, HOST, 0, 16)
+    publisher = Publisher(station.context, station.folder, "state", 16)
     Endpoints(station.folder).write("main", {"commands": "", "state": publisher.endpoint})
     subscriber = client.subscribe("state")
     for _ in range(200):
@@ -234,7 +232,7 @@ def test_the_live_streams_are_found_in_the_folder(client, station):
 
 
 def test_the_estop_goes_to_the_guard_without_any_lease(client, station):
-    guard = CommandServer(station.context, HOST, 0)
+    guard = CommandServer(station.context, station.folder, "estop")
     Endpoints(station.folder).write("guard", {"estop": guard.endpoint})
     pressed = []
 

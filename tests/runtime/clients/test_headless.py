@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import pytest
 
 from runtime import __main__ as command_line
-from runtime import headless
-from runtime.errors import RecordingError, RuntimeFault, SetupError, TransportError
-from runtime.headless import drive, summary
+from runtime.clients import headless
+from runtime.clients.headless import drive, summary
+from runtime.core.errors import RecordingError, RuntimeFault, SetupError, TransportError
 from runtime.recording import export
 from tests.sources import ROOT
 

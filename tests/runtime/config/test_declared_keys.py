@@ -14,20 +14,32 @@ from pydantic import BaseModel
 
 from robots.description import RobotTable
 from robots.robot import Gripper, Group, Robot
-from runtime.config import Deployment
+from runtime.config.schema import Deployment
 from tests.runtime.reading import Reads, reads_of
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 # They print or judge what was declared. What they read is not obeyed for that.
-SHOW = {"runtime.config_reference", "runtime.snapshot", "robots.inspection"}
+SHOW = {"runtime.config.reference", "runtime.processes.coordinator.snapshot", "robots.inspection"}
 
 # Read otherwise than as attributes: the module, which must name the key or hand the whole table on.
 ELSEWHERE = {
-    "runtime.config.Deployment.tasks": ("runtime/snapshot.py", "plan.deployment.tasks"),  # offered on pages
-    "runtime.config.GripperSettings": ("runtime/family.py", "robots.GripperChoice(**given.model_dump())"),
-    "runtime.collection.CollectionSettings.streams": ("runtime/recording/schema.py", 'said["streams"]'),
-    "runtime.collection.CollectionSettings.columns": ("runtime/recording/schema.py", 'said["columns"]'),
-    "runtime.collection.CollectionSettings.max_skew_s": (
+    "runtime.config.schema.Deployment.tasks": (
+        "runtime/processes/coordinator/snapshot.py",
+        "plan.deployment.tasks",
+    ),  # offered on pages
+    "runtime.config.schema.GripperSettings": (
+        "runtime/station/spec.py",
+        "robots.GripperChoice(**given.model_dump())",
+    ),
+    "runtime.config.collection.CollectionSettings.streams": (
+        "runtime/recording/schema.py",
+        'said["streams"]',
+    ),
+    "runtime.config.collection.CollectionSettings.columns": (
+        "runtime/recording/schema.py",
+        'said["columns"]',
+    ),
+    "runtime.config.collection.CollectionSettings.max_skew_s": (
         "runtime/recording/schema.py",
         'said.get("max_skew_s")',
     ),
@@ -37,7 +49,7 @@ ELSEWHERE = {
     "runtime.transports.ros1.Link.insecure_link": ("runtime/transports/ros1.py", "self.insecure_link"),
     "runtime.transports.ros2.Link.insecure_link": ("runtime/transports/ros2.py", "self.insecure_link"),
     "runtime.transports.zmq.Config.insecure_link": ("runtime/transports/zmq.py", "self.insecure_link"),
-    "runtime.leaders.zmq.Config.insecure_link": ("runtime/leaders/zmq.py", "self.insecure_link"),
+    "runtime.teleoperators.zmq.Config.insecure_link": ("runtime/teleoperators/zmq.py", "self.insecure_link"),
     # "Where the limits come from": for people alone, required, and printed by `robots check`.
     "robots.robot.Robot.limits_source": ("robots/inspection.py", "robot.limits_source"),
     "robots.robot.Robot.overrides": (
@@ -86,7 +98,9 @@ def unread(reads: Reads, *roots: type) -> set[str]:
     found = set()
     for owner, name, classes in keys(*roots):
         # Sections of several kinds are typed as what they have in common.
-        common = {f"runtime.config.{part}" for part in ("Variant", "StrategyConfig", "KinematicsConfig")}
+        common = {
+            f"runtime.config.schema.{part}" for part in ("Variant", "StrategyConfig", "KinematicsConfig")
+        }
         readers = {
             module
             for kind in classes | (common if name == "kind" else set())

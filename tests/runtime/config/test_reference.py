@@ -1,17 +1,17 @@
 import re
 from pathlib import Path
 
-from runtime.config import Deployment
-from runtime.config_reference import reference
-from runtime.plugins import variants
+from runtime.config.reference import reference
+from runtime.config.schema import Deployment
+from runtime.core.plugins import variants
 
-COMMITTED = Path(__file__).parents[2] / "docs" / "configuration.md"
+COMMITTED = Path(__file__).parents[3] / "docs" / "configuration.md"
 ROW = re.compile(r"^\| `(\w+)` \| (.+?) \| (.+?) \| (.*?) \|$", re.MULTILINE)
 
 
 def test_the_committed_file_is_what_the_models_say():
     assert COMMITTED.read_text("utf-8") == reference(), (
-        "the keys of a deployment have changed: python -m runtime.config_reference > docs/configuration.md"
+        "the keys of a deployment have changed: python -m runtime.config.reference > docs/configuration.md"
     )
 
 

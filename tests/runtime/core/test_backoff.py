@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runtime.back_off import BackOff
+from runtime.core.backoff import BackOff
 
 
 def test_it_waits_twice_as_long_after_every_failure_up_to_a_bound() -> None:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.clock import ClockMap, MonotonicClock, VirtualClock
+from runtime.core.clock import ClockMap, MonotonicClock, VirtualClock
 
 DELAYS = st.lists(st.floats(0.0, 0.3), min_size=1, max_size=60)
 

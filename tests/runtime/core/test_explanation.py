@@ -4,16 +4,16 @@ import pytest
 from pydantic import AfterValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
-from runtime.explanation import explanation
-from runtime.section import Section
+from runtime.core.explanation import explanation
+from runtime.core.settings import Settings
 
 
-class Leg(Section):
+class Leg(Settings):
     length: float = Field(gt=0)
     colour: str = "black"
 
 
-class Table(Section):
+class Table(Settings):
     legs: list[Leg]
     name: str = ""
 
@@ -58,7 +58,7 @@ def _no_secret(value):
     raise PydanticCustomError("secret", "name a file")
 
 
-class Keyed(Section):
+class Keyed(Settings):
     key: Annotated[str, AfterValidator(_no_secret)]
 
 

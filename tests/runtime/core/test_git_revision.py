@@ -6,8 +6,8 @@ import subprocess
 
 import pytest
 
-from runtime import revision as module
-from runtime.revision import revision, revision_of
+from runtime.core import git_revision as module
+from runtime.core.git_revision import revision, revision_of
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="there is no git command")
 
@@ -38,7 +38,12 @@ def test_a_clean_checkout_is_its_commit(checkout):
 
 @pytest.mark.parametrize(
     ("name", "dirty"),
-    [("runtime/tick.py", True), ("notes.md", True), ("runtime/new.py", True), ("run.log", False)],
+    [
+        ("runtime/tick.py", True),
+        ("notes.md", True),
+        ("runtime/new.py", True),
+        ("run.log", False),
+    ],
 )
 def test_a_changed_file_or_a_new_one_among_the_code_makes_it_dirty(checkout, name, dirty):
     (checkout / name).write_text("changed\n")
@@ -80,4 +85,4 @@ def test_our_own_is_asked_for_once(monkeypatch):
     finally:
         revision.cache_clear()
     (root,) = asked
-    assert (root / "runtime" / "revision.py").is_file()
+    assert (root / "runtime" / "core" / "git_revision.py").is_file()

@@ -8,7 +8,7 @@ import pytest
 
 _ROUNDS = """
 import resource, sys
-from runtime import heap
+from runtime.core import malloc as heap
 if sys.argv[1] == "keep":
     assert heap.keep()
 pieces = lambda: [bytearray(b"x") * 900_000 for _ in range(6)]

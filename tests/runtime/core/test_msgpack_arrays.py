@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from runtime import codecs
-from runtime.errors import CodecError
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.errors import CodecError
 
-VECTORS = Path(__file__).parent / "vectors"
+VECTORS = Path(__file__).parents[1] / "vectors"
 
 BYTES_OF: list[tuple[object, str]] = [
     (

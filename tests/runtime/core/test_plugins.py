@@ -2,14 +2,14 @@ import sys
 
 import pytest
 
-from runtime.errors import ConfigurationError
-from runtime.plugins import variants
+from runtime.core.errors import ConfigurationError
+from runtime.core.plugins import variants
 
 MODULE = """
 from typing import Literal
-from runtime.section import Section
+from runtime.core.settings import Settings
 
-class Config(Section):
+class Config(Settings):
     kind: Literal["{kind}"] = "{kind}"
 """
 

@@ -9,16 +9,16 @@ import sys
 
 import pytest
 
-from runtime import realtime
+from runtime.core import realtime
 
 _ASK = (
-    "from runtime import realtime; import gc, os; "
+    "from runtime.core import realtime; import gc, os; "
     "print(realtime.enter(20), os.sched_getscheduler(0), gc.isenabled())"
 )
 
 
 _ASK_BELOW = (
-    "from runtime import realtime; import gc, os, threading; "
+    "from runtime.core import realtime; import gc, os, threading; "
     "words = realtime.enter_below(20); found = []; "
     "child = threading.Thread(target=lambda: found.append(os.sched_getscheduler(0))); child.start(); child.join(); "
     "leaver = threading.Thread(target=lambda: (realtime.leave(), found.append(os.sched_getscheduler(0)))); "

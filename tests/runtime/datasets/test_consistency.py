@@ -17,11 +17,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from runtime.core.errors import RecordingError
 from runtime.datasets.__main__ import main
 from runtime.datasets.consistency import check, examine, rounded
 from runtime.datasets.published import publish
 from runtime.datasets.rows import read_rows, write_table
-from runtime.errors import RecordingError
 from tests.runtime.datasets.small import record, write_video
 
 

@@ -6,11 +6,11 @@ import av
 import numpy as np
 import pytest
 
+from runtime.core.errors import RecordingError
 from runtime.datasets.cut import NotCopyableError, cut, encode
 from runtime.datasets.entries import Span
 from runtime.datasets.pictures import Pictures, Stretch
 from runtime.datasets.reader import open_dataset
-from runtime.errors import RecordingError
 from tests.runtime.datasets.foreign import Plan, shown, write
 from tests.runtime.datasets.small import seen, write_video
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from runtime.core.errors import RecordingError
 from runtime.datasets.mapping import ColumnMapping
 from runtime.datasets.reader import open_dataset
-from runtime.errors import RecordingError
 from tests.runtime.datasets.small import seen, write_dataset
 
 

@@ -4,18 +4,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from runtime.core.errors import RecordingError
 from runtime.datasets.stats import aggregate, column_statistic, video_statistic
-from runtime.errors import RecordingError
 from tests.runtime.datasets.small import picture, write_video
 
 ROWS = arrays(np.float32, st.tuples(st.integers(1, 9), st.just(3)), elements=st.floats(-100, 100, width=32))
 
 
-@settings(deadline=None)
 @given(parts=st.lists(ROWS, min_size=1, max_size=5))
 def test_statistics_of_parts_together_are_those_of_the_whole(parts: list[np.ndarray]) -> None:
     statistics = [{"x": statistic} for part in parts if (statistic := column_statistic(part))]

@@ -8,10 +8,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from runtime.core.errors import RecordingError
 from runtime.datasets.consistency import check
 from runtime.datasets.mapping import ColumnMapping
 from runtime.datasets.reader import open_dataset
-from runtime.errors import RecordingError
 from tests.runtime.datasets.foreign import Plan, column, shown, write
 from tests.runtime.datasets.small import seen
 

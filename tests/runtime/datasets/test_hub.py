@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
+from runtime.core.errors import RecordingError
 from runtime.datasets import hub
 from runtime.datasets.__main__ import main
-from runtime.errors import RecordingError
 from tests.runtime.datasets.foreign import Plan, write
 
 

@@ -14,13 +14,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from runtime.core.errors import RecordingError
 from runtime.datasets import operations, staging
 from runtime.datasets.consistency import check
 from runtime.datasets.operations import convert, delete, merge, repair, split
 from runtime.datasets.published import publish
 from runtime.datasets.reader import open_dataset
 from runtime.datasets.sides import attach, side_files
-from runtime.errors import RecordingError
 from tests.runtime.datasets.foreign import Plan, column, shown, write
 from tests.runtime.datasets.small import record, seen
 

@@ -14,12 +14,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from runtime.core.errors import RecordingError
 from runtime.datasets import staging
 from runtime.datasets.consistency import check
 from runtime.datasets.mapping import ColumnMapping
 from runtime.datasets.published import publish
 from runtime.datasets.reader import open_dataset
-from runtime.errors import RecordingError
 from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.reader import open_episode

@@ -6,9 +6,9 @@ from pathlib import Path
 import av
 import pytest
 
+from runtime.core.errors import RecordingError
 from runtime.datasets.pictures import Pictures
 from runtime.datasets.remux import VideoFacts, remux
-from runtime.errors import RecordingError
 from tests.runtime.datasets.small import record, seen, write_video
 
 

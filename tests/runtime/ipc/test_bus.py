@@ -1,12 +1,16 @@
 import errno
-import socket
+import os
+import shutil
 import time
+from pathlib import Path
 
 import pytest
 import zmq
 
-from runtime import bus
-from runtime.bus import (
+from runtime.core.errors import TransportError
+from runtime.core.msgpack_arrays import pack
+from runtime.ipc import bus
+from runtime.ipc.bus import (
     CAMERA_HIGH_WATER,
     STREAM_HIGH_WATER,
     CommandClient,
@@ -16,11 +20,8 @@ from runtime.bus import (
     Publisher,
     Subscriber,
 )
-from runtime.codecs import pack
-from runtime.errors import TransportError
-from runtime.messages import Ack, Command, Event, decode, encode
+from runtime.ipc.messages import Ack, Command, Event, decode, encode
 
-HOST = "127.0.0.1"
 PACE_S = 0.002  # between bursts: ZMQ looks only once a millisecond at what a reader has taken
 
 
@@ -32,8 +33,8 @@ def context():
 
 
 @pytest.fixture
-def server(context):
-    return CommandServer(context, HOST, 0)
+def server(context, tmp_path):
+    return CommandServer(context, tmp_path, "commands")
 
 
 @pytest.fixture
@@ -148,36 +149,37 @@ def test_a_late_answer_is_never_taken_for_that_of_the_next_command(context, serv
     assert command.uuid == "second"
 
 
-def test_a_command_nobody_took_in_time_is_not_delivered_when_the_runtime_comes_up(context):
-    reserved = socket.socket()
-    reserved.bind((HOST, 0))
-    port = reserved.getsockname()[1]
-    reserved.close()
-    client = CommandClient(context, f"tcp://{HOST}:{port}")
+def test_a_command_nobody_took_in_time_is_not_delivered_when_the_runtime_comes_up(context, server):
+    server.close()
+    client = CommandClient(context, server.endpoint)
     with pytest.raises(TransportError):
         client.request(Command("old", "stop"), 0.02)
-    server = CommandServer(context, HOST, port)
+    again = context.socket(zmq.ROUTER)
+    again.bind(server.endpoint)
     client._socket.send(encode(Command("new", "stop")))
-    assert next_command(server)[1].uuid == "new"
-    assert server.receive() is None
+    assert again.poll(2000)
+    assert decode(again.recv_multipart()[-1]).uuid == "new"
+    assert not again.poll(0)
 
 
-def test_a_port_that_is_taken_is_a_clear_error(context, server):
-    port = int(server.endpoint.rpartition(":")[2])
-    with pytest.raises(
-        TransportError, match=rf"cannot listen on {HOST}:{port}: .*; name another port in \[bus\]"
-    ):
-        CommandServer(context, HOST, port)
-
-
-def test_a_port_is_free_again_once_its_process_is_gone(context, server):
-    port = int(server.endpoint.rpartition(":")[2])
-    server.close()
-    context.term()
-    successor = zmq.Context()
-    again = CommandServer(successor, HOST, port)
-    assert again.endpoint == f"tcp://{HOST}:{port}"
-    successor.destroy(linger=0)
+def test_a_socket_that_somebody_removed_is_listened_at_anew(context, server, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(bus, "_LOOK_S", 0.0)
+    before = server.endpoint
+    early = context.socket(zmq.DEALER)
+    early.connect(before)
+    early.send(encode(Command("early", "run")))
+    address, _ = next_command(server)
+    assert not server.moved()
+    shutil.rmtree(os.environ["XDG_RUNTIME_DIR"] + "/eva-web")  # as with the last logout of the account
+    assert server.moved()
+    assert server.endpoint != before
+    assert f"it is {server.endpoint.removeprefix('ipc://')} now" in caplog.text
+    server.answer(address, Ack("early", "accepted"))
+    assert answer_to(early).uuid == "early", "who was connected stays so"
+    late = context.socket(zmq.DEALER)
+    late.connect(server.endpoint)
+    late.send(encode(Command("late", "run")))
+    assert next_command(server)[1].uuid == "late"
 
 
 # --- streams -----------------------------------------------------------------------------------------------
@@ -196,8 +198,8 @@ def connected(publisher, subscriber, stream):
 
 
 @pytest.fixture
-def publisher(context):
-    return Publisher(context, HOST, 0, STREAM_HIGH_WATER)
+def publisher(context, tmp_path):
+    return Publisher(context, tmp_path, "state", STREAM_HIGH_WATER)
 
 
 def test_a_subscriber_gets_what_it_asked_for_by_prefix(context, publisher):
@@ -267,8 +269,8 @@ def test_who_was_away_does_not_get_what_has_piled_up_meanwhile(context, publishe
     assert content == {"state": {"new": True}}
 
 
-def test_three_cameras_at_once_all_arrive(context):
-    publisher = Publisher(context, HOST, 0, CAMERA_HIGH_WATER)
+def test_three_cameras_at_once_all_arrive(context, tmp_path):
+    publisher = Publisher(context, tmp_path, "cameras", CAMERA_HIGH_WATER)
     subscriber = Subscriber(context, publisher.endpoint, "camera/")
     connected(publisher, subscriber, "camera/0")
     for _ in range(10):
@@ -327,15 +329,15 @@ def test_what_a_former_family_left_can_be_cleared(tmp_path):
 def refusing(monkeypatch):
     """A disk that takes nothing until the test says so."""
     disk = {"full": True}
-    write = bus.Path.write_text
+    write = Path.write_text
 
     def written(path, *arguments):
         if disk["full"]:
             raise OSError(errno.ENOSPC, "No space left on device")
         return write(path, *arguments)
 
-    monkeypatch.setattr(bus.Path, "write_text", written)
-    monkeypatch.setattr(bus, "RETRY_S", 0.01)
+    monkeypatch.setattr(Path, "write_text", written)
+    monkeypatch.setattr("runtime.ipc.endpoints.RETRY_S", 0.01)
     return disk
 
 

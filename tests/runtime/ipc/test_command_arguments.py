@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.errors import RuntimeFault
-from runtime.requests import (
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.command_arguments import (
     LARGEST,
     BenchRequest,
     Checkpoint,

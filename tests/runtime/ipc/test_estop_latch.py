@@ -3,7 +3,7 @@ import os
 
 import pytest
 
-from runtime.latch import Latch, Latched
+from runtime.ipc.estop_latch import Latch, Latched
 
 
 @pytest.fixture

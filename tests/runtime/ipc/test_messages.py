@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.codecs import pack, unpack
-from runtime.errors import CodecError
-from runtime.messages import (
+from runtime.core.errors import CodecError
+from runtime.core.msgpack_arrays import pack, unpack
+from runtime.ipc.messages import (
     Ack,
     BeginEpisode,
     BeginRun,

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.errors import RuntimeFault
-from runtime.memory import Record, Ring, TornReadError
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.shared_memory import Record, Ring, TornReadError
 
 DTYPE = np.dtype([("a", "i8"), ("b", "f4", 7)])
 

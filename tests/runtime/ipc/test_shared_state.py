@@ -3,15 +3,15 @@ import os
 import numpy as np
 import pytest
 
-from runtime.page import PICTURE_SLOTS, EStop, Page, PageLayout
-from runtime.types import Observation
+from runtime.core.types import Observation
+from runtime.ipc.shared_state import PICTURE_SLOTS, EStop, SharedState, SharedStateLayout
 
-LAYOUT = PageLayout(dim=3, eef_dim=8, cameras=("cam_high", "cam_wrist"), picture_bytes=4 * 6 * 3)
+LAYOUT = SharedStateLayout(dim=3, eef_dim=8, cameras=("cam_high", "cam_wrist"), picture_bytes=4 * 6 * 3)
 
 
 @pytest.fixture
 def page():
-    made, descriptor = Page.create(LAYOUT)
+    made, descriptor = SharedState.create(LAYOUT)
     yield made
     os.close(descriptor)
 
@@ -34,8 +34,8 @@ def test_nothing_may_be_sent_before_the_guard_has_spoken(page):
 
 
 def test_a_second_mapping_sees_the_same_beats():
-    first, descriptor = Page.create(LAYOUT)
-    second = Page.attach(LAYOUT, descriptor)
+    first, descriptor = SharedState.create(LAYOUT)
+    second = SharedState.attach(LAYOUT, descriptor)
     first.beat("media", 12.5)
     assert second.last_beat("media") == 12.5
     assert second.last_beat("control") == 0.0

@@ -65,7 +65,7 @@ def test_forward_gives_each_arm_its_pose_for_rows_as_for_single_vectors() -> Non
         np.testing.assert_allclose(poses[1, 1, index], arm.chain.pose(q[1, 1, arm.joint_dims]), atol=1e-15)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(shares, moves)
 def test_reachable_targets_near_the_seed_are_reached(share: np.ndarray, move: np.ndarray) -> None:
     seed = within(share)
@@ -75,7 +75,7 @@ def test_reachable_targets_near_the_seed_are_reached(share: np.ndarray, move: np
     assert inside_limits(result.q)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(shares, st.lists(st.floats(-2, 2), min_size=14, max_size=14))
 def test_whatever_is_asked_joints_stay_in_limits_and_errors_are_those_of_the_joints(
     share: np.ndarray, numbers: list[float]
@@ -280,7 +280,7 @@ def test_what_carries_an_arm_stands_as_in_the_seed(lifting: tuple[Robot, Compile
     assert result.reached.all()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_errors_and_flags_are_those_of_the_joints_that_are_returned(
     lifting: tuple[Robot, CompiledKinematics], seed: int
@@ -429,7 +429,7 @@ def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_deployment_is_read_without_numba() -> None:
-    code = "import sys, runtime.config, runtime.kinematics.links; print('numba' in sys.modules)"
+    code = "import sys, runtime.config.schema, runtime.kinematics.links; print('numba' in sys.modules)"
     assert python(code).stdout.strip() == "False"
 
 
@@ -437,7 +437,7 @@ def test_where_numba_is_missing_the_error_says_what_to_do() -> None:
     code = """if True:
         import sys, robots
         sys.modules["numba"] = None
-        from runtime.errors import SetupError
+        from runtime.core.errors import SetupError
         from runtime.kinematics.compiled import Config, build
         try:
             build(Config(), robots.load("agilex_piper"))

@@ -33,8 +33,9 @@ def test_joints_of_another_width_are_refused() -> None:
 
 def test_control_and_media_load_no_compiler() -> None:
     code = """if True:
-        import sys, numpy, robots, runtime.control, runtime.media, runtime.reception
-        from runtime.end_effectors import EndEffectors
+        import sys, numpy, robots
+        import runtime.processes.control.process, runtime.processes.media.process, runtime.processes.reception.process
+        from runtime.spaces.end_effectors import EndEffectors
         from runtime.kinematics.forward import ChainForward
         robot = robots.load("agilex_piper")
         EndEffectors(robot, ChainForward(robot)).eef_of(numpy.zeros(14))

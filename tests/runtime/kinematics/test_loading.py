@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
 from runtime.kinematics import compiled
 from runtime.kinematics.base import Kinematics
 from runtime.kinematics.forward import ChainForward
 from runtime.kinematics.loading import Loading
-from runtime.runner import LockstepRunner, ThreadRunner
-from tests.runtime.station import Station, plan
+from runtime.processes.coordinator.inference.worker import LockstepRunner, ThreadRunner
+from tests.runtime.lockstep_station import Station, plan
 
 ROBOT = robots.load("ur5e")
 Q = ROBOT.poses["home"]
@@ -115,7 +115,7 @@ def test_what_cannot_be_made_is_said_to_who_solves_and_forward_goes_on(error: Ex
 def test_a_station_with_a_policy_of_joints_loads_no_compiler(tmp_path: Path) -> None:
     """In a process of its own: this one has loaded it."""
     script = (
-        "import sys; from pathlib import Path; from tests.runtime.station import Station, plan\n"
+        "import sys; from pathlib import Path; from tests.runtime.lockstep_station import Station, plan\n"
         f"station = Station(plan(Path({str(tmp_path)!r}))).running(30)\n"
         "assert station.main.spaces.eef_of(station.main.by_hand.commanded()).shape == (16,)\n"
         "assert 'numba' not in sys.modules, 'loaded'\n"

@@ -129,7 +129,7 @@ def held_to(robot: Robot, result: IkResult, anchor: np.ndarray, row: int, dt: fl
     assert (result.q[:, still] == result.q[0, still]).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.sampled_from(names()), st.integers(0, 10_000), st.integers(0, 12), st.floats(0.0, 0.5))
 def test_whatever_is_planned_anew_keeps_to_limits_and_velocities(
     name: str, number: int, row: int, off: float

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
 from runtime.kinematics import compiled, pyroki
 
 RATE = 30.0

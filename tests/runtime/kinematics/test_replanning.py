@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.ik_paths import arm_dims
-from benchmarks.ik_postures import path
+from benchmarks.ik_paths import ROWS, arm_dims
+from benchmarks.ik_postures import followed, path, worst
 from robots import load
 from runtime.kinematics import compiled
 from runtime.kinematics.base import IkFlag, IkResult
@@ -15,6 +15,8 @@ from runtime.kinematics.replanning import missed, postures, replanned
 
 ARX = load("arx_r5")
 KINEMATICS = CompiledKinematics(ARX)
+FRANKA = load("dual_franka")
+SEVEN = CompiledKinematics(FRANKA)
 DT = 1 / ARX.control_rate
 JOINTS = path(ARX, 47, 1)  # comes by a singularity at once, behind which one of two branches ends at a limit
 
@@ -76,6 +78,32 @@ def test_where_the_last_pose_is_out_of_reach_no_more_than_a_few_postures_are_tri
     starts = np.zeros((25, 6))
     targets = KINEMATICS.forward(JOINTS)[:, :1]
     dims = arm_dims(ARX)[:6]
-    assert replanned(sweep, targets, ARX.poses["home"], DT, dims, starts) is None
+    assert replanned(sweep, targets, ARX.poses["home"], DT, dims, starts, lambda q: np.inf) is None
     assert len(asked) == 4
     assert all(len(poses) == 1 for poses in asked)
+
+
+@pytest.mark.parametrize("number", [9, 55])
+def test_a_chunk_that_ends_by_a_limit_has_another_posture_so_that_the_next_ones_are_met(
+    monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    """The elbow is stretched to 0.2 rad by poses that it meets at 0.5 too, and those that come stretch it farther."""
+    joints = path(FRANKA, number)
+    assert worst(FRANKA, SEVEN, joints, ROWS).max() < 1e-3
+    q = followed(SEVEN, FRANKA, SEVEN.forward(joints), joints[0], ROWS).q
+    assert (np.abs(np.diff(q, axis=0)) <= FRANKA.velocity / FRANKA.control_rate + 1e-9).all()
+    monkeypatch.setattr(compiled, "CRAMPED", -np.inf)
+    assert worst(FRANKA, SEVEN, joints, ROWS).max() > 15e-3
+
+
+def test_room_is_that_of_the_nearest_limit_and_none_is_missed_where_home_has_less_or_there_is_no_choice() -> (
+    None
+):
+    arm, dims = SEVEN._arms[0], FRANKA.arms[0].joint_dims
+    q = FRANKA.poses["home"].copy()
+    q[dims[3]] = FRANKA.upper[dims[3]] - 0.2
+    assert compiled._room(arm, q) == pytest.approx(0.25)
+    near_home = arm.copy()
+    near_home["above"][3] = 0.1
+    assert compiled._room(near_home, q) > 0.25
+    assert compiled._room(KINEMATICS._arms[0], ARX.lower) == np.inf

@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from runtime.resampling import length, resample
+from runtime.motion.resampling import length, resample
+from runtime.motion.timeline import DimensionKinds, Timeline
 from runtime.strategies.base import Arrival
 from runtime.strategies.ensemble import EnsembleMerge
-from runtime.timeline import Dims, Timeline
 
 
 def ramp(count: int) -> np.ndarray:
@@ -61,7 +61,7 @@ def test_every_row_is_of_a_time_that_the_given_rows_cover_and_linear_between_the
 def test_chunks_that_agree_average_to_what_they_agree_on(
     rate: float, control: float, chunks: list[tuple[int, int]]
 ) -> None:
-    merge, timeline, step = EnsembleMerge(None, 0.01, 8, Dims()), Timeline(1), 0
+    merge, timeline, step = EnsembleMerge(None, 0.01, 8, DimensionKinds()), Timeline(1), 0
     for number, (count, later) in enumerate(chunks, 1):
         step += later
         times = step / control + np.arange(count) / rate

@@ -4,10 +4,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from runtime.timeline import (
-    Dims,
+from runtime.motion.timeline import (
+    DimensionKinds,
     Fade,
-    Laid,
+    PlacedChunk,
     Timeline,
     difference,
     fading,
@@ -43,7 +43,7 @@ def test_a_plan_is_found_by_its_absolute_step():
 
 def test_a_fade_goes_on_over_whatever_is_planned_meanwhile():
     timeline = Timeline(1)
-    timeline.begin_fade(Fade(0, np.zeros((5, 1)), tuple(single(0, 5)), fading(5), Dims()))
+    timeline.begin_fade(Fade(0, np.zeros((5, 1)), tuple(single(0, 5)), fading(5), DimensionKinds()))
     timeline.replace(0, np.ones((9, 1)), single(1, 9))
     assert timeline.span(0)[0][:, 0].tolist() == [0, 0.25, 0.5, 0.75, 1, 1, 1, 1, 1]
     timeline.replace(2, np.full((9, 1), 2.0), single(2, 9))
@@ -54,10 +54,10 @@ def test_a_fade_goes_on_over_whatever_is_planned_meanwhile():
 
 def test_a_fade_that_is_over_is_forgotten_and_so_is_everything_when_cleared():
     timeline = Timeline(1)
-    timeline.begin_fade(Fade(0, np.zeros((5, 1)), tuple(single(0, 5)), fading(5), Dims()))
+    timeline.begin_fade(Fade(0, np.zeros((5, 1)), tuple(single(0, 5)), fading(5), DimensionKinds()))
     timeline.replace(4, np.ones((9, 1)), single(1, 9))
     assert timeline.fade is not None
-    timeline.replace(5, np.ones((9, 1)), single(1, 9), (Laid(1, 5, np.ones((9, 1))),))
+    timeline.replace(5, np.ones((9, 1)), single(1, 9), (PlacedChunk(1, 5, np.ones((9, 1))),))
     assert timeline.fade is None
     timeline.clear()
     assert (timeline.remaining(0), timeline.laid) == (0, ())
@@ -65,7 +65,7 @@ def test_a_fade_that_is_over_is_forgotten_and_so_is_everything_when_cleared():
 
 def test_a_fade_leaves_the_plan_beneath_as_it_is():
     timeline = Timeline(1)
-    timeline.begin_fade(Fade(0, np.zeros((4, 1)), tuple(single(0, 4)), fading(4), Dims()))
+    timeline.begin_fade(Fade(0, np.zeros((4, 1)), tuple(single(0, 4)), fading(4), DimensionKinds()))
     timeline.replace(0, np.ones((4, 1)), single(1, 4))
     timeline.span(0)
     timeline.at(0)
@@ -106,7 +106,7 @@ def test_an_overlap_of_one_step_takes_the_new_action(old, window):
 
 
 def test_a_binary_gripper_switches_and_is_never_blended():
-    blended, _ = overlap_blend(np.zeros((10, 2)), np.ones((10, 2)), None, Dims(switched=(1,)))
+    blended, _ = overlap_blend(np.zeros((10, 2)), np.ones((10, 2)), None, DimensionKinds(switched=(1,)))
     assert set(blended[:, 1]) == {1.0}
     assert blended[4, 0] not in (0.0, 1.0)
 
@@ -115,12 +115,14 @@ def test_a_binary_gripper_switches_and_is_never_blended():
 @given(arrays(np.float32, (12, 3), elements=st.floats(-3, 3, width=32)), st.integers(1, 12))
 def test_equal_plans_blend_to_the_same_numbers_exactly(shape, rows, window):
     wide = rows.astype(np.float64)
-    blended, _ = overlap_blend(wide, wide.copy(), window, Dims(wrapping=(1,)), shape)
+    blended, _ = overlap_blend(wide, wide.copy(), window, DimensionKinds(wrapping=(1,)), shape)
     assert (blended == wide).all()
 
 
 def test_angles_that_wrap_are_blended_the_shorter_way_round():
-    blended, _ = overlap_blend(np.full((5, 2), 3.0), np.full((5, 2), -3.0), None, Dims(wrapping=(1,)))
+    blended, _ = overlap_blend(
+        np.full((5, 2), 3.0), np.full((5, 2), -3.0), None, DimensionKinds(wrapping=(1,))
+    )
     assert blended[2, 0] == 0.0
     assert blended[2, 1] == pytest.approx(-np.pi)
     assert blended[0, 1] == pytest.approx(3.0 - 2 * np.pi)

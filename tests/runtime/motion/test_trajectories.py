@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.motion import Brake, Trajectory
+from runtime.motion.trajectories import Brake, Trajectory
 
 angles = st.lists(st.floats(-3, 3), min_size=4, max_size=4).map(np.array)
 

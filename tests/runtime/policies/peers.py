@@ -14,8 +14,8 @@ from websockets.sync.server import ServerConnection, serve
 
 import robots
 from robots import Robot
-from runtime import codecs
-from runtime.types import Observation
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.types import Observation
 
 FRANKA = robots.load("dual_franka", ["left_arm"])  # the arm of DROID: seven joints and a gripper, 1 is open
 PIPER = robots.load("agilex_piper")

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from runtime.core.types import Observation
 from runtime.policies.arena.history import History
-from runtime.types import Observation
 from tests.runtime.policies.peers import FRANKA, seen
 
 STEPS = (23, 16, 8, 0)

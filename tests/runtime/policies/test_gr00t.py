@@ -13,8 +13,8 @@ import pytest
 import zmq
 
 import robots
-from runtime.clock import MonotonicClock
-from runtime.errors import (
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import (
     ConfigurationError,
     ContradictionError,
     PolicyError,
@@ -22,11 +22,12 @@ from runtime.errors import (
     PolicyLostError,
     PolicyTimeout,
 )
+from runtime.core.types import Observation
 from runtime.policies import gr00t
 from runtime.policies.gr00t import Config, Gr00tPolicy
+from runtime.policies.groot import arrays
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
-from runtime.types import Observation
 from tests.processes import eventually
 
 ROBOT = robots.load("agilex_piper")
@@ -385,3 +386,59 @@ def test_an_answer_that_comes_twice_is_thrown_away(when: str) -> None:
         ended.set()
         thread.join()
         wire.close(linger=0)
+
+
+# Servers that do not say which arrays they read
+
+
+def _unmarked(reads_npy: bool, asked: list[str]) -> Callable[[dict[str, Any]], bytes]:
+    """A server of N1.7's answers without its mark, whose errors are those of a real one."""
+    names = {"video": [camera.key for camera in ROBOT.cameras], "state": list(PARTS), "action": list(PARTS)}
+    modality = {
+        name: {"as_json": {"delta_indices": [0], "modality_keys": keys}}
+        for name, keys in (*names.items(), ("language", ["task"]))
+    }
+
+    def answer(message: dict[str, Any]) -> bytes:
+        if message["endpoint"] == "get_modality_config":
+            return arrays.pack(modality)
+        state = next(iter(message["data"]["observation"]["state"].values()))
+        asked.append("MNP" if b"nd" in state else "NPY")
+        if asked[-1] != ("NPY" if reads_npy else "MNP"):
+            return arrays.pack({"error": "State key 'arm' must be a numpy array, got dict"})
+        rows = {name: np.zeros((1, 1, len(part)), np.float32) for name, part in PARTS.items()}
+        return arrays.pack([rows, {}], True)
+
+    return answer
+
+
+@pytest.mark.parametrize(
+    ("reads_npy", "forms"), [(True, ["NPY", "NPY"]), (False, ["NPY", "MNP", "MNP"])], ids=["NPY", "MNP"]
+)
+def test_a_server_that_does_not_say_how_it_reads_arrays_is_asked_once_in_the_other_form(
+    reads_npy: bool, forms: list[str]
+) -> None:
+    asked: list[str] = []
+    with stub(_unmarked(reads_npy, asked)) as url, policy_at(url, dialect="nested") as policy:
+        policy.connect()
+        for _ in range(2):
+            assert policy.infer(observation()).actions.shape == (1, ROBOT.dim)
+    assert asked == forms
+
+
+def test_where_neither_form_is_read_the_first_error_is_said_and_nothing_is_tried_again() -> None:
+    asked: list[str] = []
+    says = _unmarked(True, asked)
+
+    def neither(message: dict[str, Any]) -> bytes:
+        says(message)
+        if message["endpoint"] == "get_modality_config":
+            return says(message)
+        return arrays.pack({"error": f"error {len(asked)}"})
+
+    with stub(neither) as url, policy_at(url, dialect="nested") as policy:
+        policy.connect()
+        for sentence in ("error 1", "error 3"):
+            with pytest.raises(PolicyError, match=sentence):
+                policy.infer(observation())
+    assert asked == ["NPY", "MNP", "NPY"]

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runtime.formats import PoseRows
+from runtime.core.pose_format import PoseFormat
 from runtime.policies.grip import Grip
-from runtime.pose_format import PoseFormat
+from runtime.spaces.pose_rows import PoseRows
 from tests.runtime.policies.peers import FRANKA, PIPER, seen
 
 

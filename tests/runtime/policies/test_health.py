@@ -9,8 +9,8 @@ import pytest
 from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
-from runtime.clock import MonotonicClock
-from runtime.errors import PolicyError, PolicyLostError
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import PolicyError, PolicyLostError
 from runtime.policies import openpi
 from runtime.policies.health import require_healthy
 from runtime.policies.openpi import OpenpiPolicy

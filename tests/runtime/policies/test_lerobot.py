@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.clock import MonotonicClock
-from runtime.errors import ConfigurationError, PolicyError, PolicyLostError, PolicyTimeout
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import ConfigurationError, PolicyError, PolicyLostError, PolicyTimeout
+from runtime.core.types import Observation
 from runtime.policies import lerobot
 from runtime.policies.lerobot import Config, LerobotPolicy
 from runtime.sim.faults import NONE, Fault
-from runtime.types import Observation
 
 pytest.importorskip("grpc", reason="the extra lerobot-grpc is not installed")
 from runtime.sim.lerobot_server import LerobotBehaviour, LerobotServer

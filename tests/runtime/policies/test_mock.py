@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import robots
-from runtime.clock import VirtualClock
-from runtime.errors import PolicyError
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import PolicyError
+from runtime.core.types import Float64, Observation
 from runtime.policies import mock
 from runtime.policies.mock import Config, MockPolicy
-from runtime.types import Float64, Observation
 
 RATE = 30.0
 

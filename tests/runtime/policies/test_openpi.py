@@ -16,9 +16,9 @@ from websockets.server import ServerProtocol
 from websockets.sync.server import ServerConnection, serve
 
 import robots
-from runtime import codecs
-from runtime.clock import MonotonicClock
-from runtime.errors import (
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import (
     ConfigurationError,
     ContradictionError,
     PolicyError,
@@ -29,15 +29,15 @@ from runtime.errors import (
     UnsolicitedError,
     WrongProtocolError,
 )
+from runtime.core.pose_format import PoseFormat
+from runtime.core.types import Conditioning, Observation
 from runtime.policies import openpi
 from runtime.policies.link import WebsocketLink, headline
 from runtime.policies.openpi import Config, OpenpiPolicy
-from runtime.pose_format import PoseFormat
 from runtime.sim.faults import NONE, TOO_LARGE, Fault
 from runtime.sim.in_poses import InPoses
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.script import Waving
-from runtime.types import Conditioning, Observation
 
 ROBOT = robots.load("agilex_piper")
 CAMERAS = tuple(camera.key for camera in ROBOT.cameras)

@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 
 from robots import Robot
-from runtime import deployment, family
-from runtime.clock import MonotonicClock
-from runtime.errors import PolicyLostError
+from runtime.config import loader as deployment
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import PolicyLostError
 from runtime.policies.openpi import OpenpiPolicy
+from runtime.station import spec as family
 from tests.runtime.policies.peers import FRANKA, PIPER, seen
 
 ROOT = Path(__file__).parents[3]

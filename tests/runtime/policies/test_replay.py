@@ -6,17 +6,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.clock import VirtualClock
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import PolicyError
+from runtime.core.pose_format import PoseFormat
+from runtime.core.types import Observation
 from runtime.datasets.journal import read_journal
 from runtime.datasets.mapping import ColumnMapping
-from runtime.errors import PolicyError
 from runtime.policies import replay
 from runtime.policies.replay import Config, ReplayPolicy
-from runtime.pose_format import PoseFormat
-from runtime.types import Observation
 from tests.runtime.datasets.foreign import Plan, column, write
 from tests.runtime.datasets.small import record, robot, write_dataset
 from tests.runtime.recording.samples import resealed
@@ -67,7 +67,6 @@ def test_the_first_observation_after_a_reset_has_row_0(root: Path, actions: np.n
 
 
 @given(step=st.integers(0, 200), rate=st.sampled_from([10.0, 20.0, 30.0, 50.0, 100.0]))
-@settings(deadline=None)
 def test_steps_of_another_rate_find_the_row_of_their_time(
     root: Path, actions: np.ndarray, step: int, rate: float
 ) -> None:

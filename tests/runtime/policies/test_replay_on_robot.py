@@ -10,9 +10,9 @@ import pytest
 
 import robots
 from runtime.policies import replay
-from runtime.transitions import State
+from runtime.processes.coordinator.session.transitions import State
+from tests.runtime.lockstep_station import Station, StubPlan, plan
 from tests.runtime.quality import built
-from tests.runtime.station import Station, StubPlan, plan
 
 ROWS = 90
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.tunnel.policy import TunnelledPolicy
-from runtime.types import ActionChunk, Conditioning, Observation
 from tests.runtime.policies.peers import FRANKA, seen
 
 

@@ -12,9 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from websockets.sync.server import ServerConnection
 
-from runtime import codecs
-from runtime.clock import MonotonicClock
-from runtime.errors import (
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import (
     ConfigurationError,
     ContradictionError,
     PolicyError,
@@ -22,12 +22,12 @@ from runtime.errors import (
     PolicyLostError,
     PolicyTimeout,
 )
+from runtime.core.pose_format import PoseFormat
+from runtime.core.types import Conditioning, Observation
 from runtime.policies import roboarena
 from runtime.policies.roboarena import Config, RoboarenaPolicy
-from runtime.pose_format import PoseFormat
 from runtime.sim.faults import Fault
 from runtime.sim.roboarena_server import Arena, RoboarenaServer
-from runtime.types import Conditioning, Observation
 from tests.runtime.policies.peers import FRANKA, PIPER, answering, seen, serving
 
 VECTORS = Path(__file__).parents[1] / "vectors"

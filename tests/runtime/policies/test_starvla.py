@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from websockets.sync.server import ServerConnection
 
-from runtime import codecs
-from runtime.clock import MonotonicClock
-from runtime.errors import ConfigurationError, ContradictionError, PolicyError, PolicyLostError
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import ConfigurationError, ContradictionError, PolicyError, PolicyLostError
+from runtime.core.pose_format import PoseFormat
+from runtime.core.types import Conditioning, Observation
 from runtime.policies import starvla
 from runtime.policies.starvla import Config, StarvlaPolicy
-from runtime.pose_format import PoseFormat
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.starvla_server import Star, StarvlaServer
-from runtime.types import Conditioning, Observation
 from tests.runtime.policies.peers import FRANKA, PIPER, Handler, seen, serving
 
 VECTORS = Path(__file__).parents[1] / "vectors"

@@ -14,7 +14,7 @@ import pytest
 from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
-from runtime import codecs
+from runtime.core import msgpack_arrays as codecs
 
 Certificate = tuple[Path, Path]  # and its key
 

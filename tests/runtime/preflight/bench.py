@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from robots import Robot
-from runtime import deployment, family
-from runtime.family import Plan
+from runtime.config import loader as deployment
 from runtime.preflight.course import Course
 from runtime.preflight.report import Report
 from runtime.sim.faults import NONE, Fault
+from runtime.station import spec as family
+from runtime.station.spec import StationSpec
 from tests.runtime.policies.peers import FRANKA, PIPER
 
 SIZE = (24, 32)
@@ -45,10 +46,10 @@ def _arena(variant: Any) -> Callable[[Fault], Any]:
     return lambda fault: RoboarenaServer(FRANKA, Arena(fault=fault, variant=variant, resolution=SIZE))
 
 
-def _starvla(fault: Fault) -> Any:
+def _starvla(old: bool) -> Callable[[Fault], Any]:
     from runtime.sim.starvla_server import Star, StarvlaServer
 
-    return StarvlaServer(FRANKA, Star(fault=fault, size=SIZE))
+    return lambda fault: StarvlaServer(FRANKA, Star(fault=fault, size=SIZE, old=old))
 
 
 def _gr00t(version: Any) -> Callable[[Fault], Any]:
@@ -68,6 +69,8 @@ ARENA = {
     "cameras": {"cam_high": "first", "cam_left_wrist": "wrist"},
     "reset_deadline": 5.0,
 }
+STARVLA = {"kind": "starvla", "cameras": CAMERAS, "ping_every": None}
+STATISTICS = {"low": list(FRANKA.lower), "high": list(FRANKA.upper)}
 GROOT = {"kind": "gr00t", "video": VIEWS, "state": PARTS, "actions": PARTS}
 LEROBOT = {
     "kind": "lerobot",
@@ -80,14 +83,17 @@ WIRES = {
     "openpi": Wire({"kind": "openpi"}, _openpi),
     "roboarena": Wire(ARENA, _arena("roboarena")),
     "vllm": Wire(ARENA, _arena("vllm")),
-    "starvla": Wire({"kind": "starvla", "cameras": CAMERAS, "ping_every": None}, _starvla),
+    "starvla": Wire(STARVLA, _starvla(old=False)),
+    "starvla-old": Wire({**STARVLA, "statistics": STATISTICS}, _starvla(old=True)),
     "gr00t-n1.5": Wire({**GROOT, "dialect": "n1.5"}, _gr00t("n1.5"), PIPER, None),
     "gr00t-n1.6": Wire({**GROOT, "dialect": "nested"}, _gr00t("n1.6"), PIPER, None),
+    "gr00t-n1.7-early": Wire(GROOT, _gr00t("n1.7-early"), PIPER, None),
+    "gr00t-starvla": Wire(GROOT, _gr00t("starvla"), PIPER, None),
     "lerobot": Wire(LEROBOT, _lerobot, PIPER, None),
 }
 
 
-def planned(wire: Wire, url: str, settings: Mapping[str, Any] | None = None, **tables: Any) -> Plan:
+def planned(wire: Wire, url: str, settings: Mapping[str, Any] | None = None, **tables: Any) -> StationSpec:
     """A plan whose policy is that of the wire, at `url`."""
     tree = {
         "station": "bench-1",

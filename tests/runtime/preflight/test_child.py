@@ -6,18 +6,24 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from websockets.exceptions import ConnectionClosed, ConnectionClosedOK
+from websockets.sync.server import ServerConnection
 
-from runtime import deployment
-from runtime.deployment import server_of
-from runtime.errors import RuntimeFault
-from runtime.preflight import child as module
-from runtime.preflight.child import Preflights
-from runtime.requests import PreflightRequest
-from tests.runtime.policies.peers import FRANKA
+from runtime.config import loader as deployment
+from runtime.config.loader import server_of
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.command_arguments import PreflightRequest
+from runtime.policies.link import LEAVING, await_left
+from runtime.station import preflight_child as module
+from runtime.station.preflight_child import Preflights
+from tests.processes import eventually
+from tests.runtime.policies.peers import FRANKA, serving
 from tests.runtime.preflight.bench import WIRES, planned, served
 
 OWN = planned(WIRES["openpi"], "ws://127.0.0.1:1").resolved
@@ -214,3 +220,31 @@ def test_a_server_has_one_spelling(url: str, server: str) -> None:
 def test_a_policy_without_a_server_has_none() -> None:
     changed = deployment.changed(OWN, {"policy": {"kind": "mock"}}, "test")
     assert server_of(changed.deployment) == ""
+
+
+@pytest.mark.slow
+def test_the_program_leaves_a_server_with_a_close_frame() -> None:
+    """Else servers of openpi print a traceback for each preflight."""
+    ended: list[ConnectionClosed] = []
+
+    def converse(connection: ServerConnection) -> None:
+        connection.send(codecs.pack({"action_dim": 99}))
+        try:
+            connection.recv()
+        except ConnectionClosed as closed:
+            ended.append(closed)
+
+    with serving(converse) as url:
+        report, code = flown({"tree": dict(OWN.tree), "changes": {"policy": {"url": url}}, "deadline_s": 60})
+        eventually(lambda: ended, 30, "the end of the conversation")
+    assert (report["verdict"], code) == ("wrong_action_space", 1)
+    assert isinstance(ended[0], ConnectionClosedOK), ended[0]
+
+
+def test_a_server_that_is_being_left_is_given_a_moment() -> None:
+    told = threading.Event()
+    leaving = threading.Thread(target=told.wait, args=(30,), name=LEAVING)
+    leaving.start()
+    threading.Timer(0.0, told.set).start()
+    await_left(30.0)
+    assert not leaving.is_alive()

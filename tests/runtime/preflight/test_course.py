@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.clock import VirtualClock
-from runtime.errors import ConfigurationError
-from runtime.plugins import variants
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import ConfigurationError
+from runtime.core.plugins import variants
+from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.preflight.course import Course, patience
+from runtime.preflight.course import Course
 from runtime.preflight.report import Report, shown
 from runtime.preflight.subject import Subject, pictures
 from runtime.preflight.verdict import Stage, Verdict
-from runtime.types import ActionChunk, Conditioning, Observation
+from runtime.station.preflight_child import patience
 from tests.runtime.policies.peers import FRANKA
 from tests.runtime.preflight.bench import WIRES, planned
 
@@ -229,10 +230,10 @@ def test_a_report_without_a_policy_is_two_lines_and_advice() -> None:
 
 @pytest.mark.slow
 def test_compiling_kinematics_is_not_the_policys_time(flown: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    from runtime.family import Plan
+    from runtime.station.spec import StationSpec
 
-    made = Plan.kinematics
-    monkeypatch.setattr(Plan, "kinematics", lambda plan: (threading.Event().wait(3.2), made(plan))[1])
+    made = StationSpec.kinematics
+    monkeypatch.setattr(StationSpec, "kinematics", lambda plan: (threading.Event().wait(3.2), made(plan))[1])
     poses = np.concatenate([np.append(arm.pose(FRANKA.poses["home"]), 0.5) for arm in FRANKA.arms])
 
     class Posed(Stub):

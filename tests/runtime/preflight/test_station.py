@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from runtime.clock import VirtualClock
-from runtime.errors import RuntimeFault
-from runtime.messages import Command, Event
-from runtime.preflight.child import Flight
-from runtime.preflight.station import PREFLIGHT_QUERIES, PreflightDesk
-from runtime.transitions import State
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.messages import Command, Event
+from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightDesk
+from runtime.processes.coordinator.session.transitions import State
+from runtime.station.preflight_child import Flight
+from tests.runtime.lockstep_station import Station, plan
 from tests.runtime.preflight.bench import LEROBOT, WIRES, planned
-from tests.runtime.station import Station, plan
 
 OWN = planned(WIRES["openpi"], "ws://127.0.0.1:8000")
 GRPC = "grpc://127.0.0.1:8080"

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from runtime.deployment import server_of
+from runtime.config.loader import server_of
 from runtime.policies.tunnel.process import free_port
-from runtime.preflight.course import Course, patience
+from runtime.preflight.course import Course
+from runtime.station.preflight_child import patience
 from tests.runtime.preflight.bench import WIRES, planned, served
 from tests.ssh import SshServer
 

@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.quality.inspection import inspect
 from runtime.quality.settings import QualitySettings, read_settings
 from tests.runtime.quality import built

@@ -9,9 +9,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from runtime.core.errors import RecordingError
 from runtime.datasets.operations import convert
 from runtime.datasets.published import publish
-from runtime.errors import RecordingError
 from runtime.quality.__main__ import main
 from runtime.quality.inspection import inspect, inspect_dataset
 from tests.runtime.quality import built

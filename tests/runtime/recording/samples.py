@@ -13,7 +13,7 @@ import numpy as np
 
 from runtime.recording.base import ExecutedTick, RawChunk, Row
 from runtime.recording.layout import Layout
-from runtime.recording.sealing import digests_of, sealed, told
+from runtime.recording.sealing import OUTCOME, SECOND, digests_of, sealed, told, write_outcome
 from runtime.recording.settings import RecordingSettings
 
 HEIGHT, WIDTH = 48, 64
@@ -131,9 +131,16 @@ def chunk(chunk_id: int, horizon: int = 4, width: int = 2) -> RawChunk:
 
 
 def unsealed(folder: Path, **changes: object) -> None:
-    """Make the outcome one from before there were digests, with `changes`."""
+    """Make the outcome one from before there were digests and copies of it, with `changes`."""
     path = folder / "outcome.json"
+    (folder / SECOND).unlink(missing_ok=True)
     path.write_text(json.dumps(told(json.loads(path.read_text())) | changes))
+
+
+def unended(folder: Path) -> None:
+    """Take its outcome and the copy of that away, as if the recorder had been killed just before it wrote them."""
+    for name in (SECOND, OUTCOME):
+        (folder / name).unlink()
 
 
 def resealed(folder: Path, **changes: object) -> None:
@@ -141,4 +148,4 @@ def resealed(folder: Path, **changes: object) -> None:
     path = folder / "outcome.json"
     outcome = told(json.loads(path.read_text())) | changes
     layout = Layout.of(json.loads((folder / "manifest.json").read_text()))
-    path.write_bytes(sealed(outcome, digests_of(folder, layout)))
+    write_outcome(folder, sealed(outcome, digests_of(folder, layout)))

@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.admission import admit_chunk, admit_row, admit_tick
 from runtime.recording.base import RawChunk
 from runtime.recording.layout import Layout

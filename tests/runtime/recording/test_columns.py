@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.base import RawChunk
 from runtime.recording.columns import RecordedRow
 from runtime.recording.layout import Layout

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.encoder import CameraEncoder
 from runtime.recording.video import FragmentedVideo
 

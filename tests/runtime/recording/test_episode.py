@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.base import Loss, Outcome
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.files import DiskFullError, UnclosedError
@@ -21,7 +21,7 @@ from runtime.recording.video import FragmentedVideo
 from tests.processes import eventually
 from tests.runtime.recording.failing import fail_at
 
-from .samples import CAMERAS, HEIGHT, SETTINGS, WIDTH, chunk, manifest, numbers, row, tick
+from .samples import CAMERAS, HEIGHT, SETTINGS, WIDTH, chunk, manifest, numbers, row, tick, unended
 
 FINISHED = Outcome("finished", "stopped by the operator", 1.7e9 + 10, {"success": True, "frames": "mine"})
 
@@ -346,7 +346,7 @@ def test_repair_keeps_the_rows_after_a_camera_was_lost(
     for k in range(told, told + 30):
         journal.append(row(k))
     journal.end(FINISHED)
-    (folder / "outcome.json").unlink()
+    unended(folder)
     report = repair(folder)
     assert (report.verdict, report.frames, report.rows_cut) == ("repaired", told + 30, 0)
     outcome = open_episode(folder).outcome or {}
@@ -484,8 +484,8 @@ def test_an_outcome_that_alone_finds_no_room_is_written_once_there_is_some(
     def full(path: Path, data: bytes) -> None:
         raise DiskFullError(f"disk full while writing {path}")
 
-    monkeypatch.setattr("runtime.recording.episode.write_whole", full)
-    with pytest.raises(UnclosedError, match=r"disk full while writing .*outcome\.json") as waits:
+    monkeypatch.setattr("runtime.recording.sealing.write_whole", full)
+    with pytest.raises(UnclosedError, match=r"disk full while writing .*sealed\.json") as waits:
         journal.end(FINISHED)
     monkeypatch.undo()
     waits.value.again()

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording import export as exporting
 from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.files import (
     AppendFile,
     document,

@@ -1,7 +1,7 @@
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime.recording.files import AppendFile
@@ -37,7 +37,6 @@ def test_a_whole_video_is_whole(video: bytes, path: Path) -> None:
 
 
 @given(data=st.data())
-@settings(deadline=None)
 def test_a_cut_at_any_byte_leaves_the_frames_of_the_whole_fragments(
     video: bytes, path: Path, data: st.DataObject
 ) -> None:
@@ -54,7 +53,6 @@ def test_a_cut_at_any_byte_leaves_the_frames_of_the_whole_fragments(
 
 
 @given(data=st.data())
-@settings(deadline=None)
 def test_zeros_in_the_place_of_the_tail_are_no_fragments(
     video: bytes, path: Path, data: st.DataObject
 ) -> None:

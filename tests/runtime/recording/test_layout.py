@@ -2,7 +2,7 @@ from typing import Any
 
 import pytest
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.layout import Layout
 
 from .samples import CAMERAS, manifest

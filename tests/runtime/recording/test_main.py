@@ -7,7 +7,7 @@ from runtime.recording.__main__ import main
 from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
 
-from .samples import CAMERAS, SETTINGS, chunk, manifest, row, tick
+from .samples import CAMERAS, SETTINGS, chunk, manifest, row, tick, unended
 
 
 @pytest.fixture
@@ -40,12 +40,17 @@ def test_show_says_what_an_episode_holds(folder: Path, capsys: pytest.CaptureFix
 
 
 def test_repair_mends_one_or_all(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "outcome.json").unlink()
+    unended(folder)
     assert main(["repair", str(folder)]) == 0
     assert "repaired: 3 rows" in capsys.readouterr().out
+    unended(folder)
+    assert main(["repair", str(folder.parent)]) == 0
+    said = capsys.readouterr().out
+    assert "repaired: 3 rows" in said
+    assert "its outcome is lost" in said
     (folder / "outcome.json").unlink()
     assert main(["repair", str(folder.parent)]) == 0
-    assert "repaired: 3 rows" in capsys.readouterr().out
+    assert "restored: it has no outcome, and a whole copy of it" in capsys.readouterr().out
     assert main(["show", str(folder)]) == 0
     assert "interrupted" in capsys.readouterr().out
 

@@ -31,7 +31,7 @@ def made(picture: np.ndarray, size: tuple[int, int]) -> list[np.ndarray]:
     width=st.integers(4, 40),
     kind=st.integers(0, 2),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_every_plane_is_that_of_the_standard_to_within_its_rounding(
     seed: int, height: int, width: int, kind: int
 ) -> None:

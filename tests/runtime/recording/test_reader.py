@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.reader import open_episode, read_events

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording import repair as repair_module
 from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
@@ -15,7 +15,7 @@ from runtime.recording.reader import open_episode
 from runtime.recording.repair import UNCUT, repair, repair_all
 from runtime.recording.tables import SCHEMAS, read_table
 
-from .samples import CAMERAS, SETTINGS, chunk, manifest, numbers, row, tick
+from .samples import CAMERAS, SETTINGS, chunk, manifest, numbers, row, tick, unended
 from .test_tables import old_raw
 
 ROWS = 40
@@ -36,7 +36,7 @@ def unfinished(tmp_path_factory: pytest.TempPathFactory) -> Path:
         journal.mark({"row": k})
     journal.append(chunk(1))
     journal.end(Outcome("finished", "", 1.7e9))
-    (folder / "outcome.json").unlink()
+    unended(folder)
     return folder
 
 
@@ -61,7 +61,7 @@ def test_an_episode_that_only_lacks_its_outcome_loses_nothing(folder: Path) -> N
     assert (report.verdict, report.frames, report.rows_cut, report.torn_bytes) == ("repaired", ROWS, 0, 0)
     assert report.video_frames == dict.fromkeys(CAMERAS, ROWS)
     after = contents(folder)
-    after.pop("outcome.json")
+    assert after.pop("outcome.json") == after.pop("sealed.json")
     assert after == before
     outcome = open_episode(folder).outcome
     assert outcome is not None
@@ -121,25 +121,24 @@ def test_a_repair_that_was_itself_killed_is_completed(folder: Path, monkeypatch:
     video = folder / f"{CAMERAS[0]}.mp4"
     rows = (folder / "rows.arrow").read_bytes()
     cut(video, video.stat().st_size // 2)
-    real = repair_module.write_whole
 
-    def killed(path: Path, data: bytes) -> None:
-        if path.name == "outcome.json":
-            raise RecordingError("killed")
-        real(path, data)
+    def killed(folder: Path, text: bytes) -> None:
+        raise RecordingError("killed")
 
-    monkeypatch.setattr(repair_module, "write_whole", killed)
+    monkeypatch.setattr(repair_module, "write_outcome", killed)
     with pytest.raises(RecordingError, match="killed"):
         repair(folder)
     monkeypatch.undo()
     report = repair(folder)
-    assert (report.verdict, report.rows_cut) == ("repaired", 0)
+    assert (report.verdict, report.rows_cut) == ("repaired", ROWS - report.frames)
+    assert report.rows_cut > 0
+    assert report.torn_bytes > 0
     assert open_episode(folder).frames == report.frames
     assert (folder / UNCUT).read_bytes() == rows
 
 
 @given(data=st.data())
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_whatever_is_torn_rows_and_frames_belong_together_afterwards(
     unfinished: Path, tmp_path: Path, data: st.DataObject
 ) -> None:

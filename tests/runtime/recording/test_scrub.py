@@ -21,26 +21,27 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from runtime.clock import VirtualClock
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import PolicyError, RecordingError
 from runtime.datasets.__main__ import main as datasets
 from runtime.datasets.importing import Whose, bring
 from runtime.datasets.published import publish
 from runtime.datasets.reader import Dataset, open_dataset
-from runtime.errors import PolicyError, RecordingError
 from runtime.policies.replay import Config, ReplayPolicy
 from runtime.recording.__main__ import main
 from runtime.recording.base import ExecutedTick, Outcome, RawChunk
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.layout import Layout
 from runtime.recording.quarantine import keep, marked
-from runtime.recording.repair import repair, repair_all
-from runtime.recording.scrub import UNSEALED, DamagedError, verify
-from runtime.recording.sealing import DIGESTS, digest_of, digests_of, read_outcome
+from runtime.recording.repair import PLAN, repair, repair_all
+from runtime.recording.scrub import verify
+from runtime.recording.sealing import DIGESTS, SEAL, digest_of, digests_of, read_outcome
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.tables import SCHEMAS, read_table
+from runtime.recording.verdict import UNSEALED, DamagedError
 from tests.runtime.datasets.small import manifest, robot, row
 
-from .samples import unsealed
+from .samples import unended, unsealed
 
 FRAMES, DIM = 45, 6
 SETTINGS = RecordingSettings(min_free_bytes=0, flush_period_s=0.02)
@@ -119,7 +120,7 @@ def test_what_was_recorded_is_sound_and_its_digests_are_those_of_any_other_progr
     verdict = verify(folder)
     assert (verdict.state, verdict.damage) == ("sound", ())
     digests = read_outcome(folder)[DIGESTS]
-    assert set(digests) == {path.name for path in folder.iterdir()} - {"outcome.json"}
+    assert set(digests) == {path.name for path in folder.iterdir()} - {"outcome.json", "sealed.json"}
     for name, told in digests.items():
         content = (folder / name).read_bytes()
         assert (told["bytes"], told["sha256"]) == (len(content), hashlib.sha256(content).hexdigest())
@@ -184,21 +185,21 @@ def a_bit_off(path: Path) -> bytes:
 
 
 NAMES = (
-    *("manifest.json", "outcome.json", "events.jsonl", "cam_high.mp4", "cam_wrist.mp4"),
+    *("manifest.json", "outcome.json", "sealed.json", "events.jsonl", "cam_high.mp4", "cam_wrist.mp4"),
     *(f"{table}.arrow" for table in SCHEMAS),
 )
 
 
 @pytest.mark.parametrize("harm", HARMS)
 @pytest.mark.parametrize("name", NAMES)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(at=st.floats(0, 1), how=st.floats(0, 1))
 def test_harm_to_any_file_is_named_and_such_a_recording_is_neither_published_nor_imported_nor_played(
     lab: Path, dataset: Dataset, name: str, harm: str, at: float, how: float
 ) -> None:
     folder = episode_in(lab)
     if (name, harm) == ("outcome.json", "absent"):
-        return  # an episode that was cut off is no other
+        return  # nothing else is lost: tests/runtime/recording/test_lost.py
     before = (lab / "set/meta/info.json").stat().st_mtime_ns
     whole = (folder / name).read_bytes()
     after = HARMS[harm](bytearray(whole), at, how)
@@ -218,7 +219,8 @@ def test_harm_to_any_file_is_named_and_such_a_recording_is_neither_published_nor
         ):  # then it is taken for a dataset, which it is not either
             with pytest.raises(PolicyError, match=name):
                 policy.connect()
-        assert repair(folder).verdict in ("damaged", "unreadable")
+        wanted = ("restored",) if name in ("outcome.json", "sealed.json") else ("damaged", "unreadable")
+        assert repair(folder).verdict in wanted
     assert (lab / "set/meta/info.json").stat().st_mtime_ns == before
     assert verify(folder).state == "sound"
 
@@ -435,13 +437,19 @@ def killed_at(monkeypatch: pytest.MonkeyPatch, number: int) -> Iterator[None]:
         yield
 
 
+def outcome_of(folder: Path) -> dict[str, object]:
+    outcome = read_outcome(folder)
+    return {name: outcome[name] for name in outcome if name not in (DIGESTS, SEAL)}
+
+
 def test_a_repair_killed_anywhere_leaves_nothing_that_is_called_damaged(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (folder / "outcome.json").unlink()
+    unended(folder)
     for name, torn in (("rows.arrow", 700), ("ticks.arrow", 30), ("cam_high.mp4", 900), ("events.jsonl", 5)):
         with open(folder / name, "r+b") as file:
             file.truncate((folder / name).stat().st_size - torn)
+    figures = []
     for number in itertools.count():
         copy = folder.with_name(f"{number}") / folder.name
         shutil.copytree(folder, copy)
@@ -449,20 +457,23 @@ def test_a_repair_killed_anywhere_leaves_nothing_that_is_called_damaged(
             with killed_at(monkeypatch, number):
                 repair(copy)
         except Killed:
-            closed = (copy / "outcome.json").exists()
+            closed, sealed = (copy / "outcome.json").exists(), (copy / "sealed.json").exists()
             assert verify(copy).state == ("sound" if closed else "open")
-            assert repair(copy).verdict == ("complete" if closed else "repaired")
+            assert repair(copy).verdict == ("complete" if closed else "restored" if sealed else "repaired")
             assert verify(copy).state == "sound"
+            assert not (copy / PLAN).exists()
+            figures.append(outcome_of(copy))
         else:
             break
     assert number > 8
+    assert all(one == outcome_of(copy) for one in figures)  # the rows, bytes and lines that were cut, too
     digests = read_outcome(copy)[DIGESTS]
     assert "rows.uncut.arrow" in digests
     assert digests == digests_of(copy, Layout.of(json.loads((folder / "manifest.json").read_text())))
 
 
 def test_what_a_repair_has_sealed_is_named_when_it_is_damaged(folder: Path) -> None:
-    (folder / "outcome.json").unlink()
+    unended(folder)
     assert [report.verdict for report in repair_all(folder.parent)] == ["repaired"]
     video = folder / "cam_wrist.mp4"
     with harmed(video, a_bit_off(video)), pytest.raises(DamagedError, match=r"cam_wrist\.mp4"):

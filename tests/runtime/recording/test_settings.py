@@ -1,6 +1,6 @@
 import pytest
 
-from runtime.errors import ConfigurationError
+from runtime.core.errors import ConfigurationError
 from runtime.recording import trial
 from runtime.recording.codecs import CODECS
 from runtime.recording.settings import RecordingSettings

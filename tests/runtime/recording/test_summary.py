@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.columns import RecordedRow
 from runtime.recording.layout import Layout
 from runtime.recording.summary import summarise

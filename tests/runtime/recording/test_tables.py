@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording.columns import RecordedRow
 from runtime.recording.layout import Layout
 from runtime.recording.tables import (
@@ -44,7 +44,6 @@ def stream(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[int]]:
 
 
 @given(data=st.data())
-@settings(deadline=None)
 def test_a_cut_at_any_byte_loses_only_whole_batches_at_the_end(
     tmp_path_factory: pytest.TempPathFactory, stream: tuple[bytes, list[int]], data: st.DataObject
 ) -> None:
@@ -64,7 +63,6 @@ def test_a_cut_at_any_byte_loses_only_whole_batches_at_the_end(
 
 
 @given(data=st.data())
-@settings(deadline=None)
 def test_zeros_in_the_place_of_the_tail_never_become_rows(
     tmp_path_factory: pytest.TempPathFactory, stream: tuple[bytes, list[int]], data: st.DataObject
 ) -> None:

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from runtime.errors import RecordingError
+from runtime.core.errors import RecordingError
 from runtime.recording import writer as writer_module
 from runtime.recording.files import AppendFile
 from runtime.recording.layout import Layout

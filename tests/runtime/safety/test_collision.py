@@ -8,9 +8,9 @@ import pytest
 import robots
 from robots import Body, Robot
 from robots.rotations import quaternion_of_matrix
-from runtime.collision import Collision, Collisions
+from runtime.core.types import Float64
 from runtime.kinematics.compiled import CompiledKinematics
-from runtime.types import Float64
+from runtime.safety.collision import Collision, Collisions
 from tests.runtime.collision_samples import MARGIN, collisions, robot, turned, way
 
 FREE, NEAR, DEEP = turned(0.5), turned(1.2), turned(1.4)

@@ -4,8 +4,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import robots
-from runtime.collision import Collisions
-from runtime.safety import Limits, RobotState, SafetyFilter, SafetySettings
+from runtime.safety.collision import Collisions
+from runtime.safety.filter import Limits, RobotState, SafetyFilter, SafetySettings
 from tests.runtime.collision_samples import collisions, robot, turned
 
 NAMES = ("arm.joint0", "arm.joint1", "arm.gripper")

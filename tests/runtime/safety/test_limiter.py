@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.limiter import CommandLimiter
-from runtime.limits import Limits
-from runtime.safety_settings import SafetySettings
+from runtime.safety.limiter import CommandLimiter
+from runtime.safety.limits import Limits
+from runtime.safety.settings import SafetySettings
 from tests.runtime.tick_bench import PERIOD
 
 # A joint, a gripper that closes on the way, one that switches, a speed of a base.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 import robots
-from runtime.safety import WorkspaceBox
-from runtime.types import Float64
-from runtime.workspace import Workspace
+from runtime.core.types import Float64
+from runtime.safety.filter import WorkspaceBox
+from runtime.safety.workspace import Workspace
 from tests.runtime.collision_samples import way
 
 

@@ -8,9 +8,11 @@ from functools import cache
 import numpy as np
 
 import robots
-from runtime.clock import VirtualClock
+from runtime.core.clock import VirtualClock
+from runtime.core.types import Float64, UInt8
+from runtime.motion.timeline import DimensionKinds, Timeline
 from runtime.policies.pictures import fitted, laid_out
-from runtime.safety import Limits, RobotState, SafetyFilter, SafetySettings
+from runtime.safety.filter import Limits, RobotState, SafetyFilter, SafetySettings
 from runtime.sim.bench import Bench
 from runtime.sim.pick_place import PickPlace, Skill
 from runtime.sim.plant import Plant
@@ -19,8 +21,6 @@ from runtime.sim.script import Answer
 from runtime.sim.tabletop import Reset, Tabletop
 from runtime.strategies import overlap
 from runtime.strategies.base import Arrival
-from runtime.timeline import Dims, Timeline
-from runtime.types import Float64, UInt8
 
 ROBOT = robots.load("agilex_piper")
 RATE = 30.0
@@ -93,7 +93,7 @@ class Trial:
 
     def run(self, seconds: float = 30.0, to_the_end: bool = False) -> Outcome:
         """Ask back to back, every answer `delay` ticks late, until success or for so long."""
-        timeline, merge = Timeline(ROBOT.dim), overlap.merge(overlap.Config(), Dims())
+        timeline, merge = Timeline(ROBOT.dim), overlap.merge(overlap.Config(), DimensionKinds())
         safety = SafetyFilter(SafetySettings(), _LIMITS)
         previous, velocity = self.plant.target.copy(), np.zeros(ROBOT.dim)
         notes: list[str] = []

@@ -10,12 +10,12 @@ import numpy as np
 import robots
 from robots import Group
 from robots.rotations import quaternion_of_matrix
+from runtime.core.types import Float64
 from runtime.kinematics.compiled import CompiledKinematics
 from runtime.sim.bench import tip_in_world
 from runtime.sim.limbs import limbs
 from runtime.sim.plant import Plant
 from runtime.sim.tabletop import Reset, Tabletop
-from runtime.types import Float64
 
 ROBOT = robots.load("agilex_piper")
 KINEMATICS = CompiledKinematics(ROBOT)

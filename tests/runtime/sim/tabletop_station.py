@@ -17,11 +17,11 @@ import numpy as np
 
 import robots
 from robots import Robot
-from runtime import deployment, family
-from runtime.clock import Clock
-from runtime.family import Plan
-from runtime.lockstep import Lockstep
-from runtime.session import State
+from runtime.config import loader as deployment
+from runtime.core.clock import Clock
+from runtime.core.types import Float64, UInt8
+from runtime.processes.coordinator.session.machine import State
+from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.sim.bench import Bench, camera_arm
 from runtime.sim.in_poses import InPoses
 from runtime.sim.link import Link
@@ -33,9 +33,10 @@ from runtime.sim.render import Renderer
 from runtime.sim.script import Script
 from runtime.sim.surroundings import Surroundings
 from runtime.sim.tabletop import Reset, Tabletop
+from runtime.station import spec as family
+from runtime.station.spec import StationSpec
 from runtime.transports import zmq
 from runtime.transports.base import Capabilities
-from runtime.types import Float64, UInt8
 
 DEPLOYMENTS = Path(__file__).parents[3] / "deployments"
 HORIZON = 50
@@ -78,7 +79,7 @@ class SlowEye(Surroundings):
 
 
 @dataclass(frozen=True, slots=True)
-class TabletopPlan(Plan):
+class TabletopPlan(StationSpec):
     """A plan whose transport is the simulated node in this process."""
 
     bench: SlowEye

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runtime.session import State
+from runtime.processes.coordinator.session.machine import State
 from tests.runtime.sim.tabletop_station import pick_and_place
 
 EVERY_MILESTONE = {"grasped": True, "lifted": True, "over_plate": True, "placed": True}

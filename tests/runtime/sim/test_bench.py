@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import robots
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
 from runtime.sim import bench
 from runtime.sim.bench import Bench, BenchError
 from runtime.sim.limbs import Limb

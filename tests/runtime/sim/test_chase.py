@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.clock import VirtualClock
-from runtime.errors import SetupError
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import SetupError
+from runtime.core.types import Float64
 from runtime.sim.bench import Belt, Layout, tip_in_world
 from runtime.sim.chase import LEAD, SPEED, Chase, Places
 from runtime.sim.pick_place import ScriptError
-from runtime.types import Float64
 from tests.runtime.sim.drawn_bench import drawn
 
 ROBOT = robots.load("agilex_piper")

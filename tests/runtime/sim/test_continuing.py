@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from robots import load
+from runtime.core.types import Float32
 from runtime.sim.continuing import ModelSpace, Prefix, continued
-from runtime.types import Float32
 
 ROBOT = load("agilex_piper")
 ROWS = arrays(np.float32, (12, 2), elements=st.floats(-3, 3, width=32))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import robots
-from runtime import codecs
+from runtime.core import msgpack_arrays as codecs
 from runtime.sim.drives import Switch
 from runtime.sim.gate import Gate
 from runtime.sim.tabletop import Reset

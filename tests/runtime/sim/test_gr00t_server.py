@@ -16,13 +16,13 @@ import pytest
 import zmq
 
 import robots
-from runtime.clock import MonotonicClock
-from runtime.deployment import load
+from runtime.config.loader import load
+from runtime.core.clock import MonotonicClock
+from runtime.core.types import Observation
 from runtime.policies import gr00t
-from runtime.session import State
+from runtime.processes.coordinator.session.machine import State
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.sim.script import Script
-from runtime.types import Observation
 from tests.runtime.sim.tabletop_station import HORIZON, TabletopPlan, pick_and_place, planned
 
 ROOT = Path(__file__).parents[3]
@@ -68,7 +68,8 @@ def toml(table: dict[str, Any]) -> str:
     return "{" + ", ".join(f"{key} = {json.dumps(value)}" for key, value in table.items()) + "}"
 
 
-def test_a_trial_through_gr00t_puts_the_block_on_the_plate(tmp_path: Path) -> None:
+@pytest.mark.parametrize("version", ["n1.7-early", "starvla"])
+def test_a_trial_through_gr00t_puts_the_block_on_the_plate(tmp_path: Path, version: Any) -> None:
     robot = planned("tabletop_ur5e", 0, tmp_path, None).robot
     groups = toml({group.name: list(range(group.slice.start, group.slice.stop)) for group in robot.groups})
     cameras = toml({camera.key: camera.key for camera in robot.cameras})
@@ -79,7 +80,7 @@ def test_a_trial_through_gr00t_puts_the_block_on_the_plate(tmp_path: Path) -> No
     servers: list[Gr00tServer] = []
 
     def serve(made: TabletopPlan, script: Script) -> Gr00tServer:
-        servers.append(Gr00tServer(made.robot, Gr00tBehaviour("n1.7", False, HORIZON, made.rate), 0, script))
+        servers.append(Gr00tServer(made.robot, Gr00tBehaviour(version, False, HORIZON, made.rate), 0, script))
         return servers[0]
 
     trial = pick_and_place("tabletop_ur5e", 0, tmp_path, assignments, serve)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.errors import SetupError
-from runtime.formats import PoseRows
-from runtime.pose_format import PoseFormat
+from runtime.core.errors import SetupError
+from runtime.core.pose_format import PoseFormat
 from runtime.sim.in_poses import InPoses, pose_format
 from runtime.sim.script import Waving
+from runtime.spaces.pose_rows import PoseRows
 
 FORMATS = [
     PoseFormat(),

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.clock import MonotonicClock
-from runtime.errors import SetupError
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import SetupError
+from runtime.core.types import Observation
 from runtime.policies import lerobot
-from runtime.session import State
+from runtime.processes.coordinator.session.machine import State
 from runtime.sim.script import Script
-from runtime.types import Observation
 from tests.runtime.sim.tabletop_station import HORIZON, TabletopPlan, pick_and_place, planned
 
 grpc = pytest.importorskip("grpc", reason="the extra lerobot-grpc is not installed")

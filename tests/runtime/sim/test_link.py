@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.clock import VirtualClock
-from runtime.errors import SetupError
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import SetupError
+from runtime.core.types import Float64, RobotCommand
 from runtime.sim.link import Link
 from runtime.sim.node import Node, parser
 from runtime.transports.node_messages import MessageRefused
-from runtime.types import Float64, RobotCommand
 
 ROBOT = robots.load("agilex_piper")
 HOME = ROBOT.poses["home"]

@@ -14,19 +14,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime import deployment, family
-from runtime.clock import VirtualClock
-from runtime.errors import SetupError
-from runtime.messages import Ack, Command
+from runtime.config import loader as deployment
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import SetupError
+from runtime.ipc.identity import LOCAL
+from runtime.ipc.messages import Ack, Command
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.lockstep.server import ServedLockstep
 from runtime.recording.reader import open_episode
-from runtime.served_lockstep import ServedLockstep
 from runtime.sim import lockstep, serve
 from runtime.sim.lockstep import Rested, planned
 from runtime.sim.node import parser
 from runtime.sim.tabletop import Tabletop
-from runtime.transitions import State
+from runtime.station import spec as family
+from tests.runtime.lockstep_station import column
 from tests.runtime.sim.tabletop_station import DEPLOYMENTS, SlowEye
-from tests.runtime.station import column
 
 LINE = "openpi --robot agilex_piper --behaviour pick_place --port 0 --seed 3 --noise {} --latency-ms {}"
 TURNS = 200_000
@@ -90,6 +92,7 @@ class Operator:
                 kind,
                 arguments,
                 holder="script",
+                role=LOCAL,
                 epoch=epoch,
                 boot=main.boot,
                 sequence=main.session.sequence,

@@ -15,9 +15,10 @@ import pytest
 import zmq
 
 import robots
-from runtime import codecs
-from runtime.clock import MonotonicClock, VirtualClock
-from runtime.errors import CodecError, SetupError
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import MonotonicClock, VirtualClock
+from runtime.core.errors import CodecError, SetupError
+from runtime.core.types import Float64, Observation, RobotCommand
 from runtime.sim import node as module
 from runtime.sim.bench import overhead_camera
 from runtime.sim.layout import layout_of
@@ -28,7 +29,6 @@ from runtime.transports.node_messages import NodeMessages
 from runtime.transports.node_sink import NodeSink
 from runtime.transports.node_source import NodeSource
 from runtime.transports.zmq import Config
-from runtime.types import Float64, Observation, RobotCommand
 
 ROBOT = robots.load("agilex_piper")
 HOME = ROBOT.poses["home"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
 from runtime.sim.bench import Bench, tip_in_world
 from runtime.sim.postures import CLEAR, TILTS, Postures, closed, gripper_dim, jaws, opened
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 import robots
-from runtime.clock import MonotonicClock
-from runtime.errors import SetupError
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import SetupError
 from runtime.recording.reader import open_episode
 from runtime.sim import ros1_modules
 from runtime.sim.ros1_node import Ros1Node, main, parser

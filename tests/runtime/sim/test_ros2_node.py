@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.clock import MonotonicClock
-from runtime.errors import SetupError
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import SetupError
 from runtime.sim.ros2_node import Ros2Node, main, parser
 from runtime.sim.ros_domain import free_domain
 from runtime.sim.ros_robot import topics

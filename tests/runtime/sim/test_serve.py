@@ -15,15 +15,15 @@ from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import ClientConnection, connect
 
 import robots
-from runtime import codecs
-from runtime.clock import MonotonicClock
-from runtime.errors import ContradictionError, PolicyError, PolicyGone
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import ContradictionError, PolicyError, PolicyGone
+from runtime.core.types import Observation
 from runtime.policies import openpi
 from runtime.policies.pictures import fitted, laid_out
 from runtime.sim.bench import Layout
 from runtime.sim.gestures import Gesture
 from runtime.sim.layout import layout_of
-from runtime.types import Observation
 from tests.runtime.sim.drawn_bench import drawn
 
 ROBOT = robots.load("agilex_piper")

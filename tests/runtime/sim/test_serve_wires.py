@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.clock import MonotonicClock
-from runtime.errors import PolicyError, PolicyGone
-from runtime.plugins import variants
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import PolicyError, PolicyGone
+from runtime.core.plugins import variants
 from tests.runtime.policies.peers import FRANKA, seen
 
 ARENA = {"cameras": {"cam_high": "first", "cam_right_wrist": "second", "cam_left_wrist": "wrist"}}

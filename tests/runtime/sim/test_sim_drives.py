@@ -3,7 +3,7 @@ import threading
 import pytest
 import zmq
 
-from runtime import codecs
+from runtime.core import msgpack_arrays as codecs
 from runtime.sim import drives
 from runtime.sim.drives import Drives, Switch
 from runtime.transports.node_messages import DRIVE_FAULTS_LIMIT

@@ -7,7 +7,7 @@ from contextlib import closing
 import pytest
 import zmq
 
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
 from runtime.sim.sockets import Sockets
 
 FREE = "tcp://127.0.0.1:0"

@@ -214,7 +214,7 @@ def test_a_reset_that_cannot_be_leaves_everything_as_it_is():
     assert hands.truth == before
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000), st.integers(1, 3))
 def test_whatever_is_commanded_blocks_stay_above_the_table_and_are_numbers(seed, blocks):
     chance = np.random.default_rng(seed)

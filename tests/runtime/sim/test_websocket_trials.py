@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from runtime.session import State
+import robots
+from runtime.processes.coordinator.session.machine import State
 from runtime.sim.faults import Fault
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.roboarena_server import Arena, RoboarenaServer
@@ -16,7 +17,10 @@ from runtime.sim.starvla_server import Star, StarvlaServer
 from tests.runtime.sim.tabletop_station import HORIZON, TabletopPlan, pick_and_place, served
 
 ARENA = ['policy.kind="roboarena"', 'policy.cameras={cam_high="first", cam_wrist="wrist"}']
+STARVLA = ['policy.kind="starvla"', 'policy.cameras=["cam_wrist", "cam_high"]']
 SIZE = (240, 320)
+ARM = robots.load("ur5e")
+LIMITS = f"{{low={list(map(float, ARM.lower))}, high={list(map(float, ARM.upper))}}}"
 
 
 def arena_server(**arena: Any) -> Any:
@@ -26,9 +30,12 @@ def arena_server(**arena: Any) -> Any:
     return made
 
 
-def starvla_server(plan: TabletopPlan, script: Script) -> StarvlaServer:
-    views = ("cam_wrist", "cam_high")
-    return StarvlaServer(plan.robot, Star(HORIZON, plan.rate, size=SIZE, views=views), 0, script)
+def starvla_server(old: bool) -> Any:
+    def made(plan: TabletopPlan, script: Script) -> StarvlaServer:
+        star = Star(HORIZON, plan.rate, size=SIZE, views=("cam_wrist", "cam_high"), old=old)
+        return StarvlaServer(plan.robot, star, 0, script)
+
+    return made
 
 
 def rtc_server(dialect: Any) -> Any:
@@ -48,7 +55,8 @@ TRIALS: dict[str, tuple[list[str], Any]] = {
         [*ARENA, 'policy.numbering="1-based"', 'policy.action_keys=["arm", "gripper"]'],
         arena_server(variant="vllm", reply="parts", numbering=1),
     ),
-    "starvla": (['policy.kind="starvla"', 'policy.cameras=["cam_wrist", "cam_high"]'], starvla_server),
+    "starvla": (STARVLA, starvla_server(old=False)),
+    "starvla-old": ([*STARVLA, f"policy.statistics={LIMITS}"], starvla_server(old=True)),
 }
 
 

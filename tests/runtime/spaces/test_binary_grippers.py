@@ -10,12 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import robots
-from runtime.limits import Limits
+from runtime.core.types import ActionChunk
+from runtime.ipc.shared_state import EStop
+from runtime.motion.timeline import DimensionKinds
 from runtime.policies.base import PolicyInfo
-from runtime.switching import DWELL_S, Dwell, Switch, switches
-from runtime.timeline import Dims
-from runtime.types import ActionChunk
-from tests.runtime.station import Station, StubPlan, plan
+from runtime.safety.limits import Limits
+from runtime.spaces.binary_grippers import DWELL_S, Dwell, Switch, switches
+from tests.runtime.lockstep_station import Station, StubPlan, plan
 from tests.runtime.tick_bench import PERIOD, WITH_GRIPPER, Bench
 
 PERCENT = Switch(6, 100.0, 0.0, 80.0, 5.0)  # an R1 Lite's
@@ -105,6 +106,9 @@ def test_a_gripper_that_has_just_switched_is_kept_and_a_continuous_one_is_not() 
         assert dwell.apply(closed, opened, 10.0 + DWELL_S)[1] == ()
 
 
+HALF = Switch(2, 0.1, 0.0, 0.05, 0.005)
+
+
 def switched_at(sent: np.ndarray) -> np.ndarray:
     """The ticks at which a gripper was told another number than at the tick before."""
     return np.flatnonzero(np.abs(np.diff(sent)) > 1e-6) + 1
@@ -117,13 +121,12 @@ chunk_of = st.tuples(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.sampled_from(KINDS), st.lists(chunk_of, min_size=1, max_size=12))
 def test_what_is_sent_switches_in_one_tick_and_rests_whatever_is_asked_for(
     kind: str, course: list[tuple[int, list[float], str]]
 ) -> None:
-    switch = Switch(2, 0.1, 0.0, 0.05, 0.005)
-    bench = Bench({"kind": kind}, limits=BINARY, dims=Dims(switched=(2,)), switches=(switch,))
+    bench = Bench({"kind": kind}, limits=BINARY, dims=DimensionKinds(switched=(2,)), switches=(HALF,))
     bench.say("follow", run=1)
     for number, (ticks, grippers, what) in enumerate(course, 1):
         bench.run(ticks)
@@ -145,7 +148,7 @@ def test_what_is_sent_switches_in_one_tick_and_rests_whatever_is_asked_for(
 
 
 def test_a_switch_that_came_too_soon_is_made_when_the_time_is_over_and_noted() -> None:
-    bench = Bench(limits=BINARY, dims=Dims(switched=(2,)))
+    bench = Bench(limits=BINARY, dims=DimensionKinds(switched=(2,)))
     rows = np.zeros((30, 3))
     rows[5:7, 2] = rows[8:, 2] = 0.1
     bench.say("follow", run=1)
@@ -166,13 +169,66 @@ def test_a_switch_that_came_too_soon_is_made_when_the_time_is_over_and_noted() -
 
 @pytest.mark.parametrize(("wanted", "told"), [(0.037, 0.0), (0.051, 0.0), (0.06, 0.1), (0.1, 0.1)])
 def test_a_motion_by_hand_switches_it_in_its_first_tick(wanted: float, told: float) -> None:
-    switch = Switch(2, 0.1, 0.0, 0.05, 0.005)
-    bench = Bench(limits=BINARY, switches=(switch,))
+    bench = Bench(limits=BINARY, switches=(HALF,))
     bench.say("motion", goal=np.array([0.5, 0.0, wanted]))
     bench.run(200)
     assert bench.sent[1, 2] == pytest.approx(told)
     assert np.unique(bench.sent[1:, 2]).tolist() == pytest.approx([told])
     assert [event.kind for event in bench.said()] == ["motion_done"]
+
+
+anything = st.one_of(st.sampled_from([0.0, 0.1]), st.floats(-0.05, 0.15))
+order = st.tuples(
+    st.sampled_from(["chunk", "motion", "lock", "unlock", "hold", "sim", "estop", "clear", "restart"]),
+    anything,
+    st.integers(1, 9),  # ticks after it
+)
+
+
+@settings(max_examples=60)
+@given(anything, st.lists(order, min_size=1, max_size=15))
+def test_whatever_control_is_ordered_it_sends_open_or_closed(
+    stood: float, course: list[tuple[str, float, int]]
+) -> None:
+    """Rows, goals and locks as nobody in main would write them, of a robot that is taken over half open."""
+    bench = Bench(limits=BINARY, dims=DimensionKinds(switched=(2,)), switches=(HALF,))
+    bench.measured = np.array([0.0, 0.0, stood])
+    bench.say("follow", run=1)
+    bench.run(3)
+    for number, (kind, value, ticks) in enumerate(course, 1):
+        if kind == "chunk":
+            bench.chunk(number, np.tile([0.0, 0.0, value], (20, 1)))
+        elif kind == "motion":
+            bench.say("motion", run=1, goal=np.array([0.1, np.nan, value]))
+        elif kind in ("lock", "unlock"):
+            bench.lock(np.nan, np.nan, value if kind == "lock" else np.nan)
+        elif kind in ("hold", "sim"):
+            bench.say("hold" if kind == "hold" else "follow", run=1, mode="sim" if kind == "sim" else None)
+        elif kind == "restart":
+            bench.tick = bench.new_tick()
+        else:
+            bench.page.set_estop(EStop.LATCHED if kind == "estop" else EStop.CLEAR)
+        bench.run(ticks)
+        told = np.array([bench.status[name][2] for name in ("locked", "simulated")], np.float64)
+        assert set(np.round(told[~np.isnan(told)], 6)) <= {0.0, 0.1}
+    assert set(np.round(bench.sent[:, 2], 6)) <= {0.0, 0.1}
+
+
+@pytest.mark.parametrize(("stood", "told"), [(0.037, 0.0), (0.06, 0.1)])
+def test_an_e_stop_that_takes_a_robot_over_moves_no_gripper_and_the_next_order_switches_it(
+    stood: float, told: float
+) -> None:
+    bench = Bench(limits=BINARY, switches=(HALF,))
+    bench.measured = np.array([0.2, 0.0, stood])
+    bench.page.set_estop(EStop.LATCHED)
+    bench.run(5)
+    bench.page.set_estop(EStop.CLEAR)
+    bench.run(5)
+    assert bench.sent[:, 2] == pytest.approx(stood)
+    begun = len(bench.sent)
+    bench.say("motion", goal=np.array([0.3, np.nan, np.nan]))
+    bench.run(5)
+    assert bench.sent[begun:, 2] == pytest.approx(told)
 
 
 # --- whole stations ------------------------------------------------------------------------------------------------

@@ -10,17 +10,17 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from robots import Robot, load
-from runtime.errors import PolicyError, SetupError
-from runtime.formats import PoseRows
+from runtime.core.errors import PolicyError, SetupError
+from runtime.core.pose_format import PoseFormat
+from runtime.core.types import ActionChunk, Observation
 from runtime.kinematics.base import IkFlag
 from runtime.kinematics.compiled import CompiledKinematics
-from runtime.pose_format import PoseFormat
-from runtime.spaces import CommandRows, Onset, Spaces
-from runtime.types import ActionChunk, Observation
+from runtime.spaces.conversion import ActionSpaces, CommandRows, Onset
+from runtime.spaces.pose_rows import PoseRows
 from tests.runtime.odd_robot import odd_robot
 
 ROBOT = load("agilex_piper")
-SPACES = Spaces(ROBOT, CompiledKinematics(ROBOT), 30.0)
+SPACES = ActionSpaces(ROBOT, CompiledKinematics(ROBOT), 30.0)
 START = np.array(
     [0.1, 1.2, -1.0, 0.3, 0.4, 0.2, 0.03, -0.2, 0.9, -0.8, 0.1, -0.4, 0.5, 0.08], dtype=np.float32
 )
@@ -137,7 +137,7 @@ def test_a_number_that_is_not_finite_is_named(space: str, column: int, name: str
 
 def test_a_rate_that_is_no_rate_is_refused() -> None:
     with pytest.raises(SetupError, match=r"control_rate = 0\.0 Hz; allowed: above zero"):
-        Spaces(ROBOT, CompiledKinematics(ROBOT), 0.0)
+        ActionSpaces(ROBOT, CompiledKinematics(ROBOT), 0.0)
 
 
 def test_eef_of_one_vector_is_pose_and_gripper_of_each_arm() -> None:
@@ -217,7 +217,7 @@ def test_relative_joints_are_added_to_the_observed_ones_and_grippers_are_not(
     np.testing.assert_array_equal(made.rows[:, ROBOT.gripper_dims], rows[:, ROBOT.gripper_dims])
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(modes, st.sampled_from(["base", "tool"]), st.integers(1, 6), st.floats(-0.02, 0.02))
 def test_relative_poses_come_back_to_the_absolute_ones_they_were_made_of(
     mode: str, frame: str, count: int, step: float
@@ -255,7 +255,7 @@ def test_an_observation_without_a_pose_is_no_ground_for_a_relative_chunk() -> No
 # Rates
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(1, 6), st.sampled_from([7.5, 10.0, 30.0, 50.0]))
 def test_poses_of_another_rate_stay_on_the_straight_way_between_rows(count: int, rate: float) -> None:
     ends = SPACES.eef_of(path(count)).astype(np.float64)
@@ -293,10 +293,10 @@ LOWER[ENDLESS_DIM], UPPER[ENDLESS_DIM] = -np.inf, np.inf
 ENDLESS = replace(ROBOT, lower=LOWER, upper=UPPER)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.lists(st.sampled_from([0.0, 0.1]), min_size=1, max_size=5), st.sampled_from(["joint", "eef"]))
 def test_binary_grippers_stay_binary_at_every_rate(values: list[float], space: str) -> None:
-    spaces = Spaces(SWITCHED, CompiledKinematics(SWITCHED), 30.0)
+    spaces = ActionSpaces(SWITCHED, CompiledKinematics(SWITCHED), 30.0)
     rows = path(len(values), 0.0)
     rows[:, 6] = values
     given_ = rows if space == "joint" else spaces.eef_of(rows)
@@ -306,7 +306,7 @@ def test_binary_grippers_stay_binary_at_every_rate(values: list[float], space: s
 
 @given(st.floats(-20, 20), st.integers(-3, 3), st.integers(1, 8))
 def test_a_joint_without_end_goes_on_from_where_it_was_seen(at: float, turns: int, count: int) -> None:
-    spaces = Spaces(ENDLESS, CompiledKinematics(ENDLESS), 30.0)
+    spaces = ActionSpaces(ENDLESS, CompiledKinematics(ENDLESS), 30.0)
     start = START.copy()
     start[ENDLESS_DIM] = at
     way = start[ENDLESS_DIM] + 0.3 * np.arange(count, dtype=np.float32)
@@ -330,7 +330,9 @@ FORMATS = [
 ]
 
 
-def written(spaces: Spaces, robot: Robot, pose: PoseFormat, rows: np.ndarray, at: np.ndarray) -> np.ndarray:
+def written(
+    spaces: ActionSpaces, robot: Robot, pose: PoseFormat, rows: np.ndarray, at: np.ndarray
+) -> np.ndarray:
     """Joint rows [T, D] as a policy of that format writes them; what it does not write stands as in `at` [T, D]."""
     vectors = spaces.vectors(rows.astype(np.float64))
     return PoseRows(pose, robot).encode(vectors, at.astype(np.float64))
@@ -448,12 +450,12 @@ def test_a_chunk_whose_rows_are_all_stale_is_solved_all_the_same() -> None:
 
 
 @pytest.fixture(scope="module")
-def odd(tmp_path_factory: pytest.TempPathFactory) -> tuple[Robot, Spaces]:
+def odd(tmp_path_factory: pytest.TempPathFactory) -> tuple[Robot, ActionSpaces]:
     robot = odd_robot(tmp_path_factory.mktemp("robots"))
-    return robot, Spaces(robot, CompiledKinematics(robot), 30.0)
+    return robot, ActionSpaces(robot, CompiledKinematics(robot), 30.0)
 
 
-def test_an_arm_without_a_gripper_has_a_0_that_is_nobodys(odd: tuple[Robot, Spaces]) -> None:
+def test_an_arm_without_a_gripper_has_a_0_that_is_nobodys(odd: tuple[Robot, ActionSpaces]) -> None:
     robot, spaces = odd
     home = robot.poses["home"]
     vector = spaces.eef_of(home)
@@ -467,7 +469,7 @@ def test_an_arm_without_a_gripper_has_a_0_that_is_nobodys(odd: tuple[Robot, Spac
     assert made.rows[0, 14] == vector[15]
 
 
-def test_what_rows_say_nothing_of_is_held_where_it_is_commanded(odd: tuple[Robot, Spaces]) -> None:
+def test_what_rows_say_nothing_of_is_held_where_it_is_commanded(odd: tuple[Robot, ActionSpaces]) -> None:
     robot, spaces = odd
     home = robot.poses["home"]
     told = home + 0.01
@@ -477,7 +479,9 @@ def test_what_rows_say_nothing_of_is_held_where_it_is_commanded(odd: tuple[Robot
 
 
 @pytest.mark.parametrize("mode", ["absolute", "relative", "delta"])
-def test_joints_that_follow_the_poses_are_commanded_with_them(odd: tuple[Robot, Spaces], mode: str) -> None:
+def test_joints_that_follow_the_poses_are_commanded_with_them(
+    odd: tuple[Robot, ActionSpaces], mode: str
+) -> None:
     robot, spaces = odd
     home = robot.poses["home"]
     pose = PoseFormat(orientation="rotation_vector", groups=["hand", "neck"])
@@ -499,7 +503,7 @@ def test_joints_that_follow_the_poses_are_commanded_with_them(odd: tuple[Robot, 
 
 
 TORSO = load("r1_lite", ["left_arm", "right_arm", "torso"])
-CARRIED = Spaces(TORSO, CompiledKinematics(TORSO), 30.0)
+CARRIED = ActionSpaces(TORSO, CompiledKinematics(TORSO), 30.0)
 STANDS = TORSO.poses["ready"] if "ready" in TORSO.poses else TORSO.poses["home"]
 
 

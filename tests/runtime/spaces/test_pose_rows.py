@@ -11,13 +11,13 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from robots import Robot, load
-from runtime.deployment import load as load_deployment
-from runtime.errors import ConfigurationError, PolicyError
-from runtime.formats import PoseRows
-from runtime.pose_format import CANONICAL, PoseFormat, refuse_format
+from runtime.config.loader import load as load_deployment
+from runtime.core.errors import ConfigurationError, PolicyError
+from runtime.core.pose_format import CANONICAL, PoseFormat, refuse_format
+from runtime.spaces.pose_rows import PoseRows
 from tests.runtime.odd_robot import odd_robot
-from tests.runtime.test_frames import joints, some_vectors
-from tests.runtime.test_orientations import ORDERS
+from tests.runtime.spaces.test_frames import joints, some_vectors
+from tests.runtime.spaces.test_orientations import ORDERS
 
 PIPER = load("agilex_piper")
 BODY = load("agibot_g2")
@@ -39,7 +39,7 @@ def odd(tmp_path_factory: pytest.TempPathFactory) -> Robot:
     return odd_robot(tmp_path_factory.mktemp("robots"))
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(formats, frames, groups, st.integers(0, 1000))
 def test_what_is_written_comes_back_exactly_in_every_format_and_frame(
     made: PoseFormat, frame: str, following: list[str], seed: int
@@ -101,7 +101,7 @@ def test_an_arm_without_a_gripper_writes_0_and_reads_nothing(odd: Robot) -> None
     np.testing.assert_array_equal(rows.decode(written)[0][:, 0, 7], 0.0)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(formats, st.integers(0, 1000))
 def test_rows_that_are_written_one_by_one_are_those_that_are_written_together(
     made: PoseFormat, seed: int
@@ -179,7 +179,7 @@ def test_a_key_that_the_orientation_has_no_use_for_is_refused(settings_: dict[st
 
 
 def test_a_file_with_such_a_key_is_refused_by_its_name() -> None:
-    file = Path(__file__).parents[2] / "deployments" / "tabletop.toml"
+    file = Path(__file__).parents[3] / "deployments" / "tabletop.toml"
     said = r"policy.action_pose = .*: degrees = True beside orientation = '6d'"
     with pytest.raises(ConfigurationError, match=said):
         load_deployment(file, ["policy.action_pose.orientation=6d", "policy.action_pose.degrees=true"])

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from runtime.formats import continuous
-from runtime.poses import absolute
-from runtime.types import ActionMode, RelativeFrame
+from runtime.core.types import ActionMode, RelativeFrame
+from runtime.spaces.pose_rows import continuous
+from runtime.spaces.relative_poses import absolute
 
 
 def quarter_turned(rows: int) -> tuple[np.ndarray, np.ndarray]:
@@ -64,7 +64,7 @@ def test_absolute_poses_are_unit_and_continuous(
     assert (made[0, :, 0] >= 0).all()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(unit, st.integers(1, 30), st.sampled_from(["base", "tool"]))
 def test_steps_amount_to_what_they_are_one_after_the_other(
     quaternions: np.ndarray, count: int, frame: RelativeFrame

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.clock import VirtualClock
-from runtime.control import make_tick
-from runtime.errors import RuntimeFault
-from runtime.messages import Order, TickDone, decode, encode
-from runtime.page import EStop, Page
-from runtime.transitions import State
-from runtime.types import Float64, Observation
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Float64, Observation
+from runtime.ipc.messages import Order, TickDone, decode, encode
+from runtime.ipc.shared_state import EStop, SharedState
+from runtime.processes.control.process import make_tick
+from runtime.processes.coordinator.session.transitions import State
 from tests.runtime.collision_samples import collisions, turned
-from tests.runtime.station import Station, plan
+from tests.runtime.lockstep_station import Station, plan
 from tests.runtime.tick_bench import RecordingSink
 
 INWARDS = 0.01  # [rad] per step
@@ -106,10 +106,12 @@ def test_homing_by_command_through_the_other_arm_is_refused_and_nothing_changes(
     station.close()
 
 
-def control(tmp_path: Path, start: Float64, **safety: Any) -> tuple[Any, Page, RecordingSink, VirtualClock]:
+def control(
+    tmp_path: Path, start: Float64, **safety: Any
+) -> tuple[Any, SharedState, RecordingSink, VirtualClock]:
     """Control alone, engaged at `start`."""
     made = plan(tmp_path, start=start, safety=safety)
-    page, _ = Page.create(made.layout)
+    page, _ = SharedState.create(made.layout)
     page.set_estop(EStop.CLEAR)
     clock, sink = VirtualClock(10.0), RecordingSink()
     return make_tick(made, page, sink, clock.now), page, sink, clock
@@ -144,12 +146,12 @@ def test_control_needs_no_compiler(tmp_path: Path) -> None:
     program = f"""
 import sys
 from pathlib import Path
-from runtime.control import make_tick
-from runtime.page import Page
-from tests.runtime.station import plan
+from runtime.processes.control.process import make_tick
+from runtime.ipc.shared_state import SharedState
+from tests.runtime.lockstep_station import plan
 from tests.runtime.tick_bench import RecordingSink
 made = plan(Path({str(tmp_path)!r}), safety={{"workspace": {box!r}}})
-page, _ = Page.create(made.layout)
+page, _ = SharedState.create(made.layout)
 make_tick(made, page, RecordingSink(), lambda: 0.0)
 print("numba" in sys.modules)
 """

@@ -10,13 +10,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from runtime import __main__ as command_line
-from runtime import deployment, rerun
-from runtime.errors import ConfigurationError
+from runtime.config import loader as deployment
+from runtime.core.errors import ConfigurationError
 from runtime.recording.files import document
 from runtime.recording.reader import open_episode
-from runtime.rerun import find
-from runtime.run import Provenance
-from tests.runtime.station import plan
+from runtime.station import rerun
+from runtime.station.rerun import find
+from runtime.station.run import Provenance
+from tests.runtime.lockstep_station import plan
 
 ONE = "1a2b3c4d-0000-4000-8000-000000000001"
 CLEAN = {"commit": "c" * 40, "dirty": False}
@@ -146,6 +147,15 @@ def test_settings_that_there_were_not_yet_have_their_defaults(tmp_path: Path) ->
     assert found.resolved.digest == manifest["configuration_hash"]
     assert "faults.policy_error (none) -> " in line(found.lines, "hash")
     assert line(found.lines, "versions") == "of then are not known"
+
+
+def test_the_ports_of_a_bus_of_before_say_nothing_of_what_was_done(tmp_path: Path) -> None:
+    manifest = kept(tmp_path)
+    old = dict(manifest["configuration"])
+    old["bus"] = old["bus"] | {"host": "127.0.0.1", "command_port": 5, "estop_port": 0}
+    changed = manifest | {"configuration": old, "configuration_hash": deployment.digest_of(old)}
+    (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(document(changed, "the manifest"))
+    assert rerun.rerun(ONE, tmp_path).resolved.digest == manifest["configuration_hash"]
 
 
 # --- what keeps it from starting ---------------------------------------------------------------------------

@@ -1,9 +1,9 @@
 import json
 
+from runtime.core.git_revision import revision
 from runtime.recording.files import document
-from runtime.revision import revision
-from runtime.run import Provenance, Run, installed_versions
-from tests.runtime.station import plan
+from runtime.station.run import Provenance, Run, installed_versions
+from tests.runtime.lockstep_station import plan
 
 BEGUN = {"ticks": 900, "missed": 2, "records_lost": 1, "lateness_p99_ms": 0.4}
 

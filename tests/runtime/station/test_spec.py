@@ -6,17 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runtime import family
-from runtime.deployment import changed, load
-from runtime.errors import ConfigurationError, SetupError
-from runtime.family import Lifeline, plan
-from runtime.page import Page
-from runtime.pose_format import PoseFormat
-from runtime.timeline import Dims
+from runtime.config.loader import changed, load
+from runtime.core.errors import ConfigurationError, SetupError
+from runtime.core.pose_format import PoseFormat
+from runtime.ipc.lifeline import Lifeline
+from runtime.ipc.shared_state import SharedState
+from runtime.motion.timeline import DimensionKinds
+from runtime.processes import child
+from runtime.station.spec import plan
 from runtime.transports import zmq
 from runtime.transports.base import Capabilities
 
-DEPLOYMENTS = Path(__file__).parents[2] / "deployments"
+DEPLOYMENTS = Path(__file__).parents[3] / "deployments"
 
 
 @pytest.fixture
@@ -79,14 +80,22 @@ def test_a_transport_that_says_nothing_of_cameras_has_all_of_them():
 
 
 def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path, monkeypatch):
-    page, descriptor = Page.create(plan(resolved).layout)
+    page, descriptor = SharedState.create(plan(resolved).layout)
     page.beat("main", 12.5)
     handed = tmp_path / "resolved.json"
     handed.write_text(json.dumps(dict(resolved.tree)), "utf-8")
-    arguments = ["runtime.control", "--resolved", str(handed), "--page", str(descriptor), "--boot", "b"]
+    arguments = [
+        "runtime.processes.control.process",
+        "--resolved",
+        str(handed),
+        "--page",
+        str(descriptor),
+        "--boot",
+        "b",
+    ]
     monkeypatch.setattr("sys.argv", arguments)
-    monkeypatch.setattr(family.log, "start", lambda process: None)
-    member = family.join("control", pictures=False)
+    monkeypatch.setattr(child.log, "start", lambda process: None)
+    member = child.join("control", pictures=False)
     assert member.plan.resolved.digest == resolved.digest
     assert member.page.last_beat("main") == 12.5
     assert member.boot == "b"
@@ -95,12 +104,12 @@ def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path,
 
 def test_angles_without_limits_wrap_and_grippers_that_know_two_places_switch(resolved):
     made = plan(resolved)
-    assert made.dims == Dims()
+    assert made.dims == DimensionKinds()
     lower, upper = made.robot.lower.copy(), made.robot.upper.copy()
     lower[[2, 9]], upper[[2, 4]] = -np.inf, np.inf
     group = replace(made.robot.groups[1], gripper=replace(made.robot.groups[1].gripper, binary=True))
     turning = replace(made.robot, lower=lower, upper=upper, groups=(made.robot.groups[0], group))
-    assert replace(made, robot=turning).dims == Dims(switched=(13,), wrapping=(2,))
+    assert replace(made, robot=turning).dims == DimensionKinds(switched=(13,), wrapping=(2,))
 
 
 # --- publication ------------------------------------------------------------------------------------------

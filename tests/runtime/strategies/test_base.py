@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from runtime.plugins import variants
+from runtime.core.plugins import variants
+from runtime.motion.timeline import HELD, DimensionKinds, Timeline, single
 from runtime.strategies import naive, overlap, sync
 from runtime.strategies.base import JOIN_WINDOW, Arrival, Paced, Progress, StrategyParameters, join
-from runtime.timeline import HELD, Dims, Timeline, single
 
-PLAIN = Dims()
+PLAIN = DimensionKinds()
 STRATEGIES = variants("runtime.strategies")
 
 
@@ -133,14 +133,14 @@ def test_a_dropped_chunk_changes_nothing(how):
 
 
 def test_a_gripper_switches_also_where_a_chunk_joins():
-    dims = Dims(switched=(1,))
+    dims = DimensionKinds(switched=(1,))
     timeline = Timeline(2)
     join(merger(naive, dims), timeline, Arrival(1, 0, rows(1, 20, 2)), 0, np.zeros(2), dims)
     assert timeline.at(0).action.tolist() == [0.0, 1.0]
 
 
 def test_an_angle_that_wraps_stays_on_the_branch_of_the_last_command():
-    dims = Dims(wrapping=(0,))
+    dims = DimensionKinds(wrapping=(0,))
     timeline = Timeline(1)
     before = np.array([7.0])
     join(
@@ -150,7 +150,7 @@ def test_an_angle_that_wraps_stays_on_the_branch_of_the_last_command():
 
 
 def test_an_angle_that_wraps_joins_the_plan_the_shorter_way_round():
-    dims = Dims(wrapping=(0,))
+    dims = DimensionKinds(wrapping=(0,))
     timeline = planned(3.0, 30)
     join(merger(overlap, dims), timeline, Arrival(1, 0, rows(-3.0, 20)), 0, None, dims)
     actions = timeline.span(0)[0][:, 0]

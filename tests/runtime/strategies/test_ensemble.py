@@ -3,13 +3,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from runtime.motion.timeline import DimensionKinds, Timeline
 from runtime.strategies import ensemble
 from runtime.strategies.base import Arrival, join
-from runtime.timeline import Dims, Timeline
 
 
 def merger(dims=None, **parameters):
-    return ensemble.merge(ensemble.Config(**parameters), dims or Dims())
+    return ensemble.merge(ensemble.Config(**parameters), dims or DimensionKinds())
 
 
 def rows(value, count=50, dim=1):
@@ -62,7 +62,7 @@ def test_the_chunk_is_used_whole_whatever_the_execution_horizon():
 
 
 def test_a_gripper_is_where_the_newest_chunk_says():
-    timeline, merge = Timeline(2), merger(Dims(switched=(1,)))
+    timeline, merge = Timeline(2), merger(DimensionKinds(switched=(1,)))
     merge(timeline, Arrival(1, 0, rows(0, dim=2)), 0)
     merge(timeline, Arrival(2, 1, rows(1, dim=2)), 1)
     assert 0 < timeline.at(1).action[0] < 1
@@ -70,7 +70,7 @@ def test_a_gripper_is_where_the_newest_chunk_says():
 
 
 def test_angles_that_wrap_average_on_the_circle():
-    dims = Dims(wrapping=(0,))
+    dims = DimensionKinds(wrapping=(0,))
     timeline, merge = Timeline(1), merger(dims, ensemble_m=0.0)
     join(merge, timeline, Arrival(1, 0, rows(3.0)), 0, None, dims)
     join(merge, timeline, Arrival(2, 1, rows(-3.0)), 1, None, dims)

@@ -6,15 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.step_loop import StepLoop
-from runtime.plugins import variants
+from runtime.core.plugins import variants
+from runtime.motion.timeline import HELD, DimensionKinds
 from runtime.strategies.base import JOIN_WINDOW
-from runtime.timeline import HELD, Dims
 
 STRATEGIES = variants("runtime.strategies")
 KINDS = sorted(STRATEGIES)
 MOVING = sorted(set(KINDS) - {"sync"})
 RATE = 30.0
-DIMS = Dims(switched=(1,))
+DIMS = DimensionKinds(switched=(1,))
 GRIPPER = 0.05
 
 delays = st.lists(st.integers(0, 9), min_size=1, max_size=12)
@@ -244,7 +244,7 @@ def test_an_angle_that_goes_round_and_round_never_turns_back(kind):
         angle = 0.1 * np.arange(step, step + 40)
         return ((angle + np.pi) % (2 * np.pi) - np.pi)[:, None]
 
-    log = loop(kind, policy, [3, 1, 5], dims=Dims(wrapping=(0,))).run(200)
+    log = loop(kind, policy, [3, 1, 5], dims=DimensionKinds(wrapping=(0,))).run(200)
     steps = np.diff([tick.action[0] for tick in log.executed if tick.makers][JOIN_WINDOW:])
     assert steps.min() > 0.0
     assert steps.max() < 1.0

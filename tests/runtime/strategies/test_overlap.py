@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
+from runtime.motion.timeline import DimensionKinds, Timeline
 from runtime.strategies import overlap
 from runtime.strategies.base import Arrival
-from runtime.timeline import Dims, Timeline
 
 
 def merger(**parameters):
-    return overlap.merge(overlap.Config(**parameters), Dims())
+    return overlap.merge(overlap.Config(**parameters), DimensionKinds())
 
 
 def after_two(old=0.0, new=1.0, **parameters):

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from runtime.plugins import variants
+from runtime.core.plugins import variants
+from runtime.core.types import Float32, Float64, UInt8
+from runtime.processes.coordinator.session.transitions import State
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.script import Answer, Script
-from runtime.transitions import State
-from runtime.types import Float32, Float64, UInt8
-from tests.runtime.station import MOVED, STANDS, Station, StubPlan, column, plan
+from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, column, plan
 
 HORIZON, DELAY = 16, 4
 

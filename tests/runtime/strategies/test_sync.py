@@ -1,12 +1,12 @@
 import numpy as np
 
+from runtime.motion.timeline import DimensionKinds, Timeline, single
 from runtime.strategies import sync
 from runtime.strategies.base import Arrival, Progress
-from runtime.timeline import Dims, Timeline, single
 
 
 def merger(**parameters):
-    return sync.merge(sync.Config(**parameters), Dims())
+    return sync.merge(sync.Config(**parameters), DimensionKinds())
 
 
 def test_every_action_is_executed_in_order_whatever_the_delay():

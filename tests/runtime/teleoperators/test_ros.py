@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.clock import VirtualClock
-from runtime.errors import ConfigurationError
-from runtime.leaders import ros1, ros2
-from runtime.leaders.base import LeaderPose
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import ConfigurationError
+from runtime.teleoperators import ros1, ros2
+from runtime.teleoperators.base import LeaderPose
 from runtime.transports import ros2 as transport
 from runtime.transports.ros import cdr
 from runtime.transports.ros.messages import JointState

@@ -15,16 +15,18 @@ import numpy as np
 import pytest
 
 import robots
-from runtime import deployment, family, lockstep
-from runtime.clock import MonotonicClock
+from runtime.config import loader as deployment
+from runtime.core.clock import MonotonicClock
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.transitions import State
+from runtime.station import spec as family
 from runtime.transports import ros1, ros2
 from runtime.transports.ros import cdr, packed
 from runtime.transports.ros.messages import JointState, Wire
 from runtime.transports.ros.middleware import SENSOR_QUALITY, Middleware, Topic
+from tests.runtime.lockstep_station import column
 from tests.runtime.ros_master import RosMaster, needs_ros1
-from tests.runtime.station import column
 
 pytestmark = pytest.mark.slow
 SMALL = ("--width", "64", "--height", "48", "--lifeline")

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.clock import VirtualClock
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import RecordingError, SetupError, TransportError
+from runtime.core.types import Observation, RobotCommand
 from runtime.datasets.mapping import ColumnMapping
-from runtime.errors import RecordingError, SetupError, TransportError
 from runtime.transports import dataset
 from runtime.transports.dataset import Config, DatasetSource
-from runtime.types import Observation, RobotCommand
 from tests.runtime.datasets.small import robot, seen, write_dataset
 
 FRAMES, FPS = 12, 10.0

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime import deployment, family, lockstep
+from runtime.config import loader as deployment
+from runtime.core.errors import TransportError
 from runtime.datasets.published import publish
 from runtime.datasets.reader import open_dataset
-from runtime.errors import TransportError
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.transitions import State
+from runtime.station import spec as family
 from tests.runtime.datasets.foreign import Plan, column, shown, write
 from tests.runtime.datasets.small import seen
 
@@ -29,7 +31,7 @@ def foreign(root: Path, version: str, fps: float = FPS) -> Plan:
     return plan
 
 
-def trial(tmp_path: Path, **tables: Any) -> family.Plan:
+def trial(tmp_path: Path, **tables: Any) -> family.StationSpec:
     mapping = {"state": "joints", "action": "action"}
     place = {"path": str(tmp_path / "set"), "episode": EPISODE, "mapping": mapping}
     tree = {

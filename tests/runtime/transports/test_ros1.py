@@ -16,12 +16,12 @@ import pytest
 from pydantic import ValidationError
 
 import robots
-from runtime.clock import MonotonicClock
-from runtime.errors import ConfigurationError, SetupError
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import ConfigurationError, SetupError
+from runtime.core.types import Observation, RobotCommand
 from runtime.transports import ros1
 from runtime.transports.ros.source import RosSource
 from runtime.transports.ros.topics import GroupTopics, Topics
-from runtime.types import Observation, RobotCommand
 from tests.processes import eventually
 from tests.runtime.ros_master import RosMaster, needs_ros1
 

@@ -15,14 +15,14 @@ import pytest
 from pydantic import ValidationError
 
 import robots
-from runtime.clock import MonotonicClock
-from runtime.errors import ConfigurationError, SetupError
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import ConfigurationError, SetupError
+from runtime.core.types import Observation, RobotCommand
 from runtime.transports import ros2
 from runtime.transports.ros import rcl
 from runtime.transports.ros.middleware import Quality
 from runtime.transports.ros.source import RosSource
 from runtime.transports.ros.topics import GroupTopics, Topics
-from runtime.types import Observation, RobotCommand
 from tests.processes import eventually
 
 ROBOT = robots.load("r1_lite")

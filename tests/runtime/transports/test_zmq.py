@@ -11,15 +11,15 @@ import pytest
 import zmq
 
 import robots
-from runtime import codecs
-from runtime.clock import MonotonicClock, VirtualClock
-from runtime.errors import ConfigurationError, TransportError
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import MonotonicClock, VirtualClock
+from runtime.core.errors import ConfigurationError, TransportError
+from runtime.core.types import Observation, RobotCommand
 from runtime.transports import node_link, node_source
 from runtime.transports import zmq as link
 from runtime.transports.node_sink import NodeSink
 from runtime.transports.node_source import NodeSource
 from runtime.transports.zmq import Config
-from runtime.types import Observation, RobotCommand
 from tests.processes import eventually
 
 ROBOT = robots.load("agilex_piper")

@@ -4,8 +4,8 @@ import sys
 import numpy as np
 import pytest
 
-from evaweb.results.analysis import analyse
-from evaweb.results.outcomes import Outcome, paired
+from evaweb.results.analysis.analysis import analyse
+from evaweb.results.analysis.outcomes import Outcome, paired
 
 LABELS = ("held", "lifted", "on the plate")
 
@@ -136,6 +136,6 @@ def test_one_checkpoint_is_described_and_nothing_compared():
 
 
 def test_it_is_computed_without_django():
-    program = "import sys, evaweb.results.analysis; print('django' in sys.modules)"
+    program = "import sys, evaweb.results.analysis.analysis; print('django' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

@@ -1,10 +1,10 @@
 import pytest
 
-from evaweb.plans.handing import hand_out
+from evaweb.plans.allocation import hand_out
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_freeze
-from evaweb.results.analysis import analyse
-from evaweb.results.gathering import outcomes_of, outcomes_of_plan
+from evaweb.results.analysis.analysis import analyse
+from evaweb.results.analysis.load_outcomes import outcomes_of, outcomes_of_plan
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Trial
 from tests.evaweb.trials import builders

@@ -12,7 +12,8 @@ from django.utils import timezone
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode
 from evaweb.plans.services import plan_close
-from evaweb.results import caching, judging
+from evaweb.results.analysis import caching
+from evaweb.results.ratings import judging
 from evaweb.results.selectors import PlanRow
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Trial

@@ -4,10 +4,10 @@ from xml.etree import ElementTree
 import pytest
 from django.template import Context, Template
 
-from evaweb.results.analysis import analyse
-from evaweb.results.drawings import conditions, courses, rates
-from evaweb.results.drawings.svg import ticks, wrapped
-from tests.evaweb.results.test_recompute import outcomes
+from evaweb.results.analysis.analysis import analyse
+from evaweb.results.presentation.drawings import conditions, courses, rates
+from evaweb.results.presentation.drawings.svg import ticks, wrapped
+from tests.evaweb.results.reports.test_recompute import outcomes
 
 NASTY = "<script>alert('x')</script> & \"more\""
 

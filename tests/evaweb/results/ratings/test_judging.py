@@ -1,15 +1,15 @@
 import pytest
 
-from evaweb.episodes import lines
+from evaweb.episodes import jsonl as lines
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode
 from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.plans.blinding_rules import look
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_freeze
-from evaweb.plans.sight import look
-from evaweb.results import judging
-from evaweb.results.agreement import agreement_of, preferences_of
+from evaweb.results.analysis.agreement import agreement_of, preferences_of
 from evaweb.results.models import Preference, Rating
+from evaweb.results.ratings import judging
 from evaweb.trials.models import Checkpoint
 from tests.evaweb.trials import builders
 

@@ -8,10 +8,10 @@ from evaweb.episodes.folders import scores_file
 from evaweb.episodes.publishing import read_scores, success_of
 from evaweb.episodes.reconcile import reconcile
 from evaweb.plans.models import Plan
-from evaweb.results import judging
-from evaweb.results.agreement import agreement_of, preferences_of
+from evaweb.results.analysis.agreement import agreement_of, preferences_of
 from evaweb.results.guarded import GUARDS
 from evaweb.results.models import Preference, Rating
+from evaweb.results.ratings import judging
 from tests.evaweb.trials import builders
 from tests.evaweb.unguarded import unguarded
 
@@ -78,7 +78,9 @@ def test_a_line_whose_row_was_never_made_is_taken_unless_the_same_was_said_again
 
 def test_a_preference_whose_plan_is_lost_stays_with_its_trials(judged, monkeypatch):
     lose()
-    monkeypatch.setattr("evaweb.results.restoring.Plan.objects.filter", lambda **key: Plan.objects.none())
+    monkeypatch.setattr(
+        "evaweb.results.ratings.restoring.Plan.objects.filter", lambda **key: Plan.objects.none()
+    )
     assert reconcile().restored == 3
     assert Preference.objects.get().plan is None
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-MODULE = Path(__file__).parents[3] / "static" / "result" / "videos.js"
+MODULE = Path(__file__).parents[4] / "static" / "result" / "videos.js"
 NODE = shutil.which("node")
 pytestmark = pytest.mark.skipif(NODE is None, reason="Node is not installed: the page's modules are not run")
 _PAGE = """

@@ -5,12 +5,12 @@ import random
 
 import pytest
 
-from evaweb.results.analysis import analyse
-from evaweb.results.document import analysis_document
-from evaweb.results.outcomes import Interruption, Outcome
-from evaweb.results.recompute import judged, methods
-from evaweb.results.recompute.__main__ import differences
-from evaweb.results.recompute.numbers import Trial, numbers
+from evaweb.results.analysis.analysis import analyse
+from evaweb.results.analysis.outcomes import Interruption, Outcome
+from evaweb.results.reports.document import analysis_document
+from evaweb.results.reports.recompute import judged, methods
+from evaweb.results.reports.recompute.__main__ import differences
+from evaweb.results.reports.recompute.numbers import Trial, numbers
 from evaweb.statistics.many import holm, letters
 from evaweb.statistics.preference import Comparison, NotIdentifiedError, preferences
 from evaweb.statistics.raters import cohen_kappa, gwet_ac1, krippendorff_alpha

@@ -9,10 +9,10 @@ from django.core.management import CommandError, call_command
 
 from evaweb.plans import pictures
 from evaweb.plans.models import Achieved, Reference
-from evaweb.results import judging
-from evaweb.results.caching import analysis_of
-from evaweb.results.checklist import checklist
-from evaweb.results.reporting import write_report
+from evaweb.results.analysis.caching import analysis_of
+from evaweb.results.ratings import judging
+from evaweb.results.reports.checklist import checklist
+from evaweb.results.reports.reporting import write_report
 from tests.evaweb.plans.lab import jpeg
 from tests.evaweb.trials import builders
 

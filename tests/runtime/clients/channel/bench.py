@@ -9,13 +9,14 @@ from typing import Any
 
 import zmq
 
-from runtime.bus import CommandServer, Endpoints
-from runtime.channel.door import Door, Names
-from runtime.client import StationClient
-from runtime.main import Service
-from runtime.messages import Ack
+from runtime.clients.channel.door import Door
+from runtime.clients.channel.names import Names
+from runtime.clients.client import StationClient
+from runtime.ipc.bus import CommandServer, Endpoints
+from runtime.ipc.messages import Ack
+from runtime.processes.coordinator.process import CommandService
 from tests.processes import eventually
-from tests.runtime.station import Station, plan
+from tests.runtime.lockstep_station import Station, plan
 
 ANSWER_MS = 5000  # as the older channel's own script waits
 _TICK_S = 0.003  # ten times as fast as life
@@ -24,13 +25,13 @@ _TICK_S = 0.003  # ten times as fast as life
 class Bench:
     """Ticks in a thread, one of its `threads`; `channel` is its door's endpoint."""
 
-    def __init__(self, folder, silence_s=60.0, scripts="apart", **settings):
+    def __init__(self, folder, silence_s=60.0, scripts="together", **settings):
         self.context = zmq.Context()
         self.lock, self._ended, self.frozen = threading.Lock(), threading.Event(), False
         self.station = Station(plan(folder, lease={"ttl_s": 60.0}, **settings))
         self.folder = self.station.plan.deployment.station_dir
-        self._service = Service(self.station.main, self.context)
-        self._guard = CommandServer(self.context, "127.0.0.1", 0)
+        self._service = CommandService(self.station.main, self.context)
+        self._guard = CommandServer(self.context, self.folder, "estop")
         Endpoints(self.folder).write("guard", {"estop": self._guard.endpoint})
         self._open: list[Any] = []
         self.door = Door(

@@ -1,4 +1,4 @@
-"""`python -m runtime.channel`, by itself and started by a station."""
+"""`python -m runtime.clients.channel`, by itself and started by a station."""
 
 import os
 import signal
@@ -9,15 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from runtime.bus import Endpoints
-from runtime.channel import __main__ as channel
-from runtime.channel.door import HOST
-from runtime.config import ControlChannelSettings
-from runtime.errors import TransportError
+from runtime.clients.channel import __main__ as channel
+from runtime.clients.channel.door import HOST
+from runtime.config.schema import ControlChannelSettings
+from runtime.core.errors import TransportError
+from runtime.ipc.bus import Endpoints
 from tests.processes import alive, eventually
-from tests.runtime.channel.bench import Script
+from tests.runtime.clients.channel.bench import Script
 
-DEMO = Path(__file__).parents[3] / "deployments" / "demo.toml"
+DEMO = Path(__file__).parents[4] / "deployments" / "demo.toml"
 
 
 def test_a_station_that_is_not_known_here_is_a_sentence(tmp_path, capsys, monkeypatch):

@@ -9,12 +9,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from runtime.channel.door import Names
-from runtime.client import Refused, StationClient
-from runtime.transitions import State
+from runtime.clients.channel.names import Names
+from runtime.clients.client import Refused, StationClient
+from runtime.processes.coordinator.session.transitions import State
+from tests import presses
 from tests.processes import eventually
-from tests.runtime.channel.bench import Bench
-from tests.runtime.station import STANDS
+from tests.runtime.clients.channel.bench import Bench
+from tests.runtime.lockstep_station import STANDS
 from tests.sources import ROOT
 
 HERE = "tcp://127.0.0.1:5757"
@@ -204,7 +205,7 @@ def test_a_recording_without_a_run_has_the_task_that_was_selected_for_it(start):
 
 
 def test_a_script_takes_a_lease_of_its_own_and_the_next_is_refused_with_a_sentence(start):
-    bench = start()
+    bench = start(scripts="apart")
     one, two = bench.script(), bench.script(client="two")
     done(one.command("claim"))
     why = refused(two.cmd("setup"))
@@ -245,12 +246,39 @@ def test_a_script_that_dies_loses_its_lease_and_the_robot_holds(start):
     done(other.cmd("stop"))
 
 
-def test_who_only_looks_does_not_keep_a_dead_scripts_lease(start):
+@pytest.mark.parametrize("scripts", ["together", "apart"])
+def test_a_dashboard_does_not_keep_a_dead_scripts_lease(start, scripts):
+    bench = start(State.READY, silence_s=0.5, scripts=scripts)
+    dashboard = bench.script()
+    assert dashboard.query("status")["state"] == "ready"
+    accepted(bench.script().cmd("start"))
+
+    def looked():
+        for question in ("frame", "config", "station", "events"):  # also with a connection for each
+            bench.script().query(question)
+        return dashboard.query("status")["state"] == "holding"
+
+    eventually(looked, 20, "holding")
+
+
+def test_a_dashboards_stop_button_does_not_make_it_a_script(start):
     bench = start(State.READY, silence_s=0.5)
-    script, dashboard = bench.script(), bench.script()
-    accepted(script.cmd("start"))
-    script.close()
+    dashboard = bench.script()
+    accepted(bench.script().cmd("start"))
+    done(dashboard.cmd("stop"))
+    accepted(bench.script().cmd("start"))
     eventually(lambda: dashboard.query("status")["state"] == "holding", 20, "holding")
+
+
+@pytest.mark.parametrize("question", ["status", "result"])
+def test_a_script_waits_with_a_connection_for_every_question(start, question):
+    bench = start(State.READY, silence_s=1.0)
+    run = accepted(bench.script().cmd("start"))
+    until = time.monotonic() + 2.5
+    while time.monotonic() < until:
+        bench.script().query(question, id=run["id"])
+        assert bench.station.state is State.RUNNING
+        time.sleep(0.1)
 
 
 def test_a_script_that_asks_now_and_then_keeps_it(start):
@@ -263,8 +291,8 @@ def test_a_script_that_asks_now_and_then_keeps_it(start):
         time.sleep(0.1)
 
 
-def test_together_scripts_without_a_name_are_one_even_with_a_connection_for_every_message(start):
-    bench = start(scripts="together")
+def test_scripts_without_a_name_are_one_even_with_a_connection_for_every_message(start):
+    bench = start()
     setup = accepted(bench.script().cmd("setup"))
     assert bench.script().result(setup)["result"] == "done"
     accepted(bench.script().cmd("start"))
@@ -286,6 +314,27 @@ def test_two_scripts_at_once_get_answers_of_their_own(start):
         talks = list(pool.map(talk, scripts))
     for number, told in enumerate(talks):
         assert told == [("idle", {"ok": True, "selected_collect_task": f"s{number}"})] * 20
+
+
+# --- resets --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("verb", ["reset", "console_reset", "operator_action:rollout_reset:node"])
+def test_a_reset_ends_a_halted_run_and_goes_home(start, verb):
+    script = start(State.READY).script()
+    done(script.cmd("select_mode:manual"))
+    accepted(script.cmd("start"))
+    done(script.cmd("manual_qpos:" + ",".join(map(str, FAR))))
+    move = eventually(lambda: (one := script.cmd("manual_send"))["ok"] and one, 10, "a move")
+    assert script.result(move)["result"] == "done"
+    assert "home is not allowed while running" in refused(script.cmd(verb))
+    done(script.cmd("halt"))
+    assert script.result(accepted(script.cmd(verb)))["result"] == "done"
+    assert script.query("frame")["qpos"][0] == pytest.approx(STANDS[0], abs=1e-3)
+
+
+def test_a_reset_that_cannot_go_home_is_refused(start):
+    assert "home is not allowed while idle" in refused(start().script().cmd("console_reset"))
 
 
 # --- stops ---------------------------------------------------------------------------------------------------
@@ -324,6 +373,23 @@ def test_the_estop_needs_no_lease_and_no_main(start):
     bench.reach(State.IDLE)
 
 
+@pytest.mark.parametrize(("key", "name"), [("command", "estop"), ("cmd", "web:estop"), ("cmd", "estop")])
+def test_whatever_is_wrong_with_a_press_it_is_pressed(start, key, name):
+    bench = start()
+    for what, text in presses.in_json(key, name).items():
+        answer = bench.script().raw(text.encode())
+        assert (what, answer["ok"], answer["result"]) == (what, True, "done")
+    done(bench.script().raw(b"", json.dumps({key: name}).encode()))  # two frames
+
+
+def test_the_reason_of_a_press_is_kept_as_long_as_a_latch_has_room(start):
+    bench = start()
+    done(bench.script().cmd("estop:smoke"))
+    assert bench.station.guard._latched == ("channel:lab", "smoke")
+    done(bench.script().command("estop", why="y" * 60_000))
+    assert bench.station.guard._latched == ("channel:lab", "y" * 240)
+
+
 def test_a_station_that_does_not_answer_is_told_and_asked_again(start):
     bench = start()
     script = bench.script()
@@ -341,7 +407,7 @@ def test_a_station_that_does_not_answer_is_told_and_asked_again(start):
 # --- noise ---------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(frames=st.lists(st.binary(max_size=40), min_size=1, max_size=3))
 def test_noise_is_answered_and_changes_nothing(noisy, frames):
     answer = noisy.raw(*frames)
@@ -354,7 +420,7 @@ VERB = st.sampled_from(
 )
 
 
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     verb=VERB, argument=st.text(max_size=20) | st.from_regex(r"[lr]:(open|close)?:?[0-9e.]*", fullmatch=True)
 )

@@ -4,9 +4,9 @@ from queue import Queue
 
 import pytest
 
-from runtime.channel import lane as module
-from runtime.channel.lane import Job, Lane
-from runtime.channel.message import Message
+from runtime.clients.channel import lane as module
+from runtime.clients.channel.lane import Job, Lane
+from runtime.clients.channel.message import Message
 
 PATIENCE = 10.0
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.channel.message import LARGEST, Malformed, read
+from runtime.clients.channel.message import LARGEST, Malformed, read
 
 UUID = "6a1f3c1e-57a1-4f0e-9b43-0a8a0d2f8a11"
 

@@ -1,6 +1,6 @@
 import pytest
 
-from runtime.channel.outcomes import KEPT, Outcome, Outcomes, lasts
+from runtime.clients.channel.outcomes import KEPT, Outcome, Outcomes, lasts
 from tests.runtime.terminal_station import event, status
 
 

@@ -1,9 +1,9 @@
 import pytest
 
-from runtime.channel import scripts as module
-from runtime.channel.scripts import Lives, Scripts
-from runtime.client import Refused
-from runtime.errors import TransportError
+from runtime.clients.channel import scripts as module
+from runtime.clients.channel.scripts import Lives, Scripts
+from runtime.clients.client import Refused
+from runtime.core.errors import TransportError
 
 
 class Client:

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.channel.strict import dumps, plain
+from runtime.clients.channel.strict import dumps, plain
 
 
 def test_what_is_no_number_in_json_is_null():

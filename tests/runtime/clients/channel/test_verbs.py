@@ -2,10 +2,10 @@ import json
 
 import pytest
 
-from runtime.channel.deed import NotOurs, Scene
-from runtime.channel.message import read
-from runtime.channel.selection import Selection
-from runtime.channel.verbs import VERBS, deed, stops
+from runtime.clients.channel.deed import NotOurs, Scene
+from runtime.clients.channel.message import read
+from runtime.clients.channel.selection import Selection
+from runtime.clients.channel.verbs import VERBS, deed, stops
 from tests.runtime.terminal_station import status
 from tests.sources import ROOT
 
@@ -83,8 +83,11 @@ CHOSEN = {"task": "pour", "strategy": {"kind": "sync"}, "mode": "preview", "targ
         ("halt:now:please", "running", [("halt", {})]),
         ("rollout_stop", "running", [("stop", {})]),
         ("reset", "ready", [("home", {})]),
-        ("manual_home", "ready", [("home", {})]),
-        ("manual_home", "running", [("move", {"joints": [0.1, 0.2, 0.3, 0.4]})]),
+        ("reset", "holding", [("stop", {}), ("home", {})]),
+        ("console_reset", "ready", [("home", {})]),
+        ("console_reset", "holding", [("stop", {}), ("home", {})]),
+        ("console_reset", "running", [("home", {})]),  # refused by the station, which says so
+        ("manual_home", "running", []),
         ("manual_send", "running", [("move", {"joints": COMMANDED})]),
         ('init_move:{"qpos": [0, 1, 2, 3.5]}', "running", [("move", {"joints": [0.0, 1.0, 2.0, 3.5]})]),
         ("init_gripper:close:right", "ready", [("gripper", {"action": "close", "arm": "right_arm"})]),
@@ -99,6 +102,7 @@ CHOSEN = {"task": "pour", "strategy": {"kind": "sync"}, "mode": "preview", "targ
         ("operator_action:rollout_toggle:node", "ready", [("run", {"mode": "preview"})]),
         ("operator_action:rollout_toggle:node", "running", [("stop", {})]),
         ("operator_action:rollout_reset", "ready", [("home", {})]),
+        ("operator_action:rollout_reset", "holding", [("stop", {}), ("home", {})]),
         ("operator_action:start:node", "ready", [("run", {"mode": "preview"})]),
         ("operator_action:accept", "running", [("stop", {})]),
         ("operator_action:cancel", "running", [("stop", {})]),
@@ -138,6 +142,8 @@ def test_what_was_selected_for_collecting_is_tuned_first():
         ("select_task:pour the tea", {"task": "pour the tea"}),
         ("select_collect_task: wipe ", {"collect_task": "wipe"}),
         ("manual_qpos:0, 1,2,3", {"target": [0.0, 1.0, 2.0, 3.0]}),
+        ("manual_home", {"target": FACTS["home"]}),
+        ("console_reset", {}),
     ],
 )
 def test_what_is_selected_is_remembered(verb, chosen):
@@ -148,12 +154,11 @@ def test_a_task_in_the_message_goes_before_one_behind_the_colon():
     assert dict(deed(scene("select_task:a", task="b")).chosen) == {"task": "b"}
 
 
-def test_strategies_add_up_and_a_reset_of_the_console_forgets_the_rest():
-    selection = Selection(task="pour", mode="sim", target=[1.0])
+def test_strategies_add_up():
+    selection = Selection(task="pour")
     selection.choose(strategy={"kind": "sync"})
     selection.choose(strategy={"k_max": 4})
-    selection.choose(**deed(scene("console_reset")).chosen)
-    assert selection == Selection(strategy={"kind": "sync", "k_max": 4})
+    assert selection == Selection(task="pour", strategy={"kind": "sync", "k_max": 4})
 
 
 @pytest.mark.parametrize(
@@ -187,6 +192,7 @@ def test_armed_counts_for_the_tab_collect_alone(verb, armed, told):
         ("rollout_save", "ready", "nothing was recorded"),
         ("manual_send", "running", "web:manual_qpos first"),
         ("operator_action:rollout_toggle", "holding", "the station is holding: say web:run"),
+        ("console_reset:now", "ready", "web:console_reset: takes no argument; given 'now'"),
         ("start:now", "ready", "web:start: takes no argument; given 'now'"),
         ("select_task", "ready", "needs 'task' in the message, or an argument"),
         ("select_task:  ", "ready", "needs 'task' in the message, or an argument"),

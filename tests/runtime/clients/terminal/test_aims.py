@@ -2,10 +2,10 @@ import math
 
 import pytest
 
-from runtime.errors import RuntimeFault
-from runtime.requests import AimRequest
-from runtime.terminal import aims
-from runtime.terminal.syntax import parse
+from runtime.clients.terminal import aims
+from runtime.clients.terminal.syntax import parse
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.command_arguments import AimRequest
 from tests.runtime.terminal_station import AIM, Script
 
 NAMES = ["a", "b", "grip"]

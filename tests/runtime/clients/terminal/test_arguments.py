@@ -1,8 +1,8 @@
 import pytest
 
-from runtime.requests import GripperRequest, RunRequest, SetUpRequest, TuneRequest
-from runtime.terminal.arguments import arguments
-from runtime.terminal.syntax import parse
+from runtime.clients.terminal.arguments import arguments
+from runtime.clients.terminal.syntax import parse
+from runtime.ipc.command_arguments import GripperRequest, RunRequest, SetUpRequest, TuneRequest
 
 
 def said(*words):

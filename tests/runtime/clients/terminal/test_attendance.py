@@ -3,10 +3,10 @@ import signal
 
 import pytest
 
-from runtime.client import Refused
-from runtime.terminal import attendance
-from runtime.terminal.attendance import attend
-from runtime.terminal.keys import Keys, NoKeys
+from runtime.clients.client import Refused
+from runtime.clients.terminal import attendance
+from runtime.clients.terminal.attendance import attend
+from runtime.clients.terminal.keys import Keys, NoKeys
 from tests.runtime.terminal_station import Script, status
 
 
@@ -30,7 +30,7 @@ class Person(Keys):
 def at_the_terminal(monkeypatch):
     """Nobody, or who the test sets there; waits take no time."""
     there = {"keys": NoKeys()}
-    monkeypatch.setattr("runtime.terminal.keys.time.sleep", lambda _: None)
+    monkeypatch.setattr("runtime.clients.terminal.keys.time.sleep", lambda _: None)
     monkeypatch.setattr(attendance, "keys", lambda: there["keys"])
     return there
 

@@ -1,6 +1,6 @@
 import math
 
-from runtime.terminal import figures
+from runtime.clients.terminal import figures
 from tests.runtime.terminal_station import STATUS, status
 
 ANSWERED = STATUS["policy"] | {

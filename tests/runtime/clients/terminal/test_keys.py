@@ -6,8 +6,8 @@ import termios
 
 import pytest
 
-from runtime.terminal import keys as module
-from runtime.terminal.keys import Keyboard, NoKeys, keys
+from runtime.clients.terminal import keys as module
+from runtime.clients.terminal.keys import Keyboard, NoKeys, keys
 
 PATIENCE = 10.0
 

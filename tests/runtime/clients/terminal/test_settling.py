@@ -1,7 +1,7 @@
 import pytest
 
-from runtime.terminal import settling
-from runtime.terminal.settling import settle
+from runtime.clients.terminal import settling
+from runtime.clients.terminal.settling import settle
 from tests.runtime.terminal_station import Script, event, status
 
 

@@ -1,8 +1,8 @@
 import pytest
 
-from runtime.terminal import syntax
-from runtime.terminal.syntax import parse
-from runtime.transitions import COMMANDS, State
+from runtime.clients.terminal import syntax
+from runtime.clients.terminal.syntax import parse
+from runtime.processes.coordinator.session.transitions import COMMANDS, State
 
 
 def said(*words):
@@ -31,6 +31,36 @@ def said(*words):
 def test_a_command_needs_no_more_than_its_word(command):
     given = said(command)
     assert (given.station, given.command, given.json) == ("bench-1", command, False)
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("bench-1 estop now please", "now please"),
+        ("bench-1 estop --why smoke", "smoke"),
+        ("bench-1 estop --speed 3", "3"),
+        ("bench-1 --loud estop", "pressed in a terminal"),
+        ("estop bench-1", "pressed in a terminal"),
+        ("--colour bench-1 estop", "pressed in a terminal"),
+        ("bench-1 estop --data-dir", "pressed in a terminal"),
+    ],
+)
+def test_a_press_is_one_whatever_else_is_said(words, why):
+    given = parse(words.split())
+    assert (given.station, given.command, given.why) == ("bench-1", "estop", why)
+
+
+def test_a_press_with_a_word_too_many_goes_where_it_was_said():
+    given = parse(["--data-dir=/a", "bench-1", "estop", "--json", "--loud"])
+    assert (given.data_dir, given.json) == ("/a", True)
+
+
+@pytest.mark.parametrize(
+    "words", ["bench-1 label bad --note estop", "bench-1 halt estop", "estop", "bench-1 estop -h"]
+)
+def test_what_only_has_the_word_in_it_is_no_press(words):
+    with pytest.raises(SystemExit):
+        parse(words.split())
 
 
 def test_every_command_of_the_session_can_be_said():

@@ -2,8 +2,8 @@ import json
 
 import pytest
 
-from runtime.terminal import watching
-from runtime.terminal.syntax import parse
+from runtime.clients.terminal import watching
+from runtime.clients.terminal.syntax import parse
 from tests.runtime.terminal_station import Script, event, status
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.errors import CodecError
+from runtime.core.errors import CodecError
 from runtime.policies.async_inference import messages
 
 VECTORS = Path(__file__).parents[2] / "vectors"

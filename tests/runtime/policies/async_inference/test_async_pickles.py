@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.errors import CodecError
+from runtime.core.errors import CodecError
 from runtime.policies.async_inference.pickles import (
     MODULES,
     RemotePolicyConfig,

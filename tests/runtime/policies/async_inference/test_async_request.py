@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.core.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.core.types import Observation
 from runtime.policies.async_inference.pickles import TimedAction
 from runtime.policies.async_inference.request import AsyncRequest, RequestSettings
-from runtime.types import Observation
 
 ROBOT = robots.load("agilex_piper")
 SETTINGS: dict[str, Any] = {"policy_type": "act", "checkpoint": "user/ckpt", "images": {"top": "cam_high"}}

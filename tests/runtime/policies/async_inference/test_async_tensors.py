@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.errors import CodecError
+from runtime.core.errors import CodecError
 from runtime.policies.async_inference.pickles import Reader
 from runtime.policies.async_inference.tensors import Tensors
 

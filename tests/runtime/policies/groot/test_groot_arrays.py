@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
-from runtime import codecs
-from runtime.errors import CodecError
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.errors import CodecError
 from runtime.policies.groot import arrays
 
 VECTORS = Path(__file__).parents[2] / "vectors"

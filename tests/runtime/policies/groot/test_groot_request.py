@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
 import robots
-from runtime.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.core.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.core.pose_format import PoseFormat
+from runtime.core.types import Float32, Observation
 from runtime.policies.groot.modality import Modalities, Modality, Written
 from runtime.policies.groot.request import Gr00tRequest, RequestSettings
-from runtime.pose_format import PoseFormat
-from runtime.types import Float32, Observation
 
 ROBOT = robots.load("agilex_piper")
 LEFT, RIGHT = list(range(7)), list(range(7, 14))
@@ -288,3 +288,39 @@ def test_control_that_begins_anew_does_not_show_the_future() -> None:
     made = request(wanted(video=Modality(("ego_view",), (-8, 0))), history="nearest")
     shown(made, 20)
     assert newest(shown(made, 3)) == [30, 30]
+
+
+# Servers without modality configurations
+
+
+def contract(**changes: Any) -> Modalities:
+    flat = {"video": Modality(None), "language": Modality(None), "contract": {"unnorm_key": "bench"}}
+    return wanted(**{**flat, **changes})
+
+
+def test_what_a_server_does_not_say_is_as_the_deployment_has_it() -> None:
+    made = shown(request(contract()))
+    assert list(made["observation"]["video"]) == ["ego_view"]
+    assert made["observation"]["language"] == {"annotation.human.task_description": [["pick"]]}
+    named = shown(request(contract(), language_key="task"))
+    assert named["observation"]["language"] == {"task": [["pick"]]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "settings", "says"),
+    [
+        ({"state": Modality(("left",))}, {}, "policy.state has left, right"),
+        (
+            {"state": Modality(("left", "right"), widths={"left": 6})},
+            {},
+            r"6 numbers in 'left'; policy.state.left",
+        ),
+        ({"action": Modality(("left", "right"), widths={"right": 8})}, {}, "policy.actions.right has 7"),
+        ({}, {"dialect": "sim_wrapper"}, 'allowed for such a server: "nested"'),
+    ],
+)
+def test_what_it_does_say_is_held_against_the_deployment(
+    changes: dict[str, Any], settings: dict[str, Any], says: str
+) -> None:
+    with pytest.raises(ContradictionError, match=says):
+        request(contract(**changes), **settings)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.errors import PolicyError
+from runtime.core.errors import PolicyError
 from runtime.policies.groot import arrays
 from runtime.policies.groot.modality import Modality, Written, modalities
 
@@ -37,7 +37,48 @@ def test_the_answers_of_n16_and_n17_are_read() -> None:
     assert found.state == Modality(("single_arm",), (0,))
     assert found.action == Modality()
     assert not found.early
-    assert modalities(arrays.unpack(N17, 1000)).video == Modality(("ego_view",), (0,))
+    assert not found.reads_mnp
+    newest = modalities(arrays.unpack(N17, 1000))
+    assert newest.video == Modality(("ego_view",), (0,))
+    assert newest.reads_mnp
+
+
+def test_text_under_the_mark_of_n17_is_not_n15() -> None:
+    fields = '{"delta_indices": [0], "modality_keys": ["ego_view"]}'
+    assert not modalities({"video": {"__ModalityConfig__": True, "as_json": fields}}).early
+
+
+def test_a_configuration_without_a_mark_says_nothing_of_arrays() -> None:
+    fields = {"modality_keys": ["ego_view"], "delta_indices": [0]}
+    for configuration in ({"as_json": fields}, fields):
+        found = modalities({"video": configuration})
+        assert (found.video, found.reads_mnp) == (Modality(("ego_view",), (0,)), None)
+
+
+def test_starvla_says_keys_and_numbers_in_flat_lists() -> None:
+    reply = {
+        "state_keys": ["state.arm"],
+        "state_key_dims": {"state.arm": 7},
+        "action_keys": ["action.arm"],
+        "action_key_dims": {"action.arm": 7},
+        "unnorm_key": "bench",
+    }
+    found = modalities(reply)
+    assert (found.state.keys, found.state.widths) == (("arm",), {"arm": 7})
+    assert (found.action.keys, found.action.widths) == (("arm",), {"arm": 7})
+    assert found.video.keys is found.language.keys is None
+    assert found.plain() == reply
+    assert not found.early
+    assert not found.reads_mnp
+
+
+def test_starvlas_server_of_egovla_says_no_numbers_and_a_horizon() -> None:
+    found = modalities(
+        {"video_keys": ["ego_view"], "state_keys": [], "action_keys": ["arm"], "action_horizon": 30}
+    )
+    assert found.video.keys == ("ego_view",)
+    assert found.state.keys is None  # it is shown none, and takes none amiss
+    assert (len(found.action.steps), found.action.widths) == (30, {})
 
 
 def test_n15_writes_json_as_text_and_keys_with_their_prefix() -> None:
@@ -54,6 +95,8 @@ def test_n15_writes_json_as_text_and_keys_with_their_prefix() -> None:
         (None, "NoneType"),
         ({"actions": 1}, "expected a map of video, state, action, language"),
         ({"video": 3}, "modality 'video' is int"),
+        ({"state_keys": "arm", "action_keys": []}, "state_keys str 'arm'; expected a list of names"),
+        ({"action_keys": [], "action_key_dims": {"arm": "7"}}, "action_key_dims dict"),
         ({"video": {"as_json": {}}}, "modality 'video'"),
         ({"video": {MARK: True, "as_json": 3}}, "expected a map"),
         ({"video": {MARK: True, "as_json": "{"}}, "no JSON"),

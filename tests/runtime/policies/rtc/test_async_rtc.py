@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.errors import PolicyError
+from runtime.core.errors import PolicyError
+from runtime.core.types import Conditioning
 from runtime.policies.rtc.async_rtc import AsyncRtc
-from runtime.types import Conditioning
 
 HEAD = {"protocol": "openpi-async-rtc", "protocol_version": 2}
 SAID = {**HEAD, "model_action_horizon": 50, "rtc_supported": True, "image_transport_codecs": ["raw", "jpeg"]}

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime import codecs
-from runtime.errors import PolicyError
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.errors import PolicyError
+from runtime.core.types import Conditioning
 from runtime.policies.rtc.kai0 import Kai0
-from runtime.types import Conditioning
 
 VECTORS = Path(__file__).parents[2] / "vectors"
 

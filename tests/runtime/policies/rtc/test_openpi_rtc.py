@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.core.errors import ConfigurationError, ContradictionError, PolicyError
+from runtime.core.types import Conditioning
 from runtime.policies.rtc.openpi_rtc import EnvelopeKeys, OpenpiRtc
-from runtime.types import Conditioning
 
 ANCESTOR = EnvelopeKeys(server_shift=25)
 FORK = EnvelopeKeys(observation="observation", flag="use_rtc", shift="s_param", delay="d_param")

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.errors import PolicyError
+from runtime.core.errors import PolicyError
+from runtime.core.types import Conditioning
 from runtime.policies.rtc.prev_action import PrevAction
-from runtime.types import Conditioning
 
 
 def committed(count: int, consumed: int) -> Conditioning:

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runtime.errors import PolicyError
+from runtime.core.errors import PolicyError
+from runtime.core.types import Conditioning
 from runtime.policies.rtc.base import Plain
-from runtime.types import Conditioning
 
 
 def test_a_plain_server_is_sent_the_observation_alone_and_never_conditioning() -> None:

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 import robots
-from runtime import codecs
-from runtime.clock import MonotonicClock
-from runtime.commitment import Commitment
-from runtime.errors import PolicyError, PolicyLostError, PolicyTimeout
-from runtime.messages import ChunkMerged
+from runtime.core import msgpack_arrays as codecs
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import PolicyError, PolicyLostError, PolicyTimeout
+from runtime.core.types import ActionChunk, Conditioning, Observation
+from runtime.ipc.messages import ChunkMerged
 from runtime.policies import openpi
 from runtime.policies.openpi import OpenpiPolicy
+from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
-from runtime.types import ActionChunk, Conditioning, Observation
 
 ROBOT = robots.load("agilex_piper")
 DIALECTS = ["prev_action", "openpi_rtc", "kai0", "async_rtc"]
@@ -55,7 +55,7 @@ def placed(number: int, step: int, delay: int, count: int) -> ChunkMerged:
 @pytest.mark.parametrize("delay", [0, 1, 3, 8])
 def test_every_chunk_begins_with_what_the_robot_executes_until_it_arrives(dialect: str, delay: int) -> None:
     """Back to back: a request goes out when the answer before has arrived."""
-    held = Commitment(30.0)
+    held = RtcPrefix(30.0)
     executed: dict[int, np.ndarray] = {}
     step = 100
     with talking(dialect) as policy:
@@ -172,7 +172,7 @@ def _answered(policy: OpenpiPolicy, value: float) -> ActionChunk:
 
 
 def test_a_reset_with_a_reply_in_flight_leaves_nothing_to_continue() -> None:
-    held = Commitment(30.0)
+    held = RtcPrefix(30.0)
     with talking("prev_action", Fault("late_reply", "0.3")) as policy, ThreadPoolExecutor(1) as pool:
         policy.connect()
         policy.infer(seen(0))

@@ -7,13 +7,14 @@ from typing import Any
 
 import pytest
 
-from runtime import deployment, family
-from runtime.clock import MonotonicClock
-from runtime.errors import ConfigurationError, PolicyError
+from runtime.config import loader as deployment
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import ConfigurationError, PolicyError
 from runtime.policies.base import Policy
 from runtime.policies.openpi import OpenpiPolicy
 from runtime.policies.tunnel import policy as tunnelled
 from runtime.policies.tunnel.policy import TunnelledPolicy
+from runtime.station import spec as family
 from tests.runtime.policies.peers import PIPER, seen
 
 CAMERAS = {camera.key: camera.key for camera in PIPER.cameras}

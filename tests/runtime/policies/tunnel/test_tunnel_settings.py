@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from runtime.errors import ConfigurationError
+from runtime.core.errors import ConfigurationError
 from runtime.policies.tunnel.command import command, far_end, require_files
 from runtime.policies.tunnel.settings import TunnelSettings, is_host
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from runtime import deployment, family
-from runtime.clock import MonotonicClock
-from runtime.errors import (
+from runtime.config import loader as deployment
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import (
     ConfigurationError,
     PolicyError,
     PolicyLostError,
@@ -26,11 +26,12 @@ from runtime.policies.base import Policy
 from runtime.policies.tunnel import policy as tunnelled
 from runtime.policies.tunnel.policy import TunnelledPolicy
 from runtime.policies.tunnel.process import free_port
-from runtime.session import State
+from runtime.processes.coordinator.session.machine import State
 from runtime.sim.faults import Fault
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.starvla_server import Star, StarvlaServer
+from runtime.station import spec as family
 from tests.processes import alive, eventually
 from tests.runtime.policies.peers import PIPER, seen
 from tests.runtime.policies.tls import encrypted, self_signed

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from runtime.actuator import RobotActuator, SimulatedActuator, TickSettings
-from runtime.behaviour import Target
-from runtime.page import EStop
-from runtime.safety import Limits, SafetySettings
-from runtime.seen import Seen
-from runtime.timeline import Dims
+from runtime.ipc.observation_reader import LatestObservation
+from runtime.ipc.shared_state import EStop
+from runtime.motion.timeline import DimensionKinds
+from runtime.processes.control.actuator import RobotActuator, SimulatedActuator, TickSettings
+from runtime.processes.control.behaviours import Target
+from runtime.safety.filter import Limits, SafetySettings
 from tests.runtime.tick_bench import NO, PERIOD, Bench
 
 HELD = Target(np.zeros(2), "hold", None)
@@ -16,7 +16,7 @@ def settings(limits=None, **options):
     fields = {
         "period": PERIOD,
         "limits": limits or Bench().limits,
-        "dims": Dims(),
+        "dims": DimensionKinds(),
         "safety": SafetySettings(),
         "heartbeat_timeout": 1.0,
         "starvation": "slow",
@@ -31,7 +31,7 @@ def robot(bench, **options):
 
 def seen(*joints, captured=100.0):
     qpos = np.array(joints, np.float32)
-    return Seen(1, qpos, qpos.astype(float), captured, (("cam", 99.9),), True)
+    return LatestObservation(1, qpos, qpos.astype(float), captured, (("cam", 99.9),), True)
 
 
 @pytest.mark.parametrize(("answer", "patience"), [("slow", 1.0), ("hold", 0.0), ("stop", 0.0)])
@@ -69,13 +69,13 @@ def test_old_or_incomplete_joints_are_no_measurement():
     assert actuator.measured(seen(0.3, 0.4), 100.1) == pytest.approx([0.3, 0.4])
     assert actuator.measured(seen(0.3, 0.4), 100.3) is None
     qpos = np.array([np.nan, 0.0], np.float32)
-    assert actuator.measured(Seen(1, qpos, qpos.astype(float), 100.0, (), False), 100.0) is None
+    assert actuator.measured(LatestObservation(1, qpos, qpos.astype(float), 100.0, (), False), 100.0) is None
 
 
 def test_an_angle_that_wraps_is_counted_in_the_turn_of_the_last_command():
     """An e-stop that sent 3.0 after 9.4 would unwind the joint by a whole turn."""
     limits = Limits(("t", "b"), np.array([-np.inf, -2.0]), np.array([np.inf, 2.0]), np.full(2, 3.0), NO, NO)
-    actuator = robot(Bench(), limits=limits, dims=Dims(wrapping=(0,)))
+    actuator = robot(Bench(), limits=limits, dims=DimensionKinds(wrapping=(0,)))
     actuator.engage(np.array([3.0, 0.1]))
     actuator.commanded = np.array([3.0 + 2 * np.pi, 0.1])
     measured = actuator.measured(seen(3.05, 0.1), 100.0)
@@ -84,7 +84,7 @@ def test_an_angle_that_wraps_is_counted_in_the_turn_of_the_last_command():
 
 def test_a_brake_at_an_angle_without_limits_is_as_soft_as_configured():
     limits = Limits(("t", "b"), np.array([-np.inf, -2.0]), np.array([np.inf, 2.0]), np.full(2, 3.0), NO, NO)
-    actuator = robot(Bench(), limits=limits, dims=Dims(wrapping=(0,)))
+    actuator = robot(Bench(), limits=limits, dims=DimensionKinds(wrapping=(0,)))
     actuator.engage(np.zeros(2))
     actuator.velocity = np.array([2.0, 0.0])
     assert actuator.brake().duration == pytest.approx(2.0 / 20.0)

@@ -10,16 +10,16 @@ import pytest
 
 import robots
 from robots import Robot
-from runtime.errors import RuntimeFault
-from runtime.grippers import Grippers
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Float64
+from runtime.ipc.command_arguments import AimRequest, GripperRequest, Jog, MoveRequest
+from runtime.ipc.messages import LockGrippers, encode
 from runtime.kinematics.base import Kinematics
-from runtime.messages import LockGrippers, encode
-from runtime.requests import AimRequest, GripperRequest, Jog, MoveRequest
-from runtime.safety import Limits, SafetySettings
-from runtime.spaces import Spaces
-from runtime.targets import Targets
-from runtime.timeline import Dims
-from runtime.types import Float64
+from runtime.motion.timeline import DimensionKinds
+from runtime.processes.coordinator.manual.grippers import Grippers
+from runtime.processes.coordinator.manual.targets import Targets
+from runtime.safety.filter import Limits, SafetySettings
+from runtime.spaces.conversion import ActionSpaces
 from tests.runtime.tick_bench import PERIOD, Bench, following
 
 EVERY = pytest.mark.parametrize("name", robots.names())
@@ -37,13 +37,13 @@ def limits_of(robot: Robot) -> Limits:
 def plan_of(robot: Robot) -> Any:
     settings = SimpleNamespace(safety=SafetySettings())
     return SimpleNamespace(
-        robot=robot, limits=limits_of(robot), deployment=settings, dims=Dims(robot.binary_dims)
+        robot=robot, limits=limits_of(robot), deployment=settings, dims=DimensionKinds(robot.binary_dims)
     )
 
 
 def standing_at(robot: Robot, pose: Float64) -> Bench:
     """Control that has taken the robot over at a pose."""
-    bench = Bench(limits=limits_of(robot), dims=Dims(robot.binary_dims))
+    bench = Bench(limits=limits_of(robot), dims=DimensionKinds(robot.binary_dims))
     bench.measured = pose.astype(float)
     bench.run()
     return bench
@@ -124,7 +124,7 @@ class Standing(Kinematics):
 def test_poses_are_gone_to_by_name_and_an_arm_that_there_is_not_is_refused(name: str) -> None:
     robot = robots.load(name)
     kinematics = Standing(robot)
-    targets = Targets(plan_of(robot), Spaces(robot, kinematics, 30.0), kinematics)
+    targets = Targets(plan_of(robot), ActionSpaces(robot, kinematics, 30.0), kinematics)
     home, ready = robot.poses["home"], robot.poses["ready"]
     aim = targets.aim(AimRequest(pose="ready"), home)
     assert np.array_equal(aim.joints, ready)
@@ -144,7 +144,7 @@ def test_an_endless_joint_goes_the_shorter_way_and_is_never_far_from_its_own_tur
         np.zeros(1, bool),
         np.zeros(1, bool),
     )
-    bench = Bench(limits=limits, dims=Dims(wrapping=(0,)))
+    bench = Bench(limits=limits, dims=DimensionKinds(wrapping=(0,)))
     bench.measured = np.array([2 * np.pi - 0.2])
     bench.run()
     bench.say("motion", goal=np.array([0.1]))

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from runtime.errors import ConfigurationError
-from runtime.execution import strategy
-from runtime.messages import ChunkMerged, Event
-from runtime.timeline import HELD, Dims
+from runtime.core.errors import ConfigurationError
+from runtime.ipc.messages import ChunkMerged, Event
+from runtime.motion.timeline import HELD, DimensionKinds
+from runtime.processes.control.chunk_execution import strategy
 from tests.runtime.tick_bench import Bench, following, wave
 
 
@@ -21,7 +21,7 @@ def speeds(bench):
 
 @pytest.mark.parametrize("kind", ["sync", "async", "ensemble", "naive", "rtc"])
 def test_every_kind_of_strategy_is_made_from_its_section(kind):
-    assert strategy({"kind": kind}, Dims()).kind == kind
+    assert strategy({"kind": kind}, DimensionKinds()).kind == kind
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,7 @@ def test_every_kind_of_strategy_is_made_from_its_section(kind):
 )
 def test_what_is_no_strategy_is_refused_by_its_key(section, said):
     with pytest.raises(ConfigurationError, match=said):
-        strategy(section, Dims())
+        strategy(section, DimensionKinds())
 
 
 # --- chunks -------------------------------------------------------------------------------------------------
@@ -89,7 +89,7 @@ def test_one_useless_chunk_is_forgiven_where_the_next_is_none():
 
 def test_what_goes_wrong_with_one_chunk_drops_it_and_control_goes_on(monkeypatch, caplog):
     bench = following(Bench())
-    monkeypatch.setattr("runtime.execution.join", lambda *given, **more: [][0])
+    monkeypatch.setattr("runtime.processes.control.chunk_execution.join", lambda *given, **more: [][0])
     bench.chunk(2, wave(60))
     bench.run(3)
     assert merged(bench)[-1].dropped == "control cannot use it: IndexError: list index out of range"
@@ -286,7 +286,7 @@ def test_an_angle_without_limits_goes_on_in_its_turn_and_never_unwinds():
         limits_of.grippers,
         limits_of.binary,
     )
-    bench = Bench(limits=endless, dims=Dims(wrapping=(0,)))
+    bench = Bench(limits=endless, dims=DimensionKinds(wrapping=(0,)))
     angle = 3.0 + 0.02 * np.arange(120)
     rows = np.column_stack([(angle + np.pi) % (2 * np.pi) - np.pi, np.zeros(120)])
     bench.measured = np.array([3.0, 0.0])

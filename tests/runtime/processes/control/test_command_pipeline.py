@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from runtime.messages import TickDone, decode
-from runtime.page import EStop
+from runtime.ipc.messages import TickDone, decode
+from runtime.ipc.shared_state import EStop
 from tests.runtime.tick_bench import PERIOD, Bench, following, wave
 
 

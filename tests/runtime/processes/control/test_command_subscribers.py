@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from runtime.errors import TransportError
-from runtime.hearing import Hearing
-from runtime.page import Page, PageLayout
-from runtime.transitions import State
+from runtime.core.errors import TransportError
+from runtime.core.types import RobotCommand
+from runtime.ipc.shared_state import SharedState, SharedStateLayout
+from runtime.processes.control.command_subscribers import SubscriberCheck
+from runtime.processes.coordinator.session.transitions import State
 from runtime.transports.base import Sink
-from runtime.types import RobotCommand
-from tests.runtime.station import Station, plan
+from tests.runtime.lockstep_station import Station, plan
 
 WHY = "a subscriber of /right is incompatible in its reliability"
 
@@ -45,10 +45,10 @@ class Desk:
     """Looks at a mouth, tick by tick at 10 Hz."""
 
     def __init__(self) -> None:
-        self.page, _ = Page.create(PageLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16))
+        self.page, _ = SharedState.create(SharedStateLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16))
         self.mouth = Mouth()
         self.said: list[tuple[str, str, Mapping[str, Any]]] = []
-        self._hearing = Hearing(self.page, self.mouth, lambda *event: self.said.append(event))
+        self._hearing = SubscriberCheck(self.page, self.mouth, lambda *event: self.said.append(event))
         self.now = 100.0
         self.page.beat("main", self.now)
 

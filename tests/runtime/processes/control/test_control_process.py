@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.clock import VirtualClock
-from runtime.control import Lateness, Loop, make_tick
-from runtime.messages import Order, PostedChunk, TickDone, decode, encode
-from runtime.page import EStop, Page, PageLayout
-from tests.runtime import station
-from tests.runtime.station import STANDS
+from runtime.core.clock import VirtualClock
+from runtime.ipc.messages import Order, PostedChunk, TickDone, decode, encode
+from runtime.ipc.shared_state import EStop, SharedState, SharedStateLayout
+from runtime.processes.control.process import Lateness, Loop, make_tick
+from tests.runtime import lockstep_station as station
+from tests.runtime.lockstep_station import STANDS
 from tests.runtime.tick_bench import RecordingSink
 
 
@@ -32,7 +32,7 @@ class LateClock(VirtualClock):
 class Ticks:
     """In the place of the tick: keeps what it was called with."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: SharedState) -> None:
         self.status = np.zeros((), page.layout.control_dtype())
         self.done: list[tuple[int, float, float]] = []
 
@@ -41,12 +41,12 @@ class Ticks:
 
 
 @pytest.fixture
-def page() -> Page:
-    page, _ = Page.create(PageLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16))
+def page() -> SharedState:
+    page, _ = SharedState.create(SharedStateLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16))
     return page
 
 
-def looped(page: Page, clock: VirtualClock, times: int, rate: float = 10.0) -> Ticks:
+def looped(page: SharedState, clock: VirtualClock, times: int, rate: float = 10.0) -> Ticks:
     ticks: Any = Ticks(page)
     loop = Loop(ticks, page, clock, rate, "FIFO 20")
     for _ in range(times):
@@ -54,27 +54,27 @@ def looped(page: Page, clock: VirtualClock, times: int, rate: float = 10.0) -> T
     return ticks
 
 
-def test_a_late_tick_does_not_make_the_next_one_late(page: Page) -> None:
+def test_a_late_tick_does_not_make_the_next_one_late(page: SharedState) -> None:
     done = looped(page, LateClock(0.0, 0.03, 0.0), 3).done
     assert [step for step, _, _ in done] == [1, 2, 3]
     assert [planned for _, planned, _ in done] == pytest.approx([100.1, 100.2, 100.3])
     assert [woke - planned for _, planned, woke in done] == pytest.approx([0.0, 0.03, 0.0])
 
 
-def test_missed_ticks_are_skipped_and_counted_and_steps_follow_the_clock(page: Page) -> None:
+def test_missed_ticks_are_skipped_and_counted_and_steps_follow_the_clock(page: SharedState) -> None:
     ticks = looped(page, LateClock(0.0, 0.25, 0.0), 3)
     assert [step for step, _, _ in ticks.done] == [1, 4, 5]
     assert [planned for _, planned, _ in ticks.done] == pytest.approx([100.1, 100.4, 100.5])
     assert [woke - planned for _, planned, woke in ticks.done] == pytest.approx([0.0, 0.05, 0.0])
 
 
-def test_the_rate_is_exact_however_late_each_tick_is(page: Page) -> None:
+def test_the_rate_is_exact_however_late_each_tick_is(page: SharedState) -> None:
     done = looped(page, LateClock(*[0.001, 0.004] * 500), 1000, rate=200.0).done
     assert done[-1][1] - done[0][1] == pytest.approx(999 / 200.0)
 
 
 def test_its_figures_are_those_of_the_newest_ticks_and_counters_go_on() -> None:
-    status = np.zeros((), PageLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16).control_dtype())
+    status = np.zeros((), SharedStateLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16).control_dtype())
     status["ticks"], status["missed"] = 50, 2
     lateness = Lateness(status, "FIFO 20")
     lateness.write()
@@ -96,7 +96,7 @@ def test_its_figures_are_those_of_the_newest_ticks_and_counters_go_on() -> None:
 class Beats:
     """In the place of the tick: looks when control last said that it is alive."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: SharedState) -> None:
         self.status = np.zeros((), page.layout.control_dtype())
         self._page = page
         self.seen: list[float] = []
@@ -105,7 +105,7 @@ class Beats:
         self.seen.append(self._page.last_beat("control"))
 
 
-def test_control_is_alive_in_the_page_before_its_tick_begins(page: Page) -> None:
+def test_control_is_alive_in_the_page_before_its_tick_begins(page: SharedState) -> None:
     beats: Any = Beats(page)
     Loop(beats, page, LateClock(0.002), 10.0, "ordinary").once()
     assert beats.seen == pytest.approx([100.102])
@@ -117,7 +117,7 @@ def test_the_tick_of_a_deployment_keeps_its_arms_in_their_boxes(
 ) -> None:
     box = {"lower": [-half] * 3, "upper": [half] * 3}
     plan = station.plan(tmp_path, safety={"workspace": {"left_arm": box}})
-    page, _ = Page.create(plan.layout)
+    page, _ = SharedState.create(plan.layout)
     page.set_estop(EStop.CLEAR)
     clock, sink = VirtualClock(10.0), RecordingSink()
     tick = make_tick(plan, page, sink, clock.now)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from runtime.locks import Locks
+from runtime.processes.control.gripper_locks import GripperLocks
 from tests.runtime.tick_bench import WITH_GRIPPER, Bench, following
 
 NAN = float("nan")
@@ -21,8 +21,8 @@ def bench():
 
 
 def test_a_locked_dimension_is_replaced_and_noted_where_that_made_a_difference():
-    locks = Locks(WITH_GRIPPER)
-    assert locks.set(np.array([NAN, NAN, 0.05])) == ""
+    locks = GripperLocks(WITH_GRIPPER)
+    assert locks.set(np.array([NAN, NAN, 0.05]), np.zeros(3)) == ""
     action, notes = locks.apply(np.array([0.3, 0.2, 0.1]))
     assert action.tolist() == [0.3, 0.2, 0.05]
     assert notes == ("gripper locked at 0.05",)
@@ -30,14 +30,14 @@ def test_a_locked_dimension_is_replaced_and_noted_where_that_made_a_difference()
 
 
 def test_a_lock_beyond_the_range_is_at_its_end():
-    locks = Locks(WITH_GRIPPER)
-    assert locks.set(np.array([NAN, NAN, 0.5])) == ""
+    locks = GripperLocks(WITH_GRIPPER)
+    assert locks.set(np.array([NAN, NAN, 0.5]), np.zeros(3)) == ""
     assert locks.values[2] == 0.1
 
 
 def test_an_action_of_another_shape_is_left_to_safety():
-    locks = Locks(WITH_GRIPPER)
-    locks.set(np.array([NAN, NAN, 0.05]))
+    locks = GripperLocks(WITH_GRIPPER)
+    locks.set(np.array([NAN, NAN, 0.05]), np.zeros(3))
     assert locks.apply(np.zeros(2))[1] == ()
 
 
@@ -50,8 +50,8 @@ def test_an_action_of_another_shape_is_left_to_safety():
     ],
 )
 def test_what_cannot_be_locked_is_refused_and_changes_nothing(values, said):
-    locks = Locks(WITH_GRIPPER)
-    assert said in locks.set(values)
+    locks = GripperLocks(WITH_GRIPPER)
+    assert said in locks.set(values, np.zeros(3))
     assert not locks.on.any()
     assert str(locks) == "every gripper is free"
 

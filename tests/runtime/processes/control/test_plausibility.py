@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.limits import Limits
-from runtime.plausibility import Plausibility, Unquestioned
-from runtime.seen import Seen
-from runtime.timeline import Dims
+from runtime.ipc.observation_reader import LatestObservation
+from runtime.motion.timeline import DimensionKinds
+from runtime.processes.control.plausibility import Plausibility, Unquestioned
+from runtime.safety.limits import Limits
 from tests.runtime.tick_bench import PERIOD
 
 LIMITS = Limits(
@@ -25,7 +25,7 @@ NAN = float("nan")
 
 class Watcher:
     def __init__(self, limits=LIMITS, dims=None):
-        self.judge = Plausibility(limits, dims or Dims())
+        self.judge = Plausibility(limits, dims or DimensionKinds())
         self.now, self.sequence, self.captured = 100.0, 0, 0.0
 
     def see(self, joints, commanded=None, stamp=True):
@@ -34,7 +34,7 @@ class Watcher:
         self.sequence += 1
         self.captured = self.now - 0.01 if stamp else self.captured
         joints = np.array(joints, float)
-        seen = Seen(
+        seen = LatestObservation(
             self.sequence,
             joints.astype(np.float32),
             joints,
@@ -50,7 +50,7 @@ class Watcher:
         return [self.see(joints) for _ in range(ticks)]
 
     def miss(self, ticks):
-        seen = Seen(self.sequence, STANDS.astype(np.float32), STANDS, self.captured, (), True)
+        seen = LatestObservation(self.sequence, STANDS.astype(np.float32), STANDS, self.captured, (), True)
         for _ in range(ticks):
             self.now += PERIOD
             self.judge.judge(seen, self.now, None)
@@ -132,6 +132,57 @@ def test_swapped_joints_are_never_believed_however_long_they_last():
     assert watcher.see(STANDS) == ""
 
 
+def test_joints_that_are_swapped_within_what_they_can_move_are_noticed():
+    watcher = stood([0.1, -0.1, 0.05])
+    doubts = [watcher.see([-0.1, 0.1, 0.05]) for _ in range(30)]
+    assert set(doubts) == {"hip and knee read each other's values: are they swapped?"}
+    assert watcher.see([0.1, -0.1, 0.05]) == ""
+
+
+def test_of_three_that_are_swapped_one_may_have_read_nearly_the_same():
+    three = Limits(
+        ("a", "b", "c"), np.full(3, -2.0), np.full(3, 2.0), np.full(3, 5.0), np.zeros(3, bool), LIMITS.binary
+    )
+    watcher = Watcher(three)
+    watcher.stand(5, [1.406, 1.366, 0.855])
+    doubts = [watcher.see([0.855, 1.406, 1.366]) for _ in range(30)]
+    assert set(doubts) == {"a and b and c read each other's values: are they swapped?"}
+
+
+@pytest.mark.parametrize("rate", [10, 30, 100])
+@pytest.mark.parametrize("shift", np.linspace(0.0, 0.3, 16).tolist())
+def test_joints_that_pass_each_other_at_full_speed_are_not_swapped(rate, shift):
+    watcher, period = stood([-1.5, 1.5, 0.05]), 1 / rate
+    for time in np.arange(0.0, 1.1, period):
+        way = min(15.0 * time**2, 3.0 * time - 0.15)  # 30 rad/s2 up to 3 rad/s
+        watcher.now += period - PERIOD
+        assert watcher.see([-1.5 + way, 1.5 - shift - way, 0.05]) == ""
+
+
+def test_samples_from_before_a_contradiction_do_not_count_for_how_long_others_agree():
+    watcher = stood()
+    watcher.stand(10, [-0.4, 0.8, 0.05])  # swapped
+    assert watcher.stand(2, [0.6, -0.4, 0.05]) == ["", ""]
+    assert not watcher.judge.settled
+    watcher.stand(2, [0.6, -0.4, 0.05])
+    assert watcher.judge.settled
+
+
+def test_swapped_joints_are_noticed_beside_one_that_begins_another_turn():
+    endless = Limits(
+        ("hip", "knee", "wheel"),
+        np.array([-2.0, -2.0, -np.inf]),
+        np.array([2.0, 2.0, np.inf]),
+        LIMITS.velocity,
+        np.zeros(3, bool),
+        LIMITS.binary,
+    )
+    watcher = Watcher(endless, DimensionKinds((), (2,)))
+    watcher.stand(5, [0.8, -0.4, 3.141])
+    doubts = [watcher.see([-0.4, 0.8, -3.141]) for _ in range(30)]
+    assert set(doubts) == {"hip and knee read each other's values: are they swapped?"}
+
+
 def test_an_arm_that_is_elsewhere_is_believed_once_several_samples_agree():
     watcher = stood()
     elsewhere = np.array([-0.5, 0.3, 0.05])
@@ -149,6 +200,57 @@ def test_an_encoder_that_was_noisy_and_is_stuck_elsewhere_is_never_believed():
     assert doubts[0].startswith("hip reads -0.700 rad, 0.800 just before")
     assert set(doubts[3:]) == {"hip jumped to -0.700 rad and reads exactly that: is it stuck?"}
     assert watcher.see(STANDS) == ""
+
+
+def test_an_encoder_is_known_to_be_noisy_by_samples_that_are_not_believed_too():
+    watcher = stood()
+    for tick in range(10):
+        watcher.see(np.array([-0.4, 0.8, 0.05]) + 1e-5 * (tick % 3))  # swapped
+    doubts = [watcher.see([-1.5, 0.8 + 1e-5 * (tick % 3), 0.05]) for tick in range(30)]
+    assert set(doubts[3:]) == {"hip jumped to -1.500 rad and reads exactly that: is it stuck?"}
+
+
+@pytest.mark.parametrize(("others", "stuck"), [(1e-5, True), (0.0, False)])
+def test_a_joint_that_moved_and_is_still_where_it_jumped_to_is_stuck_unless_all_have_come_to_rest(
+    others, stuck
+):
+    watcher = Watcher()
+    for tick in range(12):
+        watcher.see([0.8 - 0.01 * tick, -0.4, 0.05])
+    doubts = [watcher.see([-0.7, -0.4 + others * (tick % 3), 0.05]) for tick in range(100)]
+    assert doubts[0].startswith("hip reads -0.700 rad, 0.690 just before")
+    assert set(doubts[3:]) == (
+        {"hip jumped to -0.700 rad and reads exactly that: is it stuck?"} if stuck else {""}
+    )
+
+
+def test_an_encoder_that_was_noisy_leaps_as_far_as_the_joint_can_and_is_stuck_there_is_not_believed():
+    watcher = Watcher()
+    for tick in range(10):
+        watcher.see(STANDS + 1e-5 * (tick % 3))
+    doubts = []
+    for tick in range(100):
+        doubts.append(watcher.see([0.6, -0.4 + 1e-5 * (tick % 3), 0.05]))
+        assert not watcher.judge.apart(STANDS, 0.1)
+    assert doubts[:2] == ["", ""]
+    assert set(doubts[2:]) == {"hip jumped to 0.600 rad and reads exactly that: is it stuck?"}
+    assert watcher.see(STANDS) == ""
+
+
+def test_two_that_leap_and_are_stuck_there_are_not_believed_either():
+    watcher = Watcher()
+    for tick in range(10):
+        watcher.see(STANDS + 1e-5 * (tick % 3))
+    doubts = watcher.stand(30, [0.6, -0.2, 0.05])
+    assert set(doubts[2:]) == {"hip jumped to 0.600 rad and reads exactly that: is it stuck?"}
+
+
+def test_a_noisy_joint_that_is_fast_and_comes_to_rest_is_believed():
+    watcher = Watcher()
+    way = 0.8 - 0.2 * np.arange(5)
+    for hip in (0.8, 0.80001, 0.8, 0.80001, 0.8, *way, 0.00001, 0.0, 0.00001):
+        assert watcher.see([hip, -0.4, 0.05]) == "" or hip > 0.7
+    assert watcher.judge.settled
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -202,7 +304,7 @@ def test_no_motion_within_the_velocity_is_ever_doubted_whatever_the_stamps(speed
         captured += gap
         watcher.now = max(watcher.now + 1e-3, captured)
         joints = np.array([hip, -0.4, 0.05])
-        seen = Seen(1, joints.astype(np.float32), joints, captured, (), True)
+        seen = LatestObservation(1, joints.astype(np.float32), joints, captured, (), True)
         assert watcher.judge.judge(seen, watcher.now, None).doubt == ""
 
 
@@ -290,14 +392,14 @@ def test_an_endless_joint_that_is_counted_in_another_turn_has_not_moved():
         LIMITS.grippers,
         LIMITS.binary,
     )
-    watcher = Watcher(endless, Dims((), (0,)))
+    watcher = Watcher(endless, DimensionKinds((), (0,)))
     watcher.stand(5, [3.1, 0.0, 0.0])
     assert watcher.see([-3.1, 0.0, 0.0]) == ""
 
 
 def test_what_moves_no_robot_is_believed_at_once():
-    judge = Unquestioned(LIMITS, Dims())
-    seen = Seen(1, STANDS.astype(np.float32), STANDS, 99.0, (), True)
+    judge = Unquestioned(LIMITS, DimensionKinds())
+    seen = LatestObservation(1, STANDS.astype(np.float32), STANDS, 99.0, (), True)
     assert judge.judge(seen, 99.0, None) is seen
     assert judge.apart(np.zeros(3), 0.5)
     assert not judge.apart(STANDS, 0.5)

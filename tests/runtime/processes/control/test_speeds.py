@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.errors import RuntimeFault
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import ActionChunk, Float64, Observation
+from runtime.ipc.command_arguments import MoveRequest
+from runtime.ipc.messages import LockGrippers, encode
+from runtime.ipc.shared_state import EStop
 from runtime.kinematics.base import IkResult, Kinematics
-from runtime.messages import LockGrippers, encode
-from runtime.motion import Brake
-from runtime.page import EStop
-from runtime.requests import MoveRequest
-from runtime.safety import Limits, RobotState, SafetyFilter, SafetySettings
-from runtime.spaces import Spaces
-from runtime.targets import Targets
-from runtime.timeline import Dims
-from runtime.types import ActionChunk, Float64, Observation
+from runtime.motion.timeline import DimensionKinds
+from runtime.motion.trajectories import Brake
+from runtime.processes.coordinator.manual.targets import Targets
+from runtime.safety.filter import Limits, RobotState, SafetyFilter, SafetySettings
+from runtime.spaces.conversion import ActionSpaces
 from tests.runtime.tick_bench import PERIOD, Bench, following
 
 DRIVEN = Limits(
@@ -149,7 +149,7 @@ def test_a_person_cannot_have_a_base_driven_by_a_motion_and_an_approach_leaves_i
         robot.joint_names, robot.lower, robot.upper, robot.velocity, grippers, none, robot.speed_dims
     )
     settings = SimpleNamespace(safety=SafetySettings())
-    plan: Any = SimpleNamespace(robot=robot, limits=limits, deployment=settings, dims=Dims())
+    plan: Any = SimpleNamespace(robot=robot, limits=limits, deployment=settings, dims=DimensionKinds())
     unused: Any = None
     targets = Targets(plan, unused, unused)
     driving = robot.poses["home"].copy()
@@ -177,7 +177,7 @@ class StandingArms(Kinematics):
 
 def test_a_policy_in_poses_leaves_the_base_standing_and_one_in_steps_names_its_speed() -> None:
     robot = robots.load("r1_lite", ["left_arm", "base"])
-    spaces = Spaces(robot, StandingArms(robot), 30.0)
+    spaces = ActionSpaces(robot, StandingArms(robot), 30.0)
     qpos = robot.poses["ready"].copy()
     qpos[list(robot.speed_dims)] = 0.3
     seen = Observation(1, 0.0, {}, qpos.astype(np.float32), {})

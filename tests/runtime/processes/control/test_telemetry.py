@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from runtime.actuator import Sent
-from runtime.behaviour import Target
-from runtime.collision import Collision
-from runtime.report import Limiting, Nearing, Report
+from runtime.processes.control.actuator import Sent
+from runtime.processes.control.behaviours import Target
+from runtime.processes.control.telemetry import Limiting, Nearing, Telemetry
+from runtime.safety.collision import Collision
 from tests.runtime.tick_bench import Bench, following, wave
 
 
@@ -84,7 +84,7 @@ def test_what_comes_near_is_told_once_and_how_near_it_came_when_it_is_over():
 def test_a_record_says_what_filled_its_tick(sent, simulated, source):
     bench = Bench()
     bench.observe()
-    report = Report(bench.page)
+    report = Telemetry(bench.page)
     report.begin(3, 100.0)
     report.record(bench.tick._eyes.look(), sent, simulated)
     (record,) = bench.records()
@@ -95,7 +95,7 @@ def test_a_restarted_control_goes_on_counting():
     bench = following(Bench())
     bench.tick.status["missed"] = 5
     bench.run(2)
-    assert Report(bench.page).status["missed"] == 5
+    assert Telemetry(bench.page).status["missed"] == 5
 
 
 def test_what_leads_a_step_is_the_chunk_with_the_largest_part():

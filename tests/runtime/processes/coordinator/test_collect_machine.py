@@ -9,13 +9,14 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import initialize, rule
 
-from runtime import deployment, family
+from runtime.config import loader as deployment
+from runtime.processes.coordinator.session.transitions import State
 from runtime.recording.labels import newest
-from runtime.transitions import State
-from tests.runtime import test_session_machine
+from runtime.station import spec as family
 from tests.runtime.collect_station import CollectPlan, CollectStation
-from tests.runtime.station import STANDS, plan
-from tests.runtime.test_session_machine import ticks
+from tests.runtime.lockstep_station import STANDS, plan
+from tests.runtime.processes.coordinator.session import test_session_machine
+from tests.runtime.processes.coordinator.session.test_session_machine import ticks
 
 ENDED = 60  # ticks in which an episode that has ended is on disk
 buttons = st.sampled_from(["arm", "disarm", "run", "stop", "discard", "halt", "resume"])
@@ -126,5 +127,5 @@ class Collects(test_session_machine.Machine):
 
 TestCollects = Collects.TestCase
 TestCollects.settings = settings(
-    max_examples=8, stateful_step_count=20, deadline=None, suppress_health_check=list(HealthCheck)
+    max_examples=8, stateful_step_count=20, suppress_health_check=list(HealthCheck)
 )

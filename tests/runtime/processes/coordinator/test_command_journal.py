@@ -4,9 +4,9 @@ import os
 
 import pytest
 
-from runtime import command_journal
-from runtime.command_journal import CommandJournal
-from runtime.messages import Ack, Command
+from runtime.ipc.messages import Ack, Command
+from runtime.processes.coordinator import command_journal
+from runtime.processes.coordinator.command_journal import CommandJournal
 
 ACK = Ack("u-1", "accepted", "", ["stop"], "boot-1", 3, {"epoch": 2, "holder": "anna"})
 
@@ -42,6 +42,16 @@ def test_a_restart_remembers_every_answer(tmp_path, journal):
     assert journal.append(Command("u-1", "run"), ACK) == ""
     assert journal.append(Command("u-2", "halt"), refused) == ""
     assert reopened(tmp_path) == {"u-1": ACK, "u-2": refused}
+
+
+def test_answers_of_one_moment_are_on_disk_at_the_price_of_one(tmp_path, journal, monkeypatch):
+    synced = []
+    monkeypatch.setattr(command_journal.os, "fdatasync", synced.append)
+    answered = [(Command(f"u-{n}", "run"), Ack(f"u-{n}", "refused", str(n))) for n in range(5)]
+    assert journal.append_all(answered) == ""
+    assert journal.append_all([]) == ""
+    assert len(synced) == 1
+    assert list(reopened(tmp_path).values()) == [ack for _, ack in answered]
 
 
 def test_a_line_says_who_asked_for_what_under_which_lease(journal, path):

@@ -3,17 +3,17 @@ import mmap
 import numpy as np
 import pytest
 
-from runtime.errors import RuntimeFault
-from runtime.messages import NodeRequest, Order, PostedChunk, decode
-from runtime.orders import Orders
-from runtime.page import Page, PageLayout
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.messages import NodeRequest, Order, PostedChunk, decode
+from runtime.ipc.shared_state import SharedState, SharedStateLayout
+from runtime.processes.coordinator.control_queue import ControlQueue
 
-LAYOUT = PageLayout(dim=2, eef_dim=8, cameras=())
+LAYOUT = SharedStateLayout(dim=2, eef_dim=8, cameras=())
 
 
 @pytest.fixture
 def page():
-    return Page(LAYOUT, mmap.mmap(-1, Page.size(LAYOUT)))
+    return SharedState(LAYOUT, mmap.mmap(-1, SharedState.size(LAYOUT)))
 
 
 def obey(page, number):
@@ -27,7 +27,7 @@ def read(page):
 
 
 def test_orders_are_numbered_and_arrive_in_order(page):
-    orders = Orders(page)
+    orders = ControlQueue(page)
     assert orders.give("hold", run=3, reason="halted") == 1
     assert orders.give("motion", goal=np.array([0.5, 1.0])) == 2
     first, second = read(page)
@@ -36,7 +36,7 @@ def test_orders_are_numbered_and_arrive_in_order(page):
 
 
 def test_an_order_is_obeyed_once_control_says_so(page):
-    orders = Orders(page)
+    orders = ControlQueue(page)
     number = orders.give("hold")
     assert not orders.obeyed(number)
     obey(page, number)
@@ -45,13 +45,13 @@ def test_an_order_is_obeyed_once_control_says_so(page):
 
 def test_a_restarted_main_counts_on_from_what_control_has_obeyed(page):
     obey(page, 41)
-    orders = Orders(page)
+    orders = ControlQueue(page)
     assert not orders.obeyed(orders.give("follow", run=1))
     assert read(page)[0].number == 42
 
 
 def test_chunks_keep_their_numbers_and_their_place_among_the_orders(page):
-    orders = Orders(page)
+    orders = ControlQueue(page)
     orders.give("follow", run=1)
     orders.post(PostedChunk(orders.next_chunk(), 1, 10, np.zeros((3, 2))))
     orders.give("hold", run=1)
@@ -60,14 +60,14 @@ def test_chunks_keep_their_numbers_and_their_place_among_the_orders(page):
 
 
 def test_a_word_for_the_node_goes_the_way_of_the_orders(page):
-    orders = Orders(page)
+    orders = ControlQueue(page)
     orders.give("hold")
     orders.ask_node("scene_reset", {"id": "r", "seed": 3})
     assert read(page)[1] == NodeRequest("scene_reset", {"id": "r", "seed": 3})
 
 
 def test_a_control_that_does_not_read_is_a_fault_and_not_silence(page):
-    orders = Orders(page)
+    orders = ControlQueue(page)
     large = PostedChunk(1, 1, 10, np.zeros((40_000, 2)))
     orders.post(large)
     with pytest.raises(RuntimeFault, match="control does not read its orders: the ring is full"):

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import zmq
 
-from runtime.bus import Endpoints, Subscriber
-from runtime.main import _MOST_WAITING, Service
-from runtime.messages import Ack, Command, decode, encode
-from tests.runtime.station import DIM, Station, plan
+from runtime.ipc.bus import Endpoints, Subscriber
+from runtime.ipc.messages import Ack, Command, decode, encode
+from runtime.processes.coordinator.process import CommandService
+from tests.runtime.lockstep_station import DIM, Station, plan
 
 PATIENCE = 500  # times 10 ms
 
@@ -24,7 +24,7 @@ class Watched:
     def __init__(self, folder: Path) -> None:
         self._context: zmq.Context[Any] = zmq.Context()
         self.station = Station(plan(folder))
-        self._service = Service(self.station.main, self._context)
+        self._service = CommandService(self.station.main, self._context)
         endpoint = Endpoints(self.station.plan.deployment.station_dir).read("main")["state"]
         self._reader = Subscriber(self._context, endpoint, "joints")
         self.serve = self._service.serve
@@ -138,11 +138,12 @@ def test_of_many_that_wait_for_what_is_being_loaded_some_are_refused(
     watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(watched.station.main.by_hand._targets, "prepare", lambda: False)
+    monkeypatch.setattr("runtime.processes.coordinator.process._MOST_WAITING", 10)
     asker = Asker(watched)
-    for number in range(_MOST_WAITING + 3):
+    for number in range(13):
         asker.ask(str(number), jog=JOG)
     answers = asker.answers(3)
     assert [(ack.uuid, ack.status) for ack in answers] == [
-        (str(_MOST_WAITING + n), "refused") for n in range(3)
+        (str(number), "refused") for number in (10, 11, 12)
     ]
-    assert answers[0].reason == "aim: 100 wait already for what is still being loaded: ask again"
+    assert answers[0].reason == "aim: 10 wait already for what is still being loaded: ask again"

@@ -9,14 +9,15 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from runtime import deployment, family
+from runtime.config import loader as deployment
+from runtime.core.errors import RecordingError, SetupError
 from runtime.datasets.published import publish
-from runtime.errors import RecordingError, SetupError
+from runtime.processes.coordinator.session.transitions import State
 from runtime.recording.labels import labels
 from runtime.recording.reader import Episode
-from runtime.transitions import State
+from runtime.station import spec as family
 from tests.runtime.collect_station import CollectStation, SelfDriven, collecting
-from tests.runtime.station import MOVED, STANDS, column, plan
+from tests.runtime.lockstep_station import MOVED, STANDS, column, plan
 
 LEFT = MOVED[0]
 SESSION = {"uuid": "00000000-0000-4000-8000-000000000007", "dataset": "cups"}
@@ -375,7 +376,7 @@ def test_a_set_up_to_collect_takes_no_policy(tmp_path: Path, given: dict[str, An
 
 
 def test_a_deployment_without_a_collection_says_so(tmp_path: Path) -> None:
-    from tests.runtime.station import Station
+    from tests.runtime.lockstep_station import Station
 
     station = Station(plan(tmp_path)).ready()
     assert station.main.snapshot()["collect"] is None

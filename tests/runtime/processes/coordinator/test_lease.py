@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.lease import HIGHEST_EPOCH, Lease
+from runtime.processes.coordinator.lease import HIGHEST_EPOCH, Lease
 
 TTL = 5.0
 ACTS = st.tuples(

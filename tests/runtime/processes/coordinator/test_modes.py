@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.errors import PolicyError, PolicyLostError, SetupError
-from runtime.transitions import State
-from tests.runtime.station import STANDS, Station, column, on_time, plan, ramp
+from runtime.core.errors import PolicyError, PolicyLostError, SetupError
+from runtime.processes.coordinator.session.transitions import State
+from tests.runtime.lockstep_station import STANDS, Station, column, on_time, plan, ramp
 
 LEFT_GRIPPER = 6
 
@@ -542,14 +542,15 @@ def test_an_arm_that_was_moved_while_a_person_looks_holds_the_run(tmp_path: Path
     station.command("step")
     station.go(30)
     station.robot.blocked = True
-    station.robot.position = station.robot.position + np.eye(14)[0]
-    station.go(10)
+    for _ in range(28):  # by a hand, which is seen on its way
+        station.robot.position = station.robot.position + 0.02 * np.eye(14)[0]
+        station.go(1)
+    station.go(30)
     assert station.state is State.HOLDING
-    assert "faster than it moves" in station.reason
-    assert "from where it was told to hold" in station.events("displaced")[0]
+    assert "from where it was told to hold" in station.reason
     assert station.main.inference.proposal is None
     if station.robot.commands:
-        assert np.allclose(station.robot.sent[-1], station.robot.position, atol=1e-6)
+        assert np.allclose(station.robot.sent[-1], station.robot.position, atol=0.05)
     station.close()
 
 

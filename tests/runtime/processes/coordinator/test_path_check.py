@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.errors import RuntimeFault
-from runtime.safety import Limits, SafetySettings, WorkspaceBox
-from runtime.timeline import Dims
-from runtime.ways import Ways
+from runtime.core.errors import RuntimeFault
+from runtime.motion.timeline import DimensionKinds
+from runtime.processes.coordinator.path_check import PathCheck
+from runtime.safety.filter import Limits, SafetySettings, WorkspaceBox
 from tests.runtime.collision_samples import collisions, robot, turned
 
 
-def ways(**safety: Any) -> Ways:
+def ways(**safety: Any) -> PathCheck:
     own = robot()
     grippers = np.isin(np.arange(own.dim), own.gripper_dims)
     limits = Limits(own.joint_names, own.lower, own.upper, own.velocity, grippers, np.zeros(own.dim, bool))
     settings = SimpleNamespace(safety=SafetySettings(**safety))
-    plan: Any = SimpleNamespace(robot=own, limits=limits, deployment=settings, dims=Dims())
-    return Ways(plan)
+    plan: Any = SimpleNamespace(robot=own, limits=limits, deployment=settings, dims=DimensionKinds())
+    return PathCheck(plan)
 
 
 def test_a_way_into_the_other_arm_is_refused_with_the_pair_where_and_what_to_do() -> None:

@@ -5,36 +5,36 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runtime.page import Page, PageLayout
-from runtime.punctuality import Punctuality
+from runtime.ipc.shared_state import SharedState, SharedStateLayout
+from runtime.processes.coordinator.timing_report import TimingReport
 
 
 @pytest.fixture
-def page() -> Page:
-    page, _ = Page.create(PageLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16))
+def page() -> SharedState:
+    page, _ = SharedState.create(SharedStateLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16))
     return page
 
 
-def tell(page: Page, scheduling: str, p99_ms: float = 0.1, ticks: int = 1000) -> None:
+def tell(page: SharedState, scheduling: str, p99_ms: float = 0.1, ticks: int = 1000) -> None:
     status = np.zeros((), page.layout.control_dtype())
     status["scheduling"], status["ticks"], status["lateness_p99"] = scheduling.encode(), ticks, p99_ms / 1000
     page.control.write(status)
 
 
-def watching(page: Page, asked: bool = True) -> Punctuality:
-    return Punctuality(page, 100.0, 20, asked)
+def watching(page: SharedState, asked: bool = True) -> TimingReport:
+    return TimingReport(page, 100.0, 20, asked)
 
 
-def kinds(punctuality: Punctuality, now: float) -> list[str]:
+def kinds(punctuality: TimingReport, now: float) -> list[str]:
     return [event.kind for event in punctuality.look(now)]
 
 
-def test_who_has_the_real_time_class_and_is_on_time_is_told_nothing(page: Page) -> None:
+def test_who_has_the_real_time_class_and_is_on_time_is_told_nothing(page: SharedState) -> None:
     tell(page, "FIFO 20")
     assert watching(page).look(10.0) == []
 
 
-def test_another_class_is_told_once_with_what_to_do_about_it(page: Page) -> None:
+def test_another_class_is_told_once_with_what_to_do_about_it(page: SharedState) -> None:
     tell(page, "slice 0.1 ms unlocked")
     told = watching(page)
     (event,) = told.look(10.0)
@@ -45,12 +45,12 @@ def test_another_class_is_told_once_with_what_to_do_about_it(page: Page) -> None
     assert told.look(12.0) == []
 
 
-def test_who_did_not_ask_for_the_class_gets_no_advice(page: Page) -> None:
+def test_who_did_not_ask_for_the_class_gets_no_advice(page: SharedState) -> None:
     tell(page, "ordinary")
     assert watching(page, asked=False).look(10.0) == []
 
 
-def test_late_ticks_are_told_once_and_once_again_when_they_are_over(page: Page) -> None:
+def test_late_ticks_are_told_once_and_once_again_when_they_are_over(page: SharedState) -> None:
     told = watching(page)
     heard = []
     for now, p99_ms in enumerate((0.2, 1.4, 3.0, 0.8, 0.4, 0.4), start=10):
@@ -59,7 +59,9 @@ def test_late_ticks_are_told_once_and_once_again_when_they_are_over(page: Page) 
     assert heard == [[], ["late_ticks"], [], [], ["punctual"], []]
 
 
-def test_nothing_is_judged_before_two_seconds_of_ticks_nor_without_a_clock_of_its_own(page: Page) -> None:
+def test_nothing_is_judged_before_two_seconds_of_ticks_nor_without_a_clock_of_its_own(
+    page: SharedState,
+) -> None:
     told = watching(page)
     tell(page, "ordinary", 5.0, ticks=199)
     assert told.look(10.0) == []
@@ -69,7 +71,7 @@ def test_nothing_is_judged_before_two_seconds_of_ticks_nor_without_a_clock_of_it
     assert kinds(told, 14.0) == ["scheduling", "late_ticks"]
 
 
-def test_it_looks_once_a_second(page: Page) -> None:
+def test_it_looks_once_a_second(page: SharedState) -> None:
     told = watching(page)
     assert told.look(10.0) == []
     tell(page, "ordinary", 5.0)

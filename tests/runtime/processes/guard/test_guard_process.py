@@ -1,15 +1,21 @@
 import errno
 import mmap
+import os
 
 import pytest
+import zmq
 
-from runtime.clock import VirtualClock
-from runtime.guard import Guard
-from runtime.latch import Latch
-from runtime.messages import Command
-from runtime.page import EStop, Page, PageLayout
+from runtime.core.clock import VirtualClock
+from runtime.ipc.bus import Endpoints, Key
+from runtime.ipc.endpoints import account
+from runtime.ipc.estop_latch import Latch
+from runtime.ipc.messages import Command, decode, encode
+from runtime.ipc.shared_state import EStop, SharedState, SharedStateLayout
+from runtime.processes.guard import process as guard_module
+from runtime.processes.guard.process import Desk, Guard
+from tests import presses
 
-LAYOUT = PageLayout(dim=2, eef_dim=8, cameras=())
+LAYOUT = SharedStateLayout(dim=2, eef_dim=8, cameras=())
 PERIOD = 1 / 30
 
 
@@ -50,7 +56,7 @@ class FailingLatch(Latch):
 
 @pytest.fixture
 def page():
-    return Page(LAYOUT, mmap.mmap(-1, Page.size(LAYOUT)))
+    return SharedState(LAYOUT, mmap.mmap(-1, SharedState.size(LAYOUT)))
 
 
 @pytest.fixture
@@ -223,6 +229,34 @@ def test_a_restarted_guard_does_not_carry_out_releases_of_before(page, latch, co
     assert page.estop is EStop.LATCHED
 
 
+def to_main(page, uuid="u"):
+    """What main does with a press that comes to its socket."""
+    page.rings["presses"].push(encode(Command(uuid, "estop", {"why": "at the wrong door"}, "ben")))
+    page.set_estop(EStop.LATCHED)
+
+
+def test_a_press_that_came_to_main_is_latched_on_disk_with_who_and_why(guard, page, latch):
+    to_main(page)
+    guard.watch()
+    assert (latch.read().by, latch.read().why) == ("ben", "at the wrong door")
+    assert page.estop is EStop.LATCHED
+
+
+def test_a_press_that_came_to_main_while_there_was_no_guard_is_latched_by_the_next(page, latch, control):
+    to_main(page)
+    restarted = Guard(page, latch, control, PERIOD)
+    restarted.watch()
+    assert (page.estop, latch.read().by) == (EStop.LATCHED, "ben")
+
+
+def test_a_release_under_way_does_not_undo_a_press_that_comes_to_main(guard, page, latch):
+    press(guard)
+    page.ask_release()
+    to_main(page)
+    guard.watch()
+    assert (page.estop, latch.read().by) == (EStop.LATCHED, "ben")
+
+
 def test_the_status_says_who_pressed(guard):
     assert guard.answer(Command("u", "status")).data == {"latched": False, "by": ""}
     press(guard)
@@ -234,3 +268,265 @@ def test_the_guard_knows_nothing_else(guard, page, kind):
     ack = guard.answer(Command("u", kind))
     assert (ack.status, ack.reason) == ("refused", f"the guard knows estop and status, not {kind!r}")
     assert page.estop is EStop.CLEAR
+
+
+# --- the socket ----------------------------------------------------------------------------------------------
+
+
+class Counting(Latch):
+    """A latch that counts how often it is written."""
+
+    def __init__(self, folder):
+        super().__init__(folder)
+        self.written = 0
+
+    def set(self, by, why):
+        self.written += 1
+        return super().set(by, why)
+
+
+class Door:
+    """The guard behind its real socket; `client` sends whatever it likes."""
+
+    def __init__(self, page, control, folder):
+        self.folder, self.page, self.latch = folder, page, Counting(folder)
+        self.context = zmq.Context()
+        self.guard = Guard(page, self.latch, control, PERIOD, "bench-1")
+        self.desk = Desk(self.guard, page, self.context, folder)
+        self._endpoint = Endpoints(folder).read("guard")["estop"]
+
+    def client(self):
+        made = self.context.socket(zmq.DEALER)
+        made.set_hwm(100_000)
+        made.linger = 0
+        made.connect(self._endpoint)
+        return made
+
+    def serve(self, turns=1):
+        for _ in range(turns):
+            self.desk.serve(2.0)
+            self.guard.watch()
+
+    def heard(self, client):
+        """What the client is answered first, however many turns what others send takes."""
+        for _ in range(200):
+            self.serve()
+            if client.poll(10):
+                return decode(client.recv())
+        raise AssertionError("no answer")
+
+    def close(self):
+        self.desk.close()
+        self.context.destroy(linger=0)
+
+
+@pytest.fixture
+def door(page, control, tmp_path):
+    made = Door(page, control, tmp_path / "bench-1")
+    yield made
+    made.close()
+
+
+def pressed(uuid="u", user="anna", why="smoke"):
+    return encode(Command(uuid, "estop", {"why": why}, user, user))
+
+
+def answers(client):
+    found = []
+    while client.poll(200):
+        found.append(decode(client.recv()))
+    return found
+
+
+def test_a_press_that_the_web_has_signed_is_recorded_by_name(door):
+    payload = pressed()
+    client = door.client()
+    client.send_multipart([payload, Key(door.folder).sign(payload)])
+    door.serve()
+    assert [(ack.uuid, ack.status) for ack in answers(client)] == [("u", "done")]
+    assert door.latch.read().by == "anna"
+
+
+def test_a_press_of_a_program_is_recorded_by_account(door):
+    client = door.client()
+    client.send(pressed())
+    door.serve()
+    assert answers(client)[0].status == "done"
+    assert door.latch.read().by == f"account:{account(os.geteuid())}"
+
+
+@pytest.mark.parametrize("trouble", ["forged", "no key", "a key for everybody", "a folder for a key"])
+def test_a_press_that_cannot_be_verified_is_obeyed_and_recorded_so(door, page, trouble):
+    payload = pressed()
+    signature = b"made up" if trouble == "forged" else Key(door.folder).sign(payload)
+    if trouble == "no key":
+        (door.folder / "bus.key").unlink()
+    elif trouble == "a key for everybody":
+        (door.folder / "bus.key").chmod(0o644)
+    elif trouble == "a folder for a key":
+        (door.folder / "bus.key").unlink()
+        (door.folder / "bus.key").mkdir()
+    client = door.client()
+    client.send_multipart([payload, signature])
+    door.serve()
+    assert answers(client)[0].status == "done"
+    assert page.estop is EStop.LATCHED
+    assert door.latch.read().by == "anna (unverified)"
+
+
+@pytest.mark.parametrize("name", presses.PACKED)
+def test_whatever_is_wrong_with_a_press_it_is_pressed_recorded_and_answered(door, page, name):
+    client = door.client()
+    client.send(presses.PACKED[name])
+    door.serve()
+    (ack,) = answers(client)
+    assert (ack.status, page.estop) == ("done", EStop.LATCHED)
+    assert door.latch.read().by == f"account:{account(os.geteuid())}"
+    assert 0 < len(door.latch.read().why) < 1000
+
+
+_WHOLE = pressed()
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        [b"x", _WHOLE],
+        [b"", b"x", _WHOLE],
+        [b"x", b"y", _WHOLE],
+        *([_WHOLE[:end], _WHOLE[end:]] for end in (3, _WHOLE.index(b"estop") + 2, len(_WHOLE) - 1)),
+        [_WHOLE[number : number + 7] for number in range(0, len(_WHOLE), 7)],
+    ],
+)
+def test_a_press_in_a_later_frame_or_in_several_is_heard(door, page, frames):
+    client = door.client()
+    client.send_multipart(frames)
+    door.serve()
+    assert client.poll(2000)
+    assert decode(client.recv_multipart()[-1]).status == "done"
+    assert page.estop is EStop.LATCHED
+
+
+@pytest.mark.parametrize("name", presses.OTHERS)
+def test_what_follows_a_message_of_another_kind_makes_it_no_press(door, page, name):
+    client = door.client()
+    client.send_multipart([presses.OTHERS[name], b"a signature with kind: estop"])
+    door.serve()
+    assert page.estop is EStop.CLEAR
+
+
+@pytest.mark.parametrize("name", presses.OTHERS)
+def test_what_only_speaks_of_the_e_stop_does_not_press_it(door, page, name):
+    client = door.client()
+    client.send(presses.OTHERS[name])
+    door.serve()
+    assert len(answers(client)) == 1
+    assert page.estop is EStop.CLEAR
+
+
+def test_presses_behind_a_flood_of_long_garbage_are_answered_before_it_is_read(door, page):
+    noisy, client = door.client(), door.client()
+    for _ in range(200):
+        noisy.send(b"\xc1" * (200 << 10))
+    client.send(pressed("mine", "ben"))
+    assert door.heard(client).uuid == "mine"
+    assert page.estop is EStop.LATCHED
+
+
+def test_the_flag_is_up_before_anybody_is_asked_who_he_is(door, page, monkeypatch):
+    seen = []
+    monkeypatch.setattr(guard_module, "identified", lambda command, *_: seen.append(page.estop) or command)
+    client = door.client()
+    client.send(pressed())
+    door.serve()
+    assert seen == [EStop.LATCHED]
+
+
+def test_the_answer_says_whether_the_press_latched_and_when_it_was_carried_out(door, page):
+    client = door.client()
+
+    def asked(uuid):
+        client.send(pressed(uuid))
+        said = door.heard(client).data
+        return said["latched"], said["carried_out_at"]
+
+    first, again, other = asked("u"), asked("u"), asked("v")
+    assert [latched for latched, _ in (first, again, other)] == ["anew", "before", "already"]
+    assert again[1] == first[1] < other[1]
+    page.ask_release()
+    door.guard.watch()
+    late = asked("u")
+    assert late[0] == "anew"
+    assert late[1] > other[1]
+
+
+def test_of_presses_that_come_together_the_first_latched(door):
+    client = door.client()
+    for uuid in ("u", "v", "u"):
+        client.send(pressed(uuid))
+    found = [door.heard(client).data for _ in range(3)]
+    assert [said["latched"] for said in found] == ["anew", "already", "before"]
+    assert found[0]["carried_out_at"] == found[2]["carried_out_at"]
+
+
+@pytest.mark.parametrize("same", [True, False], ids=["one uuid", "1500 uuids"])
+def test_a_flood_of_presses_is_latched_once_and_every_one_is_answered(door, same):
+    client = door.client()
+    for number in range(1500):
+        client.send(pressed("u" if same else str(number)))
+    found = []
+    for _ in range(20):
+        door.serve()
+        found += answers(client)
+        if len(found) >= 1500:
+            break
+    assert {ack.status for ack in found} == {"done"}
+    assert [ack.uuid for ack in found] == ["u" if same else str(number) for number in range(1500)]
+    assert door.latch.written == 1
+
+
+@pytest.mark.parametrize("flood", [pressed(), b"\xc1 no message", encode(Command("s", "status"))])
+def test_a_flood_does_not_delay_the_press_of_another(door, flood):
+    noisy, client = door.client(), door.client()
+    for _ in range(1500):
+        noisy.send(flood)
+    client.send(pressed("mine", "ben"))
+    ack = door.heard(client)
+    assert (ack.uuid, ack.status) == ("mine", "done")
+
+
+def test_different_reasons_in_a_flood_are_one_latch_in_a_turn(door):
+    client = door.client()
+    for number in range(500):
+        client.send(pressed(str(number), why=f"reason {number}"))
+    found, turns = [], 0
+    while len(found) < 500 and turns < 20:
+        door.serve()
+        turns += 1
+        found += answers(client)
+    assert (len(found), door.latch.written <= turns) == (500, True)
+
+
+def test_a_repeat_after_a_release_presses_again(door, page):
+    client = door.client()
+    client.send(pressed())
+    door.serve()
+    page.ask_release()
+    door.guard.watch()
+    assert (page.estop, door.latch.read()) == (EStop.CLEAR, None)
+    client.send(pressed())
+    door.serve()
+    assert [ack.status for ack in answers(client)] == ["done", "done"]
+    assert page.estop is EStop.LATCHED
+    assert door.latch.read() is not None
+
+
+def test_a_press_that_control_did_not_obey_is_asked_for_anew_when_it_is_repeated(door, control):
+    control.alive = False
+    client = door.client()
+    client.send(pressed())
+    door.serve()
+    control.alive = True
+    client.send(pressed())
+    door.serve()
+    assert [ack.status for ack in answers(client)] == ["failed", "done"]

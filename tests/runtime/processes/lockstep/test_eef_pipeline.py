@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime import deployment
-from runtime.formats import PoseRows
+from runtime.config import loader as deployment
+from runtime.core.pose_format import PoseFormat
+from runtime.core.types import ActionChunk, ActionMode, Conditioning, Float64, Observation
 from runtime.kinematics.base import IkFlag
-from runtime.pose_format import PoseFormat
-from runtime.poses import absolute
-from runtime.spaces import Spaces
-from runtime.transitions import State
+from runtime.processes.coordinator.session.transitions import State
+from runtime.spaces.conversion import ActionSpaces
+from runtime.spaces.pose_rows import PoseRows
+from runtime.spaces.relative_poses import absolute
 from runtime.transports.base import Capabilities
-from runtime.types import ActionChunk, ActionMode, Conditioning, Float64, Observation
-from tests.runtime.station import MOVED, STANDS, Station, StubPlan, column, on_time, plan, ramp
+from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, column, on_time, plan, ramp
 
 SIX = PoseFormat(orientation="6d", gripper=False)
 EULER = PoseFormat(orientation="euler", euler_order="ZYX", degrees=True, frame="world")
@@ -196,7 +196,7 @@ def publishing(tmp_path: Path, pose: PoseFormat) -> Station:
 def test_published_poses_are_those_of_the_safe_joint_command(tmp_path: Path, pose: PoseFormat) -> None:
     station = publishing(tmp_path, pose).running(60)
     robot = station.plan.robot
-    spaces, layout = Spaces(robot, station.plan.kinematics(), 30.0), PoseRows(pose, robot)
+    spaces, layout = ActionSpaces(robot, station.plan.kinematics(), 30.0), PoseRows(pose, robot)
     sent = station.robot.commands
     assert len(sent) > 50
     previous = None

@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 
 from runtime import __main__ as command_line
-from runtime import deployment, family, lockstep
+from runtime.config import loader as deployment
+from runtime.core.errors import PolicyError, SetupError
+from runtime.core.types import Float64, Observation
 from runtime.datasets.published import publish
-from runtime.errors import PolicyError, SetupError
-from runtime.latch import Latch
-from runtime.page import EStop
+from runtime.ipc.estop_latch import Latch
+from runtime.ipc.shared_state import EStop
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.transitions import State
-from runtime.types import Float64, Observation
+from runtime.station import spec as family
+from tests.runtime.lockstep_station import DIM, MOVED, STANDS, Station, column, on_time, plan, ramp
 from tests.runtime.recording.samples import decoded, numbers
-from tests.runtime.station import DIM, MOVED, STANDS, Station, column, on_time, plan, ramp
 
 DELAYS = [0, 3, 7]
 TABLES = ("rows", "ticks", "smoothed", "raw")

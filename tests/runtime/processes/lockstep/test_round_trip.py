@@ -21,7 +21,7 @@ import pytest
 from runtime.datasets.consistency import check
 from runtime.recording.reader import Episode, open_episode
 
-REPOSITORY = Path(__file__).parents[2]
+REPOSITORY = Path(__file__).parents[4]
 FRAMES, FPS = 398, 30
 CAMERAS = ("cam_high", "cam_left_wrist", "cam_right_wrist")
 GRIPPERS = (6, 13)

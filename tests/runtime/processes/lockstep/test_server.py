@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import uuid
 from collections.abc import Callable, Iterator
@@ -13,19 +14,20 @@ import numpy as np
 import pytest
 import zmq
 
-from runtime import served_lockstep
-from runtime.bus import Endpoints, Subscriber, TransportError
-from runtime.clock import VirtualClock
-from runtime.closing import Close, in_background
-from runtime.errors import SetupError
-from runtime.latch import Latch
-from runtime.messages import Ack, Command, decode, encode
-from runtime.recorder import Closed
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import SetupError
+from runtime.core.types import ActionChunk
+from runtime.ipc.bus import Endpoints, Subscriber, TransportError
+from runtime.ipc.endpoints import account
+from runtime.ipc.estop_latch import Latch
+from runtime.ipc.messages import Ack, Command, decode, encode
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.lockstep import server as served_lockstep
+from runtime.processes.lockstep.server import ServedLockstep
+from runtime.processes.media.episode_closing import Close, in_background
+from runtime.processes.media.recorder import ClosedEpisode
 from runtime.recording.reader import Episode, open_episode
-from runtime.served_lockstep import ServedLockstep
-from runtime.transitions import State
-from runtime.types import ActionChunk
-from tests.runtime.station import STANDS, StubPlan, StubPolicy, StubRobot, column, plan
+from tests.runtime.lockstep_station import STANDS, StubPlan, StubPolicy, StubRobot, column, plan
 
 TURNS = 5000
 
@@ -245,8 +247,8 @@ def test_who_sets_up_while_a_recording_is_closed_finds_the_same_as_who_comes_lat
 ) -> None:
     gate = threading.Event()
 
-    def slowly(close: Close) -> Future[Closed]:
-        def waiting() -> Closed:
+    def slowly(close: Close) -> Future[ClosedEpisode]:
+        def waiting() -> ClosedEpisode:
             gate.wait(60)
             return close()
 
@@ -346,11 +348,11 @@ def test_the_e_stop_is_obeyed_at_once(client: Client, during: str) -> None:
         gate = client.hangs()
         assert client.turn(20) == 0
     answer = client.ask("estop", guard=True, why="smoke")
-    assert (answer.status, answer.data) == ("done", {"station": "bench"})
+    assert (answer.status, answer.data["station"], answer.data["latched"]) == ("done", "bench", "anew")
     gate.set()
     client.turn(20, 1 / 30)
     assert client.state is State.FAULTED
-    assert "ada: smoke" in client.reason
+    assert f"account:{account(os.getuid())}: smoke" in client.reason
     assert Latch(client.station.plan.deployment.station_dir).read() is not None
     client.accepted("release")
     client.turn(20, 1 / 30)

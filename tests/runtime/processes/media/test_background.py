@@ -9,8 +9,8 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
-from runtime.aside import NICE, Aside
-from runtime.types import Observation
+from runtime.core.types import Observation
+from runtime.processes.media.background import NICE, LowPriorityWorker
 from tests.processes import eventually
 
 
@@ -33,7 +33,7 @@ def test_what_comes_while_it_is_at_work_is_passed_over_but_for_the_newest() -> N
         begun.set()
         assert go_on.wait(30)
 
-    aside = Aside(work)
+    aside = LowPriorityWorker(work)
     aside(numbered(1))
     assert begun.wait(30)
     for sequence in (2, 3, 4):
@@ -47,7 +47,7 @@ def test_what_comes_while_it_is_at_work_is_passed_over_but_for_the_newest() -> N
 def test_its_thread_gives_way_and_its_process_does_not() -> None:
     found: list[int] = []
     own = os.getpriority(os.PRIO_PROCESS, 0)
-    aside = Aside(
+    aside = LowPriorityWorker(
         lambda observation: found.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
     )
     aside(numbered(1))
@@ -61,7 +61,7 @@ def test_a_failure_is_that_of_the_next_call() -> None:
     def work(observation: Observation) -> None:
         raise ValueError("no such picture")
 
-    aside = Aside(work)
+    aside = LowPriorityWorker(work)
     aside(numbered(1))
     aside._thread.join(30)
     with pytest.raises(ValueError, match="no such picture"):

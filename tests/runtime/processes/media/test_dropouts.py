@@ -5,15 +5,15 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.messages import Event
-from runtime.silences import QUIET_S, Silences
+from runtime.ipc.messages import Event
+from runtime.processes.media.dropouts import QUIET_S, DropoutLog
 
 RATE = 10.0  # rows per second
 
 
 def played(silent: list[bool], camera: str = "cam") -> tuple[list[Event], list[Event]]:
     """What is said of a camera that is silent in these rows, and at the end."""
-    silences = Silences([camera])
+    silences = DropoutLog([camera])
     events: list[Event] = []
     for row, here in enumerate(silent):
         events += silences.look(row / RATE, row, {camera: 0.6} if here else {})
@@ -72,12 +72,12 @@ def test_what_was_counted_is_said_at_the_end_of_the_episode() -> None:
 
 
 def test_each_camera_has_a_quiet_time_of_its_own() -> None:
-    silences = Silences(["wrist", "high"])
+    silences = DropoutLog(["wrist", "high"])
     assert [event.data["camera"] for event in silences.look(0.0, 0, {"wrist": 1.0})] == ["wrist"]
     assert [event.data["camera"] for event in silences.look(1.0, 1, {"wrist": 2.0, "high": 1.0})] == ["high"]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 40)), min_size=1, max_size=60))
 def test_whatever_the_camera_does_little_is_said_and_every_silence_is_counted_once(
     stretches: list[tuple[bool, int]],

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from runtime import exports as module
-from runtime.exports import Exports
+from runtime.processes.media import export_jobs as module
+from runtime.processes.media.export_jobs import Exports
 from runtime.recording.export import place
 from runtime.recording.files import read_document
 from tests.runtime.recording.test_export import recorded
@@ -79,7 +79,7 @@ def test_it_ends_with_its_standard_input(folder, tmp_path):
     lock = os.open(folder_of_it, os.O_RDONLY)
     fcntl.flock(lock, fcntl.LOCK_EX)
     command = [sys.executable, "-m", "runtime.recording", "export", str(folder), "--to", str(tmp_path)]
-    child = subprocess.Popen([*command, "--background"], stdin=subprocess.PIPE, cwd=Path(__file__).parents[2])
+    child = subprocess.Popen([*command, "--background"], stdin=subprocess.PIPE, cwd=Path(__file__).parents[4])
     try:
         with pytest.raises(subprocess.TimeoutExpired):
             child.wait(3.0)

@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.clock import VirtualClock
-from runtime.closing import at_once, in_background
-from runtime.errors import RecordingError, TransportError
-from runtime.leftovers import leftovers, repair_leftovers
-from runtime.media import Media
-from runtime.messages import (
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import RecordingError, TransportError
+from runtime.core.types import Observation
+from runtime.ipc.messages import (
     BeginEpisode,
     EndEpisode,
     EpisodeClosed,
@@ -29,15 +27,17 @@ from runtime.messages import (
     decode,
     encode,
 )
-from runtime.page import PICTURE_SLOTS, Page, PageLayout
-from runtime.reception import Reception
-from runtime.recorder import Grid, Recorder
+from runtime.ipc.shared_state import PICTURE_SLOTS, SharedState, SharedStateLayout
+from runtime.processes.media.crash_repair import leftovers, repair_leftovers
+from runtime.processes.media.episode_closing import at_once, in_background
+from runtime.processes.media.process import Media
+from runtime.processes.media.recorder import DatasetGrid, Recorder
+from runtime.processes.reception.process import Reception
 from runtime.recording.base import Outcome
 from runtime.recording.files import UnclosedError
 from runtime.recording.repair import Report
 from runtime.transports.base import Source
-from runtime.types import Observation
-from tests.runtime.test_recorder import FakeJournal
+from tests.runtime.processes.media.test_recorder import FakeJournal
 
 RATE = 30.0
 CAMERAS = ("left", "right")
@@ -80,11 +80,11 @@ class FakeSource(Source):
 
 class Desk:
     def __init__(self, closer: Any = at_once) -> None:
-        layout = PageLayout(2, 8, CAMERAS, 300)
-        self.page = Page(layout, mmap.mmap(-1, Page.size(layout)))
+        layout = SharedStateLayout(2, 8, CAMERAS, 300)
+        self.page = SharedState(layout, mmap.mmap(-1, SharedState.size(layout)))
         self.clock, self.source, self.journal = VirtualClock(100.0), FakeSource(), FakeJournal()
         robot = {"name": "toy", "joint_names": ["a", "b"], "eef_names": [], "dim": 2, "eef_dim": 0}
-        grid = Grid(robot, CAMERAS, RATE, RATE, lambda q: q)
+        grid = DatasetGrid(robot, CAMERAS, RATE, RATE, lambda q: q)
         recorder = Recorder(self.journal, Path("/episodes"), grid, self.clock.now)
         self.previewed: list[int] = []
         self.on_disk: list[Path] = []
@@ -697,7 +697,7 @@ def test_a_leftover_that_cannot_be_repaired_keeps_no_other_from_it(
             raise error
         return Report(folder, "repaired", frames=7)
 
-    monkeypatch.setattr("runtime.leftovers.repair", repaired)
+    monkeypatch.setattr("runtime.processes.media.crash_repair.repair", repaired)
     folders = [left(tmp_path, "bad"), left(tmp_path, "foreign", "bench-2"), left(tmp_path, "good")]
     repair_leftovers(folders, "bench")
     assert seen == ["bad", "good"]
@@ -792,7 +792,7 @@ def test_a_leftover_that_was_repaired_is_passed_on_and_a_broken_one_is_not(
     def repair(folder: Path) -> Report:
         return Report(folder, "unreadable" if folder.name == "bad" else "repaired")
 
-    monkeypatch.setattr("runtime.leftovers.repair", repair)
+    monkeypatch.setattr("runtime.processes.media.crash_repair.repair", repair)
     heard: list[Path] = []
     repair_leftovers([left(tmp_path, "bad"), left(tmp_path, "good")], "bench", heard.append)
     assert heard == [tmp_path / "good"]

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import simplejpeg
 
-from runtime.previews import Previews
-from runtime.types import Observation
-from tests.runtime.station import plan
+from runtime.core.types import Observation
+from runtime.processes.media.previews import Previews
+from tests.runtime.lockstep_station import plan
 
 
 class Looking:
@@ -26,6 +26,9 @@ class Looking:
 
     def publish(self, stream: str, jpeg: bytes) -> None:
         self._shown.append((stream, jpeg))
+
+    def moved(self) -> bool:
+        return False
 
     def seen(self, arrived: float, captured: float, brightness: int = 90) -> list[tuple[str, bytes]]:
         """What comes of an observation with one picture."""

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.errors import RecordingError
-from runtime.messages import ChunkMerged, PolicyAnswer, TickDone
-from runtime.recorder import Grid, Recorder
+from runtime.core.errors import RecordingError
+from runtime.core.types import Observation
+from runtime.ipc.messages import ChunkMerged, PolicyAnswer, TickDone
+from runtime.processes.media.recorder import DatasetGrid, Recorder
 from runtime.recording.base import ExecutedTick, Journal, Loss, Outcome, RawChunk, Record, Row
 from runtime.recording.settings import RecordingSettings
-from runtime.types import Observation
 
 CAMERA = "cam"
 PICTURE = np.zeros((4, 6, 3), np.uint8)
@@ -71,7 +71,7 @@ class Desk:
     def __init__(self, rate: float = 30.0, fps: float = 30.0) -> None:
         self.journal = FakeJournal()
         robot = {"name": "toy", "joint_names": ["a", "b"], "eef_names": [], "dim": 2, "eef_dim": 8}
-        grid = Grid(robot, (CAMERA,), rate, fps, lambda q: np.full(8, q[0] + 0.5, np.float32))
+        grid = DatasetGrid(robot, (CAMERA,), rate, fps, lambda q: np.full(8, q[0] + 0.5, np.float32))
         self.recorder = Recorder(self.journal, Path("/episodes"), grid, lambda: 5.0)
         self.rate = rate
 
@@ -124,7 +124,7 @@ def desk() -> Desk:
     return desk
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     rates=st.sampled_from([(30, 30), (100, 30), (200, 30), (30, 10), (30, 60), (50, 15)]),
     first=st.integers(0, 10_000),

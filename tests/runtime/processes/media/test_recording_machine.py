@@ -9,11 +9,11 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from runtime.messages import Ack
+from runtime.ipc.messages import Ack
+from runtime.processes.coordinator.session.transitions import State
 from runtime.recording.reader import open_episode
-from runtime.run import Run
-from runtime.transitions import State
-from tests.runtime.station import Station, plan
+from runtime.station.run import Run
+from tests.runtime.lockstep_station import Station, plan
 
 SETTLED = 4  # ticks after which an order has gone to media and its answer to main
 ticks = st.integers(0, 6)
@@ -146,6 +146,5 @@ TestRecorded = Recorded.TestCase
 TestRecorded.settings = settings(
     max_examples=20,
     stateful_step_count=20,
-    deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
 )

@@ -1,8 +1,8 @@
 import pytest
 
-from runtime.drives import Drives
-from runtime.transitions import State
-from tests.runtime.station import Station, plan
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.reception.drive_status import Drives
+from tests.runtime.lockstep_station import Station, plan
 
 GOOD = {"enabled": True, "faults": []}
 OFF = {"enabled": False, "faults": []}

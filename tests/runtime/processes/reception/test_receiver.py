@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.clock import VirtualClock
-from runtime.errors import TransportError
-from runtime.intake import Intake
-from runtime.messages import Event
-from runtime.page import Page, PageLayout
-from runtime.types import Observation
-from tests.runtime.test_media import FakeSource
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import TransportError
+from runtime.core.types import Observation
+from runtime.ipc.messages import Event
+from runtime.ipc.shared_state import SharedState, SharedStateLayout
+from runtime.processes.reception.receiver import ObservationReceiver
+from tests.runtime.processes.media.test_media_process import FakeSource
 
 RATE = 30.0
 
@@ -22,15 +22,15 @@ class Gate:
     """An intake with one camera; `order` says what was handed on, and whether the page had it by then."""
 
     def __init__(self) -> None:
-        layout = PageLayout(2, 8, ("cam",), 75)
-        self.page = Page(layout, mmap.mmap(-1, Page.size(layout)))
+        layout = SharedStateLayout(2, 8, ("cam",), 75)
+        self.page = SharedState(layout, mmap.mmap(-1, SharedState.size(layout)))
         self.clock, self.source = VirtualClock(100.0), FakeSource()
         self.said: list[Event] = []
         self.order: list[tuple[int, dict[str, int], bool]] = []
         self.intake = self.begun()
 
-    def begun(self) -> Intake:
-        return Intake(self.page, self.source, self.clock, self.said.append, self.hand_on)
+    def begun(self) -> ObservationReceiver:
+        return ObservationReceiver(self.page, self.source, self.clock, self.said.append, self.hand_on)
 
     def hand_on(self, seen: Observation, numbers: Any) -> None:
         self.order.append((seen.sequence, dict(numbers), self.published() == seen.sequence))

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import pytest
 
-from runtime import realtime
-from runtime.messages import BeginRun, Event, Observed, ReceptionReport, RunBegun, decode, encode
-from runtime.reception import Reception, Share
-from tests.runtime.test_media import CAMERAS, Desk
+from runtime.core import realtime
+from runtime.ipc.messages import BeginRun, Event, Observed, ReceptionReport, RunBegun, decode, encode
+from runtime.processes.reception.process import Reception, Share
+from tests.runtime.processes.media.test_media_process import CAMERAS, Desk
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@ import logging
 
 import pytest
 
-from runtime.companion import LONGEST_S, Companion
+from runtime.processes.supervisor.optional_child import LONGEST_S, OptionalChild
 
 
 class Process:
@@ -16,7 +16,7 @@ class Process:
 class World:
     def __init__(self):
         self.now, self.started = 100.0, []
-        self.companion = Companion("channel", self._start, lambda: self.now)
+        self.companion = OptionalChild("channel", self._start, lambda: self.now)
 
     def _start(self):
         self.started.append(Process())

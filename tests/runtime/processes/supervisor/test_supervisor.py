@@ -4,14 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from runtime import bus, supervisor
-from runtime.bus import Endpoints
-from runtime.deployment import load
-from runtime.errors import SetupError, TransportError
-from runtime.family import plan
-from runtime.supervisor import Supervisor
+from runtime.config.loader import load
+from runtime.core.errors import SetupError, TransportError
+from runtime.ipc.bus import Endpoints
+from runtime.processes.supervisor import supervisor
+from runtime.processes.supervisor.supervisor import Supervisor
+from runtime.station.spec import plan
 
-DEMO = Path(__file__).parents[2] / "deployments" / "demo.toml"
+DEMO = Path(__file__).parents[4] / "deployments" / "demo.toml"
 WAITS = ["cat"]  # like our children it ends with its standard input
 DIES = ["false"]
 DEAF = ["sh", "-c", "trap '' TERM; echo deaf > $DEAF; while true; do sleep 0.05; done"]
@@ -22,6 +22,7 @@ def started(monkeypatch):
     """What was started in place of each process, in order."""
     made = []
     real = subprocess.Popen
+    modules = {**supervisor._MODULES, "channel": "runtime.clients.channel"}
 
     class Started(real):
         commands = dict.fromkeys(
@@ -29,7 +30,7 @@ def started(monkeypatch):
         )
 
         def __init__(self, arguments, **options):
-            self.process = arguments[2].removeprefix("runtime.")
+            self.process = {module: name for name, module in modules.items()}[arguments[2]]
             self.environment = options["env"]
             super().__init__(self.commands[self.process], **options, stdout=subprocess.DEVNULL)
             made.append(self)
@@ -111,14 +112,14 @@ def test_headless_the_processes_log_only_what_matters_unless_told_otherwise(
 
 def test_a_full_disk_does_not_keep_a_process_from_being_restarted(station, started, monkeypatch, caplog):
     made, commands = started
-    write = bus.Path.write_text
+    write = Path.write_text
 
     def full(path, *arguments):
         if path.parent.name == "endpoints":
             raise OSError(errno.ENOSPC, "No space left on device")
         return write(path, *arguments)
 
-    monkeypatch.setattr(bus.Path, "write_text", full)
+    monkeypatch.setattr(Path, "write_text", full)
     commands["media"] = DIES
     assert station.run(headless=False) == 1  # because it gives up after so many restarts, not before
     assert [child.process for child in made].count("media") == 6
@@ -141,3 +142,12 @@ def test_nothing_is_found_of_a_station_that_has_ended(station, started, tmp_path
     station.run(headless=True)
     with pytest.raises(TransportError, match="is not running here"):
         Endpoints(tmp_path / "stations" / "demo").read("supervisor")
+
+
+@pytest.mark.parametrize("spoil", ["rm -r {0}", "echo garbage > {0}/supervisor.json"])
+def test_what_somebody_did_to_its_file_is_mended(station, started, spoil):
+    _, commands = started
+    folder = station._station_dir / "endpoints"
+    there = f"until grep -q boot {folder}/supervisor.json; do sleep 0.02; done"
+    commands["headless"] = ["sh", "-c", f"{there}; {spoil.format(folder)}; {there}; exit 3"]
+    assert station.run(headless=True) == 3

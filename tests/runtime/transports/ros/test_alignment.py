@@ -3,7 +3,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime.transports.ros.alignment import Aligned, Alignment, Sample
@@ -99,7 +99,6 @@ def test_a_stalled_stream_makes_no_other_one_grow() -> None:
 times = st.lists(st.integers(0, 3000), min_size=1, max_size=40, unique=True).map(sorted)
 
 
-@settings(deadline=None)
 @given(st.dictionaries(st.sampled_from("abcd"), times, min_size=1))
 def test_a_frame_is_bounded_nearest_and_at_the_newest_common_moment(streams: dict[str, list[int]]) -> None:
     made = filled(**{name: [t / 1000 for t in ticks] for name, ticks in streams.items()})

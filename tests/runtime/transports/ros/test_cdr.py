@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.errors import CodecError
+from runtime.core.errors import CodecError
 from runtime.transports.ros import cdr
 from runtime.transports.ros.messages import (
     Image,
@@ -27,13 +27,11 @@ ANY = messages(TEXT, STAMPS)
 ROSBAGS = Rosbags("ROS2_JAZZY")
 
 
-@settings(deadline=None)
 @given(ANY)
 def test_what_was_written_is_read_again(message: Message) -> None:
     assert same(cdr.decode(name_of(message), cdr.encode(message)), message)
 
 
-@settings(deadline=None)
 @given(ANY)
 def test_every_truncation_is_refused(message: Message) -> None:
     payload = cdr.encode(message)
@@ -42,7 +40,6 @@ def test_every_truncation_is_refused(message: Message) -> None:
             cdr.decode(name_of(message), payload[:size])
 
 
-@settings(deadline=None)
 @given(st.sampled_from(NAMES), st.binary(max_size=120), st.booleans())
 def test_random_bytes_are_a_message_or_refused(name: MessageName, garbage: bytes, headed: bool) -> None:
     payload = b"\x00\x01\x00\x00" + garbage if headed else garbage
@@ -72,7 +69,6 @@ def test_big_endian_is_read() -> None:
     assert same(message, PoseStamped(1_000_000_002, "a", np.arange(7.0)))
 
 
-@settings(deadline=None)
 @given(ANY)
 def test_rosbags_writes_the_same_bytes_and_reads_ours(message: Message) -> None:
     theirs = bytes(ROSBAGS.store.serialize_cdr(ROSBAGS.message(message), ROSBAGS.kind(message)))

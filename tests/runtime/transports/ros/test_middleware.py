@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.errors import TransportError
+from runtime.core.errors import TransportError
 from runtime.transports.ros import cdr
 from runtime.transports.ros.messages import JointState, PoseStamped
 from runtime.transports.ros.middleware import COMMAND_QUALITY, SENSOR_QUALITY, Middleware, Quality, Topic

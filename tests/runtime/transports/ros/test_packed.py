@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.errors import CodecError
+from runtime.core.errors import CodecError
 from runtime.transports.ros import packed
 from runtime.transports.ros.messages import (
     MESSAGES,
@@ -27,13 +27,11 @@ ANY = messages(TEXT, STAMPS)
 ROSBAGS = Rosbags("ROS1_NOETIC", 0)
 
 
-@settings(deadline=None)
 @given(ANY)
 def test_what_was_written_is_read_again(message: Message) -> None:
     assert same(packed.decode(name_of(message), packed.encode(message)), message)
 
 
-@settings(deadline=None)
 @given(ANY)
 def test_every_truncation_and_every_remainder_is_refused(message: Message) -> None:
     payload = packed.encode(message)
@@ -44,7 +42,7 @@ def test_every_truncation_and_every_remainder_is_refused(message: Message) -> No
         packed.decode(name_of(message), payload + b"\0")
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(st.sampled_from(NAMES), st.binary(max_size=120))
 def test_random_bytes_are_a_message_or_a_codec_error(name: MessageName, payload: bytes) -> None:
     with contextlib.suppress(CodecError):
@@ -77,7 +75,6 @@ def test_the_bytes_are_those_of_the_definition() -> None:
     )
 
 
-@settings(deadline=None)
 @given(ANY)
 def test_rosbags_writes_the_same_bytes_and_reads_ours(message: Message) -> None:
     theirs = bytes(ROSBAGS.store.serialize_ros1(ROSBAGS.message(message), ROSBAGS.kind(message)))

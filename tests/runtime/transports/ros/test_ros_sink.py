@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.clock import VirtualClock
-from runtime.errors import TransportError
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import TransportError
+from runtime.core.types import RobotCommand
 from runtime.transports import ros2
 from runtime.transports.ros import cdr
 from runtime.transports.ros.messages import JointState, PoseStamped
 from runtime.transports.ros.middleware import Deliver, Match, Middleware, Publish, Topic
 from runtime.transports.ros.sink import RosSink
 from runtime.transports.ros.topics import GroupTopics, Topics
-from runtime.types import RobotCommand
 
 ROBOT = robots.load("r1_lite")
 LEFT, RIGHT = "/motion_target/target_joint_state_arm_left", "/motion_target/target_joint_state_arm_right"

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.clock import VirtualClock
-from runtime.errors import ConfigurationError, TransportError
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import ConfigurationError, TransportError
+from runtime.core.types import Observation
 from runtime.transports import ros2
 from runtime.transports.ros import cdr
 from runtime.transports.ros.messages import Image, JointState, Message, PoseStamped
 from runtime.transports.ros.middleware import Match
 from runtime.transports.ros.source import RosSource
 from runtime.transports.ros.topics import GroupTopics, Topics
-from runtime.types import Observation
 from tests.runtime.transports.ros.hand import Hand
 
 ROBOT = robots.load("ur5e")

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.errors import SetupError, TransportError
+from runtime.core.errors import SetupError, TransportError
 from runtime.transports.ros import packed, rospy_process
 from runtime.transports.ros.messages import JointState, MessageName, PoseStamped
 from runtime.transports.ros.middleware import COMMAND_QUALITY, SENSOR_QUALITY, Topic

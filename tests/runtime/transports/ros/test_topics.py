@@ -7,7 +7,7 @@ import pytest
 
 import robots
 from robots import Robot
-from runtime.errors import ConfigurationError
+from runtime.core.errors import ConfigurationError
 from runtime.transports.ros.topics import GroupTopics, Outlet, TopicPlan, Topics
 
 SPLIT = robots.load("r1_lite")  # its grippers have topics of their own, and its stack is ROS 2

@@ -8,21 +8,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.asking import Asking
-from runtime.clock import VirtualClock
-from runtime.commitment import Commitment
-from runtime.errors import PolicyError, PolicyLostError
-from runtime.inference import Inference, Patience, Strategy
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import PolicyError, PolicyLostError
+from runtime.core.types import ActionChunk, Conditioning, Float32, Observation
+from runtime.ipc.messages import ChunkMerged, Mode, PolicyAnswer, PostedChunk, decode
+from runtime.ipc.shared_state import SharedState, SharedStateLayout
 from runtime.kinematics.base import IkResult
-from runtime.messages import ChunkMerged, Mode, PolicyAnswer, PostedChunk, decode
-from runtime.orders import Orders
-from runtime.page import Page, PageLayout
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.runner import LockstepRunner, Runner, ThreadRunner
-from runtime.sight import Sight, SightSettings
-from runtime.spaces import CommandRows, Onset, Spaces
+from runtime.processes.coordinator.control_queue import ControlQueue
+from runtime.processes.coordinator.inference.inference import Inference, Patience, Strategy
+from runtime.processes.coordinator.inference.policy_observation import PolicyObservation, SightSettings
+from runtime.processes.coordinator.inference.requests import PolicyRequests
+from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
+from runtime.processes.coordinator.inference.worker import LockstepRunner, Runner, ThreadRunner
+from runtime.spaces.conversion import ActionSpaces, CommandRows, Onset
 from runtime.strategies import overlap, rtc, sync
-from runtime.types import ActionChunk, Conditioning, Float32, Observation
 
 RATE = 30.0
 ASYNC = Strategy(overlap.query(overlap.Config()), overlap.Config())
@@ -63,7 +63,7 @@ class FakePolicy(Policy):
         self.calls.append("close")
 
 
-class FakeSpaces(Spaces):
+class FakeSpaces(ActionSpaces):
     """Joint rows pass; a row of NaN is refused as the real ones refuse it."""
 
     def __init__(self) -> None:
@@ -91,22 +91,22 @@ class Desk:
     """Inference with everything around it under the test's hand; media and control are played by it."""
 
     def __init__(self, runner: Runner | None = None, strategy: Strategy | None = None) -> None:
-        layout = PageLayout(2, 8, ("cam",), 300)
-        self.page = Page(layout, mmap.mmap(-1, Page.size(layout)))
+        layout = SharedStateLayout(2, 8, ("cam",), 300)
+        self.page = SharedState(layout, mmap.mmap(-1, SharedState.size(layout)))
         self.clock = VirtualClock(100.0)
         self.policy = FakePolicy()
         self.runner = runner or LockstepRunner(0)
-        sight = Sight(self.page, self.clock, SightSettings(RATE, 0.2, 0.5))
+        sight = PolicyObservation(self.page, self.clock, SightSettings(RATE, 0.2, 0.5))
         self.spaces = FakeSpaces()
-        self.asking = Asking(self.policy, "pick", self.spaces, sight, self.runner, self.clock)
+        self.asking = PolicyRequests(self.policy, "pick", self.spaces, sight, self.runner, self.clock)
         self.inference = Inference(
             self.asking,
             strategy or ASYNC,
             self.page,
-            Orders(self.page),
+            ControlQueue(self.page),
             self.clock,
             Patience(stale=1.0, lost=3.0),
-            Commitment(RATE),
+            RtcPrefix(RATE),
         )
         self.sequence = 0
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.messages import ChunkMerged
-from runtime.tally import Tally, quantile
+from runtime.ipc.messages import ChunkMerged
+from runtime.processes.coordinator.inference.metrics import PolicyMetrics, quantile
 
 
 def merged(delay: int, mistimed: int = 0, dropped: str = "") -> ChunkMerged:
@@ -18,7 +18,7 @@ def merged(delay: int, mistimed: int = 0, dropped: str = "") -> ChunkMerged:
 
 
 def test_answers_delays_and_what_went_wrong_are_counted() -> None:
-    tally = Tally()
+    tally = PolicyMetrics()
     for milliseconds in range(1, 101):
         tally.answered(milliseconds / 1000)
     tally.merged(merged(3))
@@ -32,7 +32,7 @@ def test_answers_delays_and_what_went_wrong_are_counted() -> None:
 
 
 def test_without_a_measurement_there_is_no_figure() -> None:
-    tally = Tally()
+    tally = PolicyMetrics()
     assert tally.figures()["latency_ms"] is None
     assert tally.figures()["delay_steps"] is None
     newest = tally.newest()
@@ -42,7 +42,7 @@ def test_without_a_measurement_there_is_no_figure() -> None:
 
 
 def test_a_page_is_told_the_newest_sixty_and_the_counts_go_on() -> None:
-    tally = Tally()
+    tally = PolicyMetrics()
     for number in range(100):
         tally.answered(number / 1000)
         tally.merged(merged(number))
@@ -53,7 +53,7 @@ def test_a_page_is_told_the_newest_sixty_and_the_counts_go_on() -> None:
 
 
 def test_how_old_an_observation_was_when_the_policy_was_asked_is_a_figure() -> None:
-    tally = Tally()
+    tally = PolicyMetrics()
     tally.answered(0.1)
     assert tally.figures()["observation_age_ms"] is None
     for age in (0.010, 0.020, 0.030):
@@ -67,7 +67,7 @@ def test_how_old_an_observation_was_when_the_policy_was_asked_is_a_figure() -> N
 
 
 def test_a_page_is_told_the_spread_of_the_newest_three_hundred() -> None:
-    tally = Tally()
+    tally = PolicyMetrics()
     for number in range(1000):
         tally.answered(number / 1000)
         tally.merged(merged(1000 - number))
@@ -84,9 +84,9 @@ def test_a_quantile_is_that_of_numpy(values: list[float], percent: float) -> Non
 
 
 def test_a_new_run_begins_anew() -> None:
-    tally = Tally()
+    tally = PolicyMetrics()
     tally.answered(0.1, 0.02)
     tally.merged(merged(3, mistimed=1, dropped="x"))
     tally.starved = tally.lost = 2
     tally.forget()
-    assert tally.figures() == Tally().figures()
+    assert tally.figures() == PolicyMetrics().figures()

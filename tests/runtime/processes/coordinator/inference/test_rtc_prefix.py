@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -9,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import robots
-from runtime.commitment import Commitment
-from runtime.end_effectors import EndEffectors
-from runtime.formats import PoseRows
+from runtime.core.pose_format import OrientationName, PoseFormat
+from runtime.core.types import ActionChunk, Conditioning
+from runtime.ipc.messages import ChunkMerged
 from runtime.kinematics.forward import ChainForward
-from runtime.messages import ChunkMerged
-from runtime.mixture import Mixture
-from runtime.pose_format import OrientationName, PoseFormat
-from runtime.timeline import Dims
-from runtime.types import ActionChunk, Conditioning
+from runtime.motion.timeline import DimensionKinds
+from runtime.processes.coordinator.inference.chunk_mixture import Mixture
+from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
+from runtime.spaces.end_effectors import EndEffectors
+from runtime.spaces.pose_rows import PoseRows
 
 RATE = 30.0
 ALONE = np.zeros((0, 3))  # no step that another chunk has a part in
@@ -38,9 +39,9 @@ def merged(
 
 def committed(
     chunk: ActionChunk | None = None, step: int = 100, delay: int = 3, waited: bool = False, mistimed: int = 0
-) -> Commitment:
+) -> RtcPrefix:
     """A commitment to one chunk that answers the observation of `step`."""
-    made, chunk = Commitment(RATE), chunk or ActionChunk(rows(50))
+    made, chunk = RtcPrefix(RATE), chunk or ActionChunk(rows(50))
     made.answered(1, chunk, step, waited)
     count = int(len(chunk.actions) * RATE / (chunk.rate or RATE))
     made.merged(merged(1, step + delay if waited else step, 0 if waited else delay, count, mistimed))
@@ -48,7 +49,7 @@ def committed(
 
 
 def asked(
-    held: Commitment, step: int, delays: list[int] | None = None, horizon: int | None = None
+    held: RtcPrefix, step: int, delays: list[int] | None = None, horizon: int | None = None
 ) -> Conditioning:
     found = held.conditioning(step, [3] if delays is None else delays, 0.9, horizon)
     assert found is not None
@@ -59,7 +60,7 @@ def asked(
 
 
 def test_nobody_is_committed_to_anything_before_a_chunk_was_merged() -> None:
-    held = Commitment(RATE)
+    held = RtcPrefix(RATE)
     assert held.conditioning(100, [3], 0.9, None) is None
     held.answered(1, ActionChunk(rows(50)), 100)
     assert held.conditioning(104, [3], 0.9, None) is None
@@ -161,25 +162,42 @@ def test_the_chunks_own_delay_is_predicted_where_no_other_was_measured() -> None
     assert asked(committed(delay=7), 110, []).predicted_delay == 7
 
 
-@given(st.integers(0, 60), st.integers(3, 49), st.one_of(st.none(), st.integers(1, 80)))
-def test_it_warns_exactly_where_the_answer_comes_after_the_last_row_that_may_be_executed(
-    delay: int, later: int, horizon: int | None
+@given(
+    st.sampled_from([None, 10.0, 12.0, 24.0, 75.0]),
+    st.integers(3, 90),
+    st.integers(0, 60),
+    st.integers(3, 89),
+    st.one_of(st.none(), st.integers(1, 80)),
+)
+def test_all_that_is_predicted_and_planned_is_fixed_and_it_warns_where_the_answer_comes_after_the_plan(
+    rate: float | None, planned: int, delay: int, later: int, horizon: int | None
 ) -> None:
-    held = committed()
+    """Whatever the horizon is now: what was planned with another one stays planned, and rates have no row per step."""
+    pace = 1.0 if rate is None else rate / RATE
+    held = RtcPrefix(RATE)
+    held.answered(1, ActionChunk(rows(math.ceil((planned - 1) * pace) + 1), rate=rate), 100)
+    held.merged(merged(1, 100, 3, planned))
     found = held.conditioning(100 + later, [delay], 0.9, horizon)
-    last = 50 if horizon is None else min(50, horizon)
-    assert (found is None) == (later >= last)
+    assert (found is None) == (later >= planned)
     if found is not None:
-        assert found.execution_horizon == last
-        assert found.predicted_delay == min(delay, last - later)
-        assert bool(held.warning) == (delay > last - later)
+        wanted = min(math.ceil(delay * pace - 1e-9), math.floor((planned - 1 - later) * pace + 1e-9) + 1)
+        assert found.predicted_delay == wanted
+        meant = later * pace + np.arange(wanted)
+        np.testing.assert_allclose(found.left_over[:wanted, 0], meant, atol=1e-4)
+        assert bool(held.warning) == (delay > planned - later)
+
+
+def test_the_horizon_is_that_of_the_answer_in_its_rows() -> None:
+    assert asked(committed(), 110, None, 20).execution_horizon == 20
+    assert asked(committed(), 110, None, 80).execution_horizon == 50
+    assert asked(committed(ActionChunk(rows(50), rate=10.0)), 110, None, 20).execution_horizon == 7
 
 
 def test_the_warning_says_the_numbers() -> None:
-    held = committed()
-    asked(held, 110, [12], 20)
-    assert "expected after 12 rows, but 10 of the 20 that may be executed are left" in held.warning
-    asked(held, 105, [12], 20)
+    held = committed(ActionChunk(rows(20)))
+    asked(held, 110, [12])
+    assert "expected after 12 steps, but 10 are planned" in held.warning
+    asked(held, 105, [12])
     assert held.warning == ""
 
 
@@ -215,7 +233,7 @@ events = st.lists(
 def test_only_an_answer_asked_for_and_merged_since_the_last_reset_counts(
     given_: list[tuple[str, int]],
 ) -> None:
-    held = Commitment(RATE)
+    held = RtcPrefix(RATE)
     expected: int | None = None
     asked_in: dict[int, int] = {}
     answered_in: dict[int, int] = {}
@@ -247,11 +265,9 @@ def test_only_an_answer_asked_for_and_merged_since_the_last_reset_counts(
 # What control has blended
 
 
-def blended(
-    first: ActionChunk, second: ActionChunk, shares: list[list[float]], **settings: Any
-) -> Commitment:
+def blended(first: ActionChunk, second: ActionChunk, shares: list[list[float]], **settings: Any) -> RtcPrefix:
     """A commitment to a chunk for step 100, and from 105 on to one for step 102, as far as `shares` do not say else."""
-    held = Commitment(RATE, Mixture(**settings))
+    held = RtcPrefix(RATE, Mixture(**settings))
     held.answered(1, first, 100)
     held.merged(merged(1, 100, 0, len(first.actions)))
     held.answered(2, second, 102)
@@ -272,7 +288,7 @@ def test_rows_that_control_has_blended_are_given_back_as_they_became() -> None:
 def test_the_models_own_rows_are_mixed_by_the_same_weights() -> None:
     first = ActionChunk(rows(50), model_actions=rows(50, 32, first=0.5))
     second = ActionChunk(rows(50, first=200), model_actions=rows(50, 32, first=20))
-    held = blended(first, second, HALF, dims=Dims(switched=(1,)))
+    held = blended(first, second, HALF, dims=DimensionKinds(switched=(1,)))
     left = asked(held, 105).left_over
     assert left[:3, 0].tolist() == [5.5, (6.5 + 24.0) / 2, 25.0]
     assert left[:3, 1].tolist() == [5.5, 24.0, 25.0]  # a binary gripper does not lie in between
@@ -282,11 +298,11 @@ def test_the_models_own_rows_are_mixed_by_the_same_weights() -> None:
 def test_angles_without_limits_mix_the_shorter_way_round_and_in_the_models_own_numbers_not_at_all() -> None:
     first, second = (np.full((50, 2), angle, np.float32) for angle in (3.1, -3.1))
     shares = [[105, 1, 0.5], [105, 2, 0.5]]
-    held = blended(ActionChunk(first), ActionChunk(second), shares, dims=Dims(wrapping=(0,)))
+    held = blended(ActionChunk(first), ActionChunk(second), shares, dims=DimensionKinds(wrapping=(0,)))
     mixed = asked(held, 105).left_over[0]
     np.testing.assert_allclose(mixed, [-np.pi, 0.0], atol=1e-6)
     own = (ActionChunk(angles, model_actions=rows(50, 32)) for angles in (first, second))
-    held = blended(*own, shares, dims=Dims(wrapping=(0,)))
+    held = blended(*own, shares, dims=DimensionKinds(wrapping=(0,)))
     assert held.conditioning(105, [3], 0.9, None) is None
     assert asked(held, 106).left_over[0, 0] == 4.0
 
@@ -300,7 +316,7 @@ def test_blended_poses_are_those_of_the_blended_joints(orientation: OrientationN
     def chunk(at: np.ndarray) -> ActionChunk:
         return ActionChunk(layout.encode(ends.vectors(at), at).astype(np.float32), "eef", pose=pose)
 
-    held = Commitment(RATE, Mixture(robot=robot))
+    held = RtcPrefix(RATE, Mixture(robot=robot))
     for number, at in enumerate(joints, 1):
         held.answered(number, chunk(at), 100, commands=at)
         held.merged(

@@ -5,8 +5,8 @@ import weakref
 
 import pytest
 
-from runtime.errors import PolicyError
-from runtime.runner import DeclaredRunner, LockstepRunner, ThreadRunner
+from runtime.core.errors import PolicyError
+from runtime.processes.coordinator.inference.worker import DeclaredRunner, LockstepRunner, ThreadRunner
 
 
 def test_lockstep_hands_every_result_over_the_same_number_of_ticks_later() -> None:

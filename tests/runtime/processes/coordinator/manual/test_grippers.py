@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.errors import RuntimeFault
-from runtime.grippers import Grippers
-from runtime.requests import GripperRequest
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.command_arguments import GripperRequest
+from runtime.processes.coordinator.manual.grippers import Grippers
 
 
 @cache

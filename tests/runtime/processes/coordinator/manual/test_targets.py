@@ -8,24 +8,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import robots
-from runtime.errors import RuntimeFault
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.command_arguments import AimRequest, Jog, MoveRequest
 from runtime.kinematics import compiled
-from runtime.requests import AimRequest, Jog, MoveRequest
-from runtime.safety import Limits, SafetySettings, WorkspaceBox
-from runtime.spaces import Spaces
-from runtime.targets import Targets
-from runtime.timeline import Dims
+from runtime.motion.timeline import DimensionKinds
+from runtime.processes.coordinator.manual.targets import Targets
+from runtime.safety.filter import Limits, SafetySettings, WorkspaceBox
+from runtime.spaces.conversion import ActionSpaces
 
 
 @cache
 def parts() -> tuple[Any, Any, Any]:
     robot = robots.load("agilex_piper")
     kinematics = compiled.build(compiled.Config(), robot)
-    return robot, kinematics, Spaces(robot, kinematics, 30.0)
+    return robot, kinematics, ActionSpaces(robot, kinematics, 30.0)
 
 
 def targets(workspace: dict[str, WorkspaceBox] | None = None) -> Targets:
@@ -35,7 +35,7 @@ def targets(workspace: dict[str, WorkspaceBox] | None = None) -> Targets:
         robot.joint_names, robot.lower, robot.upper, robot.velocity, grippers, np.zeros(robot.dim, bool)
     )
     chosen = SimpleNamespace(safety=SafetySettings(workspace=workspace or {}))
-    plan: Any = SimpleNamespace(robot=robot, limits=limits, deployment=chosen, dims=Dims())
+    plan: Any = SimpleNamespace(robot=robot, limits=limits, deployment=chosen, dims=DimensionKinds())
     return Targets(plan, spaces, kinematics)
 
 
@@ -76,7 +76,6 @@ def test_a_wish_that_means_nothing_is_refused_with_what_is_allowed(asked: MoveRe
 
 
 @pytest.mark.parametrize("frame", ["base", "tool"])
-@settings(deadline=None)  # the first example builds the kinematics
 @given(shift=st.tuples(*[st.floats(-0.03, 0.03)] * 3), turn=st.tuples(*[st.floats(-0.2, 0.2)] * 3))
 def test_a_jog_moves_one_end_effector_by_what_was_asked_and_no_other_joint(
     frame: Any, shift: tuple[float, ...], turn: tuple[float, ...]

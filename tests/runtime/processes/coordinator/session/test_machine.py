@@ -4,17 +4,23 @@ from itertools import count, product
 
 import pytest
 
-from runtime import session as session_module
-from runtime.clock import VirtualClock
-from runtime.effects import Effects, Situation
-from runtime.errors import RuntimeFault
-from runtime.lease import Lease
-from runtime.messages import Ack, Command
-from runtime.requests import BenchRequest, LabelRequest, RunRequest, SetUpRequest
-from runtime.session import Session
-from runtime.transitions import COMMANDS, HAPPENINGS, STOPPING, Happening, State
+from runtime.core.clock import VirtualClock
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.command_arguments import BenchRequest, LabelRequest, RunRequest, SetUpRequest
+from runtime.ipc.messages import Ack, Command
+from runtime.processes.coordinator.lease import Lease
+from runtime.processes.coordinator.session import machine as session_module
+from runtime.processes.coordinator.session.effects import Effects, GuardFacts
+from runtime.processes.coordinator.session.machine import SessionMachine
+from runtime.processes.coordinator.session.transitions import (
+    COMMANDS,
+    EVENT_TRANSITIONS,
+    STOPPING,
+    SessionEvent,
+    State,
+)
 
-S, H = State, Happening
+S, H = State, SessionEvent
 EFFECTS = {
     "setup": "begin_setup",
     "run": "begin_run",
@@ -61,9 +67,9 @@ GUARDED = {
 }
 MODES = (None, "continuous", "step", "preview", "sim", "manual")
 SITUATIONS = [
-    *(Situation(*fields) for fields in product(MODES, *[(False, True)] * 7)),
+    *(GuardFacts(*fields) for fields in product(MODES, *[(False, True)] * 7)),
     *(
-        Situation(mode, collection=collection, collecting=collecting, armed=armed, unled=unled)
+        GuardFacts(mode, collection=collection, collecting=collecting, armed=armed, unled=unled)
         for mode, collection, collecting, armed, unled in product(
             (None, "collect", "manual"), *[(False, True)] * 3, ("", "the leader is silent")
         )
@@ -97,7 +103,7 @@ def allowed_in(state, situation):
 class Recorded(Effects):
     """Remembers what was asked for; refuses what it is told to."""
 
-    situation = Situation()
+    situation = GuardFacts()
 
     def __init__(self):
         self.done, self.refuse = [], set()
@@ -184,7 +190,7 @@ class Bench:
 
     def __init__(self, state=S.DISCONNECTED):
         self.clock, self.effects, self.lease = VirtualClock(100.0), Recorded(), Lease(5.0)
-        self.session = Session(self.effects, self.lease, "boot-1", self.clock.now)
+        self.session = SessionMachine(self.effects, self.lease, "boot-1", self.clock.now)
         self.session.state = state
         self._uuids = (f"uuid-{n}" for n in count())
         self.give("lease_claim")
@@ -251,28 +257,28 @@ def test_a_refusal_names_the_state_or_what_the_guard_says():
     bench = Bench(S.IDLE)
     assert bench.give("step").reason.startswith("step is not allowed while idle (")
     bench = Bench(S.RUNNING)
-    bench.effects.situation = Situation(mode="preview", proposed=True)
+    bench.effects.situation = GuardFacts(mode="preview", proposed=True)
     assert "a chunk is shown: commit or cancel it first" in bench.give("step").reason
-    bench.effects.situation = Situation(mode="continuous", trial=True)
+    bench.effects.situation = GuardFacts(mode="continuous", trial=True)
     assert "one of a trial" in bench.give("tune").reason
 
 
 def test_what_collects_is_refused_with_what_is_missing():
     bench = Bench(S.READY)
     assert "its deployment has no [collection]" in bench.give("arm").reason
-    bench.effects.situation = Situation(collection=True)
+    bench.effects.situation = GuardFacts(collection=True)
     assert "set up with collect first" in bench.give("arm").reason
-    bench.effects.situation = Situation(collection=True, collecting=True, unled="the leader is silent")
+    bench.effects.situation = GuardFacts(collection=True, collecting=True, unled="the leader is silent")
     assert "the leader is silent" in bench.give("arm").reason
     assert "not armed: arm first" in bench.give("run").reason
     bench = Bench(S.HOLDING)
-    bench.effects.situation = Situation(mode="collect", collection=True, collecting=True)
+    bench.effects.situation = GuardFacts(mode="collect", collection=True, collecting=True)
     assert "arm first, or stop" in bench.give("resume").reason
 
 
 @pytest.mark.parametrize("state", State)
 def test_discarding_what_goes_on_ends_it_and_discarding_what_is_named_ends_nothing(state):
-    collects = Situation(mode="collect", collection=True, collecting=True, armed=True)
+    collects = GuardFacts(mode="collect", collection=True, collecting=True, armed=True)
     named, open_one = Bench(state), Bench(state)
     named.effects.situation = open_one.effects.situation = collects
     named.give("discard", args={"episode": "e"})
@@ -283,7 +289,7 @@ def test_discarding_what_goes_on_ends_it_and_discarding_what_is_named_ends_nothi
 
 def test_an_effect_knows_who_gave_the_command():
     bench = Bench(S.READY)
-    bench.effects.situation = Situation(collection=True)
+    bench.effects.situation = GuardFacts(collection=True)
     bench.give("label", args={"result": "fail", "note": "dropped"}, user="ben")
     assert bench.effects.by == "ben"
     assert bench.effects.done == [("label", LabelRequest(result="fail", note="dropped"))]
@@ -291,11 +297,11 @@ def test_an_effect_knows_who_gave_the_command():
 
 def test_going_to_the_first_action_is_a_set_up_of_its_own_but_within_a_run_the_run_goes_on():
     bench = Bench(S.READY)
-    bench.effects.situation = Situation(first_action=True)
+    bench.effects.situation = GuardFacts(first_action=True)
     bench.give("approach")
     assert bench.session.state is S.SETTING_UP
     bench = Bench(S.RUNNING)
-    bench.effects.situation = Situation(mode="preview", proposed=True)
+    bench.effects.situation = GuardFacts(mode="preview", proposed=True)
     bench.give("approach")
     assert bench.session.state is S.RUNNING
 
@@ -509,12 +515,12 @@ EXPECTED_EFFECTS = {
 }
 
 
-@pytest.mark.parametrize(("happening", "state"), list(product(Happening, State)))
+@pytest.mark.parametrize(("happening", "state"), list(product(SessionEvent, State)))
 def test_what_happens_changes_the_state_as_the_table_says_and_in_no_other_case(happening, state):
     bench = Bench(state)
     sequence = bench.session.sequence
     changed = bench.session.observe(happening, "because")
-    after = HAPPENINGS.get((happening, state))
+    after = EVENT_TRANSITIONS.get((happening, state))
     assert changed == (after is not None)
     if after is None:
         assert (bench.session.state, bench.session.sequence) == (state, sequence)
@@ -547,7 +553,7 @@ def test_a_run_is_closed_with_the_status_of_what_ended_it(happening, status):
 def test_the_estop_faults_every_state_and_only_its_release_leads_out(state):
     bench = Bench(state)
     bench.session.observe(H.ESTOPPED, "e-stop by anna")
-    for happening in set(Happening) - {H.RELEASED}:
+    for happening in set(SessionEvent) - {H.RELEASED}:
         bench.session.observe(happening, "because")
         assert bench.session.state is S.FAULTED
     bench.give("release")
@@ -557,7 +563,7 @@ def test_the_estop_faults_every_state_and_only_its_release_leads_out(state):
 
 
 def test_nothing_that_happens_starts_a_motion():
-    for happening, state in product(Happening, State):
+    for happening, state in product(SessionEvent, State):
         bench = Bench(state)
         bench.session.observe(happening, "because")
         assert not {"begin_setup", "begin_run", "resume_run", "go_home"} & set(bench.names)

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from runtime import deployment
-from runtime.errors import ConfigurationError, SetupError
-from runtime.transitions import State
-from tests.runtime.station import Station, on_time, plan
+from runtime.config import loader as deployment
+from runtime.core.errors import ConfigurationError, SetupError
+from runtime.processes.coordinator.session.transitions import State
+from tests.runtime.lockstep_station import Station, on_time, plan
 
 OTHER = {"amplitude": 0.1}  # of the mock policy, whose default is 0.2
 BENCH = {"id": "reset-1", "seed": 7, "positions": {"block": [0.1, 0.3, 45.0]}}

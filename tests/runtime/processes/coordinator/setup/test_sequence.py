@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime import deployment
-from runtime.errors import PolicyError, SetupError
+from runtime.config import loader as deployment
+from runtime.core.errors import PolicyError, SetupError
+from runtime.core.types import Observation
 from runtime.policies.base import PolicyInfo
-from runtime.setup import Stage
-from runtime.spaces import CommandRows
-from runtime.transitions import State
-from runtime.types import Observation
-from tests.runtime.station import MOVED, STANDS, Station, on_time, plan, ramp
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.coordinator.setup.sequence import Stage
+from runtime.spaces.conversion import CommandRows
+from tests.runtime.lockstep_station import MOVED, STANDS, Station, on_time, plan, ramp
 
 
 def failed(station: Station) -> str:

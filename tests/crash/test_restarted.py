@@ -1,0 +1,114 @@
+"""Control killed in the middle of a motion: what the node is told before, meanwhile and afterwards."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+import zmq
+
+from benchmarks.fuzzing.bodies import body
+from runtime.core import msgpack_arrays as codecs
+from runtime.safety.settings import SafetySettings
+from tests.crash.lab import FREE, ROBOT
+from tests.processes import eventually
+
+pytestmark = pytest.mark.slow
+PERIOD = 1 / 30
+MARGIN = 1.06  # of the last check, and what single precision adds
+ELAPSED = (PERIOD, 1.5 * PERIOD)  # that limits may use: after a tick, and after one or more that were missed
+
+
+class Tap:
+    """Stands between a station and its node, and keeps every target that comes by."""
+
+    def __init__(self, onward):
+        context = zmq.Context.instance()
+        self._incoming, self._onward = context.socket(zmq.SUB), context.socket(zmq.PUB)
+        self._incoming.bind(FREE)
+        self._incoming.setsockopt(zmq.SUBSCRIBE, b"")
+        self._onward.connect(onward)
+        self.endpoint = self._incoming.getsockopt(zmq.LAST_ENDPOINT).rstrip(b"\0").decode()
+        self.controls = {}  # each one's targets, in order
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._pass)
+        self._thread.start()
+
+    def _pass(self):
+        while not self._over.is_set():
+            if self._incoming.poll(50):
+                payload = self._incoming.recv()
+                message = codecs.unpack(payload, 1 << 20)
+                if message["target"] == "real":
+                    self.controls.setdefault(message["master"], []).append(message["action"].astype(float))
+                self._onward.send(payload)
+
+    @property
+    def targets(self):
+        """What the newest control sent."""
+        return list(self.controls.values())[-1] if self.controls else []
+
+    def moves(self):
+        """Whether the newest command is well on its way."""
+        last = self.targets[-2:]
+        return len(last) == 2 and np.abs(last[1] - last[0]).max() > 0.1 * PERIOD
+
+    def close(self):
+        self._over.set()
+        self._thread.join()
+        self._incoming.close()
+        self._onward.close()
+
+
+@pytest.fixture
+def tap(lab):
+    lab.node()
+    ends = lab.addresses["node"]
+    made = Tap(ends["action_endpoint"])
+    ends["action_endpoint"] = made.endpoint
+    yield made
+    lab.close()
+    made.close()
+
+
+def within_limits(targets):
+    """Whether these targets [N, D] can be followed from rest, each tick on time or after missed ones."""
+    limits = body(ROBOT).limits
+    top = MARGIN * limits.velocity
+    rate = MARGIN * SafetySettings().acceleration * limits.reach
+    before = [np.zeros(len(top))]  # velocities that may be the last one's
+    for step in np.diff(targets, axis=0):
+        possible = [(step / elapsed, elapsed) for elapsed in ELAPSED if (np.abs(step) <= top * elapsed).all()]
+        before = [
+            now
+            for now, elapsed in possible
+            if any((np.abs(now - last) <= rate * elapsed).all() for last in before)
+        ]
+        if not before:
+            return False
+    return bool(np.isfinite(targets).all()) and not (limits.outside(np.array(targets)) > 1e-5).any()
+
+
+@pytest.mark.parametrize("what", ["run", "motion"])
+def test_a_control_that_is_killed_while_the_robot_moves_goes_on_holding_where_that_was(lab, tap, what):
+    lab.up("recording.enabled=false").ready()
+    if what == "run":
+        lab.client.command("run")
+    else:
+        lab.client.command("run", mode="manual")
+        lab.client.wait(lambda status: "move" in status["allowed"], lab.patience)
+        lab.client.command("move", pose="ready")
+    eventually(tap.moves, 20, "a motion")
+    lab.kill("control")
+    eventually(lambda: len(tap.controls) == 2, 20, "a restarted control")
+    lab.reach("idle")
+    eventually(lambda: len(tap.targets) >= 60, 10, "commands of the restarted control")
+    (old, new) = tap.controls.values()
+    assert within_limits(old)
+    # The last command of the old one may have been lost on its way, or not written down: one tick's way apart at most.
+    assert np.abs(new[0] - old[-1]).max() <= np.abs(np.diff(old, axis=0)).max()
+    assert (np.array(new) == new[0]).all()
+    lab.ready()
+    assert within_limits(tap.targets)
+    assert len(tap.controls) == 2

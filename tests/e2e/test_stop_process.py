@@ -1,0 +1,96 @@
+"""A press on a page in a real browser arrives by one way while the other one is gone."""
+
+import os
+import signal
+
+import pytest
+
+from runtime.ipc.estop_latch import Latch
+from tests.e2e.bench_page import BenchPage
+from tests.e2e.lab import STATION, WIDE
+from tests.e2e.remote import tidy, visitor
+from tests.e2e.test_faults import suspended
+from tests.processes import alive, eventually
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+AREA = "#estop-area"
+PRESSES = "SELECT uuid, status FROM stations_command WHERE kind = 'estop'"
+ANSWERS = """
+async () => {
+  const { stops, address } = document.getElementById("estop-area").dataset;
+  return fetch(stops + address, { credentials: "include" }).then((answer) => answer.ok, () => false);
+}
+"""
+ENDED = """
+from django.contrib.sessions.models import Session
+from django.utils import timezone
+for session in Session.objects.all():
+    if session.get_decoded().get("_auth_user_id") == str({user}):
+        Session.objects.filter(pk=session.pk).update(expire_date=timezone.now())
+"""
+
+
+@pytest.fixture(scope="module")
+def demo(shared):
+    return shared
+
+
+@pytest.fixture(scope="module")
+def admin(demo):
+    return visitor(demo, "admin")
+
+
+@pytest.fixture
+def page(browser, demo, admin):
+    """The page of somebody who has the station's e-stop before them, both ways to which stand."""
+    tidy(admin)
+    window = BenchPage(browser, demo, "visitor", WIDE).open(f"/stations/{STATION}/eval/")
+    window.at_rest()
+    window.page.locator(f"{AREA}[data-second-way]").wait_for()
+    yield window
+    window.close()
+    tidy(admin)
+
+
+def latched(demo):
+    return Latch(demo.data / "stations" / STATION).read()
+
+
+def pressed(demo, page):
+    """Press the button; it is acknowledged, and the station is latched."""
+    assert latched(demo) is None
+    page.page.click("#estop")
+    page.page.locator(f"{AREA}[data-kind=stopped]").wait_for()
+    assert latched(demo) is not None
+
+
+def test_a_press_arrives_while_the_web_stands_still_and_is_written_down_once(demo, page):
+    before = set(demo.rows(PRESSES))
+    with suspended(demo.pid("serve")):
+        pressed(demo, page)
+    page.reaches("FAULTED")
+    eventually(lambda: set(demo.rows(PRESSES)) - before, 30, "the press is written down")
+    eventually(lambda: not list((demo.data / "unwritten").iterdir()), 30, "nothing waits to be written")
+    assert [status for _, status in set(demo.rows(PRESSES)) - before] == ["done"]
+    assert page.errors == []
+
+
+def test_a_press_arrives_while_the_process_for_stops_is_gone_and_pages_know_its_port_all_along(demo, page):
+    said = page.page.get_attribute(AREA, "data-stops")
+    with suspended(demo.child.pid):
+        gone = demo.pid("stops")
+        os.kill(gone, signal.SIGKILL)
+        eventually(lambda: not alive(gone), 20, "it has ended")
+        pressed(demo, page)
+        page.page.reload()
+        assert page.page.get_attribute(AREA, "data-stops") == said
+    eventually(lambda: page.page.evaluate(ANSWERS), 60, "the lab has started it again where it was")
+    assert demo.pid("stops") != gone
+    page.page.reload()
+    page.page.locator(f"{AREA}[data-second-way]").wait_for()
+
+
+def test_a_page_whose_session_has_ended_still_presses(demo, page):
+    demo.python(ENDED.format(user=demo.rows("SELECT id FROM auth_user WHERE username = 'visitor'")[0][0]))
+    page.reaches("LOGGED OUT")
+    pressed(demo, page)

@@ -1,0 +1,174 @@
+"""What pages say of stops whose answers come late: run by Node on a stand-in of the page."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tests.evaweb.console.test_modules import MODULES, NODE, run
+
+pytestmark = pytest.mark.skipif(NODE is None, reason="Node is not installed: the page's modules are not run")
+
+PAGE = """
+const heard = {};
+const timers = [];
+const element = () => ({
+  dataset: {}, textContent: "", title: "", innerHTML: "rest",
+  append() {}, toggleAttribute() {}, querySelector: () => null,
+  addEventListener(kind, take) { heard[kind] = take; },
+});
+const elements = { config: { textContent: '{"api": {"estop": "/web/estop", "commands": "/web"}}' } };
+globalThis.document = {
+  getElementById: (id) => (elements[id] ??= element()),
+  querySelector: () => null, querySelectorAll: () => [], createElement: element, addEventListener() {},
+  body: element(),
+};
+globalThis.window = { addEventListener() {} };
+globalThis.setTimeout = (take) => timers.push(take);
+globalThis.clearTimeout = (id) => { timers[id - 1] = () => {}; };
+const posts = [];
+globalThis.fetch = (address, { body }) => new Promise((resolve) => {
+  posts.push((said) => resolve({ ok: true, json: async () => said, text: async () => JSON.stringify(said) }));
+});
+const settled = () => new Promise((resolve) => setImmediate(resolve));
+const area = document.getElementById("estop-area");
+const kinds = [];
+const look = async () => { await settled(); kinds.push(area.dataset.kind ?? "rest"); };
+const sent = [];
+const store = { on(_, take) { this.take = take; }, snapshot: { state: "idle" }, page: "p1", epoch: 1 };
+const state = (name) => { store.snapshot = { state: name }; store.take(); };
+const socket = { send: (message) => { sent.push(message); return true; } };
+const way = { there: true, estop: "/stops/estop", ask: async () => true };
+const late = () => timers.forEach((take) => take());
+"""
+PRESSES = (
+    PAGE + f"const {{ EStop }} = await import({json.dumps((MODULES / 'commands/estop.js').as_uri())});"
+    "const estop = new EStop(store, socket, way);"
+    'const ack = (index, status = "done") => estop.acknowledged({ uuid: sent[index].uuid, status, reason: "why" });'
+)
+
+
+def pressing(body: str) -> list[str]:
+    """What the area of the button shows at each `look` of `body`."""
+    return run("../site/identity.js", PRESSES + body + "return kinds;")
+
+
+def test_an_answer_of_a_press_that_was_answered_changes_nothing_after_the_release() -> None:
+    assert pressing(
+        """
+        estop.press("button"); ack(0); await look();
+        state("faulted"); state("idle"); await look();
+        posts[0]({ status: "done" }); await look();
+        ack(0); await look();
+        """
+    ) == ["stopped", "rest", "rest", "rest"]
+
+
+def test_an_answer_of_an_earlier_press_acknowledges_no_later_one() -> None:
+    assert pressing(
+        """
+        estop.press("button"); ack(0); state("faulted"); state("idle");
+        estop.press("button"); await look();
+        posts[0]({ status: "done" }); await look();
+        late(); await look();
+        posts[0]({ status: "done" }); ack(0); await look();
+        """
+    ) == ["pressed", "pressed", "failed", "failed"]
+
+
+def test_the_answer_of_a_press_that_waits_answers_those_before_it_and_not_those_after() -> None:
+    assert pressing(
+        """
+        estop.press("one"); estop.press("two");
+        ack(0); await look();
+        late(); await look();
+        estop.press("three"); ack(2); late(); await look();
+        ack(1, "failed"); await look();
+        """
+    ) == ["pressed", "failed", "stopped", "stopped"]
+
+
+EARLY = (
+    PAGE
+    + """
+    globalThis.crypto ??= (await import("node:crypto")).webcrypto;
+    area.dataset.address = "/estop"; area.dataset.stops = "";
+    const { readFileSync } = await import("node:fs");
+    (0, eval)(readFileSync(given, "utf8"));
+    const press = () => heard.click();
+    """
+)
+
+
+@pytest.mark.parametrize(
+    ("body", "shown"),
+    [
+        (
+            "press(); press(); posts[0]({status: 'done'}); await look(); posts[1]({status: 'done'}); await look();",
+            ["pressed", "stopped"],
+        ),
+        (
+            "press(); press(); posts[1]({status: 'no'}); await look(); posts[0]({status: 'done'}); await look();",
+            ["failed", "failed"],
+        ),
+        (
+            "press(); press(); posts[1]({status: 'done'}); posts[0]({status: 'no'}); await look();",
+            ["stopped"],
+        ),
+    ],
+)
+def test_before_the_modules_run_an_answer_counts_for_the_last_press_alone(
+    body: str, shown: list[str]
+) -> None:
+    script = str(MODULES / "commands/estop_early.js")
+    assert run("../site/identity.js", EARLY + body + "return kinds;", script) == shown
+
+
+def test_an_answer_to_the_early_script_says_nothing_of_a_press_of_the_modules() -> None:
+    modules = json.dumps((MODULES / "commands/estop.js").as_uri())
+    body = f"""
+        press(); await look();
+        const {{ EStop }} = await import({modules});
+        const estop = new EStop(store, socket, way);
+        if (given.again) estop.press("button");
+        posts[0]({{ status: "done" }}); await look();
+        late(); await look();
+    """
+    script = str(MODULES / "commands/estop_early.js")
+    early = EARLY.replace("readFileSync(given,", "readFileSync(given.script,")
+    shown = [
+        run("../site/identity.js", early + body + "return kinds;", {"script": script, "again": again})
+        for again in (True, False)
+    ]
+    assert shown == [["pressed", "pressed", "failed"], ["pressed", "stopped", "stopped"]]
+
+
+STOPS = (
+    PAGE
+    + f"const {{ Commands }} = await import({json.dumps((MODULES / 'commands/commands.js').as_uri())});"
+    + """
+    const answers = [];
+    way.post = () => new Promise((resolve, reject) => answers.push([resolve, reject]));
+    const commands = new Commands(store, socket, way);
+    commands.gate = () => {};
+    const line = document.getElementById("outcome");
+    const said = async () => { await settled(); await settled(); kinds.push(line.dataset.kind); };
+    """
+)
+
+
+def test_an_answer_to_an_earlier_stop_is_not_said_of_the_later_one() -> None:
+    assert run(
+        "../site/identity.js",
+        STOPS
+        + """
+        commands.give("stop"); commands.give("stop"); await said();
+        answers[0][0]({ status: "done" }); await said();
+        answers[1][1](new Error("gone"));
+        commands.acknowledged({ uuid: sent[1].uuid, kind: "stop", status: "unknown", reason: "?" }); await said();
+        commands.acknowledged({ uuid: sent[0].uuid, kind: "stop", status: "done" }); await said();
+        commands.acknowledged({ uuid: sent[1].uuid, kind: "stop", status: "done" }); await said();
+        return kinds;
+        """,
+    ) == ["pressed", "pressed", "unknown", "unknown", "accepted"]

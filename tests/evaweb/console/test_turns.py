@@ -1,0 +1,89 @@
+"""What many ask at once is done in turns, and below the messages a socket says no more than it may."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from evaweb.console.quota import AT_ONCE, Quota
+from evaweb.console.sockets import _MOST_PARTS, PING, CountedSocket
+from evaweb.console.turns import Turns
+
+
+@pytest.fixture
+def loop():
+    """What is planned for the next turn; `turn` is that turn."""
+    planned = []
+
+    def turn():
+        due, planned[:] = list(planned), []
+        for work in due:
+            work()
+
+    return SimpleNamespace(soon=planned.append, turn=turn, planned=planned)
+
+
+def test_a_turn_begins_so_much_and_the_rest_waits_in_order(loop):
+    turns, done = Turns(loop.soon, most=2), []
+    for number in range(5):
+        turns.take(lambda number=number: done.append(number))
+    assert (done, len(loop.planned)) == ([], 1)
+    for expected in ([0, 1], [0, 1, 2, 3], [0, 1, 2, 3, 4]):
+        loop.turn()
+        assert done == expected
+    assert loop.planned == []
+
+
+def test_work_that_fails_or_brings_more_keeps_no_other_waiting(loop):
+    turns, done = Turns(loop.soon, most=1), []
+
+    def fails():
+        turns.take(lambda: done.append("more"))
+        raise OSError("it failed")
+
+    turns.take(fails)
+    turns.take(lambda: done.append("next"))
+    with pytest.raises(OSError, match="it failed"):
+        loop.turn()
+    loop.turn()
+    loop.turn()
+    assert done == ["next", "more"]
+
+
+@pytest.fixture
+def socket(monkeypatch):
+    """One that is open, on a clock that stands; `cut` says whether it was cut off."""
+    monkeypatch.setattr(
+        "evaweb.console.sockets.WebSocketProtocol.onPing", lambda self, payload: self.heard.append(payload)
+    )
+    monkeypatch.setattr("evaweb.console.sockets.WebSocketProtocol.onPong", lambda self, payload: None)
+    monkeypatch.setattr("evaweb.console.sockets.WebSocketProtocol.onMessageFrameBegin", lambda self, n: None)
+    monkeypatch.setattr("evaweb.console.sockets.WebSocketProtocol.onMessage", lambda self, *message: None)
+    monkeypatch.setattr(
+        "evaweb.console.sockets.WebSocketProtocol.dropConnection",
+        lambda self, abort: self.cut.append(self.wasNotCleanReason),
+    )
+    made = CountedSocket()
+    made.heard, made.cut, made._parts, made._quota = [], [], 0, Quota(lambda: 0.0)
+    return made
+
+
+def test_pings_and_pongs_beyond_the_quota_end_the_socket(socket):
+    allowed = int(AT_ONCE) // PING
+    for _ in range(allowed - 1):
+        socket.onPing(b"")
+    socket.onPong(b"")
+    assert (len(socket.heard), socket.cut) == (allowed - 1, [])
+    socket.onPing(b"")
+    assert (len(socket.heard), socket.cut) == (allowed - 1, ["too many pings"])
+
+
+def test_a_message_in_endless_parts_ends_the_socket_and_many_messages_do_not(socket):
+    for _ in range(3 * _MOST_PARTS):
+        socket.onMessageFrameBegin(5)
+        socket.onMessage(b"hello", False)
+    assert socket.cut == []
+    for _ in range(_MOST_PARTS + 1):
+        socket.onMessageFrameBegin(0)
+    assert socket.cut == [f"a message in more than {_MOST_PARTS} parts"]

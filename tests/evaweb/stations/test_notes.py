@@ -1,0 +1,118 @@
+"""Stops on their way into the records."""
+
+from __future__ import annotations
+
+from uuid import uuid4
+
+import pytest
+from django.contrib.auth.models import User
+from django.db import OperationalError
+
+from evaweb.stations import notes as module
+from evaweb.stations.models import Command, CommandStatus, Station
+from evaweb.stations.notes import Notes
+
+
+class Quiet(Notes):
+    """One whose thread is the test."""
+
+    def __init__(self, keep):
+        self.now = 0.0
+        super().__init__(keep, clock=lambda: self.now)
+
+    def _run_soon(self):
+        pass
+
+
+@pytest.fixture
+def kept():
+    return []
+
+
+@pytest.fixture
+def quiet(kept):
+    return Quiet(kept.append)
+
+
+def halted(user="ann", station="bench-1", pk=1, status=CommandStatus.ACCEPTED):
+    at = Station(pk=pk, name=station)
+    return Command(uuid=uuid4(), station=at, user=User(username=user), kind="halt", status=status)
+
+
+def test_the_first_is_written_at_once_and_a_flood_is_counted(quiet, kept):
+    first = halted()
+    quiet.note(first)
+    assert quiet.write() is None
+    flood = [halted() for _ in range(5000)]
+    for row in flood:
+        quiet.note(row)
+    assert quiet.write() == 1.0
+    assert kept == [first]
+    quiet.now = 1.0
+    assert quiet.write() is None
+    assert kept == [first, flood[-1]]
+    assert (first.data, flood[-1].data) == ({}, {"times": 5000})
+
+
+def test_what_differs_is_written_each_for_itself(quiet, kept):
+    rows = [
+        halted(),
+        halted(user="bob"),
+        halted(station="bench-2"),
+        halted(status=CommandStatus.REFUSED),
+    ]
+    for row in rows:
+        quiet.note(row)
+    quiet.write()
+    assert kept == rows
+
+
+def test_no_press_that_latched_is_only_counted_with_those_that_came_after_it(quiet, kept):
+    rows = [halted(status=CommandStatus.DONE) for _ in range(4)]
+    for row, how, at in zip(rows, ("anew", "already", "anew", "already"), (1.0, 2.0, 3.0, 4.0), strict=True):
+        row.kind, row.data = "estop", {"latched": how, "carried_out_at": at}
+        quiet.note(row)
+    quiet.write()
+    assert [row.data["carried_out_at"] for row in kept if row.data["latched"] == "anew"] == [1.0, 3.0]
+
+
+def test_the_end_of_the_process_waits_for_no_second(quiet, kept):
+    for _ in range(3):
+        quiet.note(halted())
+        quiet.write()
+    assert len(kept) == 1
+    quiet.write(all_of_them=True)
+    assert kept[1].data == {"times": 2}
+
+
+def test_one_that_cannot_be_kept_keeps_no_other_from_it(kept, caplog):
+    def keep(row):
+        if row.user.username == "ann":
+            raise OperationalError("gone")
+        kept.append(row)
+
+    quiet = Quiet(keep)
+    for row in (halted(), halted(user="bob")):
+        quiet.note(row)
+    quiet.write()
+    assert [row.user.username for row in kept] == ["bob"]
+    assert "is not written down" in caplog.text
+
+
+def test_names_that_somebody_made_up_fill_no_disk(quiet, kept, settings, tmp_path, caplog):
+    settings.DATA_DIR = tmp_path
+    (tmp_path / "stations" / "real").mkdir(parents=True)
+    for name in ("made-up", "real"):
+        quiet.note(halted(station=name, pk=None))
+    quiet.write()
+    assert [row.station.name for row in kept] == ["real"]
+    assert "there is no such station" in caplog.text
+
+
+def test_so_many_different_ones_wait_and_the_log_has_the_others(quiet, kept, monkeypatch, caplog):
+    monkeypatch.setattr(module, "_MOST", 2)
+    for name in ("ann", "bob", "cyd"):
+        quiet.note(halted(user=name))
+    quiet.write()
+    assert [row.user.username for row in kept] == ["bob", "cyd"]
+    assert "is given up" in caplog.text

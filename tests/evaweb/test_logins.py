@@ -1,0 +1,161 @@
+"""Logins that fail are counted by name and address together, and logged; nothing that is logged in notices."""
+
+import logging
+from datetime import timedelta
+
+import pytest
+from axes.models import AccessAttempt
+from django.conf import settings
+from django.core.management import call_command
+from django.db import connection
+from django.test import Client
+from django.test.utils import CaptureQueriesContext
+from django.utils import timezone
+
+from evaweb import audit
+from evaweb.api.tokens import token_create
+from tests.evaweb.trials import builders
+
+pytestmark = pytest.mark.django_db
+WRONG, MOST = "not-the-one", settings.AXES_FAILURE_LIMIT
+
+
+@pytest.fixture
+def ann(db):
+    return builders.user("ann")
+
+
+def login(name="ann", password=WRONG, path="/login/", address="10.0.0.5", **headers):
+    data = {"username": name, "password": password}
+    headers = {"accept": "text/html", **headers}
+    return Client().post(path, data, headers=headers, REMOTE_ADDR=address)
+
+
+def locked(**where):
+    for _ in range(MOST - 1):
+        assert login(**where).status_code == 200
+    return login(**where)
+
+
+@pytest.mark.parametrize("path", ["/login/", "/admin/login/"])
+def test_after_a_few_wrong_passwords_the_name_is_locked_there_and_the_page_says_how_long(ann, path):
+    answer = locked(path=path)
+    assert answer.status_code == 429
+    assert "tried again in 15 minutes" in answer.content.decode()
+    assert 0 < int(answer["Retry-After"]) <= 900
+    right = login(password="ann", path=path)
+    assert right.status_code == 429
+    assert "sessionid" not in right.cookies
+
+
+def test_others_and_other_addresses_are_not_locked(ann):
+    builders.user("bob")
+    assert locked().status_code == 429
+    assert login(password="ann", address="10.0.0.6").status_code == 302
+    assert login("bob", "bob").status_code == 302
+
+
+def test_the_lock_ends_by_itself_and_trying_does_not_prolong_it(ann):
+    locked()
+    AccessAttempt.objects.update(attempt_time=timezone.now() - timedelta(minutes=14))
+    answer = login(password="ann")
+    assert "tried again in 1 minute;" in answer.content.decode()
+    AccessAttempt.objects.update(attempt_time=timezone.now() - timedelta(minutes=16))
+    assert login(password="ann").status_code == 302
+
+
+def test_the_right_password_forgets_the_wrong_ones(ann):
+    for _ in range(MOST - 1):
+        login()
+    assert login(password="ann").status_code == 302
+    assert not AccessAttempt.objects.exists()
+
+
+def test_an_administrator_unlocks_by_command_or_by_removing_the_row(ann, alma, client):
+    locked()
+    call_command("axes_reset_ip_username", "10.0.0.5", "ann")
+    assert login(password="ann").status_code == 302
+    locked()
+    client.force_login(alma)
+    page = client.get("/admin/axes/accessattempt/").content.decode()
+    assert "10.0.0.5" in page
+    assert WRONG not in page
+    chosen = {
+        "action": "delete_selected",
+        "_selected_action": [AccessAttempt.objects.get().pk],
+        "post": "yes",
+    }
+    assert client.post("/admin/axes/accessattempt/", chosen).status_code == 302
+    assert login(password="ann").status_code == 302
+
+
+def test_nothing_is_kept_of_a_password(ann):
+    locked()
+    assert WRONG not in str(list(AccessAttempt.objects.values()))
+
+
+def test_who_is_logged_in_goes_on_and_stops_while_the_name_is_locked(ann, live):
+    client = Client(REMOTE_ADDR="10.0.0.5")
+    client.force_login(ann)
+    token = token_create(user=ann, name="pedal")
+    assert locked().status_code == 429
+    assert client.get("/").status_code == 200
+    press = f"/api/v1/stations/{live.name}/estop"
+    with CaptureQueriesContext(connection) as asked:
+        by_page = client.post(press, "{}", content_type="application/json")
+        bearer = {"authorization": f"Bearer {token}"}
+        by_token = Client(REMOTE_ADDR="10.0.0.5").post(
+            press, "{}", content_type="application/json", headers=bearer
+        )
+    assert (by_page.status_code, by_token.status_code) == (200, 200)
+    assert not [query["sql"] for query in asked if "axes" in query["sql"]]
+
+
+def test_a_name_that_nobody_has_is_locked_as_well_and_not_logged(db, caplog):
+    assert locked(name="Hunter2").status_code == 429
+    said = [row.getMessage() for row in caplog.records if row.name == "evaweb.audit"]
+    assert said[0] == "login of a name that nobody has (7 characters) failed from 10.0.0.5"
+    assert "Hunter2" not in caplog.text
+
+
+def test_logins_and_logouts_are_logged(ann, caplog):
+    caplog.set_level(logging.INFO)
+    client = Client(REMOTE_ADDR="10.0.0.5")
+    client.post("/login/", {"username": "ann", "password": WRONG})
+    client.post("/login/", {"username": "ann", "password": "ann"})
+    client.post("/logout/")
+    assert [row.getMessage() for row in caplog.records if row.name == "evaweb.audit"] == [
+        "login of 'ann' failed from 10.0.0.5",
+        "'ann' has logged in from 10.0.0.5",
+        "'ann' has logged out from 10.0.0.5",
+    ]
+    assert WRONG not in caplog.text
+
+
+def test_control_characters_of_a_name_are_escaped(caplog):
+    caplog.set_level(logging.INFO)
+    builders.user("ann\n2026 INFO forged\x1b[2J\u202e")
+    client = Client()
+    client.force_login(builders.User.objects.get())
+    assert caplog.messages == ["'ann\\n2026 INFO forged\\x1b[2J\\u202e' has logged in from nowhere"]
+
+
+def test_refused_tokens_are_logged_once_a_minute_for_an_address(monkeypatch, caplog):
+    now = [100.0]
+    monkeypatch.setattr(audit.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(audit, "_refused", {})
+    for _ in range(3):
+        audit.token_refused("10.0.0.5", "is not known")
+    now[0] += 61
+    audit.token_refused("10.0.0.5", "is not known")
+    assert caplog.messages == [
+        "a token from 10.0.0.5 is not known",
+        "a token from 10.0.0.5 is not known (2 before it)",
+    ]
+
+
+def test_no_more_addresses_are_remembered_than_there_is_room_for(monkeypatch):
+    monkeypatch.setattr(audit, "_refused", {})
+    for number in range(audit._MOST + 10):
+        audit.token_refused(f"10.0.{number // 256}.{number % 256}", "is not known")
+    assert len(audit._refused) == audit._MOST

@@ -1,0 +1,111 @@
+"""What is a press of the e-stop, in each wire format, and what is none."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.ipc.estop_requests import LONGEST, WHY, in_json, in_packed, why_in
+from runtime.ipc.messages import Command, decode, encode
+from tests import presses
+
+
+@pytest.mark.parametrize("name", presses.PACKED)
+def test_a_message_of_the_bus_that_says_so_is_a_press_whatever_is_wrong_with_it(name: str) -> None:
+    press = in_packed(presses.PACKED[name])
+    assert press is not None
+    assert press.kind == "estop"
+    assert 0 < len(press.uuid) <= 64
+    assert len(press.args["why"]) <= 2 * LONGEST
+    assert decode(encode(press)) == press, "it can be sent on and written down"
+
+
+def test_a_press_with_nothing_wrong_is_read_as_it_was_written() -> None:
+    assert in_packed(presses.WHOLE) == Command("u", "estop", {"why": "smoke"}, "ann", "ann")
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("args is a list", "pressed (message: args is no map)"),
+        ("a why that is a number", "pressed (message: why is no text)"),
+        ("a uuid that is a number", "smoke (message: uuid is no text)"),
+        ("a uuid of 70 KB", "smoke (message: uuid has 70000 characters)"),
+        ("bytes behind it", "smoke (message: unreadable: 2 bytes follow it)"),
+        ("a why of 70 KB", "y" * LONGEST),
+    ],
+)
+def test_what_was_wrong_is_said_in_the_reason(name: str, why: str) -> None:
+    press = in_packed(presses.PACKED[name])
+    assert press is not None
+    assert press.args["why"] == why
+
+
+@pytest.mark.parametrize("name", presses.OTHERS)
+def test_a_message_of_another_kind_is_no_press_though_the_word_is_in_it(name: str) -> None:
+    assert in_packed(presses.OTHERS[name]) is None
+
+
+@given(presses.packed())
+def test_any_mutation_on_the_bus_that_still_names_it_presses(payload: bytes) -> None:
+    press = in_packed(payload)
+    assert press is not None
+    assert decode(encode(press)) == press
+
+
+@given(st.binary())
+def test_bytes_without_the_word_are_no_press(payload: bytes) -> None:
+    assert in_packed(payload) is None or b"estop" in payload
+
+
+@pytest.mark.parametrize("key", ["type", "kind"])
+@pytest.mark.parametrize("name", presses.in_json("kind"))
+def test_a_message_in_json_that_says_so_is_a_press_whatever_is_wrong_with_it(key: str, name: str) -> None:
+    text = presses.in_json(key)[name]
+    for said in (text, text.encode("utf-8"), text.encode("utf-16"), text.encode() + b"\xff"):
+        found = in_json(said, key)
+        assert found is not None
+        assert 0 < len(why_in(found)) <= LONGEST
+
+
+@given(presses.json_texts("type"))
+def test_any_mutation_in_json_that_still_names_it_presses(text: str) -> None:
+    assert in_json(text, "type") is not None
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"type": "aim", "args": {"type": "estop"}},
+        {"type": "watch", "streams": ["estop"]},
+        {"type": "events", "boot": 'type: "estop"'},
+        {"type": "estops"},
+        {"name": "estop"},
+        ["estop"],
+        "estop",
+    ],
+)
+def test_json_that_says_something_else_is_no_press(said: object) -> None:
+    assert in_json(json.dumps(said), "type") is None
+
+
+@given(st.text() | st.binary())
+def test_a_text_without_the_word_is_no_press(said: str | bytes) -> None:
+    assert in_json(said, "type") is None or ("estop" if isinstance(said, str) else b"estop") in said
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        ({"why": "smoke"}, "smoke"),
+        ({"args": {"why": "smoke"}}, "smoke"),
+        ({"arguments": {"why": "smoke"}, "why": ""}, "smoke"),
+        ({"why": [], "args": 3}, WHY),
+        ({"why": "a\x00\ud800"}, "a?"),
+    ],
+)
+def test_the_reason_is_found_where_people_write_it(said: dict[str, object], why: str) -> None:
+    assert why_in(said) == why

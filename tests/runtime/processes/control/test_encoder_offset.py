@@ -1,0 +1,168 @@
+"""A robot whose servos follow what they are told, seen through an encoder that is off: it must not run away."""
+
+import numpy as np
+import pytest
+
+from runtime.ipc.shared_state import EStop
+from tests.runtime.tick_bench import PERIOD, TWO_JOINTS, Bench, following, wave
+
+BEGINS, FOR = 1.0, 8.0  # [s] after the fault began
+ONE_DISPLACEMENT = 0.9  # [rad]: the following error, and what a joint may move while samples agree
+
+
+class Servo(Bench):
+    """Joint a is read by `fault(true, seconds since it began)`; it goes on towards its command after `lag` ticks."""
+
+    def __init__(self, fault, lag=0, **given):
+        self.fault, self.began, self.lag = None, 0.0, lag
+        self.true = np.zeros(2)
+        super().__init__({"kind": "naive"}, **given)
+        self.moves = []
+        self._to_be = fault
+
+    def break_encoder(self):
+        self.fault, self.began = self._to_be, self.clock.now()
+
+    def observe(self, **changes):
+        read = self.true.copy()
+        if self.fault is not None:
+            read[0] = self.fault(read[0], self.clock.now() - self.began)
+        super().observe(qpos=read.astype(np.float32), **changes)
+
+    def go(self, seconds):
+        """The true joint a, tick by tick."""
+        for _ in range(round(seconds / PERIOD)):
+            self.run()
+            told = self.sent[-1 - self.lag] if len(self.sent) > self.lag else self.true
+            most = 2.0 * TWO_JOINTS.velocity * PERIOD  # what it is told is slower
+            self.true = self.true + np.clip(told - self.true, -most, most)
+            self.moves.append(self.true[0])
+
+
+FAULTS = {
+    "offset": lambda true, since: true + 0.9,
+    "offset below": lambda true, since: true - 0.6,
+    "small offset": lambda true, since: true + 0.25,
+    "ramping": lambda true, since: true + min(1.0 * since, 0.9),
+    "ramping on": lambda true, since: true + 0.6 * since,
+    "flipped": lambda true, since: -true,
+    "scaled": lambda true, since: 1.2 * true,
+    "alternating": lambda true, since: true + (0.7 if since % 1.0 < 0.5 else -0.7),
+    "returning": lambda true, since: true + (0.7 if since % 0.6 < 0.3 else 0.0),
+}
+
+
+def told(bench, state):
+    if state == "estop":
+        bench.page.set_estop(EStop.LATCHED)
+    elif state == "hold":
+        bench.say("hold", run=1)
+
+
+@pytest.mark.parametrize("lag", [0, 5])
+@pytest.mark.parametrize("state", ["estop", "hold", "running, then hold", "running, then estop"])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_an_encoder_that_is_off_never_makes_a_robot_run_away(fault, state, lag):
+    bench = following(Servo(FAULTS[fault], lag), wave(60, 0.4))
+    bench.go(1.0)
+    if state in ("estop", "hold"):
+        told(bench, state)
+        bench.go(1.0)
+    bench.break_encoder()
+    bench.go(0.3)
+    told(bench, state.split()[-1])
+    begins = bench.true[0]
+    bench.go(FOR)
+    way = np.diff(bench.sent[:, 0])
+    assert np.abs(way).max() <= 3.0 * PERIOD * 1.05
+    assert np.ptp([begins, *bench.moves[-round(FOR / PERIOD) :]]) <= ONE_DISPLACEMENT
+    assert np.ptp(bench.moves[-round(FOR / 2 / PERIOD) :]) <= 1e-3  # it stands
+
+
+@pytest.mark.parametrize("state", ["estop", "hold"])
+@pytest.mark.parametrize("fault", ["offset", "offset below", "flipped", "alternating", "returning"])
+def test_a_joint_that_leapt_is_not_followed_at_all(fault, state):
+    bench = following(Servo(FAULTS[fault]), wave(60, 0.4))
+    bench.go(1.5)
+    told(bench, state)
+    bench.go(1.0)
+    stood = bench.sent[-1].copy()
+    bench.said()
+    bench.break_encoder()
+    bench.go(FOR)
+    assert np.abs(bench.sent[-round(FOR / PERIOD) :] - stood).max() <= 1e-6
+    assert bench.said("implausible")[0].text.startswith("a reads")
+
+
+@pytest.mark.parametrize("state", ["estop", "hold"])
+def test_a_joint_that_keeps_its_distance_when_its_command_followed_is_named_and_held(state):
+    bench = following(Servo(FAULTS["ramping"]), wave(60, 0.4))
+    bench.go(1.0)
+    told(bench, state)
+    bench.go(1.5)
+    bench.break_encoder()
+    bench.go(FOR)
+    texts = [event.text for event in bench.said("implausible")]
+    assert len(texts) == 1
+    assert texts[0].startswith("a reads ")
+    assert texts[0].endswith("to which it was led already: is its encoder off?")
+
+
+def test_e_stops_pressed_again_and_again_do_not_lead_a_robot_on():
+    bench = following(Servo(FAULTS["small offset"]), wave(60, 0.0))
+    bench.go(1.0)
+    bench.break_encoder()
+    bench.go(0.5)
+    for _ in range(10):
+        bench.page.set_estop(EStop.LATCHED)
+        bench.go(1.5)
+        bench.page.set_estop(EStop.CLEAR)
+        bench.go(0.3)
+    assert np.ptp(bench.moves) <= 0.25 + 0.06
+
+
+def moved_by_hand(bench, way, speed=1.0):
+    """A hand moves joint a by `way` at `speed`, and lets it stay there."""
+    step = np.array([np.sign(way) * speed * PERIOD, 0.0])
+    for _ in range(round(abs(way) / speed / PERIOD)):
+        bench.moved_by_hand = bench.measured = bench.measured + step
+        bench.run()
+    bench.run(30)
+
+
+@pytest.mark.parametrize("state", ["estop", "hold"])
+@pytest.mark.parametrize("speed", [0.5, 1.0, 3.0])
+@pytest.mark.parametrize("way", [0.7, -0.7])
+def test_an_arm_that_a_hand_moves_is_still_followed_no_faster_than_it_moves(state, speed, way):
+    bench = following(Bench(), wave(60, 0.0))
+    told(bench, state)
+    bench.run(60)
+    moved_by_hand(bench, way, speed)
+    assert abs(bench.measured[0]) == pytest.approx(0.7, abs=0.04)
+    assert abs(bench.sent[-1, 0] - bench.measured[0]) <= 0.2
+    assert np.abs(np.diff(bench.sent[:, 0])).max() <= 3.0 * PERIOD * 1.05
+    bench.run(60)  # it agrees: what comes next is a hand again
+    bench.moved_by_hand = bench.measured = bench.sent[-1].copy()
+    bench.run(60)
+    before = bench.sent[-1, 0]
+    moved_by_hand(bench, -way, speed)
+    assert abs(bench.sent[-1, 0] - before) >= 0.5
+
+
+def test_a_joint_is_followed_again_after_it_agreed_for_a_second_or_a_set_up():
+    for again in ("agrees", "set up"):
+        bench = following(Bench(), wave(60, 0.0))
+        told(bench, "hold")
+        bench.run(60)
+        bench.moved_by_hand = bench.measured = np.array([0.9, 0.0])  # leaps
+        bench.run(30)
+        assert bench.sent[-1, 0] == pytest.approx(0.0)
+        if again == "set up":
+            bench.say("motion", goal=np.zeros(2))  # refused, as it is too far from its command
+            bench.run(30)
+            assert bench.sent[-1, 0] == pytest.approx(0.9)
+            continue
+        bench.moved_by_hand = bench.measured = np.full(2, 0.02)  # exactly 0 would be a dead encoder
+        bench.run(45)
+        moved_by_hand(bench, 0.7)
+        assert bench.sent[-1, 0] > 0.5
