@@ -14,9 +14,9 @@ import numpy as np
 
 import robots
 from robots import Robot
-from runtime import deployment, family
-from runtime.clock import Clock
-from runtime.family import Plan
+from runtime.config import loader as deployment
+from runtime.core.clock import Clock
+from runtime.core.types import ActionChunk, Conditioning, Float64, Observation, UInt8
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.sim.bench import BenchState, camera_arm
 from runtime.sim.chase import Chase, Places
@@ -28,9 +28,10 @@ from runtime.sim.plant import Plant
 from runtime.sim.render import Renderer
 from runtime.sim.surroundings import Surroundings
 from runtime.sim.tabletop import Reset
+from runtime.station import spec as family
+from runtime.station.spec import StationSpec
 from runtime.transports import zmq
 from runtime.transports.base import Capabilities
-from runtime.types import ActionChunk, Conditioning, Float64, Observation, UInt8
 
 HORIZON = 50  # rows of a chunk
 _WIDTH, _HEIGHT = 320, 240
@@ -117,7 +118,7 @@ class Seeing(Policy):
 
 
 @dataclass(frozen=True, slots=True)
-class ConveyorPlan(Plan):
+class ConveyorPlan(StationSpec):
     """A plan whose transport is the simulated node, and whose policy sees that node's pictures."""
 
     gallery: Gallery

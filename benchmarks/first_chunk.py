@@ -11,7 +11,7 @@ import sys
 import numpy as np
 
 import robots
-from runtime.plugins import variants
+from runtime.core.plugins import variants
 
 
 def main(kind: str, name: str) -> None:

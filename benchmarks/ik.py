@@ -25,9 +25,9 @@ from benchmarks.ik_postures import PATHS, SETTLED, drift, path, redundant, worst
 from benchmarks.labs import ROOT
 from benchmarks.report import Figure, Report
 from robots import Robot
-from runtime.errors import SetupError
+from runtime.core.errors import SetupError
+from runtime.core.plugins import variants
 from runtime.kinematics.base import IkFlag, IkResult, Kinematics
-from runtime.plugins import variants
 
 SECONDS = 0.5
 _DEFAULT = "compiled"

@@ -65,7 +65,7 @@ def lab(
 def busy_lab(folder: Path, assignments: Sequence[str], without: str = "") -> Iterator[RunningLab]:
     """The lab of `benchmarks.busy_lab`, with these settings on top of its deployment.
 
-    `without` names measures of runtime.realtime that its control is to do without, separated by commas.
+    `without` names measures of runtime.core.realtime that its control is to do without, separated by commas.
     """
     sets = [part for assignment in assignments for part in ("--set", assignment)]
     ready = folder / "ready.json"

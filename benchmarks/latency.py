@@ -7,8 +7,8 @@ waiting for the next one. `renew_ms`: the same way there and back, 20 times a se
 `rest_ms`: Resume over REST, with its row in the database. `observation_ms`: from the node's stamp until the policy is
 asked about it. `muxed_ms`: from the node's stamp until the frame's packet went to the muxer.
 
-The runtime maps the node's clock onto ours such that the fastest message took no time (runtime.clock.ClockMap). Here
-both are one clock: the shortest way is measured, and added to what counts from the node's stamp.
+The runtime maps the node's clock onto ours such that the fastest message took no time (runtime.core.clock.ClockMap).
+Here both are one clock: the shortest way is measured, and added to what counts from the node's stamp.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import zmq
 from benchmarks.labs import STATION, Processors, RunningLab, busy_lab, only_episode, set_up, watch
 from benchmarks.report import Figure, Report
 from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
-from runtime import codecs
+from runtime.core import msgpack_arrays as codecs
 from runtime.recording.reader import Episode
 
 SECONDS = 60.0

@@ -98,7 +98,10 @@ def _run(
         loops = [_sleeper(arguments, lab.environment) for arguments in sleepers]
         page.command("run")
         page.wait(lambda state: state["state"] == "running", 10.0, "starting the run")
-        processors, scheduler = Processors(lab.process), Scheduling(lab.process, "runtime.control")
+        processors, scheduler = (
+            Processors(lab.process),
+            Scheduling(lab.process, "runtime.processes.control.process"),
+        )
         state = page.wait(lambda state: state["state"] != "running", seconds + 30.0, "the run")
         percent, scheduled = processors.percent(), scheduler.figures()
         watching.communicate()

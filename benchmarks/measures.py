@@ -1,4 +1,4 @@
-"""What each measure for a steady tick brings: `loop` at one rate, with measures of runtime.realtime taken away.
+"""What each measure for a steady tick brings: `loop` at one rate, with measures of runtime.core.realtime taken away.
 
 The bare loop beside it does without them too.
 """

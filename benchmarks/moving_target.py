@@ -35,10 +35,10 @@ import numpy as np
 
 from benchmarks.conveyor_station import plan
 from benchmarks.report import Figure, Report
-from runtime.lockstep import Lockstep
-from runtime.session import State
+from runtime.core.types import Float64
+from runtime.processes.coordinator.session.machine import State
+from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.sim.conveyor import COURSE_S, Conveyor
-from runtime.types import Float64
 
 DELAYS = (0, 1, 3, 8, 15)  # control ticks of 1/30 s
 STRATEGIES: Mapping[str, Mapping[str, Any]] = {

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.busy_lab import PATIENT
 from benchmarks.recording_station import SIZE, PatientLab
-from runtime.client import Refused
+from runtime.clients.client import Refused
 from runtime.recording.reader import Episode, open_episode
 
 _LOOK_S = 20.0  # less than what the ages are of

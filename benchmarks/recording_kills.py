@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,15 +24,15 @@ from typing import Any
 from benchmarks.labs import ROOT
 from benchmarks.recording_alone import append, manifest
 from benchmarks.recording_pace import FPS, Frames
+from runtime.core.errors import RecordingError
 from runtime.datasets.consistency import check
 from runtime.datasets.layout import INFO
 from runtime.datasets.reader import open_dataset
-from runtime.errors import RecordingError
+from runtime.processes.supervisor.supervisor import MOST_RESTARTS, RESTART_WINDOW_S
 from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.reader import Episode, open_episode
 from runtime.recording.settings import RecordingSettings
-from runtime.supervisor import MOST_RESTARTS, RESTART_WINDOW_S
 from tests.crash.lab import Lab
 from tests.processes import eventually
 
@@ -42,6 +42,7 @@ _SPREAD_S = (1.0, 3.5)  # of a recording, within which its kill falls
 _WORKING_S = (0.0, 1.5)  # of a worker, from when it has its first job
 _CLOSED_S = 120.0
 _PUBLISHED_S = 180.0
+RUNNING = "select key, owner from jobs_job where status = 'running'"
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,11 +141,13 @@ def kill_worker(data: Path, many: Many, seed: int) -> list[dict[str, Any]]:
     }
     asked = _ask(environment)
     rows = []
+    dead: set[str] = set()
     for moment in many.moments(seed, _WORKING_S):
         with _worker(environment) as worker:
-            job = _working(data, worker)
+            job, owner = _working(data, worker, dead)
             time.sleep(moment)
             worker.kill()
+        dead.add(owner)
         found = {"job": job, "problems": _problems(data)}
         rows.append({"process": "worker", "after_s": moment, "lost_s": 0.0, **found})
         _ask(environment)
@@ -175,14 +178,13 @@ def _worker(environment: Mapping[str, str]) -> Iterator[subprocess.Popen[bytes]]
                 child.kill()
 
 
-def _working(data: Path, worker: subprocess.Popen[bytes]) -> str:
-    """The key of the first job that this worker has."""
+def _working(data: Path, worker: subprocess.Popen[bytes], dead: Collection[str]) -> tuple[str, str]:
+    """The key and the owner of the first job that this worker has; jobs of the `dead` are their own still."""
     begun = time.monotonic()
     while time.monotonic() - begun < 60.0 and worker.poll() is None:
-        mine = f"claimed_by like '%:{worker.pid}:%'"
-        found = _query(data, f"select key from jobs_job where status = 'running' and {mine}")
-        if found:
-            return str(found[0][0])
+        for key, owner in _query(data, RUNNING):
+            if owner not in dead:
+                return str(key), str(owner)
         time.sleep(0.02)
     raise SystemExit(f"the worker took no job ({worker.poll()})")
 

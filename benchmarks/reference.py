@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runtime.timeline import overlap_blend
-from runtime.types import Conditioning, Float64
+from runtime.core.types import Conditioning, Float64
+from runtime.motion.timeline import overlap_blend
 
 DIM = 3
 DISAGREEMENT = 0.02  # [rad] that a chunk may be off as a whole

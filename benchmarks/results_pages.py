@@ -63,7 +63,7 @@ def pages(seeded: Seeded, rounds: int) -> dict[str, dict[str, float]]:
     from django.test import Client
     from django.test.utils import CaptureQueriesContext
 
-    from evaweb.results import caching
+    from evaweb.results.analysis import caching
 
     client = Client()
     client.force_login(seeded.viewer)
@@ -237,7 +237,7 @@ def _operator(
 
 
 def _asked(plan: Any, operator: Any, station: Any, times: list[float]) -> Any:
-    from evaweb.plans.handing import hand_out
+    from evaweb.plans.allocation import hand_out
 
     began = time.perf_counter()
     trial = hand_out(user=operator, station=station, plan=plan).trial

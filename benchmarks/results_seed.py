@@ -218,7 +218,7 @@ def _scored(trials: Sequence[Any], skill: Mapping[int, float], chance: random.Ra
 
 def _handed(plan: Any, slots: Sequence[Any], trials: Sequence[Any]) -> None:
     """How each trial was handed out, in the order of the schedule."""
-    from evaweb.plans.blinding import codes
+    from evaweb.plans.commitment import codes
     from evaweb.plans.models import Handout
 
     known = codes(bytes(plan.key), len(slots))

@@ -10,8 +10,8 @@ import json
 import sys
 import time
 
-from runtime import realtime
-from runtime.clock import MonotonicClock
+from runtime.core import realtime
+from runtime.core.clock import MonotonicClock
 
 
 def main() -> None:

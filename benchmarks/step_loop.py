@@ -13,12 +13,12 @@ from types import ModuleType
 
 import numpy as np
 
-from runtime.commitment import Commitment
-from runtime.messages import ChunkMerged
-from runtime.mixture import Mixture
+from runtime.core.types import ActionChunk, Conditioning, Float64
+from runtime.ipc.messages import ChunkMerged
+from runtime.motion.timeline import Contributions, DimensionKinds, Timeline
+from runtime.processes.coordinator.inference.chunk_mixture import Mixture
+from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
 from runtime.strategies.base import Arrival, Merged, Progress, StrategyParameters, join
-from runtime.timeline import Dims, Makers, Timeline
-from runtime.types import ActionChunk, Conditioning, Float64
 
 Policy = Callable[[int, Conditioning | None], Float64]  # observation step, conditioning -> rows [H, D]
 FAR = 0.05  # [rad] that a run's first action may be off without being blended in, as in control
@@ -30,7 +30,7 @@ class Executed:
 
     step: int
     action: Float64
-    makers: Makers  # () where the last target was held
+    makers: Contributions  # () where the last target was held
     starved: bool
 
 
@@ -63,9 +63,9 @@ class StepLoop:
         delay: Callable[[int], int],
         rate: float,
         start: Float64,
-        dims: Dims | None = None,
+        dims: DimensionKinds | None = None,
     ) -> None:
-        self._dims = Dims() if dims is None else dims
+        self._dims = DimensionKinds() if dims is None else dims
         self._policy = policy
         self._delay = delay
         self._rate = rate
@@ -79,7 +79,7 @@ class StepLoop:
         self._waiting = True  # for the first chunk: no starvation yet
         self._starved = False
         self._delays: deque[int] = deque(maxlen=50)
-        self._commitment = Commitment(rate, Mixture(self._dims))
+        self._commitment = RtcPrefix(rate, Mixture(self._dims))
         self._kind = ""
         self._joining = False
         self.tune(strategy, config)

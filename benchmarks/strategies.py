@@ -38,9 +38,9 @@ from benchmarks.reference import DIM, Meant, Reference, answering, chunks_of, di
 from benchmarks.report import Figure, Report
 from benchmarks.step_loop import Executed, Log, StepLoop
 from benchmarks.strategy_station import Case, compare
-from runtime.plugins import variants
+from runtime.core.plugins import variants
+from runtime.core.types import Float64
 from runtime.strategies.base import JOIN_WINDOW, StrategyParameters
-from runtime.types import Float64
 
 KINDS = ("sync", "async", "ensemble", "naive", "rtc")
 DELAYS = (0, 1, 3, 8, 15)  # [ticks]

@@ -16,15 +16,16 @@ from benchmarks.reference import DIM, Reference, answering, chunks_of, disagreei
 from benchmarks.step_loop import Policy as Answering
 from benchmarks.step_loop import StepLoop
 from robots import Robot
-from runtime import deployment, family
-from runtime.clock import Clock
-from runtime.family import Plan
-from runtime.lockstep import Lockstep
-from runtime.plugins import variants
+from runtime.config import loader as deployment
+from runtime.core.clock import Clock
+from runtime.core.plugins import variants
+from runtime.core.types import ActionChunk, Conditioning, Float32, Float64, Observation, RobotCommand
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.session import State
+from runtime.processes.coordinator.session.machine import State
+from runtime.processes.lockstep.lockstep import Lockstep
+from runtime.station import spec as family
+from runtime.station.spec import StationSpec
 from runtime.transports.base import Capabilities, Sink, Source
-from runtime.types import ActionChunk, Conditioning, Float32, Float64, Observation, RobotCommand
 
 _SCALE = 0.3  # of the reference: so slow that safety has nothing to change
 _TICKS = 300
@@ -89,7 +90,7 @@ class Known(Policy):
 
 
 @dataclass(frozen=True, slots=True)
-class KnownPlan(Plan):
+class KnownPlan(StationSpec):
     """A plan whose robot and policy are those above; they are kept in `made`."""
 
     made: dict[str, Any]

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection, connect
 
-from evaweb.frames import decode
+from evaweb.binary_frames import decode
 from robots.broken_pipe import unread_ends
 
 

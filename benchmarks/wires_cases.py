@@ -19,8 +19,8 @@ import robots
 from benchmarks.labs import ROOT
 from benchmarks.wires_receiver import FPS
 from benchmarks.wires_recording import record
-from runtime.errors import ConfigurationError, SetupError
-from runtime.plugins import variants
+from runtime.core.errors import ConfigurationError, SetupError
+from runtime.core.plugins import variants
 from runtime.sim.ros_domain import free_domain
 
 ROBOT, ROS2_ROBOT = "agilex_piper", "r1_lite"

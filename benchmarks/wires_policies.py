@@ -25,12 +25,12 @@ import robots
 from benchmarks.labs import ROOT
 from benchmarks.wires_relay import Relay
 from robots import Robot
-from runtime import heap
-from runtime.clock import MonotonicClock
-from runtime.errors import ConfigurationError
-from runtime.plugins import variants
+from runtime.core import malloc as heap
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import ConfigurationError
+from runtime.core.plugins import variants
+from runtime.core.types import Observation
 from runtime.policies.base import Policy
-from runtime.types import Observation
 
 ROBOT = "agilex_piper"  # two arms of seven numbers, three cameras
 PICTURE = (224, 224, 3)

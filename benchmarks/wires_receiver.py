@@ -18,15 +18,15 @@ from typing import Any
 
 import robots
 from robots import Robot
-from runtime import heap
 from runtime.cameras.attaching import attached
-from runtime.clock import Clock, MonotonicClock, VirtualClock
-from runtime.intake import Intake
-from runtime.messages import Event
-from runtime.page import Page, PageLayout
-from runtime.plugins import variants
+from runtime.core import malloc as heap
+from runtime.core.clock import Clock, MonotonicClock, VirtualClock
+from runtime.core.plugins import variants
+from runtime.core.types import Observation
+from runtime.ipc.messages import Event
+from runtime.ipc.shared_state import SharedState, SharedStateLayout
+from runtime.processes.reception.receiver import ObservationReceiver
 from runtime.transports.base import Source
-from runtime.types import Observation
 
 FPS = 30.0
 _PUMP_S = 0.005  # as reception does
@@ -46,9 +46,9 @@ class Receiving:
         return json.dumps(asdict(self))
 
 
-def layout(robot: Robot) -> PageLayout:
+def layout(robot: Robot) -> SharedStateLayout:
     """The page of a station with this robot and all of its cameras."""
-    return PageLayout(robot.dim, robot.eef_dim, tuple(camera.key for camera in robot.cameras))
+    return SharedStateLayout(robot.dim, robot.eef_dim, tuple(camera.key for camera in robot.cameras))
 
 
 def source(given: Receiving, robot: Robot, clock: Clock) -> Source:
@@ -67,9 +67,11 @@ def main(text: str) -> None:
     robot = robots.load(given.robot)
     clock = VirtualClock() if given.fast else MonotonicClock()
     player = _Player()
-    page = Page.attach(layout(robot), given.page)
+    page = SharedState.attach(layout(robot), given.page)
     with contextlib.closing(source(given, robot, clock)) as opened:
-        intake = Intake(page, opened, clock, _say, lambda observation, numbers: player.see(observation))
+        intake = ObservationReceiver(
+            page, opened, clock, _say, lambda observation, numbers: player.see(observation)
+        )
         opened.connect()
         opened.begin_run()
         while not select.select([sys.stdin], [], [], 0.0)[0]:

@@ -20,8 +20,8 @@ from threading import Event
 import robots
 from benchmarks.wires_receiver import layout
 from robots.broken_pipe import unread_ends
-from runtime.clock import Clock
-from runtime.page import Page
+from runtime.core.clock import Clock
+from runtime.ipc.shared_state import SharedState
 from runtime.sim import node, standin
 from runtime.sim.mjpeg_server import MjpegServer
 
@@ -99,7 +99,7 @@ def main(file: str, page: str, module: str, *arguments: str) -> int:
 
 def _pace(page: str, arguments: Sequence[str], clock: Clock) -> Pace:
     robot = robots.load(arguments[arguments.index("--robot") + 1])
-    attached = Page.attach(layout(robot), int(page))
+    attached = SharedState.attach(layout(robot), int(page))
     return Pace(lambda: int(attached.observation.read()["picture_number"].min()), clock)
 
 

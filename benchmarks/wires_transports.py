@@ -29,10 +29,10 @@ import psutil
 import robots
 from benchmarks.wires_cases import PATIENCE_S, Case, Stage, Wired, absent, cases, end, process
 from benchmarks.wires_receiver import FPS, Receiving, layout
-from runtime.clock import MonotonicClock
-from runtime.page import Page
+from runtime.core.clock import MonotonicClock
+from runtime.core.types import UInt8
+from runtime.ipc.shared_state import SharedState
 from runtime.sim.pictures import frame_number
-from runtime.types import UInt8
 
 IDLE_FRAMES = 18_900  # of each camera: half a minute to warm up, and ten
 _WARM_FRAMES = 900  # after which memory is to stay as it is
@@ -104,10 +104,10 @@ def idle(case: Case, seconds: float, frames: int = IDLE_FRAMES) -> Row:
 @contextlib.contextmanager
 def _staged(
     case: Case, rate: float, size: tuple[int, int], hurried: bool = False
-) -> Iterator[tuple[Stage, Page]]:
+) -> Iterator[tuple[Stage, SharedState]]:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        page, descriptor = Page.create(layout(robots.load(case.robot)))
+        page, descriptor = SharedState.create(layout(robots.load(case.robot)))
         stack.callback(os.close, descriptor)
         yield Stage(stack, folder, rate, size, case.robot, descriptor, hurried), page
 
@@ -119,7 +119,7 @@ def _receiving(stage: Stage, wired: Wired, fast: bool) -> subprocess.Popen[str]:
     return stage.stack.enter_context(process(command, stage.page))
 
 
-def _await(page: Page, receiver: subprocess.Popen[str], frames: int, seconds: float = math.inf) -> int:
+def _await(page: SharedState, receiver: subprocess.Popen[str], frames: int, seconds: float = math.inf) -> int:
     """How many pictures of every camera are in the page, once it is so many or so long; SystemExit where none come."""
     seen, since = 0, time.monotonic()
     latest = since + seconds
@@ -140,7 +140,7 @@ Look = list[
 ]  # per camera: the picture's head, when it was captured, and now
 
 
-def _look(page: Page, seconds: float) -> tuple[list[Look], int]:
+def _look(page: SharedState, seconds: float) -> tuple[list[Look], int]:
     """What a control loop sees at each of its ticks, and how many observations came meanwhile."""
     clock = MonotonicClock()
     first = int(page.observation.read()["sequence"])

@@ -11,15 +11,15 @@ import numpy as np
 
 import robots
 from robots import Robot
-from runtime.clock import MonotonicClock
-from runtime.errors import PolicyError
-from runtime.plugins import variants
+from runtime.core.clock import MonotonicClock
+from runtime.core.errors import PolicyError
+from runtime.core.plugins import variants
+from runtime.core.types import Observation
 from runtime.policies.base import Policy
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.roboarena_server import Arena, RoboarenaServer
 from runtime.sim.starvla_server import Star, StarvlaServer
 from runtime.sim.websocket_server import Frames, WebsocketServer
-from runtime.types import Observation
 
 _QUESTIONS = 12
 _SIZE = (24, 32)  # of pictures

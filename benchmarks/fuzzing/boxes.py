@@ -7,10 +7,10 @@ from functools import cache
 import numpy as np
 
 import robots
-from benchmarks.fuzzing.encoders import limits_of
-from runtime.safety import WorkspaceBox
-from runtime.types import Float64
-from runtime.workspace import Workspace
+from benchmarks.fuzzing.bodies import body
+from runtime.core.types import Float64
+from runtime.safety.filter import WorkspaceBox
+from runtime.safety.workspace import Workspace
 from tests.runtime.tick_bench import Bench
 
 _TICKS = 150
@@ -33,7 +33,7 @@ def once(seed: int) -> list[str]:
     rng = np.random.default_rng(seed)
     name = str(rng.choice(sorted(robots.names())))
     workspace, start = _walled(name)
-    limits, dims, _ = limits_of(name)
+    _, limits, dims, _, _ = body(name)
     strategy = str(rng.choice(["async", "naive", "ensemble"]))
     bench = Bench({"kind": strategy}, limits, dims, workspace=workspace, jump=5.0, following_error=5.0)
     bench.measured = start

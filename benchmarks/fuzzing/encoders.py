@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
-
 import numpy as np
 
-import robots
-from runtime.family import Plan
-from runtime.limits import Limits
-from runtime.page import EStop
-from runtime.timeline import Dims
-from runtime.types import Float64
+from benchmarks.fuzzing.bodies import drawn
+from benchmarks.fuzzing.faults import FAULTS, KEPT
+from runtime.core.types import Float64
+from runtime.ipc.shared_state import EStop
+from runtime.motion.timeline import difference
+from runtime.spaces.binary_grippers import DWELL_S
 from tests.runtime.tick_bench import PERIOD, Bench
 
 _TICKS = 240
@@ -20,92 +17,60 @@ _NOISE = 2e-5  # [rad] of a sound encoder
 _NEAR = 0.35  # [rad] from the robot that a command may step to: how far it goes while samples agree
 _MARGIN = 1.05
 _SOUND = 12  # ticks
-
-Fault = Callable[[np.random.Generator, Float64, int], Float64]
-
-
-def _zeros(rng: np.random.Generator, joints: Float64, since: int) -> Float64:
-    return np.zeros_like(joints)
-
-
-def _dead(rng: np.random.Generator, joints: Float64, since: int) -> Float64:
-    return np.where(rng.permutation(len(joints)) < 2, 0.0, joints)
-
-
-def _spike(rng: np.random.Generator, joints: Float64, since: int) -> Float64:
-    return joints if since else joints + rng.uniform(-1.5, 1.5, len(joints))
-
-
-def _beyond(rng: np.random.Generator, joints: Float64, since: int) -> Float64:
-    return joints + np.where(rng.permutation(len(joints)) == 0, 9.0, 0.0)
-
-
-def _noise(rng: np.random.Generator, joints: Float64, since: int) -> Float64:
-    return joints + rng.normal(0.0, 1.0, len(joints))
-
-
-def _swapped(rng: np.random.Generator, joints: Float64, since: int) -> Float64:
-    swapped = joints.copy()
-    swapped[[0, 1, 2]] = joints[[2, 0, 1]]
-    return swapped
-
-
-def _missing(rng: np.random.Generator, joints: Float64, since: int) -> Float64:
-    return np.full_like(joints, np.nan)
-
-
-_FAULTS: dict[str, Fault] = {
-    "zeros": _zeros,
-    "dead": _dead,
-    "spike": _spike,
-    "beyond": _beyond,
-    "noise": _noise,
-    "swapped": _swapped,
-    "missing": _missing,
-}
-# They keep what they read when they begin, or a number of their own.
-_KEPT = ("frozen", "stuck")
-
-
-@cache
-def limits_of(name: str) -> tuple[Limits, Dims, Float64]:
-    """What the robot `name` can do, which of its numbers do not blend, and where it is ready [D]."""
-    robot = robots.load(name)
-    plan = Plan.__new__(Plan)
-    object.__setattr__(plan, "robot", robot)
-    return plan.limits, plan.dims, robot.poses["ready"].astype(np.float64)
+_RESTS = round(DWELL_S / PERIOD)  # ticks between two switches of a gripper
+_TURN = 2.0 * np.pi
 
 
 class Scenario(Bench):
-    """A robot that follows its commands late, seen through encoders that now and then fail."""
+    """A robot that follows its commands late, seen through encoders that now and then fail.
+
+    Joints without limits are read in one turn, or in all of them. A node that leads moves the robot by itself.
+    """
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
-        self.name = str(self.rng.choice(sorted(robots.names())))
-        limits, dims, self.body = limits_of(self.name)
-        self.body = self.body.copy()
-        super().__init__({"kind": str(self.rng.choice(["async", "naive", "ensemble"]))}, limits, dims)
-        self.measured = self.body
-        self.places = limits.places
-        self.pushed: Float64 | None = None  # where a hand moves the arm to
+        self.name, limits, dims, switches, ready = drawn(self.rng)
+        self.body = ready.copy()
+        self.places, self.speeds = limits.places, list(limits.speeds)
+        self.ends = {switch.dim: (switch.open, switch.close) for switch in switches}
+        self.wraps = list(dims.wrapping) if self.rng.random() < 0.7 else []
         self.fault, self.since, self.kept = "", 0, self.body
+        kind = str(self.rng.choice(["async", "naive", "ensemble"]))
+        super().__init__({"kind": kind}, limits, dims, switches=switches)
+        for dim in self.ends:  # it may hold something
+            self.body[dim] = self.rng.uniform(limits.lower[dim], limits.upper[dim])
+        self.measured = self.body
+        self.wish = self.body  # where a hand, or the node's own leader, moves the robot to
+        self.pushed = False
         self.sound = 0  # ticks without a fault
         self.run_number = self.chunks = 0
         self.previous: Float64 | None = None
-        self.velocity = np.zeros(self.dim)
+        self.velocity = np.zeros((2, self.dim))  # the least and the most that the last command counts as
+        self.switched = dict.fromkeys(self.ends, -_RESTS)  # the tick of each gripper's last switch
         self.violations: list[str] = []
+
+    def _stand(self) -> None:
+        """As long as it takes to know that its encoders are never still."""
+        for _ in range(3 * _SOUND):
+            self.observe(qpos=self.read().astype(np.float32))
+            self.tick(self.step, self.clock.now())
+            self.clock.advance(PERIOD)
 
     # --- what happens --------------------------------------------------------------------------------------
 
     def happen(self) -> None:
         """Something, now and then."""
         if self.rng.random() < 0.06:
-            kind = self.rng.choice(["follow", "motion", "hold", "estop", "clear", "push", "sim"])
-            getattr(self, f"_{kind}")()
+            kinds = ["follow", "follow", "motion", "hold", "estop", "push", "sim", "yield", "lock"]
+            stopped = self.page.estop is EStop.LATCHED and self.rng.random() < 0.5
+            getattr(self, "_clear" if stopped else f"_{self.rng.choice(kinds)}")()
         self.sound = 0 if self.fault else self.sound + 1
         # The first samples, and those after a gap, cannot be told from sound ones by their numbers.
         if self.sound > _SOUND and self.rng.random() < 0.05:
-            self.fault, self.since = str(self.rng.choice([*_FAULTS, *_KEPT])), 0
+            faults = [*FAULTS, *KEPT]
+            if self.pushed:  # at full speed, values that are exchanged are not each other's any more
+                faults.remove("swapped")
+            self.fault, self.since = str(self.rng.choice(faults)), 0
             free = np.where(self.places & (self.rng.random(self.dim) < 0.5), self._somewhere(1.0), self.body)
             self.kept = self.body.copy() if self.fault == "frozen" else free
         elif self.fault and self.rng.random() < 0.1:
@@ -115,15 +80,23 @@ class Scenario(Bench):
 
     def _somewhere(self, reach: float) -> Float64:
         near = self.body + self.rng.uniform(-reach, reach, self.dim)
-        place = np.clip(near, self.limits.lower, self.limits.upper)
-        return np.asarray(np.where(self.places, place, self.body))
+        return np.asarray(
+            np.where(self.places, np.clip(near, self.limits.lower, self.limits.upper), self.body)
+        )
+
+    def _anything(self, reach: float) -> Float64:
+        """The same, with grippers and speeds of any number that they can have."""
+        place, free = self._somewhere(reach), ~self.places
+        place[free] = self.rng.uniform(self.limits.lower[free], self.limits.upper[free])
+        return place
 
     def _follow(self) -> None:
         self.run_number += 1
         self.say("follow", run=self.run_number)
 
     def _motion(self) -> None:
-        self.say("motion", goal=self._somewhere(0.6), speed=1.0)
+        goal = self._anything(0.6)
+        self.say("motion", goal=np.where(self.rng.random(self.dim) < 0.2, np.nan, goal), speed=1.0)
 
     def _hold(self) -> None:
         self.say("hold", run=self.run_number)
@@ -132,6 +105,14 @@ class Scenario(Bench):
         self.run_number += 1
         self.say("follow", run=self.run_number, mode="sim")
 
+    def _yield(self) -> None:
+        self.run_number += 1
+        self.say("yield", run=self.run_number)
+
+    def _lock(self) -> None:
+        locked = self.limits.grippers & (self.rng.random(self.dim) < 0.5)
+        self.lock(*np.where(locked, self._anything(0.0), np.nan))
+
     def _estop(self) -> None:
         self.page.set_estop(EStop.LATCHED)
 
@@ -139,26 +120,35 @@ class Scenario(Bench):
         self.page.set_estop(EStop.CLEAR)
 
     def _push(self) -> None:
-        self.pushed = self._somewhere(1.2) if self.rng.random() < 0.5 else None
+        self.pushed, self.wish = bool(self.rng.random() < 0.5), self._somewhere(1.2)
 
     def _chunk(self) -> None:
         self.chunks += 1
         start = np.array(self.status["commanded"], np.float64)
-        way = np.linspace(start, self._somewhere(0.3), 30)
+        way = np.linspace(start, start + self._apart(self._anything(0.3), start), 30)
+        jumps = np.flatnonzero(self.limits.grippers)
+        way[:, jumps] = self._anything(0.0)[jumps]
         self.chunk(self.chunks, way, run=self.run_number)
 
     # --- one tick ------------------------------------------------------------------------------------------
 
     def read(self) -> Float64:
         """What the encoders say."""
-        sound = self.body + self.rng.normal(0.0, _NOISE, self.dim) * self.places
-        if not self.fault:
-            return sound
+        sound = self._turned(self.body + self.rng.normal(0.0, _NOISE, self.dim) * self.places)
+        return self._faulty(sound) if self.fault else sound
+
+    def _turned(self, joints: Float64) -> Float64:
+        read = joints.copy()
+        read[self.wraps] = (read[self.wraps] + np.pi) % _TURN - np.pi
+        return read
+
+    def _faulty(self, sound: Float64) -> Float64:
         self.since += 1
-        if self.fault in _KEPT:
-            return np.where(self.kept != self.body, self.kept, sound) if self.fault == "stuck" else self.kept
-        faulty = _FAULTS[self.fault](self.rng, sound, self.since - 1)
-        return np.asarray(np.where(self.places, faulty, sound))
+        if self.fault == "stuck":
+            return np.where(self.kept != self.body, self._turned(self.kept), sound)
+        frozen = self.fault in KEPT
+        faulty = self._turned(self.kept) if frozen else FAULTS[self.fault](self.rng, sound, self.since - 1)
+        return np.where(self.places, faulty, sound)
 
     def go(self) -> None:
         """One tick: the robot is seen, told, and moves."""
@@ -169,46 +159,85 @@ class Scenario(Bench):
         self.observe(qpos=self.read().astype(np.float32))
         before = len(self.sink.sent)
         self.tick(self.step, self.clock.now())
-        self.look(self.sent[before:])
+        self.look(self.sink.sent[before:])
         self.step += 1
         self.clock.advance(PERIOD)
-        goal = self.pushed if self.pushed is not None else self.previous
-        if goal is not None:
-            most = self.limits.velocity * PERIOD
-            follow = self.body + np.clip(0.6 * (goal - self.body), -most, most)
-            self.body = np.where(self.places, follow, goal if self.pushed is None else self.body)
+        self._move()
 
-    def look(self, sent: Float64) -> None:
+    def _move(self) -> None:
+        """Whoever moves the robot does so for a tick."""
+        led = self.behaviour == "yield"
+        if led and self.rng.random() < 0.05:
+            self.wish = self._somewhere(0.5)
+        goal = self.wish if self.pushed or led else self.previous
+        if goal is None:
+            self.body[self.speeds] = 0.0
+            return
+        most = self.limits.velocity * PERIOD
+        follow = self.body + np.clip(0.6 * self._apart(goal, self.body), -most, most)
+        self.body = np.where(self.places | self.pushed, follow, goal)
+
+    # --- what is wrong -------------------------------------------------------------------------------------
+
+    def _apart(self, there: Float64, here: Float64) -> Float64:
+        return difference(there, here, self.dims.wrapping)
+
+    @property
+    def _known(self) -> Float64:
+        """Where the robot is; that an arm is moved by others while it is not seen to cannot be known."""
+        return self.kept if self.fault == "frozen" else self.body
+
+    def look(self, sent: list[Float64]) -> None:
         """What is wrong with what was sent in this tick."""
         record = self.records()[-1]
-        if len(sent) > 1:
-            self._wrong("told twice in one tick")
-        if not len(sent):
-            self.previous, self.velocity = None, np.zeros(self.dim)
+        if len(sent) > 1 or (sent and self.behaviour == "yield"):
+            self._wrong("told twice in one tick, or beside the node that leads")
+        if not sent:
+            self.previous, self.velocity = None, np.zeros((2, self.dim))
             return
-        told = sent[0]
+        told, stopped = sent[0].astype(np.float64), record.source == "estop"
         if not np.isfinite(told).all() or (self.limits.outside(told) > 1e-5 * self.limits.reach).any():
             self._wrong(f"beyond the limits or no number: {told.tolist()}")
+        if stopped and told[self.speeds].any():
+            self._wrong(f"drives under the e-stop: {told[self.speeds].tolist()}")
         if self.previous is not None:
-            self._compare(told, self.previous, " ".join(record.notes), record.source == "estop")
-        elif (np.abs(told - self.body) > _NEAR)[self.places].any():
+            self._compare(told, self.previous, " ".join(record.notes), stopped)
+        elif (np.abs(self._apart(told, self._known)) > _NEAR)[self.places].any():
             self._wrong("taken over where it is not")
+        self._look_at_grippers(told, stopped)
         self.previous = told
+
+    def _look_at_grippers(self, told: Float64, stopped: bool) -> None:
+        """An e-stop that takes the robot over, and the hold after it, leave them where they are."""
+        for dim, ends in self.ends.items():
+            before = None if self.previous is None else self.previous[dim]
+            switches = not np.isclose(told[dim], told[dim] if before is None else before)
+            if not np.isclose(told[dim], ends).any() and (switches or not (stopped or before is not None)):
+                self._wrong(f"a gripper neither open nor closed: {told[dim]}")
+            if switches and np.isclose(before, ends).any():
+                if self.step - self.switched[dim] < _RESTS:
+                    self._wrong("a gripper switches too often")
+                self.switched[dim] = self.step
 
     def _compare(self, told: Float64, before: Float64, notes: str, stopped: bool) -> None:
         moved = (told - before) / PERIOD
-        if "stepped" in notes:
+        if "where the robot is" in notes:
             hardest = 60.0 * self.limits.reach * _MARGIN * PERIOD
-            self.velocity = np.clip(moved, -hardest, hardest)  # it may have moved on from there
+            onwards = np.clip(moved, -hardest, hardest)  # it counts as at rest, or has moved on from there
+            self.velocity = np.array([np.minimum(onwards, 0.0), np.maximum(onwards, 0.0)])
             apart = np.abs(told - before) > 1e-6
-            away = np.abs(told - self.body) > np.maximum(np.abs(before - self.body), _NEAR)
-            if (apart & away)[self.places].any():
+            near = np.maximum(np.abs(self._apart(before, self._known)), _NEAR)
+            if (apart & (np.abs(self._apart(told, self._known)) > near))[self.places].any():
                 self._wrong(f"stepped away from the robot: {notes}")
+            if (np.abs(told - before) > np.pi)[list(self.dims.wrapping)].any():
+                self._wrong(f"stepped by a turn: {notes}")
             return
         free = ~self.limits.binary
+        if stopped:
+            free[self.speeds] = False
         if (np.abs(moved) > self.limits.velocity * _MARGIN + 1e-3 * self.limits.reach)[free].any():
             self._wrong(f"faster than it moves: {moved.tolist()} {notes}")
-        least, most = self.velocity, self.velocity
+        least, most = self.velocity
         if stopped:
             least, most = np.minimum(least, 0.0), np.maximum(most, 0.0)
             free = free & self.places
@@ -216,11 +245,60 @@ class Scenario(Bench):
         edge = (told <= self.limits.lower + 1e-6) | (told >= self.limits.upper - 1e-6)
         if ((moved > most + gain) | (moved < least - gain))[free & ~edge].any():
             self._wrong(f"harder than it accelerates: {notes}")
-        self.velocity = moved
+        self.velocity = np.array([moved, moved])
 
     def _wrong(self, what: str) -> None:
         doing = f"{self.name}, tick {self.step}, {self.behaviour}, encoders {self.fault or 'sound'}"
         self.violations.append(f"{doing}: {what}")
+
+
+class EncoderOff(Bench):
+    """A robot that stands, one joint of which is read elsewhere from a tick on: it must not run away."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.name, limits, dims, _, ready = drawn(rng)
+        self.body = ready.copy()
+        super().__init__({"kind": "naive"}, limits, dims)
+        self.measured = self.body
+        self._joint = int(rng.choice(np.flatnonzero(limits.places)))
+        self._offset, self._scale = rng.uniform(-1.5, 1.5), float(rng.choice([-1.0, 1.0, 1.0, 1.2]))
+        self._within = float(rng.choice([PERIOD, 0.5, 2.0]))  # [s] in which the offset grows
+        self._comes_and_goes = bool(rng.random() < 0.5)  # never long enough to be believed again
+        self._lag = float(rng.choice([1.0, 0.3]))  # the part of its way to its command that it goes in a tick
+        self._stopped = bool(rng.random() < 0.5)
+
+    def violations(self) -> list[str]:
+        """What is wrong with what it was told, in words."""
+        self.say("motion", goal=self.body)
+        self.run(10)
+        if self._stopped:
+            self.page.set_estop(EStop.LATCHED)
+            self.run(20)
+        begins = self.sent[-1]
+        told = len(self.sent)
+        for tick in range(_TICKS):
+            read, since = self.body.copy(), tick * PERIOD
+            gone = self._comes_and_goes and since % 0.8 >= 0.4
+            grown = 0.0 if gone else min(since / self._within, 1.0)
+            read[self._joint] = (1.0 + grown * (self._scale - 1.0)) * read[self._joint] + grown * self._offset
+            self.moved_by_hand = self.measured = read
+            self.run()
+            self.body += self._lag * (self.sent[-1] - self.body)
+        places = self.limits.places
+        way = np.abs(np.diff(self.sent[told - 1 :], axis=0))[:, places]
+        far = np.ptp(self.sent[told - 1 :], axis=0)[places].max()
+        found = []
+        if (way > self.limits.velocity[places] * PERIOD * _MARGIN + 1e-4).any():
+            found.append("stepped faster than it moves")
+        if far > self._bound(begins):
+            found.append(f"ran away by {far:.2f} rad")
+        return [f"{self.name}, encoder of {self.limits.names[self._joint]} off: {what}" for what in found]
+
+    def _bound(self, begins: Float64) -> float:
+        """One believed displacement [rad]: the following error, and how far the encoder is off."""
+        scaled = abs((self._scale - 1.0) * begins[self._joint])
+        return float(self.safety.following_error + abs(self._offset) + scaled + 0.1)
 
 
 def once(seed: int) -> list[str]:
@@ -228,4 +306,5 @@ def once(seed: int) -> list[str]:
     scenario = Scenario(seed)
     for _ in range(_TICKS):
         scenario.go()
-    return [f"seed {seed}: {violation}" for violation in scenario.violations]
+    found = [*scenario.violations, *EncoderOff(seed).violations()]
+    return [f"seed {seed}: {violation}" for violation in found]

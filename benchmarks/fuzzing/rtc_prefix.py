@@ -19,23 +19,24 @@ import numpy as np
 
 from benchmarks.strategy_station import KnownPlan, Obedient, lockstep_deployment
 from robots import Robot
-from runtime import deployment, family
-from runtime.clock import Clock
-from runtime.end_effectors import EndEffectors
-from runtime.errors import PolicyLostError
+from runtime.config import loader as deployment
+from runtime.core.clock import Clock
+from runtime.core.errors import PolicyLostError
+from runtime.core.types import EEF_WIDTH, ActionChunk, Conditioning, Float64, Observation
 from runtime.kinematics.forward import ChainForward
-from runtime.lockstep import Around, Lockstep
+from runtime.motion.timeline import difference
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.runner import LockstepRunner
-from runtime.timeline import difference
-from runtime.transitions import State
-from runtime.types import EEF_WIDTH, ActionChunk, Conditioning, Float64, Observation
+from runtime.processes.coordinator.inference.worker import LockstepRunner
+from runtime.processes.coordinator.session.transitions import State
+from runtime.processes.lockstep.lockstep import Around, Lockstep
+from runtime.spaces.end_effectors import EndEffectors
+from runtime.station import spec as family
 
 _TICKS = 240
 _HAIR = 1e-6  # of a step
 _ROUNDING = 2e-5  # [rad, m] of float32 there and back through the model's own numbers
 _POSES = 2e-3  # [m, and of a quaternion's numbers] that inverse kinematics meets poses to
-_ROBOTS = ("agilex_piper", "ur5e", "r1_lite")
+_ROBOTS = ("agilex_piper", "ur5e", "r1_lite", "arx_r5", "dual_franka", "agibot_g2")
 _KINDS = ("rtc", "rtc", "rtc", "async", "naive", "ensemble", "sync")
 
 
@@ -295,6 +296,10 @@ class Planned:
     missed: dict[int, float]  # by the step of the observation: what poses are missed by at most [m, rad]
     end: int
 
+    def arrived_for(self, step: int) -> int:
+        """When the first answer to what was asked from `step` on is the plan: an answer that is lost keeps nothing."""
+        return min((at for asked, at in self.arrived.items() if asked >= step), default=self.end)
+
     def missed_before(self, step: int, horizon: int) -> float:
         """What the answers that may make this step and those after it have missed at most."""
         return max((off for at, off in self.missed.items() if step - 2 * horizon <= at <= step), default=0.0)
@@ -356,7 +361,7 @@ def _violations(made: Scenario, keeper: Keeper, planned: Planned) -> list[str]:
     pace = (made.action_hz or made.control_hz) / made.control_hz
     binding = made.keeps and made.action_hz is None and "k_max" not in made.strategy
     for declared in keeper.declared:
-        arrived = planned.arrived.get(declared.step, planned.end)
+        arrived = planned.arrived_for(declared.step)
         foreign = min((step for step in planned.other if step >= declared.step), default=planned.end)
         over = min(foreign, planned.end) if binding else arrived
         for place, row in enumerate(declared.rows):

@@ -1,4 +1,4 @@
-"""On PYTHONPATH, takes the measures of runtime.realtime that EVA_WITHOUT names from control and from the bare loop.
+"""On PYTHONPATH, takes the measures of runtime.core.realtime that EVA_WITHOUT names from control and the bare loop.
 
 For benchmarks.measures alone: the runtime itself has no such switch.
 """
@@ -8,7 +8,7 @@ import sys
 
 
 def _take_away(names: list[str]) -> None:
-    from runtime import realtime
+    from runtime.core import realtime
 
     nothing = {
         "fifo": ("_fifo", lambda priority: ""),
@@ -21,5 +21,5 @@ def _take_away(names: list[str]) -> None:
         setattr(realtime, *nothing[name])
 
 
-if {"runtime.control", "benchmarks.sleeper"} & set(sys.orig_argv):
+if {"runtime.processes.control.process", "benchmarks.sleeper"} & set(sys.orig_argv):
     _take_away(os.environ["EVA_WITHOUT"].split(","))

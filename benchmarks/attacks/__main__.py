@@ -1,0 +1,66 @@
+"""`python -m benchmarks.attacks NAME READY_FILE DATA`: one attack on the lab that announced itself there.
+
+Prints a line of JSON when it has begun and, once standard input ends, one with what it did, counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from pathlib import Path
+
+from benchmarks.attacks import bus, crowds, databases, frames, requests
+from benchmarks.attacks.target import Target
+from robots.broken_pipe import unread_ends
+from runtime.sim.standin import ending
+
+ATTACKS = {
+    "status_flood": bus.status_flood,
+    "dead_station": frames.dead_station,
+    "viewer_stops": frames.viewer_stops,
+    "half_open": requests.half_open,
+    "logins": requests.logins,
+    "bodies": requests.bodies,
+    "toml": requests.toml,
+    "pings": crowds.pings,
+    "handshakes": crowds.handshakes,
+    "pages": crowds.pages,
+    "rest_clients": crowds.rest_clients,
+    "database_hangs": databases.hangs,
+}
+_NICE = 19
+
+
+@unread_ends
+def main() -> int:
+    """Attack until standard input ends."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.attacks", description=__doc__)
+    parser.add_argument("name", choices=sorted(ATTACKS))
+    parser.add_argument("ready_file", type=Path, help="of benchmarks.estop_lab")
+    parser.add_argument("data", type=Path, help="folder of that lab")
+    parser.add_argument("--database", type=Path, help="folder of its PostgreSQL server, where it has one")
+    parser.add_argument("--share", type=float, default=1.0, help="of the whole attack")
+    given = parser.parse_args()
+    os.nice(_NICE)
+    target = _target(given)
+    print(json.dumps(ATTACKS[given.name](target)), flush=True)
+    os._exit(0)  # whatever still waits for an answer
+
+
+def _target(given: argparse.Namespace) -> Target:
+    lab = json.loads(given.ready_file.read_text("utf-8"))
+    return Target(
+        url=lab["url"],
+        passwords=lab["passwords"],
+        data=given.data,
+        database=given.database,
+        share=given.share,
+        begun=lambda: print(json.dumps({"begun": given.name}), flush=True),
+        ended=ending(lifeline=True),
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

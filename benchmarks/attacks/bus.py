@@ -1,0 +1,34 @@
+"""A client of the station that asks and asks, and hears no answer."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from uuid import uuid4
+
+import zmq
+
+from benchmarks.attacks.target import Target
+from benchmarks.estop_lab import PRESSED
+from runtime.ipc.bus import CommandClient, Endpoints
+from runtime.ipc.messages import Command
+
+_SOCKETS = (("main", "commands"), ("guard", "estop"))
+
+
+def status_flood(target: Target) -> Counter[str]:
+    """Ask main and guard for their status as fast as their sockets take it."""
+    sent: Counter[str] = Counter()
+    for process, key in _SOCKETS:
+        threading.Thread(target=_flood, args=(target, process, key, sent), daemon=True).start()
+    target.begun()
+    target.ended.wait()
+    return sent
+
+
+def _flood(target: Target, process: str, key: str, sent: Counter[str]) -> None:
+    endpoints = Endpoints(target.data / "stations" / PRESSED)
+    client = CommandClient(zmq.Context.instance(), endpoints.read(process)[key])
+    while not target.ended.is_set():
+        client.post(Command(str(uuid4()), "status"))  # waits where the queue is full
+        sent[process] += 1

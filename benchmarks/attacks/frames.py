@@ -1,0 +1,97 @@
+"""Pages that say the same thing a thousand times: to a station that is dead, and without the right to."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from typing import Any
+from uuid import uuid4
+
+from benchmarks.attacks.target import Target
+from benchmarks.estop_lab import OTHER, PRESSED
+from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
+from runtime.ipc.bus import Endpoints
+
+_STOPS, _PRESSES = 5000, 1500
+_QUIET_S = 5.0  # after which nothing more is answered
+
+
+class _Page(LivePage):
+    """A page of which only acknowledgements are counted."""
+
+    def __init__(self, visitor: Visitor, station: str) -> None:
+        self.answered = 0
+        super().__init__(visitor, station)
+
+    @property
+    def closed(self) -> bool:
+        return bool(self._failure)
+
+    def say(self, message: Mapping[str, Any], times: int) -> None:
+        """Say it so often, each with a uuid of its own."""
+        for _ in range(times):
+            self._send({**message, "uuid": str(uuid4())})
+
+    def _told(self, message: Mapping[str, Any]) -> None:
+        self.answered += message.get("type") == "ack"
+
+
+def dead_station(target: Target) -> Counter[str]:
+    """Press the e-stop of a station whose guard and main are there and answer nothing."""
+    message = {"type": "estop", "why": "somebody leans on it"}
+    with _stopped(target, "guard", "main"):
+        return _waves(target, OTHER, message, target.part(_PRESSES))
+
+
+def viewer_stops(target: Target) -> Counter[str]:
+    """Ask for stop as somebody who may not command the station."""
+    return _waves(target, PRESSED, {"type": "stop", "epoch": 0}, target.part(_STOPS))
+
+
+@contextmanager
+def _stopped(target: Target, *processes: str) -> Iterator[None]:
+    """Processes of the other station, not scheduled meanwhile."""
+    found = Endpoints(target.data / "stations" / OTHER).read("supervisor")
+    pids = [int(found[process]) for process in processes]
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        for pid in pids:
+            os.kill(pid, signal.SIGCONT)
+
+
+def _waves(target: Target, station: str, message: Mapping[str, Any], times: int) -> Counter[str]:
+    """Say it `times` times, and again when that is answered; a page that is closed is opened again."""
+    done: Counter[str] = Counter()
+    visitor = target.visitor("viewer")
+    while not target.ended.is_set():
+        try:
+            with closing(_Page(visitor, station)) as page:
+                done["pages"] += 1
+                while not target.ended.is_set() and not page.closed:
+                    page.say(message, times)
+                    done["sent"] += times
+                    if done["sent"] == times:
+                        target.begun()
+                    _await(target, page, done["sent"])
+                done["answered"] += page.answered
+        except VisitFailed:
+            done["refused"] += 1
+            target.ended.wait(0.5)
+    return done
+
+
+def _await(target: Target, page: _Page, sent: int) -> None:
+    """Until all is answered, or nothing more is."""
+    answered, since = page.answered, time.monotonic()
+    while page.answered < sent and not page.closed and not target.ended.wait(0.05):
+        if page.answered != answered:
+            answered, since = page.answered, time.monotonic()
+        elif time.monotonic() - since > _QUIET_S:
+            return

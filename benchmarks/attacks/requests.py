@@ -1,0 +1,129 @@
+"""What keeps a web busy over HTTP: half requests, passwords, bodies, a file that is slow to read."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import socket
+import threading
+from collections import Counter
+from collections.abc import Callable
+from contextlib import closing
+from functools import partial
+from itertools import count
+
+from benchmarks.attacks.target import Target
+from benchmarks.estop_lab import PRESSED
+from evaweb.lab.visitor import VisitFailed, Visitor
+
+_CONNECTIONS, _LOGINS, _BODIES = 1100, 10, 4
+_BODY, _CHUNK = 200_000_000, bytes(1_000_000)
+_PARTS = 20_000
+_HALF = b"POST /login/ HTTP/1.1\r\nHost: localhost\r\nContent-Le"
+_ANSWER_S = 30.0
+_OPENING_S = 5.0
+
+
+def half_open(target: Target) -> Counter[str]:
+    """Keep connections that send nothing, or half a request; those that are closed are opened again."""
+    return asyncio.run(_half_open(target))
+
+
+async def _half_open(target: Target) -> Counter[str]:
+    opened: Counter[str] = Counter()
+    tries = [asyncio.create_task(_one(target, number, opened)) for number in range(target.part(_CONNECTIONS))]
+    await asyncio.wait(tries, timeout=_OPENING_S)
+    target.begun()
+    await asyncio.to_thread(target.ended.wait)
+    for task in tries:
+        task.cancel()
+    return opened
+
+
+async def _one(target: Target, number: int, opened: Counter[str]) -> None:
+    while True:
+        try:
+            reader, writer = await asyncio.open_connection(*target.address)
+            opened["opened"] += 1
+            if number % 2:
+                writer.write(_HALF)
+            await reader.read()
+            writer.close()
+        except OSError:
+            opened["refused"] += 1
+        await asyncio.sleep(0.5)
+
+
+def logins(target: Target) -> Counter[str]:
+    """Ten at once, again and again, every second one with a password that is wrong."""
+    return _again_and_again(target, _LOGINS, _login)
+
+
+def _login(target: Target, number: int) -> str:
+    password = target.passwords["viewer"] if number % 2 else "not-the-password"
+    Visitor(target.url).login("viewer", password)
+    return "logged in"
+
+
+def bodies(target: Target) -> Counter[str]:
+    """Post 200 MB without saying who it is, four at a time."""
+    return _again_and_again(target, _BODIES, _body)
+
+
+def _body(target: Target, number: int) -> str:
+    size = target.part(_BODY)
+    head = (
+        f"POST /api/v1/stations/{PRESSED}/estop HTTP/1.1\r\nHost: {target.address[0]}:{target.address[1]}\r\n"
+    )
+    head += f"Content-Type: application/json\r\nContent-Length: {size}\r\nConnection: close\r\n\r\n"
+    with closing(socket.create_connection(target.address, _ANSWER_S)) as wire:
+        wire.sendall(head.encode())
+        for start in range(0, size, len(_CHUNK)):
+            wire.sendall(_CHUNK[: size - start])
+        return f"answered {wire.recv(64)[9:12].decode() or 'nothing'}"
+
+
+def toml(target: Target) -> Counter[str]:
+    """Import a file of one key, or one table, of twenty thousand parts, as an administrator."""
+    visitor = target.visitor("admin")
+    return _again_and_again(target, 1, partial(_import, visitor))
+
+
+def _import(visitor: Visitor, target: Target, number: int) -> str:
+    name = ".".join("a" * target.part(_PARTS))
+    text = f"{name} = 1\n" if number % 2 else f"[{name}]\n"
+    answer = _posted_file(visitor, target, "/admin/plans/plan/import/", text)
+    return f"answered {answer}"
+
+
+def _posted_file(visitor: Visitor, target: Target, path: str, text: str) -> int:
+    border, token = "end-of-part", visitor.cookie("csrftoken")
+    parts = (
+        f'name="csrfmiddlewaretoken"\r\n\r\n{token}',
+        f'name="file"; filename="lab.toml"\r\n\r\n{text}',
+    )
+    said = "".join(f"--{border}\r\nContent-Disposition: form-data; {part}\r\n" for part in parts)
+    cookies = f"sessionid={visitor.cookie('sessionid')}; csrftoken={token}"
+    headers = {"Content-Type": f"multipart/form-data; boundary={border}", "Cookie": cookies}
+    with closing(http.client.HTTPConnection(*target.address, timeout=_ANSWER_S)) as connection:
+        connection.request("POST", path, f"{said}--{border}--\r\n".encode(), headers)
+        return connection.getresponse().status
+
+
+def _again_and_again(target: Target, at_once: int, ask: Callable[[Target, int], str]) -> Counter[str]:
+    """Ask from so many threads, each again when it has its answer; how often which came."""
+    done: Counter[str] = Counter()
+
+    def asking() -> None:
+        for number in count():
+            try:
+                done[ask(target, number)] += 1
+            except (VisitFailed, OSError, http.client.HTTPException) as fault:
+                done[type(fault).__name__] += 1
+                target.ended.wait(0.05)
+
+    for _ in range(at_once):
+        threading.Thread(target=asking, daemon=True).start()
+    target.begun()
+    target.ended.wait()
+    return done

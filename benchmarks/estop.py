@@ -1,0 +1,223 @@
+"""How long an e-stop takes while somebody is in its way, attack by attack.
+
+A page presses over its websocket and at the process for stops at once, and the first answer counts; beside it each of
+the two ways alone is measured.
+
+Each attack meets a lab of its own: real web, a station with a simulated robot under way, another station. Attackers are
+programs of their own at nice 19 (`benchmarks.attacks`).
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.estop_presses import OpenPage, Press, Program, loads
+from benchmarks.estop_station import Station, Watching
+from benchmarks.labs import ROOT, RunningLab, lab
+from benchmarks.report import Figure, Report
+from benchmarks.results_postgresql import server, why_not
+from evaweb.lab.visitor import Visitor
+from runtime.core.errors import RuntimeFault
+
+ATTACKS = (
+    "none",
+    "status_flood",
+    "dead_station",
+    "viewer_stops",
+    "half_open",
+    "logins",
+    "bodies",
+    "toml",
+    "pings",
+    "handshakes",
+    "pages",
+    "rest_clients",
+    "database_hangs",
+)
+WAYS = ("estop", "socket", "rest")  # a page, its websocket alone, REST at the process for stops
+SECONDS = 30.0  # of presses per attack, a third of them over each way
+_WANTED_MS = 200
+_RECOVERED_S, _GIVEN_UP_S = 10, 60.0
+_PAUSE_S = 0.05  # between two presses
+_FEWEST = 3  # presses over each way, however long they take
+_ENDING_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """A lab, the operator's session, the station; `database` is the folder of its PostgreSQL server, if it has one."""
+
+    lab: RunningLab
+    ready_file: Path
+    database: Path | None
+    operator: Visitor
+    station: Station
+
+
+def measure(seconds: float, attacks: Sequence[str] = ATTACKS) -> Report:
+    """`WAY_p99_ms.ATTACK` of each way, what was lost, whether station and web came through."""
+    rows = []
+    for attack in attacks:
+        with tempfile.TemporaryDirectory() as folder, bench(Path(folder)) as found:
+            rows.append(once(found, attack, seconds))
+    missing = why_not()
+    if missing:
+        print(f"not measured on PostgreSQL: {missing}", file=sys.stderr)
+    else:
+        rows.append(_on_postgresql(seconds))
+    for row in rows:
+        if not row["recovered"]:
+            print(f"{row['attack']}: the web loads no page for {_GIVEN_UP_S:g} s after it", file=sys.stderr)
+    return Report("estop", [figure for row in rows for figure in figures(row)], rows)
+
+
+def _on_postgresql(seconds: float) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        database = Path(folder) / "postgresql"
+        with server(database) as url, bench(Path(folder) / "lab", database, url) as found:
+            return once(found, "database_hangs", seconds) | {"attack": "database_hangs.postgresql"}
+
+
+@contextmanager
+def bench(folder: Path, database: Path | None = None, url: str = "") -> Iterator[Bench]:
+    """A lab that is up, in a folder; on the PostgreSQL server in `database` at `url`, or on SQLite."""
+    folder.mkdir(exist_ok=True)
+    ready = folder / "ready.json"
+    environment = {"DJANGO_SETTINGS_MODULE": "evaweb.settings", "DATABASE_URL": url}
+    with (
+        lab(["-m", "benchmarks.estop_lab", str(ready)], ready, environment) as running,
+        closing(Station(running.data)) as station,
+    ):
+        yield Bench(running, ready, database, running.visitor, station)
+
+
+def once(found: Bench, attack: str, seconds: float, share: float = 1.0) -> dict[str, Any]:
+    """A run that goes on, the attack, presses for `seconds`; `share` of the attack in its full strength."""
+    facts = found.lab.announced
+    program = Program(facts["stops"], {"Authorization": f"Bearer {facts['token']}"})
+    with closing(OpenPage(found.operator, facts["stops"])) as page:
+        ways = dict(zip(WAYS, (page.press, page.over_the_socket, program.press), strict=True))
+        _warmed(found, *ways.values())
+        found.station.run()
+        watching = Watching(found.station, facts["pids"]["web"])
+        with _under(found, attack, share) as did:
+            time.sleep(seconds / 4.0)  # for which nobody presses, and the run is to go on
+            pressed = {
+                name: _presses(found.station, press, seconds / len(ways)) for name, press in ways.items()
+            }
+    recovery = loads(found.operator, _GIVEN_UP_S)
+    beside = watching.end()
+    return {
+        "attack": attack,
+        **pressed,
+        "recovered": recovery is not None,
+        "recovery_s": _GIVEN_UP_S if recovery is None else recovery,
+        "interrupted": _interruption(found.station),
+        "attacker": dict(did),
+        **beside._asdict(),
+    }
+
+
+def _warmed(found: Bench, *ways: Callable[[str], Press]) -> None:
+    """What the first of everything costs is neither late nor growth."""
+    found.station.appeared()
+    for press in ways:
+        press("to begin with")
+    loads(found.operator, _GIVEN_UP_S)
+
+
+def _interruption(station: Station) -> str:
+    try:
+        return station.interruption()
+    except RuntimeFault as fault:
+        return str(fault)
+
+
+@contextmanager
+def _under(found: Bench, attack: str, share: float) -> Iterator[dict[str, int]]:
+    """The attack, from when it is under way to its end; then what the attackers did is in the map."""
+    did: dict[str, int] = {}
+    if attack == "none":
+        yield did
+        return
+    command = [sys.executable, "-m", "benchmarks.attacks", attack, str(found.ready_file), str(found.lab.data)]
+    command += ["--share", str(share), *(["--database", str(found.database)] if found.database else [])]
+    child = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert child.stdin is not None
+    assert child.stdout is not None
+    try:
+        if not child.stdout.readline():
+            raise SystemExit(f"the attack {attack} has not begun: it ended with {child.wait()}")
+        yield did
+    finally:
+        child.stdin.close()
+        try:
+            child.wait(_ENDING_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+        told = child.stdout.read()
+    did |= json.loads(told) if told else {}
+
+
+def _presses(station: Station, press: Callable[[str], Press], seconds: float) -> dict[str, Any]:
+    """Press and release by turns for so long; once main does not release, each press comes on top of the last."""
+    made: list[Press] = []
+    lost, releases = 0, True
+    until = time.monotonic() + seconds
+    while len(made) < _FEWEST or time.monotonic() < until:
+        made.append(press(f"press {len(made) + 1}"))
+        if not station.latched:
+            lost += 1
+        elif releases:
+            releases = (
+                station.release() or station.release()
+            )  # a press's copy may come late, by the other way
+        time.sleep(_PAUSE_S)
+    return judged(made, lost) | {"released": releases}
+
+
+def judged(presses: Sequence[Press], lost: int) -> dict[str, Any]:
+    """What became of presses, `lost` of which the station never had."""
+    ms = np.array([press.ms for press in presses])
+    undone = [
+        f"{press.status or 'unanswered'}: {press.reason}" for press in presses if press.status != "done"
+    ]
+    return {
+        "presses": len(presses),
+        **{f"p{share}_ms": float(np.percentile(ms, share)) for share in (50, 99)},
+        "max_ms": float(ms.max()),
+        "failed": sum(press.failed for press in presses),
+        "unanswered": sum(not press.status for press in presses),
+        "lost": lost,
+        "undone": list(dict.fromkeys(undone))[:5],
+    }
+
+
+def figures(row: dict[str, Any]) -> Iterator[Figure]:
+    """Of one attack."""
+    attack = row["attack"]
+    for way in WAYS:
+        found = row[way]
+        wanted = f"<= {_WANTED_MS}" if way == "estop" else ""
+        yield Figure(f"{way}_p99_ms.{attack}", found["p99_ms"], "ms", wanted)
+        yield Figure(f"{way}_p50_ms.{attack}", found["p50_ms"], "ms")
+        yield Figure(f"{way}_presses.{attack}", found["presses"], "")
+        for what in ("lost", "failed", "unanswered"):
+            yield Figure(f"{way}_{what}.{attack}", found[what], "", "== 0")
+    yield Figure(f"run_interrupted.{attack}", float(bool(row["interrupted"])), "", "== 0")
+    yield Figure(f"main_late_ms.{attack}", row["main_late_ms"], "ms")
+    yield Figure(f"web_growth_mb.{attack}", row["web_growth_mb"], "MB")
+    yield Figure(f"station_growth_mb.{attack}", row["station_growth_mb"], "MB")
+    yield Figure(f"recovery_s.{attack}", row["recovery_s"], "s", f"<= {_RECOVERED_S}")

@@ -1,0 +1,97 @@
+"""A lab whose e-stop is pressed: `python -m benchmarks.estop_lab READY_FILE`; ends with Ctrl-C.
+
+Web, worker, a station with a simulated robot and a policy whose gesture never ends, and a second one without a robot.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import sys
+from pathlib import Path
+from typing import Any
+
+from robots.broken_pipe import unread_ends
+
+PRESSED, OTHER = "pressed-1", "other-1"
+_ROBOT = "agilex_piper"
+_DEPLOYMENTS = Path(__file__).parents[1] / "deployments"
+_FILES = 1024  # that Debian lets a process have open, where its administrator says nothing
+_NOWHERE = "tcp://127.0.0.1:1"
+_SETTINGS = (
+    "run.duration_s=600",
+    "recording.min_free_bytes=0",
+    "recording.export=false",
+    "safety.joint_age_s=0.5",  # as in deployments/tabletop.toml: bench, web and attackers share the cores
+    "safety.picture_age_s=1.0",
+)
+
+
+@unread_ends
+def main() -> int:
+    """Stay up until a signal comes."""
+    import django
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("ready_file", type=Path)
+    given = parser.parse_args()
+    os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
+    django.setup()
+    from evaweb.lab.lab import a_lab
+    from evaweb.lab.lifetime import Ended
+
+    _limit_files()
+    try:
+        with a_lab("127.0.0.1", 0) as lab:
+            _up(lab, given.ready_file)
+            lab.watch()
+    except Ended:
+        return 0
+
+
+def _limit_files() -> None:
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(_FILES, most), most))
+
+
+def _up(lab: Any, ready_file: Path) -> None:
+    from evaweb.lab.lab import Bench
+    from evaweb.lab.processes import Program
+    from runtime.sim.standin import announce
+
+    small = ("--robot", _ROBOT, "--width", "64", "--height", "48")
+    free = ("--obs-endpoint", "tcp://127.0.0.1:0", "--action-endpoint", "tcp://127.0.0.1:0")
+    node = lab.processes.start(Program("bench", ("-m", "runtime.sim.node", *small, *free), announces=True))
+    serving = ("-m", "runtime.sim.serve", "openpi", "--robot", _ROBOT, "--port", "0", "--latency-ms", "80")
+    policy = lab.processes.start(Program("policy", serving, announces=True))
+    # Programs are named after their files: each station has one of its own.
+    pressed = _bench("demo.toml", PRESSED, node["obs_endpoint"], node["action_endpoint"], policy["url"])
+    other = _bench("tabletop.toml", OTHER, _NOWHERE, _NOWHERE, "ws://127.0.0.1:1")
+    url = lab.up([Bench(*pressed), Bench(*other)])
+    announce({"url": url, "stops": lab.stops, **_people(), "pids": lab.processes.pids()}, ready_file)
+
+
+def _bench(file: str, station: str, observations: str, actions: str, policy: str) -> tuple[Path, list[str]]:
+    ends = (f'transport.sub_endpoint="{observations}"', f'transport.pub_endpoint="{actions}"')
+    return _DEPLOYMENTS / file, [f'station="{station}"', *ends, f'policy.url="{policy}"', *_SETTINGS]
+
+
+def _people() -> dict[str, Any]:
+    """One of each role with a fresh password, and a token of the operator's."""
+    from django.contrib.auth.models import User
+
+    from evaweb.api.tokens import token_create
+    from evaweb.lab.seed import demo_login
+    from evaweb.roles import Role
+
+    logins = [demo_login(username=str(role), role=role) for role in (Role.OPERATOR, Role.VIEWER, Role.ADMIN)]
+    operator = User.objects.get(username=Role.OPERATOR)
+    return {
+        "passwords": {login.username: login.password for login in logins},
+        "token": token_create(user=operator, name="presses"),
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

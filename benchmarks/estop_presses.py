@@ -1,0 +1,163 @@
+"""Presses of an e-stop as people and programs make them, and how long each takes until it is done."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import queue
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlsplit
+from uuid import uuid4
+
+from benchmarks.estop_lab import PRESSED
+from evaweb.lab.patience import NoReply
+from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
+
+PATIENCE_S = 10.0
+_DONE = "done"
+
+
+@dataclass(frozen=True, slots=True)
+class Press:
+    """One press: what became of it ("" where nobody answered), why, and after how long [ms]."""
+
+    status: str
+    reason: str
+    took_ms: float
+
+    @property
+    def ms(self) -> float:
+        """Until it was done [ms]; what was not done counts as if it had taken all of the patience."""
+        return self.took_ms if self.status == _DONE else PATIENCE_S * 1000.0
+
+    @property
+    def failed(self) -> bool:
+        """Answered, and not done."""
+        return self.status not in (_DONE, "")
+
+
+class _Page(LivePage):
+    """A page that hears what becomes of its presses."""
+
+    def __init__(self, visitor: Visitor) -> None:
+        self._acks: dict[str, queue.SimpleQueue[tuple[float, Mapping[str, Any]]]] = {}  # by uuid
+        super().__init__(visitor, PRESSED)
+
+    @property
+    def broken(self) -> str:
+        return self._failure
+
+    def press(self, why: str, identity: str) -> Press:
+        begun, acks = time.monotonic(), queue.SimpleQueue[tuple[float, Mapping[str, Any]]]()
+        self._acks[identity] = acks
+        self._send({"type": "estop", "uuid": identity, "why": why})
+        while (left := begun + PATIENCE_S - time.monotonic()) > 0 and not self.broken:
+            try:
+                at, said = acks.get(timeout=min(left, 0.2))
+            except queue.Empty:
+                continue
+            return Press(said["status"], said["reason"], (at - begun) * 1000.0)
+        return Press("", self.broken or "no answer", (time.monotonic() - begun) * 1000.0)
+
+    def _told(self, message: Mapping[str, Any]) -> None:
+        if message.get("type") == "ack" and message["uuid"] in self._acks:
+            self._acks[message["uuid"]].put((time.monotonic(), message))
+        super()._told(message)
+
+
+class OpenPage:
+    """An operator's page on the station, which presses over its socket and at the process for stops, as a browser does.
+
+    Where its connection breaks it is opened again.
+    """
+
+    def __init__(self, visitor: Visitor, stops: str) -> None:
+        self._visitor = visitor
+        self._page, self._opening = _Page(visitor), threading.Lock()
+        self._way = Program(stops, {"Cookie": f"sessionid={visitor.cookie('sessionid')}"})
+        self._way.ready()
+
+    def press(self, why: str) -> Press:
+        """Press both ways under one uuid; what is done counts first."""
+        identity, answers = str(uuid4()), queue.SimpleQueue[Press]()
+        ways = (self.over_the_socket, self._way.press)
+        for way in ways:
+            asking = lambda way=way: answers.put(way(why, identity))  # noqa: E731
+            threading.Thread(target=asking, daemon=True).start()
+        pressed = [answers.get()]
+        while pressed[-1].status != _DONE and len(pressed) < len(ways):
+            pressed.append(answers.get())
+        return next((press for press in pressed if press.status == _DONE), pressed[0])
+
+    def over_the_socket(self, why: str, identity: str = "") -> Press:
+        """Press there alone, and wait for the answer."""
+        with self._opening:
+            if self._page.broken:
+                self.close()
+                try:
+                    self._page = _Page(self._visitor)
+                except VisitFailed as fault:
+                    return Press("", str(fault), 0.0)
+            page = self._page
+        return page.press(why, identity or str(uuid4()))
+
+    def close(self) -> None:
+        self._page.close()
+
+
+class Program:
+    """A program with these headers, which opens a connection for each press."""
+
+    def __init__(self, url: str, headers: Mapping[str, str]) -> None:
+        self._address = urlsplit(url).netloc
+        self._headers = {**headers, "Content-Type": "application/json"}
+
+    def ready(self) -> None:
+        """Ask whether this way stands, as a page does that is opened."""
+        self._asked("GET", "")
+
+    def press(self, why: str, identity: str = "") -> Press:
+        """Press and wait for the answer."""
+        begun = time.monotonic()
+        try:
+            said = self._asked("POST", json.dumps({"uuid": identity or str(uuid4()), "why": why}))
+        except (OSError, http.client.HTTPException, ValueError) as fault:
+            return Press("", f"{type(fault).__name__}: {fault}", (time.monotonic() - begun) * 1000.0)
+        took = time.monotonic() - begun
+        answered = took <= PATIENCE_S
+        return Press(said.get("status", "refused") if answered else "", str(said)[:200], took * 1000.0)
+
+    def _asked(self, method: str, body: str) -> dict[str, Any]:
+        with closing(http.client.HTTPConnection(self._address, timeout=PATIENCE_S)) as connection:
+            connection.request(method, f"/api/v1/stations/{PRESSED}/estop", body, self._headers)
+            found: dict[str, Any] = json.loads(connection.getresponse().read())
+            return found
+
+
+def loads(visitor: Visitor, seconds: float) -> float | None:
+    """After how long the station's page is there [s]; None: not within `seconds`."""
+    begun = time.monotonic()
+    while time.monotonic() - begun < seconds:
+        try:
+            _page_of(visitor, seconds - (time.monotonic() - begun))
+        except (NoReply, OSError, http.client.HTTPException):
+            time.sleep(0.1)
+        else:
+            return time.monotonic() - begun
+    return None
+
+
+def _page_of(visitor: Visitor, timeout: float) -> None:
+    address = urlsplit(visitor.url).netloc
+    with closing(http.client.HTTPConnection(address, timeout=max(0.1, timeout))) as connection:
+        cookies = {"Cookie": f"sessionid={visitor.cookie('sessionid')}"}
+        connection.request("GET", f"/stations/{PRESSED}/debug/", headers=cookies)
+        answer = connection.getresponse()
+        answer.read()
+        if answer.status != 200:
+            raise NoReply(f"/stations/{PRESSED}/debug/: HTTP {answer.status}")

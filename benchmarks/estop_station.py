@@ -1,0 +1,177 @@
+"""The station whose e-stop is pressed: its run, its releases, whether main speaks, and how memory grows."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import psutil
+
+from benchmarks.estop_lab import PRESSED
+from runtime.clients.client import RENEW_S, StationClient
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.bus import Endpoints
+from runtime.ipc.estop_latch import Latch
+
+_STATE_S = 0.1  # between two snapshots
+_READY_S, _RELEASE_S = 120.0, 2.0
+_TRIES = 3
+_HOLDER = "benchmark"
+_FAMILY = ("main", "guard")
+
+
+class Station:
+    """Commanded from a terminal, past the web."""
+
+    def __init__(self, data: Path) -> None:
+        self._folder = data / "stations" / PRESSED
+        self.client = self.another_client()
+        self._newest_event = 0
+
+    def another_client(self) -> StationClient:
+        """One for a thread of its own, with the same lease."""
+        return StationClient(self._folder, _HOLDER)
+
+    @property
+    def latched(self) -> bool:
+        """Whether the e-stop is, as its latch on the disk says."""
+        return Latch(self._folder).read() is not None
+
+    def pids(self) -> list[int]:
+        """Of those that answer clients."""
+        found = Endpoints(self._folder).read("supervisor")
+        return [int(found[name]) for name in _FAMILY]
+
+    def appeared(self) -> Mapping[str, Any]:
+        """Its status, as soon as it answers; raises the RuntimeFault of the last try."""
+        until = time.monotonic() + _READY_S
+        while True:
+            try:
+                return self.client.status()
+            except RuntimeFault:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(0.1)
+
+    def run(self) -> None:
+        """Set up, and begin a run that goes on until somebody stops it; tried again where the machine was late."""
+        why = ""
+        for _ in range(_TRIES):
+            try:
+                status = self._tried()
+            except RuntimeFault as fault:
+                why = str(fault)
+                continue
+            if status["state"] == "running":
+                self._newest_event = status["newest_event"]
+                return
+            why = status["reason"]
+        raise SystemExit(f"{PRESSED} does not run: {why}")
+
+    def _tried(self) -> Mapping[str, Any]:
+        """How it stands after a second of a run, or wherever it came to instead."""
+        state = self.appeared()["state"]
+        if state == "faulted":
+            self.release()
+        elif state == "holding":
+            self.client.command("stop")
+        self.client.wait(lambda found: found["state"] in ("idle", "ready"), _READY_S)
+        self.client.command("setup")
+        status = self.client.wait(lambda found: found["state"] != "setting_up", _READY_S)
+        if status["state"] != "ready":
+            return status
+        self.client.command("run")
+        return self.client.wait(
+            lambda found: found["run"]["elapsed"] > 1.0 or found["state"] != "running", _READY_S
+        )
+
+    def release(self) -> bool:
+        """Release the e-stop; False where main does not."""
+        try:
+            self.client.wait(lambda status: status["state"] == "faulted", _RELEASE_S)
+            self.client.command("release")
+            self.client.wait(lambda status: status["state"] != "faulted", _RELEASE_S)
+        except RuntimeFault:
+            return False
+        return True
+
+    def interruption(self) -> str:
+        """What ended the run before somebody pressed, "" where nothing did; raises RuntimeFault where main is mute."""
+        self.appeared()
+        events = self.client.events_since(self._newest_event)
+        left = [event["text"] for event in events if event["kind"] in ("state", "family_died")]
+        return "" if not left or "e-stop" in left[0] else left[0]
+
+    def close(self) -> None:
+        self.client.close()
+
+
+class Beside(NamedTuple):
+    """What was seen of web and station during an attack."""
+
+    main_late_ms: float  # the longest that a snapshot was overdue
+    web_growth_mb: float
+    station_growth_mb: float
+
+
+class Watching:
+    """Listens to main, keeps the lease and looks at memory until it is ended."""
+
+    def __init__(self, station: Station, web: int) -> None:
+        self._heard = [time.monotonic()]
+        self._ended = threading.Event()
+        self._web, self._family = [web], station.pids()
+        self._before = _memory(self._web), _memory(self._family)
+        self._most = self._before
+        self._threads = [
+            threading.Thread(target=work, args=given, daemon=True)
+            for work, given in (
+                (self._listen, (station.client,)),
+                (self._claim, (station.another_client(),)),
+                (self._look, ()),
+            )
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def end(self) -> Beside:
+        """What there was."""
+        self._ended.set()
+        for thread in self._threads:
+            thread.join()
+        gaps = [b - a for a, b in zip(self._heard, [*self._heard[1:], time.monotonic()], strict=True)]
+        web, family = ((most - before) / 1e6 for most, before in zip(self._most, self._before, strict=True))
+        return Beside(max(0.0, max(gaps) - _STATE_S) * 1000.0, web, family)
+
+    def _listen(self, client: StationClient) -> None:
+        with closing(client.subscribe("state")) as subscriber:
+            while not self._ended.is_set():
+                if subscriber.receive(0.05):
+                    self._heard.append(time.monotonic())
+
+    def _claim(self, client: StationClient) -> None:
+        """As a page does that is open; whether the run goes on is judged by what the station says of it."""
+        with closing(client):
+            while not self._ended.wait(RENEW_S):
+                with suppress(RuntimeFault):
+                    client.claim()
+
+    def _look(self) -> None:
+        while not self._ended.wait(0.1):
+            web, family = _memory(self._web), _memory(self._family)
+            self._most = max(self._most[0], web), max(self._most[1], family)
+
+
+def _memory(pids: list[int]) -> float:
+    """What processes hold in memory [bytes]; one that has ended holds nothing."""
+    found = 0.0
+    for pid in pids:
+        try:
+            found += psutil.Process(pid).memory_info().rss
+        except psutil.NoSuchProcess:
+            continue
+    return found
