@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
+import threading
 from collections.abc import Iterator
 
 _REAL_TIME = (os.SCHED_FIFO, os.SCHED_RR)
+_LIBC = ctypes.CDLL(None)
 
 
 @contextlib.contextmanager
@@ -21,11 +24,19 @@ def ordinary_threads() -> Iterator[None]:
     try:
         yield
     finally:
-        os.sched_setscheduler(0, policy, parameters)
+        _caller_back(policy, parameters.sched_priority)
         for thread in _threads() - before:
             with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
                 if os.sched_getscheduler(thread) in _REAL_TIME:
                     os.sched_setscheduler(thread, policy, parameters)
+
+
+def _caller_back(policy: int, priority: int) -> None:
+    """By the C library, which else takes the encoder's class for the caller's, and libzmq takes over what it says."""
+    parameters = ctypes.byref(ctypes.c_int(priority))  # struct sched_param has this one field
+    code = _LIBC.pthread_setschedparam(ctypes.c_ulong(threading.get_ident()), policy, parameters)
+    if code:
+        raise OSError(code, f"the scheduling class {policy} is not given back: {os.strerror(code)}")
 
 
 def _threads() -> set[int]:
