@@ -19,6 +19,7 @@ _MARGIN = 1.05
 _SOUND = 12  # ticks
 _RESTS = round(DWELL_S / PERIOD)  # ticks between two switches of a gripper
 _TURN = 2.0 * np.pi
+_JITTER = 0.05  # [rad] of a noisy encoder
 
 
 class Scenario(Bench):
@@ -253,7 +254,9 @@ class Scenario(Bench):
 
 
 class EncoderOff(Bench):
-    """A robot that stands, one joint of which is read elsewhere from a tick on: it must not run away."""
+    """A robot that stands, one joint of which is read elsewhere from a tick on: it must not run away, nor may a run
+    begin meanwhile.
+    """
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -267,6 +270,10 @@ class EncoderOff(Bench):
         self._comes_and_goes = bool(rng.random() < 0.5)  # never long enough to be believed again
         self._lag = float(rng.choice([1.0, 0.3]))  # the part of its way to its command that it goes in a tick
         self._stopped = bool(rng.random() < 0.5)
+        self._fault = str(rng.choice(["off", "off", "no number", "noise", "drift"]))
+        if self._fault == "drift":
+            self._within, self._comes_and_goes = float(rng.uniform(3.0, 7.0)), False
+        self._rng = rng
 
     def violations(self) -> list[str]:
         """What is wrong with what it was told, in words."""
@@ -275,25 +282,47 @@ class EncoderOff(Bench):
         if self._stopped:
             self.page.set_estop(EStop.LATCHED)
             self.run(20)
-        begins = self.sent[-1]
+        begins, found = self.sent[-1], set[str]()
         told = len(self.sent)
         for tick in range(_TICKS):
-            read, since = self.body.copy(), tick * PERIOD
-            gone = self._comes_and_goes and since % 0.8 >= 0.4
-            grown = 0.0 if gone else min(since / self._within, 1.0)
-            read[self._joint] = (1.0 + grown * (self._scale - 1.0)) * read[self._joint] + grown * self._offset
-            self.moved_by_hand = self.measured = read
+            self.moved_by_hand = self.measured = self._read(tick * PERIOD)
             self.run()
+            found.update(self._wrong(self.measured))
             self.body += self._lag * (self.sent[-1] - self.body)
         places = self.limits.places
         way = np.abs(np.diff(self.sent[told - 1 :], axis=0))[:, places]
         far = np.ptp(self.sent[told - 1 :], axis=0)[places].max()
-        found = []
         if (way > self.limits.velocity[places] * PERIOD * _MARGIN + 1e-4).any():
-            found.append("stepped faster than it moves")
+            found.add("stepped faster than it moves")
         if far > self._bound(begins):
-            found.append(f"ran away by {far:.2f} rad")
-        return [f"{self.name}, encoder of {self.limits.names[self._joint]} off: {what}" for what in found]
+            found.add(f"ran away by {far:.2f} rad")
+        joint = self.limits.names[self._joint]
+        return [f"{self.name}, encoder of {joint}: {self._fault}: {what}" for what in sorted(found)]
+
+    def _read(self, since: float) -> Float64:
+        """What the encoders say [D], `since` the fault began [s]."""
+        read = self.body.copy()
+        if self._fault == "no number":
+            read[self._joint] = np.nan
+        elif self._fault == "noise":
+            read[self._joint] += self._rng.normal(0.0, _JITTER)
+        else:
+            gone = self._comes_and_goes and since % 0.8 >= 0.4
+            grown = 0.0 if gone else min(since / self._within, 1.0)
+            read[self._joint] = (1.0 + grown * (self._scale - 1.0)) * read[self._joint] + grown * self._offset
+        return read
+
+    def _wrong(self, read: Float64) -> set[str]:
+        """What is wrong with the tick in which the joints were `read` [D]."""
+        found, told, places = set[str](), self.sent[-1], self.limits.places
+        if not np.isfinite(told).all() or (self.limits.outside(told) > 1e-5 * self.limits.reach).any():
+            found.add("told beyond the limits, or no number")
+        if self._stopped and self.behaviour != "estop":
+            found.add(f"does not stand under the e-stop: {self.behaviour}")
+        near = np.abs(difference(read, told, self.dims.wrapping)) <= self.safety.following_error + 1e-4
+        if not self.page.doubt and not near[places].all():
+            found.add("a run may begin although the joint is not where it is held")
+        return found
 
     def _bound(self, begins: Float64) -> float:
         """One believed displacement [rad]: the following error, and how far the encoder is off."""

@@ -24,8 +24,8 @@ UNHEARD, HEARD = "commands_unheard", "commands_heard"
 # --- main -> control ---------------------------------------------------------------------------------------
 
 OrderKind = Literal[
-    "silent", "hold", "follow", "motion", "yield"
-]  # "yield": the node drives, by its own leader
+    "silent", "hold", "meet", "follow", "motion", "yield"
+]  # "meet": hold, and lead what is held to where joints are read; "yield": the node drives, by its own leader
 PolicyMode = Literal[
     "continuous", "step", "preview", "sim", "manual"
 ]  # of a station that was set up with a policy

@@ -101,7 +101,7 @@ class SharedStateLayout:
                 ("starved", "u1"),  # a run is open, nothing is planned, and something should be
                 ("simulated", "f4", self.dim),  # the robot of a run in simulation; NaN where there is none
                 ("believed", "u1"),  # the joints are measured, fresh and plausible
-                ("doubt", f"S{DOUBT_BYTES}"),  # why they cannot be true
+                ("doubt", f"S{DOUBT_BYTES}"),  # why they cannot be true, or are not where they are held
                 ("locked", "f4", self.dim),  # grippers that are locked, and where; NaN for the rest
                 ("ticks", "i8"),
                 ("missed", "i8"),
@@ -209,6 +209,13 @@ class SharedState:
     def set_estop(self, state: EStop) -> None:
         """Lowered by the guard alone; main raises it for a press that came to main's socket."""
         self._shared[self._estop] = int(state)
+
+    @property
+    def doubt(self) -> str:
+        """Why nothing may begin to move, by what control says of the joints; "" where it may."""
+        status = self.control.read()
+        doubt = bytes(status["doubt"]).decode(errors="ignore")
+        return doubt or ("" if status["believed"] else "control has not seen the joints for long enough yet")
 
     def publish_observation(self, observation: Observation, pictures: Mapping[str, int]) -> None:
         """Reception's half: the observation's numbers, and for each camera the number of its newest picture."""

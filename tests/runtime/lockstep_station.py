@@ -47,6 +47,7 @@ class StubRobot(Source, Sink):
         self.cameras = [camera.key for camera in plan.robot.cameras]
         self.picture = numbered
         self.bias: Float64 = np.zeros(DIM)  # it stands beside where it is told to go
+        self.misread: Float64 = np.zeros(DIM)  # by how much its encoders are off
         self.told: list[tuple[str, dict[str, Any]]] = []
         self.wordless = not plan.simulated
         self.deaf = 0  # control words that are lost on their way to it
@@ -66,7 +67,7 @@ class StubRobot(Source, Sink):
             sequence=self._sequence,
             arrived=now,
             captured=dict.fromkeys(("joints", *self.cameras), now),
-            qpos=self.position.astype(np.float32),
+            qpos=(self.position + self.misread).astype(np.float32),
             pictures=dict.fromkeys(self.cameras, self.picture(self._sequence)),
             truth=self.truth,
             drives=self.drives,

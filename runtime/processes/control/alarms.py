@@ -42,6 +42,7 @@ class Displacement:
         self._followed = np.zeros(dim, bool)  # their command was led to where they were read
         self._off = np.zeros(dim, bool)  # they were somewhere else again then
         self._apart_at = np.full(dim, float("-inf"))  # when each was last read away from its command
+        self._meeting = False  # a set-up takes the robot over where it is read, and not yet there
         self.goal: Float64 | None = None  # where the command is being led to
         self.begins = False  # whether it has been since this tick
         self.doubt = ""  # which joints are not followed since this tick, and why
@@ -61,8 +62,10 @@ class Displacement:
             return None
         if self.goal is not None and self.distance(robot, self.goal) <= _THERE:
             self.goal = None
-        allowed = _RETURNED_AWAY if returned else self._settings.safety.following_error
-        if self.goal is None and self._away(robot, measured, allowed):
+        allowed = _RETURNED_AWAY if returned or self._meeting else self._settings.safety.following_error
+        away = self.goal is None and self._away(robot, measured, allowed)
+        self._meeting = self._meeting and (away or self.goal is not None)
+        if away:
             self.follow(robot, measured)
             if self._away(robot, measured, allowed):
                 limits = self._settings.limits
@@ -90,6 +93,37 @@ class Displacement:
             "to which it was led already: is its encoder off?"
             for i in np.flatnonzero(off)
         )
+
+    def reason(self, robot: RobotActuator, measured: Float64 | None) -> str:
+        """Why no motion may begin from what is held, "" where one may; `measured` [D], None where not known."""
+        if measured is None or not robot.engaged or not self._settings.guarded:
+            return ""
+        led = self._distrusted | (self._meeting or self.goal is not None)
+        away = np.abs(measured - robot.commanded)
+        far = self._angles & (away > np.where(led, _RETURNED_AWAY, self._settings.safety.following_error))
+        if not far.any():
+            return ""
+        worst = int(np.where(far, away, 0.0).argmax())
+        return (
+            f"{self._settings.limits.names[worst]} reads {measured[worst]:.3f} rad and is held at "
+            f"{robot.commanded[worst]:.3f}: look whether the robot stands as it is shown, then set up again"
+        )
+
+    @property
+    def speed(self) -> Float64:
+        """How fast the command is led [D]: as joints move by hand, in a set-up as in its motions."""
+        scale = self._settings.safety.motion_velocity_scale if self._meeting else 1.0
+        return self._settings.limits.velocity * scale
+
+    def meet(self) -> None:
+        """Lead what is held to where joints are read, also those that leapt: the operator wants it there."""
+        self.forget()
+        self._meeting = True
+
+    def leave_off(self) -> None:
+        """Lead on no further for a set-up that is over: where the encoder is off, that would move the robot."""
+        if self._meeting:
+            self._meeting, self.goal = False, None
 
     def forget(self) -> None:
         """Follow all joints again."""

@@ -30,7 +30,7 @@ class TickState:
 
     robot: Actuator
     believed: bool  # where the robot is is known
-    doubt: str  # why what is measured cannot be true
+    doubt: str  # why what is measured cannot be true, or is not where the robot is held
     behaviour: Behaviour  # the robot's
     simulating: bool  # the simulated robot follows a run
     simulated: Float64 | None  # [D] the simulated robot's command

@@ -120,9 +120,10 @@ class Tick:
         waits = run is None or run.waits
         empty = run is not None and sent.target is None
         simulated = None if self._simulated is None else self._simulated.actuator.commanded
+        measured = self._measured(self._report.planned)
         return TickState(
-            believed=self._measured(self._report.planned) is not None and self._plausibility.settled,
-            doubt=self._seen.doubt,
+            believed=measured is not None and self._plausibility.settled,
+            doubt=self._seen.doubt or self._displacement.reason(self._actuator, measured),
             robot=self._actuator,
             behaviour=self._robot.behaviour,
             simulating=self._simulated is not None and run is not None,
@@ -199,6 +200,7 @@ class Tick:
     def _follow_order(self, order: Order, now: float) -> None:
         self._report.limiting.close()
         self._report.nearing.close()
+        self._displacement.leave_off()
         rehearses = order.kind == "hold" or (order.kind == "follow" and order.mode == "sim")
         if order.run != self._simulated_run or not rehearses:
             self._simulated = None
@@ -209,6 +211,9 @@ class Tick:
         elif order.kind == "hold":
             for lane in self._lanes:
                 lane.hold()
+        elif order.kind == "meet":
+            self._robot.hold()
+            self._displacement.meet()
         elif order.kind == "motion":
             self._begin_motion(order, now)
         elif order.mode == "sim":
@@ -280,6 +285,7 @@ class Tick:
             commanded = self._settings.limits.standing(self._actuator.commanded.copy())
             stopped = EStopped(commanded if self._actuator.engaged else None, self._actuator.rest)
             self._actuator.rest_here()
+            self._displacement.leave_off()
             # Or a gripper that is on its way to its lock would go on after the release.
             self._lock(np.full(len(self._locks.on), np.nan))
             self._robot.behaviour, self._simulated = stopped, None
@@ -314,6 +320,8 @@ class Tick:
         kind, reason = "orphaned", "the supervisor is gone" if self.orphaned else ""
         if not reason:
             kind, reason = "family", silent_sibling(self._page, now, self._settings.heartbeat_timeout)
+        if reason:
+            self._displacement.leave_off()
         for lane in self._lanes if reason else ():
             lane.hold_because(kind, reason)
 
@@ -349,7 +357,7 @@ class Tick:
             )
             return
         away = self._displacement.distance(self._actuator, where)
-        farthest = self._settings.limits.velocity * self._actuator.elapsed(now)
+        farthest = self._displacement.speed * self._actuator.elapsed(now)
         self._actuator.step_to(where, "held where the robot is", farthest)
         if isinstance(behaviour, EStopped):
             behaviour.stay(self._actuator.commanded.copy())

@@ -195,6 +195,7 @@ class SessionActions(Effects):
             collecting=self.plan.collecting,
             armed=self.collecting.armed,
             unled=self.collecting.unled,
+            doubt=self.page.doubt if self.plan.capabilities.moves_robot else "",
         )
 
     def tune(self, asked: TuneRequest) -> Told:

@@ -47,6 +47,11 @@ def _always(state: State, situation: GuardFacts) -> str:
     return ""
 
 
+def _placed(guard: Guard = _always) -> Guard:
+    """`guard` of a command that begins to move the robot: its joints are where they are held as well."""
+    return lambda state, situation: guard(state, situation) or situation.doubt
+
+
 @dataclass(frozen=True, slots=True)
 class Rule:
     """A command: the states it is allowed in, the state after it, what it does, its guard.
@@ -155,11 +160,11 @@ S = State
 _STOPPED = "stopped by the operator"
 COMMANDS: dict[str, Rule] = {
     "setup": Rule((S.IDLE, S.READY), S.SETTING_UP, lambda e, asked: e.begin_setup(asked)),
-    "run": Rule((S.READY,), S.RUNNING, lambda e, asked: e.begin_run(asked), guard=_may_run),
+    "run": Rule((S.READY,), S.RUNNING, lambda e, asked: e.begin_run(asked), guard=_placed(_may_run)),
     "stop": Rule((S.RUNNING, S.HOLDING, S.READY), S.READY, lambda e, _: e.end_run("finished", _STOPPED)),
     "halt": Rule((S.RUNNING, S.HOLDING), S.HOLDING, lambda e, _: e.hold("halted by the operator")),
-    "resume": Rule((S.HOLDING,), S.RUNNING, lambda e, _: e.resume_run(), guard=_may_resume),
-    "home": Rule((S.READY,), S.SETTING_UP, lambda e, _: e.go_home()),
+    "resume": Rule((S.HOLDING,), S.RUNNING, lambda e, _: e.resume_run(), guard=_placed(_may_resume)),
+    "home": Rule((S.READY,), S.SETTING_UP, lambda e, _: e.go_home(), guard=_placed()),
     "release": Rule((S.FAULTED,), None, lambda e, _: e.release_estop()),
     "record_start": Rule((S.IDLE, S.READY), None, lambda e, _: e.start_recording()),
     "record_stop": Rule(
@@ -168,16 +173,18 @@ COMMANDS: dict[str, Rule] = {
     "tune": Rule(
         (S.IDLE, S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.tune(asked), guard=_untried
     ),
-    "step": Rule((S.RUNNING,), None, lambda e, _: e.step(), guard=_may_step),
-    "commit": Rule((S.RUNNING,), None, lambda e, _: e.commit(), guard=_may_commit),
+    "step": Rule((S.RUNNING,), None, lambda e, _: e.step(), guard=_placed(_may_step)),
+    "commit": Rule((S.RUNNING,), None, lambda e, _: e.commit(), guard=_placed(_may_commit)),
     "cancel": Rule((S.RUNNING,), None, lambda e, _: e.cancel(), guard=_may_cancel),
-    "move": Rule((S.RUNNING,), None, lambda e, asked: e.move(asked), guard=_may_move),
-    "gripper": Rule((S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.grip(asked), guard=_may_grip),
+    "move": Rule((S.RUNNING,), None, lambda e, asked: e.move(asked), guard=_placed(_may_move)),
+    "gripper": Rule(
+        (S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.grip(asked), guard=_placed(_may_grip)
+    ),
     "approach": Rule(
         (S.READY, S.RUNNING),
         {S.READY: S.SETTING_UP},
         lambda e, _: e.approach(),
-        guard=_may_approach,
+        guard=_placed(_may_approach),
     ),
     "arm": Rule((S.READY, S.HOLDING), None, lambda e, _: e.arm(), guard=_may_arm),
     "disarm": Rule((S.READY, S.HOLDING), None, lambda e, _: e.disarm(), guard=_may_disarm),

@@ -60,9 +60,11 @@ class SetUp:
     ) -> None:
         self._plan = plan
         self._inference = inference
+        self._orders = orders
         self._page = page
         self._clock = clock
         self._reception = reception  # what it last reported
+        self._met = False  # control was asked to take the robot over where it is read
         self._going = SetupMotion(plan, orders, page, clock)
         self.bench = BenchReset(plan, orders, clock, reception)
         self.stage = Stage.IDLE
@@ -91,7 +93,7 @@ class SetUp:
         self._least = least or LeastTimes()
         self.took = {}
         self.info, self.validated, self.first_action = None, "", None
-        self._motion_only = ""
+        self._motion_only, self._met = "", False
         self._start()
         self._connection = self._inference.runner.submit(self._inference.policy.connect)
         self._enter(Stage.CONNECT)
@@ -162,10 +164,13 @@ class SetUp:
         self.stages[stage] = self._since
 
     def _check_joints(self) -> None:
-        status = self._page.control.read()
-        if self._plan.capabilities.moves_robot and not status["believed"]:
-            doubt = bytes(status["doubt"]).decode(errors="ignore")
-            raise SetupError(doubt or "control has not seen the joints yet")
+        doubt = self._page.doubt if self._plan.capabilities.moves_robot else ""
+        if not doubt:
+            return
+        if self._page.control.read()["believed"] and not self._met:
+            self._met = True
+            self._orders.give("meet")
+        raise SetupError(doubt)
 
     def _name_zeros(self) -> None:
         """From the first samples on a dead encoder looks like a joint that stands at 0: the operator knows."""

@@ -158,11 +158,65 @@ def test_a_joint_is_followed_again_after_it_agreed_for_a_second_or_a_set_up():
         bench.run(30)
         assert bench.sent[-1, 0] == pytest.approx(0.0)
         if again == "set up":
-            bench.say("motion", goal=np.zeros(2))  # refused, as it is too far from its command
-            bench.run(30)
+            bench.say("meet")
+            bench.run(60)
             assert bench.sent[-1, 0] == pytest.approx(0.9)
             continue
         bench.moved_by_hand = bench.measured = np.full(2, 0.02)  # exactly 0 would be a dead encoder
         bench.run(45)
         moved_by_hand(bench, 0.7)
         assert bench.sent[-1, 0] > 0.5
+
+
+def leapt(way):
+    """A joint that is held at 0 and is read `way` from there from now on, through an encoder that is off."""
+    bench = following(Servo(lambda true, since: true + way), wave(60, 0.0))
+    bench.go(1.0)
+    told(bench, "hold")
+    bench.go(1.0)
+    bench.break_encoder()
+    bench.go(0.5)
+    return bench
+
+
+@pytest.mark.parametrize("way", [0.4, 0.9, -0.9])
+def test_where_a_joint_leapt_is_in_the_status_until_a_set_up_meets_it(way):
+    bench = leapt(way)
+    assert bench.page.doubt.startswith(f"a reads {way:.3f} rad and is held at 0.000")
+    bench.fault = lambda true, since: way  # the encoder is right: the joint stands there
+    bench.say("meet")
+    for _ in range(60):
+        bench.go(PERIOD)
+        assert abs(bench.sent[-1, 0] - way) <= 0.1001 or bench.page.doubt
+    assert bench.sent[-1, 0] == pytest.approx(way, abs=1e-3)
+    assert bench.page.doubt == ""
+    most = TWO_JOINTS.velocity[0] * bench.safety.motion_velocity_scale * PERIOD
+    assert np.abs(np.diff(bench.sent[:, 0])).max() <= most * 1.01
+
+
+@pytest.mark.parametrize("way", [0.4, 0.9])
+def test_a_joint_that_goes_away_from_the_set_up_that_meets_it_stays_in_doubt(way):
+    bench = leapt(way)
+    bench.say("meet")
+    bench.go(FOR)
+    assert "set up again" in bench.page.doubt
+    assert bench.true[0] == pytest.approx(way, abs=0.05)
+    assert "is its encoder off?" in bench.said("implausible")[-1].text
+
+
+@pytest.mark.parametrize("end", ["e-stop", "hold", "silence"])
+def test_a_stop_ends_at_once_what_a_set_up_leads_to_where_a_joint_is_read(end):
+    bench = leapt(0.9)
+    bench.say("meet")
+    bench.go(0.3)
+    if end == "silence":
+        bench.alive = False
+        bench.clock.advance(2.0)  # nobody has given a sign of life since
+        bench.run(1)
+    else:
+        told(bench, "estop" if end == "e-stop" else end)
+    begins = bench.true[0]
+    assert 0.05 < begins < 0.6
+    bench.go(2.0)
+    assert abs(bench.true[0] - begins) <= 0.1
+    assert bench.page.doubt

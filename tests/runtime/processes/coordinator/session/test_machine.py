@@ -65,6 +65,16 @@ GUARDED = {
     "cancel": (S.RUNNING, lambda s: s.mode in (*ON_DEMAND, "manual") and not s.opening),
     "move": (S.RUNNING, lambda s: s.mode == "manual" and not s.opening),
 }
+PLACED = {
+    "run",
+    "resume",
+    "home",
+    "step",
+    "commit",
+    "move",
+    "gripper",
+    "approach",
+}  # they begin to move the robot
 MODES = (None, "continuous", "step", "preview", "sim", "manual")
 SITUATIONS = [
     *(GuardFacts(*fields) for fields in product(MODES, *[(False, True)] * 7)),
@@ -73,6 +83,10 @@ SITUATIONS = [
         for mode, collection, collecting, armed, unled in product(
             (None, "collect", "manual"), *[(False, True)] * 3, ("", "the leader is silent")
         )
+    ),
+    *(
+        GuardFacts(mode, proposed=proposed, first_action=True, doubt="a reads 0.9 rad and is held at 0.0")
+        for mode, proposed in product(MODES, (False, True))
     ),
 ]
 
@@ -94,6 +108,8 @@ def allowed_in(state, situation):
         switched = "disarm" if situation.armed else "arm"
         possible = situation.armed or (situation.collecting and not situation.unled)
         found |= {switched} if possible and state in (S.READY, S.HOLDING) else set()
+    if situation.doubt:
+        return found - PLACED
     committable = situation.mode == "preview" and situation.proposed
     if (state is S.READY and situation.first_action) or (state is S.RUNNING and committable):
         found.add("approach")
