@@ -60,16 +60,20 @@ class Displacement:
         if not (held or (returned and robot.engaged)) or self._settings.safety.report_only:
             self.goal = None
             return None
-        if self.goal is not None and self.distance(robot, self.goal) <= _THERE:
-            self.goal = None
+        if self.goal is not None:  # joints that are pushed on, past it or back, are left where they are
+            on = (self.goal - robot.commanded) * (measured - robot.commanded) > 0.0
+            self.goal = np.where(on | ~self._angles, self.goal, robot.commanded)
+            if self.distance(robot, self.goal) <= _THERE:
+                self.goal = None
         allowed = _RETURNED_AWAY if returned or self._meeting else self._settings.safety.following_error
         away = self.goal is None and self._away(robot, measured, allowed)
         self._meeting = self._meeting and (away or self.goal is not None)
         if away:
-            self.follow(robot, measured)
-            if self._away(robot, measured, allowed):
+            where = self._plausibility.middle(measured)
+            self.follow(robot, where)
+            if self._away(robot, where, allowed):
                 limits = self._settings.limits
-                self.goal = np.clip(self.trusted(robot, measured), limits.lower, limits.upper)
+                self.goal = np.clip(self.trusted(robot, where), limits.lower, limits.upper)
                 self.begins = True
         return self.goal
 
