@@ -1,24 +1,35 @@
 // The software e-stop: a button that never moves, Escape, and space outside text fields. Waits for nothing: it goes
 // over the socket and to the process for stops at once, under one uuid, which the station carries out once. What is
-// left, plain HTTP to the web, where these say nothing; and red letters where nobody does.
+// left, plain HTTP to the web, where these say nothing; and red letters where nobody does. estop_state.js has what is true.
 
 import { post } from "../../site/api.js";
 import { uuid } from "../../site/identity.js";
 import { config } from "../live/config.js";
+import { EStopState } from "./estop_state.js";
 
 const ACK_MS = 500;
 const TEXT_FIELDS = 'textarea, [contenteditable="true"], input:not([type]), input[type="text"], input[type="search"], input[type="number"], input[type="password"], input[type="email"], input[type="url"]';
+const WORDS = {
+  pressed: { kind: "pressed", text: "E-stop pressed …" },
+  failed: { kind: "failed", text: "USE THE HARDWARE STOP" },
+  held: { kind: "stopped", text: "E-stop acknowledged: the robot is held." },
+  latched: { kind: "stopped", text: "E-stop is latched." },
+};
 const SPACE_IS_TAKEN = config.page === "collect"; // there it stops and saves whatever moves, and starts
+
+const now = () => performance.now() / 1000;
 
 export class EStop {
   #socket;
   #store;
   #way;
-  #waiting = new Map(); // uuid -> {ways under way, addresses that are left, why, reason, timer}
+  #presses = new Map(); // uuid -> {ways under way, addresses that are left, why, reason, timer}
+  #state = new EStopState();
+  #drawn = "";
+  #early = ""; // what the early script last said of its press
   #note = document.getElementById("estop-note");
   #area = document.getElementById("estop-area");
   #rest = this.#note.dataset.rest;
-  #faulted = false;
 
   constructor(store, socket, way) {
     this.#store = store;
@@ -27,7 +38,8 @@ export class EStop {
     document.getElementById("estop").addEventListener("click", () => this.press("button"));
     window.addEventListener("keydown", (event) => this.#key(event), { capture: true });
     window.addEventListener("keyup", (event) => this.#keyUp(event), { capture: true });
-    store.on("snapshot", () => this.#latched());
+    this.#heed();
+    store.on("snapshot", () => this.#news());
     this.ask();
     this.#area.dataset.ready = ""; // estop_early.js leaves it to us
   }
@@ -40,10 +52,12 @@ export class EStop {
   /** Press it; `why` is what was pressed. */
   press(why) {
     const id = uuid();
-    this.#show("pressed", "E-stop pressed …");
+    this.#heed();
+    this.#state.pressed(id, now());
     const press = { ways: 0, left: new Set([config.api.estop]), why: `${why} on the page`, reason: "" };
-    this.#waiting.set(id, press);
-    press.timer = setTimeout(() => this.#unanswered(id), ACK_MS);
+    this.#presses.set(id, press);
+    this.#show();
+    press.timer = setTimeout(() => this.#failed(id, "the software stop was not acknowledged"), ACK_MS);
     const sent = this.#socket.send({ type: "estop", uuid: id, why: press.why });
     if (sent) press.ways += 1;
     if (this.#way.there) this.#post(id, press, this.#way.estop);
@@ -52,33 +66,29 @@ export class EStop {
 
   /** An answer of the server came over the socket or by post; of a press that waits no more it changes nothing. */
   acknowledged({ uuid: id, status, reason }) {
+    if (!this.#state.waits(id)) return; // answered already, or released since
+    this.#heed();
     if (status !== "accepted" && status !== "done") {
-      this.#failed(id, reason || `the e-stop was ${status}`);
+      this.#oneWayFailed(id, reason || `the e-stop was ${status}`);
       return;
     }
-    if (!this.#waiting.has(id)) return; // it may be from before a release
-    for (const [before, { timer }] of this.#waiting) {
-      clearTimeout(timer); // one latch answers all that were pressed before
-      this.#waiting.delete(before);
-      if (before === id) break;
-    }
-    if (this.#waiting.size === 0) this.#show("stopped", "E-stop acknowledged: the robot is held.");
-  }
-
-  #unanswered(id) {
-    const press = this.#waiting.get(id);
-    this.#hardware(press.reason || "the software stop was not acknowledged");
-    this.#postWhatIsLeft(id, press);
+    this.#state.answered(id, now());
+    this.#show();
   }
 
   /** One way has failed; said where it was the last one. */
-  #failed(id, reason) {
-    const press = this.#waiting.get(id);
-    if (!press) return; // another way was acknowledged
+  #oneWayFailed(id, reason) {
+    const press = this.#presses.get(id);
     press.ways -= 1;
     press.reason ||= reason;
-    if (press.ways > 0) return;
-    this.#hardware(press.reason);
+    if (press.ways <= 0) this.#failed(id, reason);
+  }
+
+  #failed(id, reason) {
+    if (!this.#state.waits(id)) return;
+    const press = this.#presses.get(id);
+    this.#state.failed(id, press.reason || reason);
+    this.#show();
     this.#postWhatIsLeft(id, press);
   }
 
@@ -92,37 +102,54 @@ export class EStop {
     try {
       this.acknowledged({ status: "done", ...(await post(address, { uuid: id, why: press.why }, { simple: true })), uuid: id });
     } catch (error) {
-      this.#failed(id, error.message);
+      this.acknowledged({ uuid: id, status: "failed", reason: error.message });
     }
   }
 
-  #hardware(reason) {
-    this.#show("failed", "USE THE HARDWARE STOP");
+  /** News of the station; drawn only where they change something, as a screen reader says whatever is drawn. */
+  #news() {
+    this.#heed();
+    this.#state.snapshot(this.#store.snapshot, now());
+    this.#area.toggleAttribute("data-latched", this.#state.latched);
+    if (this.#state.shown.kind !== this.#drawn) this.#show();
+  }
+
+  /** Take over what the early script has said of its press, which it goes on to say until something else is drawn. */
+  #heed() {
+    const { early, kind } = this.#area.dataset;
+    if (!early || kind === this.#early) return;
+    if (!this.#early) this.#state.pressed(early, now());
+    if (kind === "failed") this.#state.failed(early, "");
+    if (kind === "stopped") this.#state.answered(early, now());
+    this.#early = kind;
+    this.#drawn = this.#state.shown.kind;
+  }
+
+  #show() {
+    const { kind, reason } = this.#state.shown;
+    for (const [id, { timer }] of this.#presses) {
+      if (this.#state.waits(id)) continue;
+      clearTimeout(timer);
+      this.#presses.delete(id);
+    }
+    this.#drawn = kind;
+    delete this.#area.dataset.early; // estop_early.js says nothing from here on
     this.#note.title = reason;
+    if (kind) this.#say(WORDS[kind], reason);
+    else this.#atRest();
+  }
+
+  #say({ kind, text }, reason) {
+    this.#area.dataset.kind = kind;
+    this.#note.textContent = text;
+    if (!reason) return;
     const detail = document.createElement("span");
     detail.className = "estop-detail";
     detail.textContent = reason;
     this.#note.append(detail);
   }
 
-  #show(kind, text) {
-    delete this.#area.dataset.early; // estop_early.js says nothing from here on
-    this.#area.dataset.kind = kind;
-    this.#note.textContent = text;
-    this.#note.title = "";
-  }
-
-  /** What the station itself says of its latch: it outlives this page's words, but never a missing answer. */
-  #latched() {
-    const before = this.#faulted;
-    this.#faulted = this.#store.snapshot.state === "faulted";
-    this.#area.toggleAttribute("data-latched", this.#faulted);
-    if (this.#faulted && ["", "stopped"].includes(this.#area.dataset.kind ?? "")) this.#show("stopped", "E-stop is latched.");
-    if (before && !this.#faulted) this.#atRest();
-  }
-
   #atRest() {
-    delete this.#area.dataset.early;
     this.#note.innerHTML = this.#rest;
     delete this.#area.dataset.kind;
   }

@@ -38,6 +38,9 @@ const look = async () => { await settled(); kinds.push(area.dataset.kind ?? "res
 const sent = [];
 const store = { on(_, take) { this.take = take; }, snapshot: { state: "idle" }, page: "p1", epoch: 1 };
 const state = (name) => { store.snapshot = { state: name }; store.take(); };
+let ours = 0;
+performance.now = () => 1000 * ours;  // this page's clock, which the test moves [s]
+const news = (name, clock, boot = "b1") => { store.snapshot = { state: name, clock, boot }; store.take(); };
 const socket = { send: (message) => { sent.push(message); return true; } };
 const way = { there: true, estop: "/stops/estop", ask: async () => true };
 const late = () => timers.forEach((take) => take());
@@ -87,6 +90,52 @@ def test_the_answer_of_a_press_that_waits_answers_those_before_it_and_not_those_
         ack(1, "failed"); await look();
         """
     ) == ["pressed", "failed", "stopped", "stopped"]
+
+
+def test_an_answer_that_comes_after_the_release_does_not_say_that_the_robot_is_held() -> None:
+    assert pressing(
+        """
+        ours = 100; news("idle", 5100);
+        estop.press("button"); late(); await look();
+        ours = 103; news("faulted", 5103); await look();
+        ours = 110; news("idle", 5110); await look();
+        ack(0); posts[0]({ status: "done" }); await look();
+        """
+    ) == ["failed", "failed", "rest", "rest"]
+
+
+def test_a_release_that_is_told_late_leaves_the_red_letters_of_a_later_press() -> None:
+    assert pressing(
+        """
+        ours = 100; news("idle", 5100); news("faulted", 5100.2);
+        ours = 120; estop.press("button"); late(); await look();
+        ours = 121; news("idle", 5119.5); await look();
+        ours = 123; news("faulted", 5119.9); news("idle", 5119.95); await look();
+        ack(0); await look();
+        ours = 130; news("faulted", 5130); await look();
+        """
+    ) == ["failed", "failed", "failed", "rest", "stopped"]
+
+
+def test_news_that_others_have_overtaken_say_nothing() -> None:
+    assert pressing(
+        """
+        ours = 100; news("faulted", 5100); await look();
+        news("idle", 5099); await look();
+        news("idle", 7, "b2"); await look();
+        """
+    ) == ["stopped", "stopped", "rest"]
+
+
+def test_what_an_answer_said_is_believed_until_the_station_says_later_that_it_is_not_held() -> None:
+    assert pressing(
+        """
+        ours = 100; news("running", 5100);
+        estop.press("button"); ack(0); await look();
+        ours = 100.1; news("running", 5100.05); await look();
+        ours = 105; news("running", 5105); await look();
+        """
+    ) == ["stopped", "stopped", "rest"]
 
 
 EARLY = (
@@ -142,6 +191,21 @@ def test_an_answer_to_the_early_script_says_nothing_of_a_press_of_the_modules() 
         for again in (True, False)
     ]
     assert shown == [["pressed", "pressed", "failed"], ["pressed", "stopped", "stopped"]]
+
+
+def test_the_early_scripts_missing_answer_outlives_a_late_release_too() -> None:
+    modules = json.dumps((MODULES / "commands/estop.js").as_uri())
+    body = f"""
+        press(); posts[0]({{ status: "no" }}); await look();
+        const {{ EStop }} = await import({modules});
+        new EStop(store, socket, way);
+        ours = 100; news("faulted", 5099.5); await look();
+        ours = 100.2; news("idle", 5099.7); await look();
+        ours = 104; news("faulted", 5104); ours = 105; news("idle", 5105); await look();
+    """
+    script = str(MODULES / "commands/estop_early.js")
+    shown = run("../site/identity.js", EARLY + body + "return kinds;", script)
+    assert shown == ["failed", "failed", "failed", "rest"]
 
 
 STOPS = (
