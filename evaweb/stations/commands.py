@@ -320,7 +320,7 @@ def _resolve(row: Command) -> None:
 
 
 unwritten = Unwritten(_written)
-notes = Notes(lambda row: unwritten.keep(row))
+notes = Notes(lambda row: unwritten.keep(row), journal=unwritten.foresee)
 
 
 def _first(row: Command) -> Command | None:

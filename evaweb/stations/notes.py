@@ -1,7 +1,7 @@
 """What was done to stop a robot, on its way into the records: nobody who stops waits for disk or database.
 
 A thread of its own takes each row: first into a file of `unwritten`, then into the database. Who presses again and
-again is written down once a second, with how often.
+again is written down once a second, with how often; until then a line of the journal has each, which a kill leaves.
 """
 
 from __future__ import annotations
@@ -9,7 +9,8 @@ from __future__ import annotations
 import atexit
 import logging
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from threading import Condition, Thread
 
 from django.conf import settings
@@ -20,15 +21,23 @@ log = logging.getLogger(__name__)
 _APART_S = 1.0  # between two rows of the same
 _MOST = 1000  # different ones that wait
 _Key = tuple[str, ...]
+_Journal = Callable[[Sequence[Command]], object]
 
 
 class Notes:
-    """Rows that are handed to `keep`, one after the other, in a thread that may wait for the disk."""
+    """Rows that are handed to `keep`, one after the other, in a thread that may wait for the disk.
+
+    `journal` is told of those that have to wait meanwhile, and with none when they have all been handed on.
+    """
 
     def __init__(
-        self, keep: Callable[[Command], object], clock: Callable[[], float] = time.monotonic
+        self,
+        keep: Callable[[Command], object],
+        clock: Callable[[], float] = time.monotonic,
+        journal: _Journal = lambda rows: None,
     ) -> None:
-        self._keep, self._clock = keep, clock
+        self._keep, self._clock, self._journal = keep, clock, journal
+        self._fresh: deque[tuple[_Key, Command]] = deque(maxlen=_MOST)  # that the journal has not
         self._news = Condition()
         self._waiting: dict[_Key, tuple[Command, int]] = {}
         self._written: dict[_Key, float] = {}
@@ -39,10 +48,9 @@ class Notes:
 
         A press that latched the e-stop anew is never one of many.
         """
-        user = row.user.get_username() if row.user else ""
-        latched_at = str(row.data["carried_out_at"]) if row.data.get("latched") == "anew" else ""
-        key = (row.station.name, row.kind, user, str(row.status), latched_at)
+        key = key_of(row)
         with self._news:
+            self._fresh.append((key, row))
             _, times = self._waiting.pop(key, (row, 0))
             if len(self._waiting) >= _MOST:
                 lost = self._waiting.pop(next(iter(self._waiting)))
@@ -59,14 +67,25 @@ class Notes:
             taken = [self._waiting.pop(key) for key in due]
             self._written |= dict.fromkeys(due, now)
             wait = min((self._written[key] + _APART_S - now for key in self._waiting), default=None)
+            waiting = [row for key, row in self._fresh if key in self._waiting]
+            self._fresh.clear()
+        self._write_ahead([row for row in waiting if _has_station(row)])
         for row, times in taken:
             self._hand_on(row, times)
+        if wait is None:
+            self._write_ahead([])
         return wait
+
+    def _write_ahead(self, rows: Sequence[Command]) -> None:
+        try:
+            self._journal(rows)
+        except OSError as error:
+            log.error("a kill would lose %d stops that wait to be written down: %s", len(rows), error)
 
     def _hand_on(self, row: Command, times: int) -> None:
         if times > 1:
             row.data = {**row.data, "times": times}
-        if row.station.pk is None and not (settings.DATA_DIR / "stations" / row.station.name).is_dir():
+        if not _has_station(row):
             log.warning("%s (%s) is not written down: there is no such station", row, row.uuid)
             return
         try:
@@ -88,3 +107,14 @@ class Notes:
                 if wait is not None or not self._waiting:
                     self._news.wait(wait)
             wait = self.write()
+
+
+def key_of(row: Command) -> _Key:
+    """What those of a second have in common that are one row."""
+    user = row.user.get_username() if row.user else ""
+    latched_at = str(row.data["carried_out_at"]) if row.data.get("latched") == "anew" else ""
+    return (row.station.name, row.kind, user, str(row.status), latched_at)
+
+
+def _has_station(row: Command) -> bool:
+    return row.station.pk is not None or (settings.DATA_DIR / "stations" / row.station.name).is_dir()

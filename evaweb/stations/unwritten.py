@@ -2,7 +2,8 @@
 
 A file each, so that a restart loses none, and any process may write any of them. Of one command each process that
 carried it out has a file of its own: none overwrites, or removes, what another one heard of it. Where the disk does
-not take them either, as when it is full, this process keeps the newest.
+not take them either, as when it is full, this process keeps the newest. What a killed process had not come to, its
+journal has.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,9 @@ from django.conf import settings
 from django.contrib.auth import get_user_model
 from django.db import DataError, Error, IntegrityError, connection
 
+from evaweb.stations.journal import Journal, left_in
 from evaweb.stations.models import Command, Station
+from evaweb.stations.notes import key_of
 from runtime.recording.files import RecordingError, write_whole
 
 log = logging.getLogger(__name__)
@@ -46,6 +49,17 @@ class Unwritten:
         self._news = threading.Event()
         self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
+        self._journal = Journal(lambda: _folder())
+
+    def foresee(self, rows: Sequence[Command]) -> None:
+        """Those that will be kept soon: whoever looks finds them where this process is killed before; OSError.
+
+        With none, all that were foreseen have been kept.
+        """
+        if rows:
+            self._journal.add(map(_document, rows))
+        else:
+            self._journal.clear()
 
     def keep(self, row: Command) -> None:
         """Have it written when the database takes it; its station and user may be known by name alone."""
@@ -73,7 +87,7 @@ class Unwritten:
 
     def attempt(self) -> bool:
         """Write what waits; whether some has to wait on. A file that the disk does not give keeps no other waiting."""
-        waits = False
+        waits = not self._inherited()
         for name in self._waiting():
             try:
                 self._attempt(name)
@@ -86,6 +100,21 @@ class Unwritten:
                 log.info("the database does not take what was commanded yet: %s", error)
                 return True
         return waits
+
+    def _inherited(self) -> bool:
+        """Keep what killed processes had foreseen, as they would have: one of each kind, and how often."""
+        try:
+            for documents in left_in(_folder()):
+                counted: dict[tuple[str, ...], list[Command]] = {}
+                for row in _readable(documents):
+                    counted.setdefault(key_of(row), []).append(row)
+                for rows in counted.values():
+                    rows[-1].data |= {"times": len(rows)} if len(rows) > 1 else {}
+                    self.keep(rows[-1])
+        except OSError as error:
+            log.info("what a killed process left waits for the disk: %s", error)
+            return False
+        return True
 
     def _run(self) -> None:
         while True:
@@ -129,6 +158,14 @@ def _document(row: Command) -> dict[str, Any]:
     user = row.user.get_username() if row.user else ""
     said = {"uuid": str(row.uuid), "station": row.station.name, "user": user}
     return said | {name: getattr(row, name) for name in _PLAIN} | times
+
+
+def _readable(documents: list[Any]) -> Iterator[Command]:
+    for document in documents:
+        try:
+            yield _row(document)
+        except (KeyError, TypeError, ValueError) as fault:  # a file may hold anything
+            log.error("a command is not in the database: %r; it was %.9999r", fault, document)
 
 
 def _row(document: dict[str, Any]) -> Command:

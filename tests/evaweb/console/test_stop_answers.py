@@ -198,8 +198,9 @@ def test_the_early_scripts_missing_answer_outlives_a_late_release_too() -> None:
     body = f"""
         press(); posts[0]({{ status: "no" }}); await look();
         const {{ EStop }} = await import({modules});
+        ours = 100;
         new EStop(store, socket, way);
-        ours = 100; news("faulted", 5099.5); await look();
+        news("faulted", 5099.5); await look();
         ours = 100.2; news("idle", 5099.7); await look();
         ours = 104; news("faulted", 5104); ours = 105; news("idle", 5105); await look();
     """

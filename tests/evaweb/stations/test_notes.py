@@ -16,9 +16,9 @@ from evaweb.stations.notes import Notes
 class Quiet(Notes):
     """One whose thread is the test."""
 
-    def __init__(self, keep):
+    def __init__(self, keep, **more):
         self.now = 0.0
-        super().__init__(keep, clock=lambda: self.now)
+        super().__init__(keep, clock=lambda: self.now, **more)
 
     def _run_soon(self):
         pass
@@ -116,3 +116,30 @@ def test_so_many_different_ones_wait_and_the_log_has_the_others(quiet, kept, mon
     quiet.write()
     assert [row.user.username for row in kept] == ["bob", "cyd"]
     assert "is given up" in caplog.text
+
+
+def test_what_waits_for_its_second_is_in_the_journal_until_it_is_handed_on(kept):
+    ahead = []
+    quiet = Quiet(kept.append, journal=lambda rows: ahead.append(list(rows)))
+    rows = [halted() for _ in range(4)]
+    for row in rows[:3]:
+        quiet.note(row)
+        quiet.write()
+    assert (kept, ahead[-2:]) == ([rows[0]], [[rows[1]], [rows[2]]])
+    quiet.now = 1.0
+    quiet.note(rows[3])
+    quiet.write()
+    assert (kept, ahead[-2:]) == ([rows[0], rows[3]], [[], []])
+
+
+def test_a_journal_that_the_disk_does_not_take_keeps_nothing_from_being_written(kept, caplog):
+    def full(rows):
+        raise OSError("no space left on device")
+
+    quiet = Quiet(kept.append, journal=full)
+    for _ in range(2):
+        quiet.note(halted())
+        quiet.write()
+    quiet.write(all_of_them=True)
+    assert len(kept) == 2
+    assert "a kill would lose 1 stops" in caplog.text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sqlite3
 from copy import copy
 from datetime import timedelta
@@ -298,3 +299,58 @@ def test_a_uuid_is_still_no_other_commands(pressed):
     commands._written(pressed())
     with pytest.raises(Conflict):
         commands._written(pressed(kind="halt"))
+
+
+def in_a_process_that_is_killed(work):
+    """Do it in a copy of this process, which ends without another line."""
+    child = os.fork()
+    if child == 0:
+        try:
+            work()
+        finally:
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+
+
+@pytest.mark.usefixtures("asleep")
+def test_what_a_killed_process_had_foreseen_is_kept_by_whoever_looks_next_as_one_row_with_how_many(
+    halted, ann, folder
+):
+    rows = [halted(ann) for _ in range(3)]
+    stop = halted(ann)
+    stop.kind = "stop"
+    in_a_process_that_is_killed(lambda: Unwritten(away).foresee([*rows, stop]))
+    assert len(list(folder.iterdir())) == 1
+    assert Unwritten(commands._written).attempt() is False
+    assert {(row.uuid, row.kind): row.data for row in Command.objects.all()} == {
+        (rows[-1].uuid, "halt"): {"times": 3},
+        (stop.uuid, "stop"): {},
+    }
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.usefixtures("asleep")
+def test_what_a_living_process_foresees_is_left_to_it(halted, folder):
+    one, other = Unwritten(commands._written), Unwritten(commands._written)
+    one.foresee([halted()])
+    one.foresee([halted()])
+    assert len(list(folder.iterdir())) == 1
+    assert other.attempt() is False
+    assert not Command.objects.exists()
+    one.foresee([])
+    assert list(folder.iterdir()) == []
+    one.foresee([halted()])
+    assert len(list(folder.iterdir())) == 1
+
+
+@pytest.mark.usefixtures("asleep")
+def test_half_a_line_of_a_killed_process_keeps_no_other_from_being_written(halted, ann, folder, caplog):
+    row = halted(ann)
+    in_a_process_that_is_killed(lambda: Unwritten(away).foresee([row]))
+    (left,) = folder.iterdir()
+    with left.open("ab") as file:
+        file.write(b'[]\n{"uuid": "0b')
+    Unwritten(commands._written).attempt()
+    assert [found.uuid for found in Command.objects.all()] == [row.uuid]
+    assert "this is no line of JSON" in caplog.text
+    assert "a command is not in the database" in caplog.text
