@@ -9,6 +9,7 @@ import socket
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from typing import Any, Protocol
 
@@ -47,8 +48,13 @@ def serve(
     beside: Beside | None,
     lifeline: bool,
     request: type[Request] = Request,
+    nice: int = 0,
 ) -> None:
-    """Serve until SIGINT, SIGTERM or, with `lifeline`, the end of standard input; prints where as JSON."""
+    """Serve until SIGINT, SIGTERM or, with `lifeline`, the end of standard input; prints where as JSON.
+
+    Not until then it gives way to others by `nice`: a start takes seconds of the processor, and a busy machine gives
+    one that gives way half a minute for them.
+    """
     sys.setswitchinterval(_TURN_S)
     address = _address(listener)
     arrivals = _arrivals(raise_file_limit())
@@ -66,6 +72,7 @@ def serve(
     events: Any = reactor
     if beside is not None:
         events.callWhenRunning(beside.start)
+    events.callWhenRunning(give_way, nice)
     events.callWhenRunning(lambda: print(json.dumps(address), flush=True))
     events.addSystemEventTrigger("before", "shutdown", _end_for_sure)
     if beside is not None:
@@ -92,6 +99,13 @@ class _Server(Server):
 
         port.doRead = few_at_once
         task.LoopingCall(self._arrivals.sweep).start(_SWEEP_S)
+
+
+def give_way(nice: int) -> None:
+    """Have all threads of this process that there are, and those that they start, be nicer by so much."""
+    for thread in map(int, os.listdir("/proc/self/task")):
+        with suppress(ProcessLookupError):  # it has ended
+            os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + nice)
 
 
 def raise_file_limit() -> int:

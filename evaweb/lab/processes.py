@@ -46,7 +46,7 @@ class Program:
     announces: bool = False
     again: Callable[[Mapping[str, Any]], tuple[str, ...]] | None = None
     patience_s: float = 5.0  # to end by itself
-    nice: int = 0  # above 0: gives way to the stations of this machine
+    nice: int = 0  # above 0: told to give way to the stations of this machine once it is ready (--nice)
     descriptors: tuple[int, ...] = ()  # of our files that it has too, under the same numbers
     of_web: bool = False  # gets the web's secrets; no other program has them in its environment
 
@@ -119,8 +119,9 @@ class Processes:
         if path.exists() and path.stat().st_size > _LONGEST_LOG:
             path.replace(path.with_suffix(".log.old"))
         output = path.open("ab")
+        yields = ("--nice", str(program.nice)) if program.nice else ()
         process = subprocess.Popen(
-            ["nice", "-n", str(program.nice), sys.executable, *arguments, "--lifeline"],
+            [sys.executable, *arguments, *yields, "--lifeline"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE if heard else output,
             stderr=output,

@@ -10,7 +10,7 @@ class BenchPage:
 
     def __init__(self, browser, demo, username, size):
         self.demo = demo
-        self.context = browser.new_context(viewport=size)
+        self.context = browser.new_context(viewport=size, ignore_https_errors=True)
         self.page = self.context.new_page()
         self.page.set_default_timeout(30_000)
         self.errors = []

@@ -77,6 +77,15 @@ def test_it_serves_and_ends_with_its_lifeline(tmp_path):
 
 
 @pytest.mark.slow
+def test_it_gives_way_once_it_serves(tmp_path):
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    with served(tmp_path, "--nice", "3") as (process, _):
+        threads = [int(thread.name) for thread in Path(f"/proc/{process.pid}/task").iterdir()]
+        found = {os.getpriority(os.PRIO_PROCESS, thread) for thread in threads}
+        assert found == {min(own + 3, 19)}
+
+
+@pytest.mark.slow
 def test_it_ends_when_it_is_told(tmp_path):
     with served(tmp_path) as (process, address):
         assert address["port"] > 0

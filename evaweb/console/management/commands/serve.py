@@ -17,9 +17,12 @@ class Command(BaseCommand):
         parser.formatter_class = argparse.ArgumentDefaultsHelpFormatter
         parser.add_argument("--host", default="127.0.0.1", help="address to listen on")
         parser.add_argument("--port", type=int, default=8000, help="0 takes a free one")
+        parser.add_argument(
+            "--nice", type=int, default=0, help="give way to others by so much, as soon as it serves"
+        )
         parser.add_argument("--lifeline", action="store_true", help="end when standard input ends")
 
-    def handle(self, *args: Any, host: str, port: int, lifeline: bool, **options: Any) -> None:
+    def handle(self, *args: Any, host: str, port: int, nice: int, lifeline: bool, **options: Any) -> None:
         from evaweb.asgi import application  # not before models are there
         from evaweb.console import server
         from evaweb.console.event_ingest import Chronicle
@@ -29,4 +32,4 @@ class Command(BaseCommand):
             listener = listen(host, port)
         except PortTaken as error:
             raise CommandError(str(error)) from None
-        server.serve(application, listener, beside=Chronicle(), lifeline=lifeline)
+        server.serve(application, listener, beside=Chronicle(), lifeline=lifeline, nice=nice)

@@ -1,0 +1,57 @@
+"""On pages of a station nothing laps over anything else, and no word is cut off, at the sizes of a lab's screens."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.bench_page import BenchPage
+from tests.e2e.lab import STATION, TABLET, WIDE
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+SIZES = [WIDE, {"width": 1280, "height": 800}, TABLET, {"width": 820, "height": 1180}]
+TABS = ["eval", "debug", "collect"]
+FAULTS = (Path(__file__).parent / "layout_faults.js").read_text("utf-8")
+FAULTY = """
+<style>
+  body { margin: 0; font: 16px/20px monospace }
+  div { position: relative; width: 200px; height: 40px }
+  .over span { position: absolute; left: 0 }
+  .short { width: 60px; overflow: hidden; white-space: nowrap }
+  .meant { text-overflow: ellipsis }
+  .scrolls { overflow: auto; white-space: nowrap; width: 60px }
+  .layer { position: fixed; top: 0; left: 0; width: 90px; height: 30px; background: #fff }
+  .low { position: fixed; margin: 0; bottom: -12px; left: 300px; height: 20px; background: #fff }
+</style>
+<div>under the layer</div>
+<p class="layer">the layer</p>
+<div class="over"><span>one</span><span>two</span></div>
+<div class="short">cut in its middle</div>
+<div class="short meant">cut with an ellipsis</div>
+<div class="scrolls">scrolled to by whoever wants</div>
+<p class="low">below the window</p>
+"""
+
+
+def test_what_laps_over_or_is_cut_off_is_found_and_what_is_meant_is_not(browser):
+    page = browser.new_page(viewport={"width": 600, "height": 400})
+    page.set_content(FAULTY)
+    found = page.evaluate(FAULTS)
+    page.close()
+    assert found == [
+        "'cut in its middle' is cut off",
+        "'below the window' is cut off",
+        "'one' laps over 'two'",
+    ]
+
+
+@pytest.mark.parametrize("tab", TABS)
+def test_a_page_of_a_station_is_whole_at_every_size(browser, patient, tab):
+    page = BenchPage(browser, patient, "ann", WIDE).open(f"/stations/{STATION}/{tab}/")
+    page.at_rest()
+    page.cameras_live()
+    page.page.locator("#curves-marks .legend").first.wait_for()
+    for size in SIZES:
+        page.page.set_viewport_size(size)
+        page.page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        assert page.page.evaluate(FAULTS) == [], f"{tab} at {size}"
+    page.close()
