@@ -1,4 +1,4 @@
-"""A lab behind a proxy that ends TLS, as docs/administrator.md has it: login, live page, lease, both ways of a press."""
+"""A lab behind a proxy that ends TLS, as docs/administrator.md has it: login, live page, lease, presses both ways."""
 
 import json
 

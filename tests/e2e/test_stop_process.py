@@ -1,7 +1,9 @@
 """A press on a page in a real browser arrives by one way while the other one is gone."""
 
+import json
 import os
 import signal
+from uuid import UUID, uuid4
 
 import pytest
 
@@ -21,6 +23,14 @@ async () => {
   return fetch(stops + address, { credentials: "include" }).then((answer) => answer.ok, () => false);
 }
 """
+ALONE = """
+async (uuid) => {
+  const { stops, address } = document.getElementById("estop-area").dataset;
+  const body = JSON.stringify({ uuid, why: "pressed by a test" });
+  return fetch(stops + address, { method: "POST", credentials: "include", body }).then((answer) => answer.json());
+}
+"""
+COUNTED = "SELECT uuid, json_extract(data, '$.times') FROM stations_command WHERE kind = 'estop'"
 ENDED = """
 from django.contrib.sessions.models import Session
 from django.utils import timezone
@@ -56,6 +66,25 @@ def latched(demo):
     return Latch(demo.data / "stations" / STATION).read()
 
 
+def foreseen(demo):
+    """How many presses are on the disk and not yet in the database."""
+    files = [path for path in (demo.data / "unwritten").iterdir() if path.suffix in (".json", ".lines")]
+    return sum(
+        len(path.read_text().splitlines()) if path.suffix == ".lines" else times(json.loads(path.read_text()))
+        for path in files
+    )
+
+
+def times(document):
+    return document["data"].get("times", 1)
+
+
+def written(demo, before):
+    """How many presses the rows stand for that were not there before."""
+    known = {uuid for uuid, _ in before}
+    return sum(count or 1 for uuid, count in demo.rows(COUNTED) if uuid not in known)
+
+
 def pressed(demo, page):
     """Press the button; it is acknowledged, and the station is latched."""
     assert latched(demo) is None
@@ -88,6 +117,28 @@ def test_a_press_arrives_while_the_process_for_stops_is_gone_and_pages_know_its_
     assert demo.pid("stops") != gone
     page.page.reload()
     page.page.locator(f"{AREA}[data-second-way]").wait_for()
+
+
+def test_a_press_arrives_after_the_web_was_killed_and_before_it_is_there_again(demo, page):
+    with suspended(demo.child.pid):
+        gone = demo.pid("serve")
+        os.kill(gone, signal.SIGKILL)
+        eventually(lambda: not alive(gone), 20, "it has ended")
+        pressed(demo, page)
+    page.reaches("FAULTED")  # over the web, which the lab has started again where it was
+
+
+def test_presses_of_one_second_are_written_down_though_the_process_for_stops_is_killed_while_the_database_is_locked(
+    demo, page
+):
+    before = set(demo.rows(PRESSES))
+    with suspended(demo.pid("serve")), demo.locked():
+        sent = [page.page.evaluate(ALONE, str(uuid4())) for _ in range(3)]
+        eventually(lambda: foreseen(demo) == len(sent), 20, "all are on the disk")
+        os.kill(demo.pid("stops"), signal.SIGKILL)
+    answered = {UUID(one["uuid"]) for one in sent if one["status"] == "done"}
+    assert len(answered) == len(sent)
+    eventually(lambda: written(demo, before) == len(sent), 60, "all presses are in the record")
 
 
 def test_a_page_whose_session_has_ended_still_presses(demo, page):
