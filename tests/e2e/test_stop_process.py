@@ -139,6 +139,7 @@ def test_presses_of_one_second_are_written_down_though_the_process_for_stops_is_
     answered = {UUID(one["uuid"]) for one in sent if one["status"] == "done"}
     assert len(answered) == len(sent)
     eventually(lambda: written(demo, before) == len(sent), 60, "all presses are in the record")
+    eventually(lambda: page.page.evaluate(ANSWERS), 60, "the lab has started it again where it was")
 
 
 def test_a_page_whose_session_has_ended_still_presses(demo, page):

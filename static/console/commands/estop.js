@@ -8,6 +8,7 @@ import { config } from "../live/config.js";
 import { EStopState } from "./estop_state.js";
 
 const ACK_MS = 500;
+const ASK_MS = 5000;
 const TEXT_FIELDS = 'textarea, [contenteditable="true"], input:not([type]), input[type="text"], input[type="search"], input[type="number"], input[type="password"], input[type="email"], input[type="url"]';
 const WORDS = {
   pressed: { kind: "pressed", text: "E-stop pressed …" },
@@ -26,6 +27,7 @@ export class EStop {
   #presses = new Map(); // uuid -> {ways under way, addresses that are left, why, reason, timer}
   #state = new EStopState();
   #drawn = "";
+  #again = 0; // when the process for stops is asked once more
   #early = ""; // what the early script last said of its press
   #note = document.getElementById("estop-note");
   #area = document.getElementById("estop-area");
@@ -44,9 +46,13 @@ export class EStop {
     this.#area.dataset.ready = ""; // estop_early.js leaves it to us
   }
 
-  /** Have the process for stops know who is here, before anybody presses. */
+  /** Have the process for stops know who is here, before anybody presses; again until it answers: it may be starting. */
   async ask() {
-    this.#area.toggleAttribute("data-second-way", await this.#way.ask());
+    clearTimeout(this.#again);
+    const there = await this.#way.ask();
+    this.#area.toggleAttribute("data-second-way", there);
+    clearTimeout(this.#again); // of another one, as where the socket was opened meanwhile
+    if (!there) this.#again = setTimeout(() => this.ask(), ASK_MS);
   }
 
   /** Press it; `why` is what was pressed. */

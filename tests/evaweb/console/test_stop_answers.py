@@ -138,6 +138,17 @@ def test_what_an_answer_said_is_believed_until_the_station_says_later_that_it_is
     ) == ["stopped", "stopped", "rest"]
 
 
+def test_the_process_for_stops_is_asked_again_until_it_answers() -> None:
+    answers = "const answers = [false, false, true]; way.ask = async () => answers.shift();"
+    body = """
+        area.toggleAttribute = (name, there) => kinds.push(there);
+        const asked = new EStop(store, socket, way);
+        for (let turn = 0; turn < 4; turn += 1) { await settled(); late(); }
+        return kinds;
+    """
+    assert run("../site/identity.js", PRESSES + answers + body) == [False, False, True]
+
+
 EARLY = (
     PAGE
     + """
