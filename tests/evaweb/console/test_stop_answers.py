@@ -146,7 +146,7 @@ def test_the_process_for_stops_is_asked_again_until_it_answers() -> None:
         for (let turn = 0; turn < 4; turn += 1) { await settled(); late(); }
         return kinds;
     """
-    assert run("../site/identity.js", PRESSES + answers + body) == [False, False, True]
+    assert run("../site/identity.js", PRESSES + "await settled();" + answers + body) == [False, False, True]
 
 
 EARLY = (
