@@ -9,8 +9,8 @@ import pytest
 from benchmarks import soak
 from benchmarks.fuzzing import answers, boxes, encoders, rtc_prefix
 
-
-PUSHED_ON = (1025813277, 1025813317, 1025813379)  # while the command is led to the robot; found by a soak of 30 minutes
+# Found by a soak of half an hour: an arm that is pushed on while the command is led to it.
+PUSHED_ON = (1025813277, 1025813317, 1025813379)
 
 
 @pytest.mark.parametrize("seed", [*range(30), *PUSHED_ON])

@@ -37,7 +37,7 @@ class GuardFacts:
     collecting: bool = False  # it is set up to collect
     armed: bool = False  # a person has switched on that a collected episode may begin
     unled: str = ""  # why the leader cannot be followed just now
-    doubt: str = ""  # why nothing may begin to move: where joints are read cannot be, or is not where they are held
+    doubt: str = ""  # why nothing may begin to move: joints are read where they cannot be, or are not held
 
 
 class Effects(ABC):
