@@ -79,7 +79,7 @@ class OpenPage:
     def __init__(self, visitor: Visitor, stops: str) -> None:
         self._visitor = visitor
         self._page, self._opening = _Page(visitor), threading.Lock()
-        self._way = Program(stops, {"Cookie": f"sessionid={visitor.cookie('sessionid')}"})
+        self._way = Program(stops, {"Cookie": visitor.cookies})
         self._way.ready()
 
     def press(self, why: str) -> Press:
@@ -155,7 +155,7 @@ def loads(visitor: Visitor, seconds: float) -> float | None:
 def _page_of(visitor: Visitor, timeout: float) -> None:
     address = urlsplit(visitor.url).netloc
     with closing(http.client.HTTPConnection(address, timeout=max(0.1, timeout))) as connection:
-        cookies = {"Cookie": f"sessionid={visitor.cookie('sessionid')}"}
+        cookies = {"Cookie": visitor.cookies}
         connection.request("GET", f"/stations/{PRESSED}/debug/", headers=cookies)
         answer = connection.getresponse()
         answer.read()

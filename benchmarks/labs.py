@@ -78,7 +78,7 @@ def busy_lab(folder: Path, assignments: Sequence[str], without: str = "") -> Ite
 def watch(visitor: Visitor, seconds: float, **counts: int) -> subprocess.Popen[str]:
     """Pages open on the station for so long, in a process of their own; `reading` or `stalled` of them."""
     options = [part for name, count in counts.items() for part in (f"--{name}", str(count))]
-    command = [sys.executable, "-m", "benchmarks.viewers", visitor.url, STATION, visitor.cookie("sessionid")]
+    command = [sys.executable, "-m", "benchmarks.viewers", visitor.url, STATION, visitor.cookies]
     command += ["--streams", ",".join(STREAMS), "--seconds", str(seconds), *options]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
 

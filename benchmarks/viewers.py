@@ -23,7 +23,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("url")
     parser.add_argument("station")
-    parser.add_argument("cookie", help="of a session that is logged in")
+    parser.add_argument("cookies", help="of a session that is logged in, as a browser sends them")
     parser.add_argument("--streams", required=True, help="separated by commas")
     parser.add_argument("--reading", type=int, default=0, help="viewers that draw what they get")
     parser.add_argument("--stalled", type=int, default=0, help="viewers that never read")
@@ -46,7 +46,7 @@ def _page(given: argparse.Namespace, name: str, **options: object) -> connect:
     return connect(
         f"ws://{address.netloc}/ws/stations/{given.station}?page={name}",
         origin=given.url,
-        additional_headers={"Cookie": f"sessionid={given.cookie}"},
+        additional_headers={"Cookie": given.cookies},
         max_size=2**24,
         **options,  # type: ignore[arg-type]
     )

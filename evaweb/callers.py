@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network, ip_address
+from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
+from typing import Any
 
 from django.conf import settings
 from django.http import HttpRequest
 
 Address = IPv4Address | IPv6Address
+_ONE_SUBSCRIBER = 64  # bits of an address of IPv6: whoever has one has all that begin with them
 
 
 def address_of(request: HttpRequest) -> str | None:
@@ -16,6 +18,16 @@ def address_of(request: HttpRequest) -> str | None:
     named = request.META.get("HTTP_X_FORWARDED_FOR", "").split(",")
     found = _caller(request.META.get("REMOTE_ADDR"), named, settings.EVA_PROXIES)
     return None if found is None else str(found)
+
+
+def share_of(scope: dict[str, Any]) -> str:
+    """From where who asks over ASGI comes, for what each of them has a share of: an address, or a network of IPv6."""
+    named = [value.decode("latin-1") for name, value in scope["headers"] if name == b"x-forwarded-for"]
+    peer = (scope.get("client") or [None])[0]
+    found = _caller(peer, ",".join(named).split(","), settings.EVA_PROXIES)
+    if isinstance(found, IPv6Address):
+        return str(ip_network((found, _ONE_SUBSCRIBER), strict=False))
+    return "nowhere" if found is None else str(found)
 
 
 def _caller(

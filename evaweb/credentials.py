@@ -1,7 +1,8 @@
 """Who a session or token stands for: asked of the database, remembered for when it does not answer.
 
 What is remembered never expires by itself: stopping works with it as long as this process lives. It is forgotten when
-the database says otherwise, which is asked again whenever it is used and older than a few seconds.
+the database says otherwise, which is asked again whenever it is used and older than a few seconds. Who is not
+remembered is asked about in the share of where they come from: a crowd of made-up ones keeps nobody else waiting.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Awaitable, Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from types import SimpleNamespace
 from typing import Any
@@ -26,6 +28,7 @@ from django.contrib.sessions.models import Session
 from django.db import connection
 
 from evaweb.lock_wait import hurried
+from evaweb.lookups import Crowded, Lookups
 from evaweb.roles import Role, role_of
 
 log = logging.getLogger(__name__)
@@ -34,17 +37,25 @@ OF_ANY_AGE = {
     kind: f"{kind} of any age" for kind in (SESSION, TOKEN)
 }  # also where its time is over: for an e-stop
 UNVERIFIED = "unverified"  # the name of who presses while the database does not say who they are
-_MOST = 4096  # remembered
-_MOST_ASKED = 64  # at once; beyond, the database is as good as gone
-_THREADS = 4
+_MOST = 4096  # remembered, and as many that are nobody's
+_THREADS = 4  # for whoever is not remembered
+_THREADS_OF_REMEMBERED = 2
 _FRESH_S = 5.0  # for which an answer of the database is taken without asking again
 COUNTS_S = 60.0  # for which it counts for what is no stop and needs no row, where the database says nothing
-_PATIENCE_S = 0.5  # for which who is not remembered waits for the database
+_PATIENCE_S = 0.5  # without any answer of the database, after which it is as good as gone
+_TURN_S = 3.0  # for which who is not remembered waits for a turn, as long as the database answers others
 _RECHECK_S = 0.25  # for which a stop of somebody who is remembered waits for it; an e-stop never does
+RETRY_AFTER_S = 1
+Credential = tuple[str, str]  # its kind, and the secret
+_Key = tuple[str, str]  # a kind, and the digest of a secret
 
 
 class Unverifiable(Exception):
     """The database did not say whose credential this is."""
+
+
+class Busy(Exception):
+    """The database answers, and there are so many to ask about from one address that this one had no turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +74,21 @@ class Login:
 
 
 class Credentials:
-    """What this process has verified; from any thread."""
+    """What this process has verified; from any thread. `wait` is asyncio's, which a test's clock may stand for."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._lock = threading.Lock()
-        self._known: OrderedDict[tuple[str, str], Login] = OrderedDict()
-        self._asked: dict[tuple[str, str], Future[Login | None]] = {}
-        self._threads = ThreadPoolExecutor(_THREADS, "credentials")
+    def __init__(
+        self,
+        clock: Callable[[], float] = time.monotonic,
+        wait: Callable[..., Awaitable[object]] = asyncio.wait,
+    ) -> None:
+        self._clock, self._wait = clock, wait
+        self._lock = threading.RLock()  # one that gives way to another is told while that one is asked about
+        self._known: OrderedDict[_Key, Login] = OrderedDict()
+        self._nobodys: OrderedDict[_Key, float] = OrderedDict()  # until when that is believed
+        self._answered_at = -float("inf")
+        self._asked: dict[tuple[_Key, str | None], Future[Login | None]] = {}
+        self._strangers: Lookups[Login | None] = Lookups(_THREADS)
+        self._remembered: Lookups[Login | None] = Lookups(_THREADS_OF_REMEMBERED, most=_MOST)
         self._owners: dict[str, Callable[[str], Any]] = {
             SESSION: session_user,
             OF_ANY_AGE[SESSION]: ended_session_user,
@@ -82,18 +100,37 @@ class Credentials:
 
     def look(self, kind: str, secret: str) -> Any:
         """The user as the database has them now, None where nobody's; in the caller's thread. Raises its Error."""
-        user = self._owners[kind](secret)
+        with connection.execute_wrapper(self._heard):
+            user = self._owners[kind](secret)
         if user is None:
-            self.forget(kind, digest(secret))
+            self._is_nobodys((kind, digest(secret)))
         else:
             self.note(kind, secret, user)
         return user
+
+    def heard(self) -> None:
+        """The database has just answered something."""
+        self._answered_at = self._clock()
+
+    def _heard(self, execute: Callable[..., Any], *asked: Any) -> Any:
+        answer = execute(*asked)
+        self.heard()
+        return answer
+
+    def _is_nobodys(self, key: _Key) -> None:
+        self.forget(*key)
+        with self._lock:
+            self._nobodys[key] = self._clock() + _FRESH_S
+            self._nobodys.move_to_end(key)
+            while len(self._nobodys) > _MOST:
+                self._nobodys.popitem(last=False)
 
     def note(self, kind: str, secret: str, user: Any) -> None:
         """The database has just said that it is this user's."""
         login = Login(user.pk, user.get_username(), role_of(user), self._clock())
         key = (kind, digest(secret))
         with self._lock:
+            self._nobodys.pop(key, None)
             self._known[key] = login
             self._known.move_to_end(key)
             while len(self._known) > _MOST:
@@ -114,89 +151,145 @@ class Credentials:
         with self._lock:
             self._known.pop((kind, digested), None)
 
-    async def presser(self, kind: str, secret: str) -> Login | None:
-        """Whose e-stop this is: at once where they are remembered, else within half a second.
+    async def presser(self, found: Sequence[Credential], share: str) -> Login | None:
+        """Whose e-stop this is, by any of these credentials: at once where one is remembered, else by the database.
 
-        No press is lost for a date: a credential whose time is over is one here. None: the database says that it is
-        nobody's. Raises Unverifiable where it says nothing.
+        No press is lost for a date: a credential whose time is over is one here. None: the database says that they
+        are nobody's. Raises Unverifiable where it says nothing, Busy where `share` has no turn though it answers.
         """
-        ended = OF_ANY_AGE.get(kind, kind)
-        for remembered in (kind, ended):
-            known = self.recall(remembered, secret)
-            if known is not None:
-                if not self._fresh(known):
-                    self._check(remembered, secret)
-                return known
-        login = await self._answer(kind, secret, _PATIENCE_S)
-        return login if login or ended == kind else await self._answer(ended, secret, _PATIENCE_S)
-
-    async def stopper(self, kind: str, secret: str) -> Login | None:
-        """Whose stop or halt this is, as the database says, or as it said last where it does not answer."""
-        known = self.recall(kind, secret)
-        if known is not None and self._fresh(known):
-            return known
+        for kind, secret in found:
+            for remembered in (kind, _of_any_age(kind)):
+                known = self.recall(remembered, secret)
+                if known is not None:
+                    if not self._fresh(known):
+                        self._check(remembered, secret)
+                    return known
+        asking = [
+            asyncio.create_task(self._stranger(_of_any_age(kind), secret, share)) for kind, secret in found
+        ]
         try:
-            return await self._answer(kind, secret, _PATIENCE_S if known is None else _RECHECK_S)
-        except Unverifiable:
+            return await _first(asking)
+        finally:
+            for one in asking:
+                one.cancel()
+
+    async def stopper(self, found: Sequence[Credential], share: str) -> tuple[str, Login] | None:
+        """Whose stop or halt this is, and by which kind of credential: one that is remembered, else any other.
+
+        As the database says, or as it said last where it does not answer. None: nobody's. Raises Unverifiable, Busy.
+        """
+        fault: Exception | None = None
+        for kind, secret in sorted(found, key=lambda one: self.recall(*one) is None):
+            known = self.recall(kind, secret)
             if known is None:
-                raise
-            return known
+                login = await self._stranger(kind, secret, share)
+            else:
+                login = known if self._fresh(known) else await self._checked(kind, secret, known)
+            if isinstance(login, Login):
+                return kind, login
+            fault = fault or login
+        if fault is not None:
+            raise fault
+        return None
 
     def _fresh(self, known: Login) -> bool:
         return self._clock() - known.checked < _FRESH_S
 
-    async def _answer(self, kind: str, secret: str, patience: float) -> Login | None:
+    async def _checked(self, kind: str, secret: str, known: Login) -> Login | None:
+        """What the database says of who is remembered, or said, where it takes its time."""
         answer = asyncio.wrap_future(self._check(kind, secret))
-        done, _ = await asyncio.wait({answer}, timeout=patience)
-        if not done:
-            answer.add_done_callback(_heard)
-            raise Unverifiable(f"the database did not answer within {patience:g} s")
-        fault = answer.exception()
-        if fault is not None:
-            raise Unverifiable(f"the database does not answer: {fault}")
-        return answer.result()
+        await self._wait({answer}, timeout=_RECHECK_S)
+        if answer.done() and answer.exception() is None:
+            return answer.result()
+        answer.add_done_callback(_read)
+        return known
 
-    def _check(self, kind: str, secret: str) -> Future[Login | None]:
-        """Ask the database, once for all who want to know the same; nobody waits here."""
-        key = (kind, digest(secret))
+    async def _stranger(self, kind: str, secret: str, share: str) -> Login | Unverifiable | Busy | None:
+        """Whose credential it is that is not remembered, or why that is not known."""
+        if self._is_known_as_nobodys((kind, digest(secret))):
+            return None
+        came = self._clock()
+        answer = asyncio.wrap_future(self._check(kind, secret, share))
+        answer.add_done_callback(_read)
+        try:
+            while not answer.done():
+                await self._wait({answer}, timeout=patience(came, self._answered_at, self._clock()))
+        except (Unverifiable, Busy) as fault:
+            return fault
+        failed = answer.exception()
+        if isinstance(failed, Crowded):
+            return Busy(str(failed))
+        return answer.result() if failed is None else Unverifiable(f"the database does not answer: {failed}")
+
+    def _is_known_as_nobodys(self, key: _Key) -> bool:
+        with self._lock:
+            return self._nobodys.get(key, -float("inf")) > self._clock()
+
+    def _check(self, kind: str, secret: str, share: str | None = None) -> Future[Login | None]:
+        """Ask the database, once for all who want to know the same; nobody waits here.
+
+        Without a `share`, who is remembered: those stand before nobody and behind nobody else.
+        """
+        key = ((kind, digest(secret)), share)
         with self._lock:
             asked = self._asked.get(key)
             if asked is not None:
                 return asked
-            asked = self._asked[key] = Future()
-            asked.set_running_or_notify_cancel()  # who stops waiting for it ends nobody else's
-            crowded = len(self._asked) > _MOST_ASKED
-        if crowded:
-            self._say(key, asked, fault=Unverifiable("too many logins are looked up at once"))
-        else:
-            self._threads.submit(self._ask, key, secret, asked)
+            work = partial(self._ask, kind, secret)
+            lookups = self._remembered if share is None else self._strangers
+            asked = self._asked[key] = lookups.ask(share, work)
+        asked.add_done_callback(lambda _: self._done(key))
         return asked
 
-    def _ask(self, key: tuple[str, str], secret: str, asked: Future[Login | None]) -> None:
-        try:
-            with hurried():
-                found = self.look(key[0], secret)
-        except Exception as fault:  # whatever it is: the database has not said who this is
-            log.warning("a %s was not verified: %s", key[0], fault)
-            self._say(key, asked, fault=fault)
-        else:
-            self._say(key, asked, None if found is None else self.recall(key[0], secret))
-        finally:
-            connection.close()
-
-    def _say(
-        self,
-        key: tuple[str, str],
-        asked: Future[Login | None],
-        login: Login | None = None,
-        fault: Exception | None = None,
-    ) -> None:
+    def _done(self, key: tuple[_Key, str | None]) -> None:
         with self._lock:
             self._asked.pop(key, None)
-        if fault is not None:
-            asked.set_exception(fault)
-        else:
-            asked.set_result(login)
+
+    def _ask(self, kind: str, secret: str) -> Login | None:
+        """A credential of any age is one that is good now, or one whose time is over."""
+        try:
+            with hurried():
+                for one in (*(now for now, ever in OF_ANY_AGE.items() if ever == kind), kind):
+                    if self.look(one, secret) is not None:
+                        return self.recall(one, secret)
+        except Exception as fault:  # whatever it is: the database has not said who this is
+            log.warning("a %s was not verified: %s", kind, fault)
+            raise
+        finally:
+            connection.close()
+        return None
+
+
+def patience(came: float, answered: float, now: float) -> float:
+    """How long who came then still waits, where the database has last answered anybody at `answered` [s].
+
+    Raises Unverifiable where it has answered nobody for half a second, Busy where others were before them for longer.
+    """
+    silent = max(came, answered) + _PATIENCE_S - now
+    if silent <= 0:
+        raise Unverifiable(f"the database did not answer within {_PATIENCE_S:g} s")
+    if came + _TURN_S <= now:
+        raise Busy(f"the database has not come to this login within {_TURN_S:g} s")
+    return min(silent, came + _TURN_S - now)
+
+
+async def _first(asking: Sequence[asyncio.Task[Login | Unverifiable | Busy | None]]) -> Login | None:
+    """The first who is somebody; raises Unverifiable at once, and Busy where nothing else is known."""
+    busy: Busy | None = None
+    for one in asyncio.as_completed(asking):
+        answer = await one
+        if isinstance(answer, Login):
+            return answer
+        if isinstance(answer, Unverifiable):
+            raise answer
+        busy = busy or answer
+    if busy is not None:
+        raise busy
+    return None
+
+
+def _of_any_age(kind: str) -> str:
+    return OF_ANY_AGE.get(kind, kind)
 
 
 def digest(secret: str) -> str:
@@ -229,8 +322,8 @@ def _logged_in(session: Any) -> Any:
     return user if user.is_authenticated else None
 
 
-def _heard(answer: asyncio.Future[Login | None]) -> None:
-    """Nobody waits for it any more: its error was logged where it arose."""
+def _read(answer: asyncio.Future[Login | None]) -> None:
+    """Nobody may wait for it any more: its error was logged where it arose."""
     if not answer.cancelled():
         answer.exception()
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from importlib.util import find_spec
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
@@ -142,9 +145,22 @@ def _take_from_others(path: Path) -> None:
 def secret_key(folder: Path) -> str:
     """EVA_SECRET_KEY, or one of the lab's own that is made once and readable by its user alone."""
     given = os.environ.get("EVA_SECRET_KEY")
-    if given:
-        return given
-    path = folder / "secret_key"
+    return given or _made_once(folder / "secret_key", partial(secrets.token_urlsafe, 50))
+
+
+def lab_id(folder: Path) -> str:
+    """Eight characters that no other lab has: its cookies are named after them, because cookies know no ports."""
+    path = folder / "lab_id"
+    found = _made_once(path, partial(secrets.token_hex, 4))
+    if not re.fullmatch("[0-9A-Za-z]{1,32}", found):
+        raise ImproperlyConfigured(
+            f"{path}: {found!r:.60}; allowed: 1 to 32 letters and digits, or remove it, and everybody logs in anew"
+        )
+    return found
+
+
+def _made_once(path: Path, make: Callable[[], str]) -> str:
+    """What the file says, which only its user reads; what is made where it is absent."""
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:
@@ -154,6 +170,6 @@ def secret_key(folder: Path) -> str:
             raise ImproperlyConfigured(f"{path} is empty: remove it, and everybody logs in anew") from None
         return found
     with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-        made = secrets.token_urlsafe(50)
+        made = make()
         file.write(made)
     return made

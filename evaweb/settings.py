@@ -51,7 +51,7 @@ MIDDLEWARE = [
     "django.middleware.security.SecurityMiddleware",
     "csp.middleware.CSPMiddleware",
     "whitenoise.middleware.WhiteNoiseMiddleware",
-    "django.contrib.sessions.middleware.SessionMiddleware",
+    "evaweb.cookies.AnySessionMiddleware",
     "django.middleware.common.CommonMiddleware",
     "django.middleware.csrf.CsrfViewMiddleware",
     "django.contrib.auth.middleware.AuthenticationMiddleware",
@@ -160,6 +160,12 @@ WHITENOISE_MAX_AGE = 0  # names carry no hash: a browser asks each time, and is 
 LANGUAGE_CODE = "en-gb"
 TIME_ZONE = environment.time_zone("EVA_TIME_ZONE", "UTC")
 USE_TZ = True
+# Cookies know no ports: another lab of this host, or another program of Django's, has cookies of other names.
+_LAB = environment.lab_id(DATA_DIR)
+SESSION_COOKIE_NAME, CSRF_COOKIE_NAME = f"eva_session_{_LAB}", f"eva_csrf_{_LAB}"
+MESSAGE_STORAGE = (
+    "django.contrib.messages.storage.session.SessionStorage"  # not in a cookie of its usual name
+)
 SESSION_COOKIE_AGE = 14 * 24 * 3600
 _HTTPS = environment.flag("EVA_HTTPS", False)
 SESSION_COOKIE_SECURE = CSRF_COOKIE_SECURE = _HTTPS

@@ -48,7 +48,8 @@ def rest_clients(target: Target) -> Counter[str]:
 
 
 def _session(target: Target, key: str = "") -> str:
-    return f"Cookie: sessionid={key or target.visitor('viewer').cookie('sessionid')}\r\n"
+    visitor = target.visitor("viewer")
+    return f"Cookie: {f'{visitor.session_name}={key}' if key else visitor.cookies}\r\n"
 
 
 def _socket(target: Target, key: str = "") -> str:

@@ -97,14 +97,13 @@ def _import(visitor: Visitor, target: Target, number: int) -> str:
 
 
 def _posted_file(visitor: Visitor, target: Target, path: str, text: str) -> int:
-    border, token = "end-of-part", visitor.cookie("csrftoken")
+    border, token = "end-of-part", visitor.csrf_token
     parts = (
         f'name="csrfmiddlewaretoken"\r\n\r\n{token}',
         f'name="file"; filename="lab.toml"\r\n\r\n{text}',
     )
     said = "".join(f"--{border}\r\nContent-Disposition: form-data; {part}\r\n" for part in parts)
-    cookies = f"sessionid={visitor.cookie('sessionid')}; csrftoken={token}"
-    headers = {"Content-Type": f"multipart/form-data; boundary={border}", "Cookie": cookies}
+    headers = {"Content-Type": f"multipart/form-data; boundary={border}", "Cookie": visitor.cookies}
     with closing(http.client.HTTPConnection(*target.address, timeout=_ANSWER_S)) as connection:
         connection.request("POST", path, f"{said}--{border}--\r\n".encode(), headers)
         return connection.getresponse().status

@@ -35,6 +35,10 @@ class Bearer(HttpBearer):
 class Session(SessionAuth):
     """The session cookie of a logged-in browser; what changes anything needs the X-CSRFToken header as well."""
 
+    openapi_description = (
+        "Named eva_session_ and what the file lab_id of the data folder says, as each lab has its own"
+    )
+
     def _get_key(self, request: HttpRequest) -> str | None:
         if not request.user.is_authenticated:  # 401 before CSRF's 403: log in first
             return None

@@ -18,7 +18,6 @@ from uuid import uuid4
 from django.conf import settings
 from django.core.exceptions import DisallowedHost
 from django.core.handlers.asgi import ASGIRequest
-from django.http import parse_cookie
 from django.utils import timezone
 from ninja.utils import check_csrf
 from pydantic import ValidationError
@@ -26,8 +25,19 @@ from pydantic import ValidationError
 from evaweb import audit
 from evaweb.api.stations import HTTP_OF, CommandIn, EStopIn
 from evaweb.api.tokens import UNKNOWN
-from evaweb.callers import address_of
-from evaweb.credentials import SESSION, TOKEN, UNVERIFIED, Login, Unverifiable, credentials
+from evaweb.callers import address_of, share_of
+from evaweb.cookies import cookies_of, sessions_of
+from evaweb.credentials import (
+    RETRY_AFTER_S,
+    SESSION,
+    TOKEN,
+    UNVERIFIED,
+    Busy,
+    Credential,
+    Login,
+    Unverifiable,
+    credentials,
+)
 from evaweb.errors import EvaError, NotAllowed
 from evaweb.headers import BARE
 from evaweb.origins import is_ours
@@ -52,6 +62,8 @@ _PREFLIGHT = [  # what a browser may send from the web's port to another one, an
     (b"access-control-allow-headers", b"content-type, x-csrftoken"),
     (b"access-control-max-age", b"7200"),
 ]
+_BUSY = (b"retry-after", b"%d" % RETRY_AFTER_S)
+_MOST_TOKENS = 4  # of one request
 _NOT_LOGGED_IN = "not logged in: log in, or send Authorization: Bearer TOKEN"
 _Receive = Callable[[], Awaitable[Any]]
 _Headers = Sequence[tuple[bytes, bytes]]
@@ -80,7 +92,7 @@ class StopDoor:
         body = await _body(receive)
         if body is None:
             return
-        told = self._told_browsers(scope)
+        told = list(self._told_browsers(scope))
         if scope["method"] == "OPTIONS":
             await _send(send, 200, {}, [*told, *_PREFLIGHT])
             return
@@ -88,6 +100,9 @@ class StopDoor:
             answered = await self._answered(scope, asked, body)
         except EvaError as fault:
             answered = (fault.status, {"error": str(fault)})
+        except Busy as fault:
+            answered = (503, {"error": f"{fault}: press or stop again; {stops.HARDWARE_STOP}"})
+            told.append(_BUSY)
         except Exception as fault:  # whatever it is: who stops must be told
             log.exception("a stop at %s was not answered", scope["path"][:200])
             answered = (500, {"error": f"{stops.HARDWARE_STOP}: {fault.__class__.__name__}"})
@@ -195,59 +210,57 @@ def _told(uuid: str, answer: stops.Answer, data: Mapping[str, Any]) -> dict[str,
 
 
 async def _presser(scope: dict[str, Any]) -> Login:
-    """Whoever presses, by any credential; raises Refused, or Unverifiable where the database might know one of them."""
+    """Whoever presses, by any credential; raises Refused, Unverifiable, Busy."""
     found = _credentials(scope)
-    for kind, secret in found:
-        login = await credentials.presser(kind, secret)
-        if login is not None:
-            return login
-    raise _nobodys(found, scope)
+    login = await credentials.presser(found, share_of(scope))
+    if login is None:
+        raise _nobodys(found, scope)
+    return login
 
 
 async def _stopper(scope: dict[str, Any]) -> tuple[str, Login]:
-    """Who stops, by which kind of credential; raises Refused."""
+    """Who stops, by which kind of credential; raises Refused, Busy."""
     found = _credentials(scope)
-    for kind, secret in found:
-        try:
-            login = await credentials.stopper(kind, secret)
-        except Unverifiable as fault:
-            raise Refused(f"{fault}: who may stop is not known; the e-stop works", 503) from None
-        if login is not None:
-            return kind, login
-    raise _nobodys(found, scope)
+    try:
+        known = await credentials.stopper(found, share_of(scope))
+    except Unverifiable as fault:
+        raise Refused(f"{fault}: who may stop is not known; the e-stop works", 503) from None
+    if known is None:
+        raise _nobodys(found, scope)
+    return known
 
 
-def _nobodys(found: list[tuple[str, str]], scope: dict[str, Any]) -> Refused:
+def _nobodys(found: list[Credential], scope: dict[str, Any]) -> Refused:
     if all(kind != TOKEN for kind, _ in found):
         return Refused(_NOT_LOGGED_IN, 401)
     audit.token_refused(address_of(ASGIRequest(scope, BytesIO())), UNKNOWN)
     return Refused(f"the token {UNKNOWN}: make one with manage.py api_token USER NAME", 401)
 
 
-def _credentials(scope: dict[str, Any]) -> list[tuple[str, str]]:
-    """Kinds and secrets, a token first: a proxy's own header, or another program's cookie, hides no session."""
-    given: dict[bytes, list[str]] = {}
-    for name, value in scope["headers"]:
-        given.setdefault(name, []).append(value.decode("latin-1"))
+def _credentials(scope: dict[str, Any]) -> list[Credential]:
+    """Kinds and secrets, tokens first: a proxy's own header, or another program's cookie, hides no session."""
     found = []
-    for header in given.get(b"authorization", ()):
+    for header in _headers(scope, b"authorization")[:_MOST_TOKENS]:
         scheme, _, secret = header.strip().partition(" ")
         found.append((TOKEN, secret.strip() if scheme.lower() == "bearer" else header))
-    session = parse_cookie("; ".join(given.get(b"cookie", ()))).get(settings.SESSION_COOKIE_NAME)
-    if session:
-        found.append((SESSION, session))
+    found += [(SESSION, key) for key in sessions_of(_headers(scope, b"cookie"))]
     if not found:
         raise Refused(_NOT_LOGGED_IN, 401)
     return found
 
 
 def _require_csrf(scope: dict[str, Any], body: bytes) -> None:
+    """Of several cookies any is good."""
+    name = settings.CSRF_COOKIE_NAME
     try:
-        refused = check_csrf(ASGIRequest(scope, BytesIO(body)))
+        for token in cookies_of(_headers(scope, b"cookie"), name) or [""]:
+            request = ASGIRequest(scope, BytesIO(body))
+            request.COOKIES[name] = token
+            if check_csrf(request) is None:
+                return
     except DisallowedHost as fault:
         raise Refused(str(fault), 400) from None
-    if refused is not None:
-        raise Refused("CSRF check Failed", 403)
+    raise Refused("CSRF check Failed", 403)
 
 
 def _said(body: bytes) -> dict[str, Any]:
@@ -281,7 +294,11 @@ def _again(body: bytes, receive: _Receive) -> _Receive:
 
 
 def _header(scope: dict[str, Any], wanted: bytes) -> str:
-    return next((value.decode("latin-1") for name, value in scope["headers"] if name == wanted), "")
+    return next(iter(_headers(scope, wanted)), "")
+
+
+def _headers(scope: dict[str, Any], wanted: bytes) -> list[str]:
+    return [value.decode("latin-1") for name, value in scope["headers"] if name == wanted]
 
 
 async def _send(send: Any, status: int, answer: Mapping[str, Any], more: _Headers = ()) -> None:

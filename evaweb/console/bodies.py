@@ -17,14 +17,13 @@ import daphne.server  # noqa: F401  first: it decides which reactor there is
 
 # isort: split
 from daphne.http_protocol import WebRequest
-from django.conf import settings
 from django.db import connections
-from django.http import parse_cookie
 from twisted.internet import reactor
 from twisted.internet.threads import deferToThread
 
 from evaweb.console.channel import refusal, whole
 from evaweb.console.logins import role_now
+from evaweb.cookies import sessions_of
 from evaweb.plans.references import LARGEST
 from evaweb.posts import post_at
 from evaweb.roles import Role
@@ -44,15 +43,16 @@ _LINGER_S = 5.0  # for which a client that goes on sending is heard, so that it 
 class Bound:
     """How many bytes a body may have, and what is answered to more; status 0: it is left out, the request goes on.
 
-    What is longer than `sure` is let in only where the session `key` is an administrator's. Where it `may_press`, the
-    first `largest` bytes of what is longer decide whether it is a press of the e-stop, of which the rest is left out.
+    What is longer than `sure` is let in only where the first session of `keys` is an administrator's. Where it
+    `may_press`, the first `largest` bytes of what is longer decide whether it is a press of the e-stop, of which the
+    rest is left out.
     """
 
     largest: int
     status: int
     sentence: str
     sure: int
-    key: str = ""
+    keys: tuple[str, ...] = ()
     may_press: bool = False
 
 
@@ -60,12 +60,12 @@ def bound_of(path: bytes, cookies: Iterable[bytes], authorized: bool) -> Bound:
     """For a request with these headers, of known length; whether its session or token is good is not known yet."""
     if _ESTOP.fullmatch(path):
         return Bound(STRANGER, 0, "", STRANGER)
-    key = parse_cookie(b";".join(cookies).decode("latin-1")).get(settings.SESSION_COOKIE_NAME, "")
-    if key or authorized:
+    keys = tuple(sessions_of(cookie.decode("latin-1") for cookie in cookies))
+    if keys or authorized:
         sure = post_at(path.decode("latin-1")).largest if path.startswith(_REST) else MEMBER
-        largest = _UPLOADS.get(path, sure) if key else sure
+        largest = _UPLOADS.get(path, sure) if keys else sure
         sentence = f"the body is too long; allowed here: {largest} bytes"
-        return Bound(largest, 413, sentence, sure, key, is_stop(path))
+        return Bound(largest, 413, sentence, sure, keys, is_stop(path))
     allowed = f"the body is too long; allowed without a login: {STRANGER} bytes"
     return Bound(STRANGER, 401 if path.startswith(_REST) else 413, allowed, STRANGER)
 
@@ -110,7 +110,7 @@ class BoundedRequest(WebRequest):
         if over and not bound.may_press:
             self._leave_out()
         elif length is not None and length > bound.sure and not bound.may_press:
-            self._ask_who(bound.key)
+            self._ask_who(bound.keys)
 
     def handleContentChunk(self, data: bytes) -> None:
         """Some of the body."""
@@ -163,10 +163,10 @@ class BoundedRequest(WebRequest):
             self.requestHeaders.removeHeader(b"expect")
             self._refuse(self.channel.transport)
 
-    def _ask_who(self, key: str) -> None:
+    def _ask_who(self, keys: tuple[str, ...]) -> None:
         """Read nothing more until the database has said whose session it is."""
         self.channel.transport.pauseProducing()
-        deferToThread(_role, key).addCallback(self._known).addErrback(self._unknown)
+        deferToThread(_role, keys).addCallback(self._known).addErrback(self._unknown)
 
     def _known(self, role: Role | None) -> None:
         said = "log in first" if role is None else f"you are {role.a}; this needs {Role.ADMIN.a}"
@@ -193,8 +193,8 @@ class BoundedRequest(WebRequest):
         events.callLater(_LINGER_S, transport.abortConnection)
 
 
-def _role(key: str) -> Role | None:
+def _role(keys: tuple[str, ...]) -> Role | None:
     try:
-        return role_now(key)
+        return next(filter(None, map(role_now, keys)), None)
     finally:
         connections.close_all()

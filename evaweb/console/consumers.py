@@ -18,10 +18,10 @@ from urllib.parse import parse_qs
 
 from channels.db import database_sync_to_async
 from channels.generic.websocket import AsyncWebsocketConsumer
-from django.conf import settings
 from django.db import Error
 
 from evaweb.blinding import EVERYTHING, Sight, sight_of
+from evaweb.callers import share_of
 from evaweb.console import requests
 from evaweb.console.hub import Room, hub
 from evaweb.console.logins import role_now
@@ -30,6 +30,7 @@ from evaweb.console.pose_queries import Aims
 from evaweb.console.quota import PER_SECOND, Quota
 from evaweb.console.requests import Aim, BadRequest, Credit, EStop, Events, Renew, Request, Stop, Watch
 from evaweb.console.stopping import Stopping
+from evaweb.cookies import sessions_of
 from evaweb.credentials import COUNTS_S, SESSION, Login, credentials
 from evaweb.errors import NotFound, StationGone
 from evaweb.roles import Role, role_of
@@ -67,6 +68,7 @@ class StationConsumer(AsyncWebsocketConsumer):
         self._aims: Aims | None = None
         self._renewing = self._admitted = False
         self._errors = 0
+        self._sessions: list[str] = []  # of which one may be the login's
         self._session = ""  # the key of the login; empty where the page has no business here
         self._cameras: Collection[str] = ()
         self._early: list[str] = []
@@ -92,16 +94,21 @@ class StationConsumer(AsyncWebsocketConsumer):
     async def connect(self) -> None:
         """Accept, and close again with a code where the page has no business here: a browser sees no other."""
         await self.accept()
-        session = self.scope["cookies"].get(settings.SESSION_COOKIE_NAME, "")
+        said = (value.decode("latin-1") for name, value in self.scope["headers"] if name == b"cookie")
+        self._sessions = sessions_of(said)
         self._page = parse_qs(self.scope["query_string"].decode()).get("page", [""])[-1]
         self._station = self.scope["url_route"]["kwargs"]["name"]
-        if not session:
+        if not self._sessions:
             await self.close(NO_LOGIN, "log in first")
         elif not requests.PAGE.fullmatch(self._page):
             await self.close(BAD_REQUEST, "page = 1 to 64 letters, digits, - or _")
         else:
-            self._session = session
-            self._stopping = Stopping(self._station, self._page, session, self._say, _go_on)
+            known = (key for key in self._sessions if credentials.recall(SESSION, key))
+            self._session = next(known, self._sessions[0])
+            found = [(SESSION, key) for key in self._sessions]
+            self._stopping = Stopping(
+                self._station, self._page, found, share_of(self.scope), self._say, _go_on
+            )
             self._keep(self._write())
             self._keep(self._admit())
 
@@ -110,15 +117,15 @@ class StationConsumer(AsyncWebsocketConsumer):
         admitted = None
         while admitted is None:
             try:
-                admitted = await _in_database(_admitted, self._station, self._session)
+                admitted = await _in_database(_admitted, self._station, self._sessions)
             except NotFound as error:
                 await self._end(NO_STATION, _short(str(error)))
                 return
             except Error as error:
                 log.warning("the database does not say who has opened a page of %s: %s", self._station, error)
                 await asyncio.sleep(_AGAIN_S)
-        user, station, role, facts, sight = admitted
-        if user is None:
+        self._session, user, station, role, facts, sight = admitted
+        if not self._session:
             await self._end(NO_LOGIN, "log in first")
             return
         self._stopping.login, self._cameras = credentials.recall(SESSION, self._session), facts["cameras"]
@@ -287,16 +294,17 @@ def _short(reason: str) -> str:
     return reason.encode("utf-8", "replace")[:123].decode("utf-8", "ignore")
 
 
-_Admitted = tuple[Any, Station | None, Role, dict[str, Any], Sight]
+_Admitted = tuple[str, Any, Station | None, Role, dict[str, Any], Sight]
 
 
-def _admitted(name: str, session: str) -> _Admitted:
-    """Who is there, and what they are shown of the station; nobody is shown nothing. NotFound."""
-    user = credentials.look(SESSION, session)
-    if user is None:
-        return None, None, Role.VIEWER, {}, EVERYTHING
-    station = station_get(name=name)
-    return user, station, role_of(user), facts_of(station.robot), sight_of(user)
+def _admitted(name: str, sessions: list[str]) -> _Admitted:
+    """By which session who is there, and what they are shown of the station; nobody is shown nothing. NotFound."""
+    for session in sessions:
+        user = credentials.look(SESSION, session)
+        if user is not None:
+            station = station_get(name=name)
+            return session, user, station, role_of(user), facts_of(station.robot), sight_of(user)
+    return "", None, None, Role.VIEWER, {}, EVERYTHING
 
 
 def _as_said(message: bytes) -> str:

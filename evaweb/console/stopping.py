@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import Future
 from datetime import datetime
 from functools import partial
@@ -17,7 +17,7 @@ from uuid import UUID
 from django.utils import timezone
 
 from evaweb.console.requests import EStop, Stop
-from evaweb.credentials import SESSION, UNVERIFIED, Login, Unverifiable, credentials
+from evaweb.credentials import UNVERIFIED, Busy, Credential, Login, Unverifiable, credentials
 from evaweb.roles import Role
 from evaweb.stations import commands, stops
 from evaweb.stations.models import CommandStatus, Station
@@ -29,11 +29,16 @@ GoOn = Callable[[Coroutine[Any, Any, None]], None]  # to the end, also when the 
 
 
 class Stopping:
-    """The stops of one page at a station; belongs to the event loop. `login` is who is there, once that is known."""
+    """The stops of one page at a station; belongs to the event loop. `login` is who is there, once that is known.
 
-    def __init__(self, station: str, page: str, session: str, say: Say, go_on: GoOn) -> None:
+    `found` are the credentials that it came with, and `share` from where.
+    """
+
+    def __init__(
+        self, station: str, page: str, found: Sequence[Credential], share: str, say: Say, go_on: GoOn
+    ) -> None:
         self.login: Login | None = None
-        self._station, self._page, self._session = station, page, session
+        self._station, self._page, self._found, self._share = station, page, found, share
         self._say, self._go_on = say, go_on
         self._unanswered = 0
 
@@ -51,7 +56,9 @@ class Stopping:
 
     async def _press_of(self, request: EStop, at: datetime) -> None:
         try:
-            login = await credentials.presser(SESSION, self._session)
+            login = await credentials.presser(self._found, self._share)
+        except Busy as fault:
+            self._refuse(request, f"{stops.HARDWARE_STOP}: {fault}")
         except Unverifiable as fault:
             log.error("an e-stop of %s is obeyed, of nobody knows whom: %s", self._station, fault)
             self._press(request, None, at, str(fault))
@@ -61,13 +68,16 @@ class Stopping:
 
     async def _stop_of(self, request: Stop, at: datetime) -> None:
         try:
-            login = await credentials.stopper(SESSION, self._session)
-        except Unverifiable as fault:
-            reason = f"{fault}: who may stop is not known; the e-stop works"
-            self._acknowledge(request.kind, request.uuid, stops.Answer(CommandStatus.FAILED, reason))
+            known = await credentials.stopper(self._found, self._share)
+        except (Unverifiable, Busy) as fault:
+            self._refuse(request, f"{fault}: who may stop is not known; the e-stop works")
         else:
-            if login is not None:
-                self._stop(request, login, at)
+            if known is not None:
+                self._stop(request, known[1], at)
+
+    def _refuse(self, request: EStop | Stop, reason: str) -> None:
+        kind = "estop" if isinstance(request, EStop) else request.kind
+        self._acknowledge(kind, request.uuid, stops.Answer(CommandStatus.FAILED, reason))
 
     def _press(self, request: EStop, login: Login | None, at: datetime, unverified: str = "") -> None:
         why, uuid = request.why, request.uuid

@@ -84,15 +84,28 @@ class Visitor:
         """Send JSON to `path` under /api/v1; VisitFailed with the sentence of the answer where it refuses."""
         headers = {
             "Content-Type": "application/json",
-            "X-CSRFToken": self.cookie("csrftoken"),
+            "X-CSRFToken": self.csrf_token,
             "Referer": self.url,
         }
         request = Request(f"{self.url}/api/v1/{path}", json.dumps(content).encode(), headers)
         return json.loads(self._open(request))
 
-    def cookie(self, name: str) -> str:
-        """The value of a cookie of this session, "" where there is none."""
-        return next((cookie.value or "" for cookie in self._cookies if cookie.name == name), "")
+    @property
+    def csrf_token(self) -> str:
+        """What goes with whatever changes something, "" where there is none."""
+        found = (cookie.value for cookie in self._cookies if cookie.name.startswith("eva_csrf_"))
+        return next(found, None) or ""
+
+    @property
+    def session_name(self) -> str:
+        """The name of the cookie with the session, whose end is the lab's own, "" where there is none."""
+        found = (cookie.name for cookie in self._cookies if cookie.name.startswith("eva_session_"))
+        return next(found, "")
+
+    @property
+    def cookies(self) -> str:
+        """The header `Cookie`, as a browser sends it."""
+        return "; ".join(f"{cookie.name}={cookie.value}" for cookie in self._cookies)
 
     def _open(self, request: Request) -> bytes:
         try:
@@ -153,7 +166,7 @@ class LivePage:
             return connect(
                 f"ws://{address.netloc}/ws/stations/{self.station}?page={self.page}",
                 origin=self._visitor.url,  # type: ignore[arg-type]
-                additional_headers={"Cookie": f"sessionid={self._visitor.cookie('sessionid')}"},
+                additional_headers={"Cookie": self._visitor.cookies},
                 max_size=_LARGEST_FRAME,
                 proxy=None,
             )

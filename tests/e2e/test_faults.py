@@ -279,7 +279,7 @@ def deaf(visitor):
             f"GET /ws/stations/{STATION}?page={os.urandom(8).hex()} HTTP/1.1",
             f"Host: {address.netloc}",
             f"Origin: {visitor.url}",
-            f"Cookie: sessionid={visitor.cookie('sessionid')}",
+            f"Cookie: {visitor.cookies}",
             "Upgrade: websocket",
             "Connection: Upgrade",
             "Sec-WebSocket-Version: 13",

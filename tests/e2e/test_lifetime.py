@@ -22,10 +22,10 @@ def demo(shared):
     return shared
 
 
-def dial(demo, origin, cookie=""):
+def dial(demo, origin, cookies=""):
     """The live socket of a page from somewhere else."""
     url = demo.url.replace("http", "ws", 1) + f"/ws/stations/{STATION}?page=p1"
-    headers = {"Cookie": f"sessionid={cookie}"} if cookie else {}
+    headers = {"Cookie": cookies} if cookies else {}
     return connect(url, origin=origin, additional_headers=headers, proxy=None)
 
 
@@ -41,11 +41,11 @@ def test_who_has_not_logged_in_is_asked_to(demo):
 
 
 def test_a_page_of_another_site_does_not_get_the_live_socket(demo):
-    cookie = visitor(demo, "operator").cookie("sessionid")
-    with pytest.raises(InvalidStatus) as refused, dial(demo, "http://elsewhere.example", cookie):
+    cookies = visitor(demo, "operator").cookies
+    with pytest.raises(InvalidStatus) as refused, dial(demo, "http://elsewhere.example", cookies):
         pass
     assert refused.value.response.status_code == 403
-    with dial(demo, demo.url, cookie) as socket:
+    with dial(demo, demo.url, cookies) as socket:
         assert json.loads(socket.recv(20))["type"] == "hello"
 
 

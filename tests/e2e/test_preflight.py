@@ -64,7 +64,7 @@ def test_the_worker_asks_where_the_station_does_not_run(bench, patient):
     patient.python(_RESTING)
     asked = bench.page.evaluate(
         """async (asked) => {
-          const token = document.cookie.match(/csrftoken=([^;]+)/)[1];
+          const token = document.querySelector('input[name="csrfmiddlewaretoken"]').value;
           const headers = { "Content-Type": "application/json", "X-CSRFToken": token };
           const answer = await fetch("/api/v1/preflights", { method: "POST", headers, body: JSON.stringify(asked) });
           return answer.json();

@@ -14,8 +14,8 @@ import pytest
 
 AWAY = Path(__file__).parent / "away.py"
 TOKEN = {"authorization": f"Bearer eva_{'x' * 43}"}
-PAGE = {"cookie": f"sessionid={'a' * 32}", "accept": "text/html"}
-BROWSER = {"cookie": f"sessionid={'a' * 32}; csrftoken={'b' * 32}", "x-csrftoken": "b" * 32}
+PAGE = {"cookie": f"eva_session_away={'a' * 32}", "accept": "text/html"}
+BROWSER = {"cookie": f"eva_session_away={'a' * 32}; eva_csrf_away={'b' * 32}", "x-csrftoken": "b" * 32}
 
 
 @pytest.fixture(params=["refuses", "hangs"])
@@ -31,6 +31,8 @@ def database(request):
 @pytest.fixture
 def ask(database, tmp_path):
     """The answers of the web to some questions."""
+
+    (tmp_path / "lab_id").write_text("away")
 
     def asked(*questions):
         environment = os.environ | {"DATABASE_URL": database, "EVA_DATA_DIR": str(tmp_path)}

@@ -45,7 +45,7 @@ def test_after_a_few_wrong_passwords_the_name_is_locked_there_and_the_page_says_
     assert 0 < int(answer["Retry-After"]) <= 900
     right = login(password="ann", path=path)
     assert right.status_code == 429
-    assert "sessionid" not in right.cookies
+    assert settings.SESSION_COOKIE_NAME not in right.cookies
 
 
 def test_others_and_other_addresses_are_not_locked(ann):

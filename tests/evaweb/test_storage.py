@@ -5,6 +5,7 @@ import json
 from contextlib import suppress
 
 import pytest
+from django.conf import settings
 from django.db import OperationalError, connection
 from django.test import Client
 
@@ -56,7 +57,7 @@ def test_a_login_on_a_full_disk_says_so(ann, full):
     answer = login()
     assert answer.status_code == 507
     assert "the disk of the lab is full" in answer.content.decode()
-    assert "sessionid" not in answer.cookies
+    assert settings.SESSION_COOKIE_NAME not in answer.cookies
     assert login("*/*").json()["error"].startswith("the disk of the lab is full")
 
 

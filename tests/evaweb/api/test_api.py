@@ -2,6 +2,7 @@ import json
 from pathlib import Path
 
 import pytest
+from django.conf import settings
 from django.db import OperationalError
 from django.test import Client
 from django.urls import reverse
@@ -66,7 +67,7 @@ def test_a_browser_needs_its_csrf_token_to_change_something_and_none_to_read(ben
     assert refused.status_code == 403
     assert "CSRF" in refused.json()["error"]
     browser.get("/login/")
-    browser.cookies["csrftoken"] = token = "a" * 32
+    browser.cookies[settings.CSRF_COOKIE_NAME] = token = "a" * 32
     done = browser.post(where, body, content_type="application/json", headers={"X-CSRFToken": token})
     assert done.status_code == 201
 

@@ -10,7 +10,7 @@ from uuid import uuid4
 
 import pytest
 from asgiref.testing import ApplicationCommunicator
-from django.conf import settings as django_settings
+from django.conf import settings as lab
 from django.contrib.sessions.models import Session
 from django.db import OperationalError, connections
 from django.test import Client
@@ -30,6 +30,7 @@ from tests.evaweb.noted import settled
 from tests.processes import eventually
 
 pytestmark = pytest.mark.django_db(transaction=True)
+NAME, CSRF = lab.SESSION_COOKIE_NAME, lab.CSRF_COOKIE_NAME
 
 
 @pytest.fixture(autouse=True)
@@ -148,15 +149,13 @@ def test_a_browser_presses_without_its_csrf_token_and_stops_with_it(live, ann, r
     browser = Client()
     browser.force_login(ann)
     connections.close_all()
-    session = (
-        f"{django_settings.SESSION_COOKIE_NAME}={browser.cookies[django_settings.SESSION_COOKIE_NAME].value}"
-    )
+    session = f"{NAME}={browser.cookies[NAME].value}"
     assert post(f"{live.name}/estop", cookie=session)[0] == 200
     stop = {"uuid": str(uuid4()), "kind": "stop", "page": "p1", "epoch": 1}
     status, answer = post(f"{live.name}/commands", stop, cookie=session)
     assert (status, answer) == (403, {"error": "CSRF check Failed"})
     assert runtime.commands == []
-    both = f"{session}; csrftoken={'a' * 32}"
+    both = f"{session}; {CSRF}={'a' * 32}"
     assert post(f"{live.name}/commands", stop, cookie=both, **{"x-csrftoken": "a" * 32})[0] in (200, 409)
     assert [command.kind for command in runtime.commands] == ["stop"]
     written(stop["uuid"])
@@ -168,8 +167,8 @@ def test_nobody_at_all_and_a_made_up_token_are_refused_in_json(live, runtime, pa
     for headers in (
         {},
         {"token": "eva_made_up"},
-        {"cookie": "sessionid=madeup"},
-        {"cookie": "sessionid=\x01; ="},
+        {"cookie": f"{NAME}=madeup"},
+        {"cookie": f"{NAME}=\x01; ="},
     ):
         status, answer = post(f"{live.name}/{path}", body, **headers)
         assert (status, list(answer)) == (401, ["error"])
@@ -190,7 +189,7 @@ def test_what_else_a_browser_sends_hides_no_session(live, ann, runtime, beside):
     browser = Client()
     browser.force_login(ann)
     connections.close_all()
-    session = f"sessionid={browser.cookies[django_settings.SESSION_COOKIE_NAME].value}"
+    session = f"{NAME}={browser.cookies[NAME].value}"
     assert (
         post(f"{live.name}/estop", **(beside | {"cookie": beside["cookie"].replace("SESSION", session)}))[0]
         == 200
@@ -201,17 +200,17 @@ def test_what_else_a_browser_sends_hides_no_session(live, ann, runtime, beside):
 def test_a_session_whose_time_is_over_presses_the_e_stop_and_nothing_else(live, ann, runtime):
     browser = Client()
     browser.force_login(ann)
-    key = browser.cookies[django_settings.SESSION_COOKIE_NAME].value
+    key = browser.cookies[NAME].value
     Session.objects.update(expire_date=timezone.now() - timedelta(days=1))
     connections.close_all()
-    assert post(f"{live.name}/estop", cookie=f"sessionid={key}")[0] == 200
+    assert post(f"{live.name}/estop", cookie=f"{NAME}={key}")[0] == 200
     assert [command.user for command in runtime.pressed] == ["ann"]
     halt = {"uuid": str(uuid4()), "kind": "halt", "page": "p1"}
-    assert post(f"{live.name}/commands", halt, cookie=f"sessionid={key}")[0] == 401
+    assert post(f"{live.name}/commands", halt, cookie=f"{NAME}={key}")[0] == 401
     Session.objects.all().delete()
     credentials.forget("session of any age", module.digest(key))
     connections.close_all()
-    assert post(f"{live.name}/estop", cookie=f"sessionid={key}")[0] == 401
+    assert post(f"{live.name}/estop", cookie=f"{NAME}={key}")[0] == 401
 
 
 def test_whatever_goes_wrong_with_a_press_is_said_with_the_hardware_stop(live, token, monkeypatch):
@@ -236,7 +235,7 @@ def test_without_the_database_who_is_remembered_stops_and_anybody_presses(live, 
     halt = {"uuid": str(uuid4()), "kind": "halt", "page": "p1", "epoch": lease.epoch}
     assert post(f"{live.name}/commands", halt, token=token)[1]["status"] == "accepted"
     assert post(f"{live.name}/estop", token=token)[0] == 200
-    for credential in ({"authorization": "Basic x"}, {"cookie": "sessionid=unknown"}):
+    for credential in ({"authorization": "Basic x"}, {"cookie": f"{NAME}=unknown"}):
         assert post(f"{live.name}/estop", **credential)[0] == 200
     unknown = str(uuid4())  # of one second's the newest has a row
     assert post(f"{live.name}/estop", {"uuid": unknown}, token="eva_unknown")[0] == 200

@@ -6,7 +6,7 @@ from datetime import timedelta
 from uuid import uuid4
 
 import pytest
-from django.conf import settings as django_settings
+from django.conf import settings as lab
 from django.contrib.sessions.models import Session
 from django.db import connections
 from django.test import Client
@@ -22,6 +22,7 @@ from tests.evaweb.api.test_door import asked, written
 from tests.evaweb.noted import settled
 
 pytestmark = pytest.mark.django_db(transaction=True)
+NAME, CSRF = lab.SESSION_COOKIE_NAME, lab.CSRF_COOKIE_NAME
 
 ALONE = stops_alone(8000)
 HERE = {"host": "localhost:8001", "of": ALONE}
@@ -40,12 +41,12 @@ def session(ann):
     browser = Client()
     browser.force_login(ann)
     connections.close_all()
-    return browser.cookies[django_settings.SESSION_COOKIE_NAME].value
+    return browser.cookies[NAME].value
 
 
 def test_who_asks_whether_it_stands_is_known_before_the_first_press(live, session):
     assert credentials.recall(SESSION, session) is None
-    status, answer, told = asked("GET", f"{live.name}/estop", cookie=f"sessionid={session}", **HERE, **PAGE)
+    status, answer, told = asked("GET", f"{live.name}/estop", cookie=f"{NAME}={session}", **HERE, **PAGE)
     assert (status, answer) == (200, {"user": "ann", "alone": True})
     assert told["access-control-allow-origin"] == PAGE["origin"]
     assert told["access-control-allow-credentials"] == "true"
@@ -53,7 +54,7 @@ def test_who_asks_whether_it_stands_is_known_before_the_first_press(live, sessio
 
 
 def test_the_web_says_that_it_is_not_alone(live, session):
-    assert asked("GET", f"{live.name}/estop", cookie=f"sessionid={session}")[:2] == (
+    assert asked("GET", f"{live.name}/estop", cookie=f"{NAME}={session}")[:2] == (
         200,
         {"user": "ann", "alone": False},
     )
@@ -64,7 +65,7 @@ def test_a_press_is_done_and_written_down_once_however_many_ways_it_comes(live, 
     press = {"uuid": str(uuid4()), "why": "both ways"}
     ways = [{**HERE, **PAGE, "content-type": "text/plain"}, {}]
     for way in ways:
-        status, answer, _ = asked("POST", f"{live.name}/estop", press, cookie=f"sessionid={session}", **way)
+        status, answer, _ = asked("POST", f"{live.name}/estop", press, cookie=f"{NAME}={session}", **way)
         assert (status, answer["status"]) == (200, "done")
     assert written(press["uuid"]).args == {"why": "both ways"}
     settled()
@@ -76,9 +77,7 @@ def test_a_press_is_done_and_written_down_once_however_many_ways_it_comes(live, 
     ["http://localhost:8002", "https://localhost:8000", "http://evil.test:8000", "null", "http://[", ""],
 )
 def test_an_odd_origin_presses_and_reads_nothing(live, session, runtime, origin):
-    status, _, told = asked(
-        "POST", f"{live.name}/estop", cookie=f"sessionid={session}", origin=origin, **HERE
-    )
+    status, _, told = asked("POST", f"{live.name}/estop", cookie=f"{NAME}={session}", origin=origin, **HERE)
     assert (status, len(runtime.pressed)) == (200, 1)
     assert "access-control-allow-origin" not in told
     assert told["vary"] == "origin"
@@ -86,12 +85,12 @@ def test_an_odd_origin_presses_and_reads_nothing(live, session, runtime, origin)
 
 def test_a_port_of_any_length_refuses_no_press(live, session, runtime):
     odd = {"host": f"localhost:{'9' * 5000}", "origin": f"http://localhost:{'9' * 5000}", "of": ALONE}
-    assert asked("POST", f"{live.name}/estop", cookie=f"sessionid={session}", **odd)[0] == 200
+    assert asked("POST", f"{live.name}/estop", cookie=f"{NAME}={session}", **odd)[0] == 200
 
 
 def test_pages_that_are_trusted_read_it_too(live, session, settings):
     settings.CSRF_TRUSTED_ORIGINS = ["https://lab.example.org"]
-    given = {"cookie": f"sessionid={session}", "origin": "https://lab.example.org"}
+    given = {"cookie": f"{NAME}={session}", "origin": "https://lab.example.org"}
     told = asked("GET", f"{live.name}/estop", **given, **HERE)[2]
     assert told["access-control-allow-origin"] == "https://lab.example.org"
 
@@ -108,13 +107,13 @@ def test_a_stop_needs_the_csrf_token_and_a_page_of_ours(live, ann, session, runt
     lease = leases.claim(user=ann, station=live, page="p1")
     runtime.do(lambda: runtime.session._enter(State.RUNNING, ""))
     connections.close_all()
-    token = {"cookie": f"sessionid={session}; csrftoken={'a' * 32}", "x-csrftoken": "a" * 32}
+    token = {"cookie": f"{NAME}={session}; {CSRF}={'a' * 32}", "x-csrftoken": "a" * 32}
 
     def halted(**given):
         order = {"uuid": str(uuid4()), "kind": "halt", "page": "p1", "epoch": lease.epoch}
         return asked("POST", f"{live.name}/commands", order, **HERE, **given)[0]
 
-    assert halted(cookie=f"sessionid={session}", **PAGE) == 403
+    assert halted(cookie=f"{NAME}={session}", **PAGE) == 403
     assert halted(**token, origin="http://localhost:8002") == 403
     assert halted(**token, origin="http://evil.test") == 403
     assert [one.kind for one in runtime.commands].count("halt") == 0
@@ -124,7 +123,7 @@ def test_a_stop_needs_the_csrf_token_and_a_page_of_ours(live, ann, session, runt
 def test_a_session_whose_time_is_over_presses_and_does_nothing_else(live, session, runtime):
     Session.objects.update(expire_date=timezone.now() - timedelta(days=1))
     connections.close_all()
-    given = {"cookie": f"sessionid={session}", **HERE, **PAGE}
+    given = {"cookie": f"{NAME}={session}", **HERE, **PAGE}
     assert asked("GET", f"{live.name}/estop", **given)[:2] == (200, {"user": "ann", "alone": True})
     assert asked("POST", f"{live.name}/estop", **given)[0] == 200
     assert [press.user for press in runtime.pressed] == ["ann"]

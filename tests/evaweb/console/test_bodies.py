@@ -9,13 +9,16 @@ import subprocess
 import sys
 
 import pytest
+from django.conf import settings
 
 from evaweb.console.bodies import MEMBER, STRANGER, bound_of
 from evaweb.headers import BARE
 from evaweb.plans.references import LARGEST
 from tests.evaweb.console.test_serve import MANAGE, served
 
-SESSION = [b"theme=dark; sessionid=abc"]
+LAB = "bodies"  # its id
+NAME = f"eva_session_{LAB}"
+SESSION = [f"theme=dark; {settings.SESSION_COOKIE_NAME}=abc".encode()]
 HUGE = 200_000_000
 
 
@@ -23,7 +26,7 @@ HUGE = 200_000_000
     ("path", "cookies", "authorized", "largest", "status"),
     [
         (b"/login/", [], False, STRANGER, 413),
-        (b"/login/", [b"csrftoken=sessionid"], False, STRANGER, 413),
+        (b"/login/", [b"eva_csrf=eva_session"], False, STRANGER, 413),
         (b"/api/v1/trials/1/score", [], False, STRANGER, 401),
         (b"/api/v1/trials/1/score", [], True, 256 * 1024, 413),
         (b"/api/v1/trials/1/score", SESSION, False, 256 * 1024, 413),
@@ -47,13 +50,15 @@ from django.test import Client
 for name, role in (("alma", {"is_superuser": True}), ("vera", {})):
     client = Client()
     client.force_login(User.objects.create(username=name, **role))
-    print(client.cookies["sessionid"].value)
-"""
+    print(client.cookies["NAME"].value)
+""".replace("NAME", NAME)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("bodies")
+    made = tmp_path_factory.mktemp("bodies")
+    (made / "lab_id").write_text(LAB)
+    return made
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +95,7 @@ def asked(port, path, *headers, body=b"", method="POST"):
 @pytest.mark.parametrize(
     ("path", "headers", "method", "status"),
     [
-        ("{}", [f"Content-Length: {HUGE}", "Cookie: sessionid=abc"], "POST", 413),
+        ("{}", [f"Content-Length: {HUGE}", f"Cookie: {NAME}=abc"], "POST", 413),
         ("{}" + "x" * 20_000, [], "GET", 414),
         ("{}", ["X-Long: " + "x" * 20_000], "GET", 431),
         ("{}", [f"X-{number}: {'x' * 1000}" for number in range(30)], "GET", 431),
@@ -127,10 +132,10 @@ def test_whatever_is_refused_is_said_in_json_or_on_a_page_of_the_lab(
     [
         ("/api/v1/trials/1/score", "X-Nothing: 1", 401),
         ("/api/v1/trials/1/score", "Authorization: Bearer eva_x", 413),
-        ("/login/", "Cookie: sessionid=abc", 413),
+        ("/login/", f"Cookie: {NAME}=abc", 413),
         ("/login/?next=/", "Expect: 100-continue", 413),
         ("/nowhere", "X-Nothing: 1", 413),
-        ("/admin/plans/plan/import/", "Cookie: sessionid=abc", 403),
+        ("/admin/plans/plan/import/", f"Cookie: {NAME}=abc", 403),
     ],
 )
 def test_what_is_too_long_is_refused_by_its_headers_alone(port, path, header, status):
@@ -144,7 +149,7 @@ def test_what_is_too_long_is_refused_by_its_headers_alone(port, path, header, st
 @pytest.mark.slow
 def test_a_file_is_read_of_an_administrator_alone(port, sessions):
     length, path = MEMBER + 1, "/admin/plans/plan/import/"
-    admin, viewer = (f"Cookie: sessionid={key}" for key in sessions)
+    admin, viewer = (f"Cookie: {NAME}={key}" for key in sessions)
     status, content = asked(port, path, f"Content-Length: {length}", viewer)
     assert (status, b"you are a viewer; this needs an admin" in content) == (403, True)
     form = "Content-Type: multipart/form-data; boundary=x"

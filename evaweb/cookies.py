@@ -1,0 +1,35 @@
+"""Cookies by name: browsers send one for each path and domain that has it, and only one of them is good."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from importlib import import_module
+
+from django.conf import settings
+from django.contrib.sessions.middleware import SessionMiddleware
+from django.http import HttpRequest, parse_cookie
+
+_MOST = 8  # of one name; a browser has one or two
+
+
+def cookies_of(headers: Iterable[str], name: str) -> list[str]:
+    """What all cookies of that name say, in the order of the headers."""
+    parts = (part for header in headers for part in header.split(";"))
+    values = (parse_cookie(part).get(name) for part in parts)
+    return list(dict.fromkeys(filter(None, values)))[:_MOST]
+
+
+def sessions_of(headers: Iterable[str]) -> list[str]:
+    """The keys of all sessions that a browser says it has."""
+    return cookies_of(headers, settings.SESSION_COOKIE_NAME)
+
+
+class AnySessionMiddleware(SessionMiddleware):
+    """Django's own, which knows the last of several cookies alone: of these the first that is a session's counts."""
+
+    def process_request(self, request: HttpRequest) -> None:
+        keys = sessions_of([request.META.get("HTTP_COOKIE", "")])
+        if len(keys) > 1:
+            exists = import_module(settings.SESSION_ENGINE).SessionStore().exists
+            request.COOKIES[settings.SESSION_COOKIE_NAME] = next(filter(exists, keys), keys[-1])
+        super().process_request(request)
