@@ -7,8 +7,6 @@ logged: it may be a password in the wrong field.
 from __future__ import annotations
 
 import logging
-import time
-from threading import Lock
 from typing import Any
 
 from axes.signals import user_locked_out
@@ -19,12 +17,12 @@ from django.dispatch import receiver
 from django.http import HttpRequest
 
 from evaweb.callers import address_of
+from evaweb.rarely import Rarely
 
 log = logging.getLogger(__name__)
 _MOST = 1000  # addresses that are remembered
 _EVERY_S = 60.0
-_refused: dict[str, tuple[float, int]] = {}  # by address: when it was told last, and how many came since
-_lock = Lock()
+_refused = Rarely(_EVERY_S, _MOST)
 
 
 @receiver(user_logged_in)
@@ -58,15 +56,10 @@ def _locked(sender: Any, request: HttpRequest, username: str, ip_address: str | 
 
 def token_refused(address: str | None, why: str) -> None:
     """A token did not open anything; once a minute per address, with how many there were."""
-    where, now = address or "nowhere", time.monotonic()
-    with _lock:
-        told, count = _refused.pop(where, (-_EVERY_S, 0))
-        due = now - told >= _EVERY_S
-        _refused[where] = (now, 0) if due else (told, count + 1)
-        if len(_refused) > _MOST:
-            del _refused[next(iter(_refused))]
-    if due:
-        log.warning("a token from %s %s%s", where, why, f" ({count} before it)" if count else "")
+    where = address or "nowhere"
+    before = _refused.due(where)
+    if before is not None:
+        log.warning("a token from %s %s%s", where, why, before)
 
 
 def _named(username: Any) -> str:

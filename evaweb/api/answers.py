@@ -1,7 +1,8 @@
-"""Shapes that all answers share: errors, pages of rows."""
+"""Shapes and sentences that all answers share: errors, pages of rows."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Generic, TypeVar
 
 from django.db.models import QuerySet
@@ -9,6 +10,8 @@ from ninja import Field, Schema
 
 Row = TypeVar("Row")
 LARGEST_PAGE = 1000
+_WRAPPERS = ("given", "filters", "paging")  # parameters of views that stand for the whole question
+_MOST_SAID = 10  # faults of one question
 
 
 class Failure(Schema):
@@ -44,3 +47,17 @@ class Paging(Schema):
 
 
 FAILURES = {frozenset({400, 401, 403, 404, 409, 422, 503}): Failure}
+
+
+def said_of(faults: Sequence[Mapping[str, Any]]) -> str:
+    """What is wrong with a question, as pydantic found it: each place, what stood there, and what is allowed."""
+    said = [_sentence(fault) for fault in faults[:_MOST_SAID]]
+    more = len(faults) - len(said)
+    return "; ".join(said) + (f"; and {more} more" if more > 0 else "")
+
+
+def _sentence(fault: Mapping[str, Any]) -> str:
+    place = ".".join(str(part) for part in fault["loc"] if part not in _WRAPPERS) or "body"
+    given = fault["input"]
+    shown = f" = {given!r:.80}" if isinstance(given, str | int | float) else ""
+    return f"{place}{shown}: {fault['msg']}"

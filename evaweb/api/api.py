@@ -26,6 +26,7 @@ from evaweb.api import (
     statistics,
     trials,
 )
+from evaweb.api.answers import said_of
 from evaweb.api.auth import Bearer, Session
 from evaweb.api.questions import Bounded, only_known
 from evaweb.errors import EvaError
@@ -33,8 +34,6 @@ from evaweb.storage import refusal_of
 from runtime.core import bounded_documents as bounded
 
 log = logging.getLogger(__name__)
-_WRAPPERS = ("given", "filters", "paging")  # parameters of views that stand for the whole question
-_MOST_SAID = 10  # faults of one question
 
 
 class _Api(NinjaAPI):
@@ -98,9 +97,7 @@ def _not_logged_in(request: HttpRequest, fault: AuthenticationError) -> HttpResp
 
 @api.exception_handler(ValidationError)
 def _malformed(request: HttpRequest, fault: ValidationError) -> HttpResponse:
-    said = [_sentence(error) for error in fault.errors[:_MOST_SAID]]
-    more = len(fault.errors) - len(said)
-    return _failure(request, "; ".join(said) + (f"; and {more} more" if more > 0 else ""), 422)
+    return _failure(request, said_of(fault.errors), 422)
 
 
 @api.exception_handler(HttpError)
@@ -130,10 +127,3 @@ def _storage(request: HttpRequest, fault: Exception) -> HttpResponse:
 
 def _failure(request: HttpRequest, sentence: str, status: int) -> HttpResponse:
     return api.create_response(request, {"error": sentence}, status=status)
-
-
-def _sentence(error: Any) -> str:
-    place = ".".join(str(part) for part in error["loc"] if part not in _WRAPPERS) or "body"
-    given = error["input"]
-    shown = f" = {given!r:.80}" if isinstance(given, str | int | float) else ""
-    return f"{place}{shown}: {error['msg']}"

@@ -23,6 +23,7 @@ from ninja.utils import check_csrf
 from pydantic import ValidationError
 
 from evaweb import audit
+from evaweb.api.answers import said_of
 from evaweb.api.stations import HTTP_OF, CommandIn, EStopIn
 from evaweb.api.tokens import UNKNOWN
 from evaweb.callers import address_of, share_of
@@ -186,7 +187,7 @@ async def _estop(scope: dict[str, Any], station: str, said: Mapping[str, Any]) -
     return HTTP_OF[answer.status], _told(str(uuid), answer, answer.data)
 
 
-async def _stop(scope: dict[str, Any], station: str, said: Mapping[str, Any], body: bytes) -> Answered | None:
+async def _stop(scope: dict[str, Any], station: str, said: Mapping[str, Any], body: bytes) -> Answered:
     at = timezone.now()
     kind, login = await _stopper(scope)
     if kind == SESSION:
@@ -195,8 +196,9 @@ async def _stop(scope: dict[str, Any], station: str, said: Mapping[str, Any], bo
         raise NotAllowed(stops.refused_to_a_viewer(login.username))
     try:
         given = CommandIn(**said)
-    except ValidationError:
-        return None  # which is said by the application, as of every command
+    except ValidationError as fault:
+        faults = [{**one, "loc": ("body", *one["loc"])} for one in fault.errors(include_url=False)]
+        raise Refused(said_of(faults), 422) from None
     named = {"kind": given.kind, "page": given.page, "epoch": given.epoch, "uuid": given.uuid}
     order = stops.order(username=login.username, **named)
     answer = await asyncio.wrap_future(stops.ask(order, station))

@@ -15,11 +15,14 @@ from threading import Condition, Thread
 
 from django.conf import settings
 
-from evaweb.stations.models import Command
+from evaweb.rarely import Rarely
+from evaweb.stations.models import Command, CommandStatus
 
 log = logging.getLogger(__name__)
 _APART_S = 1.0  # between two rows of the same
 _MOST = 1000  # different ones that wait
+_EVERY_S = 10.0  # between two lines of the log about one name
+_MOST_NAMES = 16  # that the log tells apart in that time
 _Key = tuple[str, ...]
 _Journal = Callable[[Sequence[Command]], object]
 
@@ -42,6 +45,8 @@ class Notes:
         self._waiting: dict[_Key, tuple[Command, int]] = {}
         self._written: dict[_Key, float] = {}
         self._thread: Thread | None = None
+        self._nowhere = Rarely(_EVERY_S, _MOST_NAMES, clock)
+        self._lost = Rarely(_EVERY_S, _MOST_NAMES, clock)
 
     def note(self, row: Command) -> None:
         """Have it written down; of a second's with one station, kind, user and outcome the newest, and how many.
@@ -53,10 +58,20 @@ class Notes:
             self._fresh.append((key, row))
             _, times = self._waiting.pop(key, (row, 0))
             if len(self._waiting) >= _MOST:
-                lost = self._waiting.pop(next(iter(self._waiting)))
-                log.error("more than %d stops wait to be written down, this is given up: %r", _MOST, lost)
+                self._give_up()
             self._waiting[key] = (row, times + 1)
             self._run_soon()
+
+    def _give_up(self) -> None:
+        """The oldest that came to nothing, as at a station that there is not; else the oldest."""
+        failed = (key for key, (row, _) in self._waiting.items() if row.status == CommandStatus.FAILED)
+        key = next(failed, None)
+        lost = self._waiting.pop(key or next(iter(self._waiting)))
+        before = "" if key is None else self._lost.due(CommandStatus.FAILED)
+        if before is not None:
+            log.error(
+                "more than %d stops wait to be written down, this is given up: %r%s", _MOST, lost, before
+            )
 
     def write(self, *, all_of_them: bool = False) -> float | None:
         """Hand on what is due; in how many seconds the next one is, None where nothing waits [s]."""
@@ -86,7 +101,9 @@ class Notes:
         if times > 1:
             row.data = {**row.data, "times": times}
         if not _has_station(row):
-            log.warning("%s (%s) is not written down: there is no such station", row, row.uuid)
+            before = self._nowhere.due(row.station.name, times)
+            if before is not None:
+                log.warning("%s (%s) is not written down: there is no such station%s", row, row.uuid, before)
             return
         try:
             self._keep(row)

@@ -14,6 +14,7 @@ from django.utils import timezone
 
 from evaweb import audit
 from evaweb.api.tokens import token_create
+from evaweb.rarely import Rarely
 from tests.evaweb.trials import builders
 
 pytestmark = pytest.mark.django_db
@@ -142,8 +143,7 @@ def test_control_characters_of_a_name_are_escaped(caplog):
 
 def test_refused_tokens_are_logged_once_a_minute_for_an_address(monkeypatch, caplog):
     now = [100.0]
-    monkeypatch.setattr(audit.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(audit, "_refused", {})
+    monkeypatch.setattr(audit, "_refused", Rarely(60.0, 10, clock=lambda: now[0]))
     for _ in range(3):
         audit.token_refused("10.0.0.5", "is not known")
     now[0] += 61
@@ -152,10 +152,3 @@ def test_refused_tokens_are_logged_once_a_minute_for_an_address(monkeypatch, cap
         "a token from 10.0.0.5 is not known",
         "a token from 10.0.0.5 is not known (2 before it)",
     ]
-
-
-def test_no_more_addresses_are_remembered_than_there_is_room_for(monkeypatch):
-    monkeypatch.setattr(audit, "_refused", {})
-    for number in range(audit._MOST + 10):
-        audit.token_refused(f"10.0.{number // 256}.{number % 256}", "is not known")
-    assert len(audit._refused) == audit._MOST

@@ -22,6 +22,7 @@ from evaweb.api.models import Token
 from evaweb.api.tokens import token_create
 from evaweb.asgi import application
 from evaweb.credentials import credentials
+from evaweb.rarely import Rarely
 from evaweb.stations import leases
 from evaweb.stations.models import Command
 from runtime.processes.coordinator.session.transitions import State
@@ -42,7 +43,7 @@ def _data_dir():
 
 @pytest.fixture(autouse=True)
 def _nobody_was_refused_before(monkeypatch):
-    monkeypatch.setattr(audit, "_refused", {})
+    monkeypatch.setattr(audit, "_refused", Rarely(60.0, 10))
 
 
 @pytest.fixture

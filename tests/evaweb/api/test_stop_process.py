@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from datetime import timedelta
 from uuid import uuid4
 
@@ -136,3 +137,32 @@ def test_everything_else_is_said_to_be_at_the_web(live, ann):
     for method, path in (("GET", ""), ("POST", f"{live.name}/commands"), ("PUT", f"{live.name}/estop")):
         status, answer, _ = asked(method, path, {"kind": "home"}, token=token, **HERE)
         assert (status, "the web is at port 8000" in answer["error"]) == (404, True)
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"page": "p1"}, "body.uuid: Field required"),
+        ({"page": "p1", "uuid": "5"}, "body.uuid = '5': "),
+        ({"page": "a b", "uuid": str(uuid4())}, "body.page = 'a b': "),
+        ({"page": "p1", "uuid": str(uuid4()), "epoch": -1}, "body.epoch = -1: "),
+    ],
+)
+@pytest.mark.parametrize("kind", ["stop", "halt"])
+def test_a_stop_that_lacks_something_is_told_what_as_the_pages_own_interface_says_it(
+    live, ann, runtime, kind, given, named
+):
+    token = token_create(user=ann, name="tests")
+    connections.close_all()
+    path = f"{live.name}/commands"
+    here = asked("POST", path, {"kind": kind, **given}, token=token, **HERE)[:2]
+    described = Client().post(
+        f"/api/v1/stations/{path}",
+        json.dumps({"kind": kind, **given}),
+        "application/json",
+        headers={"Authorization": f"Bearer {token}"},
+    )
+    assert here == (described.status_code, described.json())
+    assert here[0] == 422
+    assert here[1]["error"].startswith(named)
+    assert runtime.commands == []

@@ -109,6 +109,36 @@ def test_names_that_somebody_made_up_fill_no_disk(quiet, kept, settings, tmp_pat
     assert "there is no such station" in caplog.text
 
 
+def test_presses_at_names_that_somebody_makes_up_are_few_lines_of_the_log(
+    quiet, kept, settings, tmp_path, caplog
+):
+    settings.DATA_DIR = tmp_path
+    for second in range(5):
+        quiet.now = float(second)
+        for _ in range(100):
+            quiet.note(halted(station="odd", pk=None))
+        quiet.write()
+        for number in range(100):
+            quiet.note(halted(station=f"odd-{second}-{number}", pk=None))
+        quiet.write()
+    assert len(caplog.messages) == module._MOST_NAMES + 1, "of so many names, and one of all others"
+    quiet.now = module._EVERY_S
+    quiet.note(halted(station="odd", pk=None))
+    quiet.write()
+    assert caplog.messages[-1].endswith("there is no such station (400 before it)")
+    assert kept == []
+
+
+def test_what_came_to_nothing_gives_way_to_what_was_carried_out(quiet, kept, monkeypatch, caplog):
+    monkeypatch.setattr(module, "_MOST", 3)
+    rows = [halted(), *(halted(station=f"odd-{n}", status=CommandStatus.FAILED) for n in range(9))]
+    for row in rows:
+        quiet.note(row)
+    quiet.write()
+    assert [row.station.name for row in kept] == ["bench-1", "odd-7", "odd-8"]
+    assert len(caplog.messages) == 1
+
+
 def test_so_many_different_ones_wait_and_the_log_has_the_others(quiet, kept, monkeypatch, caplog):
     monkeypatch.setattr(module, "_MOST", 2)
     for name in ("ann", "bob", "cyd"):
