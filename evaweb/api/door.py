@@ -197,8 +197,7 @@ async def _stop(scope: dict[str, Any], station: str, said: Mapping[str, Any], bo
     try:
         given = CommandIn(**said)
     except ValidationError as fault:
-        faults = [{**one, "loc": ("body", *one["loc"])} for one in fault.errors(include_url=False)]
-        raise Refused(said_of(faults), 422) from None
+        raise Refused(said_of(fault.errors(include_url=False)), 422) from None
     named = {"kind": given.kind, "page": given.page, "epoch": given.epoch, "uuid": given.uuid}
     order = stops.order(username=login.username, **named)
     answer = await asyncio.wrap_future(stops.ask(order, station))

@@ -4,15 +4,28 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from unittest import mock
 
 import pytest
 from django.db import OperationalError
 from django.test import Client
+from hypothesis import given
+from hypothesis import strategies as st
 
 from evaweb import credentials as module
 from evaweb.api.models import Token
 from evaweb.api.tokens import token_create
-from evaweb.credentials import COUNTS_S, SESSION, TOKEN, Credentials, Unverifiable, credentials, session_user
+from evaweb.credentials import (
+    COUNTS_S,
+    SESSION,
+    TOKEN,
+    Busy,
+    Credentials,
+    Unverifiable,
+    credentials,
+    session_user,
+)
+from evaweb.lookups import Lookups
 from evaweb.roles import Role
 
 
@@ -33,24 +46,44 @@ class Person:
 
 
 class Base:
-    """A database under the test's hand, and how often it was asked."""
+    """A database under the test's hand, and what it was asked.
 
-    def __init__(self):
-        self.asked, self.fault, self.users = 0, None, {"a": Person("ann")}
+    Where it hangs time passes, and `meanwhile` is what happens then; else who waits has an answer.
+    """
+
+    def __init__(self, now):
+        self.questions, self.fault, self.users = [], None, {"a": Person("ann")}
         self.answers = threading.Event()
         self.answers.set()
+        self._now, self.heard, self.meanwhile = now, lambda: None, lambda: None
+
+    @property
+    def asked(self):
+        return len(self.questions)
 
     def __call__(self, secret):
-        self.asked += 1
-        assert self.answers.wait(20)
+        self.questions.append(secret)
+        assert self.answers.wait(60)
         if self.fault:
             raise self.fault
+        self.heard()
         return self.users.get(secret)
+
+    async def waited_for(self, answers, timeout):
+        assert timeout > 0
+        if self.answers.is_set():
+            await asyncio.wait(answers)
+        else:
+            self._now[0] += timeout
+            await asyncio.sleep(0)
+            self.meanwhile()
 
 
 @pytest.fixture
-def base():
-    return Base()
+def base(now):
+    made = Base(now)
+    yield made
+    made.answers.set()
 
 
 @pytest.fixture
@@ -61,54 +94,108 @@ def now():
 @pytest.fixture
 def known(base, now, monkeypatch):
     monkeypatch.setattr(module.connection, "close", lambda: None)
-    made = Credentials(clock=lambda: now[0])
+    made = Credentials(clock=lambda: now[0], wait=base.waited_for)
     made.learn("key", base)
+    base.heard = made.heard
     return made
+
+
+HERE = "192.0.2.1"
+KEY = [("key", "a")]
 
 
 def run(wanted):
     return asyncio.run(wanted)
 
 
+def presses(known, secret="a"):
+    return run(known.presser([("key", secret)], HERE))
+
+
+def stops(known, secret="a"):
+    found = run(known.stopper([("key", secret)], HERE))
+    return found and found[1]
+
+
 def test_who_is_remembered_presses_at_once_whatever_the_database_does(known, base, now):
     known.look("key", "a")
     base.answers.clear()
     now[0] += 10**6
-    login = run(known.presser("key", "a"))
-    base.answers.set()
-    assert (login.username, login.role) == ("ann", Role.OPERATOR)
+    login = presses(known)
+    assert (login.username, login.role, now[0]) == ("ann", Role.OPERATOR, 100.0 + 10**6)
 
 
-@pytest.mark.parametrize("ask", ["presser", "stopper"])
+@pytest.mark.parametrize("ask", [presses, stops])
 def test_a_database_that_is_away_verifies_nobody_new(known, base, ask):
     base.fault = OperationalError("gone")
     with pytest.raises(Unverifiable, match="the database does not answer: gone"):
-        run(getattr(known, ask)("key", "a"))
+        ask(known)
 
 
-@pytest.mark.parametrize("ask", ["presser", "stopper"])
-def test_a_database_that_hangs_is_not_waited_for(known, base, ask, monkeypatch):
-    monkeypatch.setattr(module, "_PATIENCE_S", 0.01)
+@pytest.mark.parametrize("ask", [presses, stops])
+def test_a_database_that_hangs_is_waited_for_half_a_second(known, base, now, ask):
     base.answers.clear()
-    with pytest.raises(Unverifiable, match="did not answer within"):
-        run(getattr(known, ask)("key", "a"))
+    with pytest.raises(Unverifiable, match=r"did not answer within 0\.5 s"):
+        ask(known)
+    assert now[0] == 100.5
+
+
+@pytest.mark.parametrize("ask", [presses, stops])
+def test_a_database_that_answers_others_is_waited_for_longer_and_who_has_no_turn_is_told_so(
+    known, base, now, ask
+):
+    base.answers.clear()
+    base.meanwhile = known.heard
+    with pytest.raises(Busy, match="has not come to this login within 3 s"):
+        ask(known)
+    assert now[0] == pytest.approx(103.0)
+
+
+def test_a_database_that_falls_silent_meanwhile_is_not_taken_for_a_busy_one(known, base, now):
+    base.answers.clear()
+    base.meanwhile = lambda: known.heard() if now[0] < 101.0 else None
+    with pytest.raises(Unverifiable):
+        presses(known)
+    assert now[0] == pytest.approx(101.0)
+
+
+def test_what_is_nobodys_is_not_asked_again_for_some_seconds(known, base, now):
+    assert (presses(known, "x"), stops(known, "x"), base.asked) == (None, None, 1)
+    base.answers.clear()
+    assert presses(known, "x") is None, "also where the database has gone since"
     base.answers.set()
+    now[0] += 5.0
+    base.users["x"] = Person("bob")
+    assert presses(known, "x").username == "bob"
+    assert base.asked == 2
+
+
+def test_what_was_nobodys_is_somebodys_as_soon_as_this_process_hears_of_it(known, base):
+    presses(known, "x")
+    known.note("key", "x", Person("bob"))
+    assert presses(known, "x").username == "bob"
+
+
+def test_so_many_are_known_to_be_nobodys(known, base, monkeypatch):
+    monkeypatch.setattr(module, "_MOST", 2)
+    for name in ("x", "y", "z", "z", "y", "x"):
+        presses(known, name)
+    assert base.questions == ["x", "y", "z", "x"]
 
 
 def test_a_stop_goes_by_what_was_known_where_the_database_hangs_and_by_the_database_where_it_answers(
-    known, base, now, monkeypatch
+    known, base, now
 ):
-    monkeypatch.setattr(module, "_RECHECK_S", 0.01)
     known.look("key", "a")
     base.answers.clear()
     now[0] += 60
-    assert run(known.stopper("key", "a")).role is Role.OPERATOR
-    base.answers.set()
-    monkeypatch.setattr(module, "_RECHECK_S", 20.0)
+    assert stops(known).role is Role.OPERATOR
+    assert now[0] == 160.25
     base.users.clear()
-    assert run(known.stopper("key", "a")) is None, "a withdrawn one counts at once"
+    base.answers.set()
+    assert stops(known) is None, "a withdrawn one counts at once"
     assert known.recall("key", "a") is None
-    assert run(known.presser("key", "a")) is None
+    assert presses(known) is None
 
 
 def test_for_what_is_no_stop_a_login_counts_for_a_minute_after_the_database_said_whose_it_is(
@@ -121,7 +208,7 @@ def test_for_what_is_no_stop_a_login_counts_for_a_minute_after_the_database_said
     assert known.counted("key", "a").username == "ann"
     now[0] += 0.2
     assert known.counted("key", "a") is None
-    assert run(known.stopper("key", "a")).username == "ann", "a stop counts for longer"
+    assert stops(known).username == "ann", "a stop counts for longer"
     base.fault = None
     known.look("key", "a")
     assert known.counted("key", "a").username == "ann"
@@ -130,36 +217,102 @@ def test_for_what_is_no_stop_a_login_counts_for_a_minute_after_the_database_said
 
 def test_what_was_just_verified_is_not_asked_again(known, base):
     known.look("key", "a")
-    run(known.stopper("key", "a"))
-    run(known.presser("key", "a"))
+    stops(known)
+    presses(known)
     assert base.asked == 1
 
 
 def test_a_flood_of_one_credential_asks_once(known, base):
     async def flood():
-        base.answers.clear()
-        waiting = [asyncio.create_task(known.presser("key", "a")) for _ in range(500)]
-        await asyncio.sleep(0)
-        base.answers.set()
+        waiting = [asyncio.create_task(known.presser([("key", "a")], HERE)) for _ in range(500)]
         return await asyncio.gather(*waiting)
 
     assert {login.username for login in run(flood())} == {"ann"}
     assert base.asked == 1
 
 
-def test_a_flood_of_made_up_ones_is_no_longer_queued(known, base, monkeypatch):
-    monkeypatch.setattr(module, "_PATIENCE_S", 0.01)
-    monkeypatch.setattr(module, "_MOST_ASKED", 3)
-
-    async def flood():
-        waiting = [known.presser("key", str(number)) for number in range(20)]
-        return await asyncio.gather(*waiting, return_exceptions=True)
-
+def test_of_several_credentials_one_that_is_remembered_presses_and_stops_at_once(known, base, now):
+    known.look("key", "a")
     base.answers.clear()
-    found = run(flood())
-    base.answers.set()
-    assert all(isinstance(fault, Unverifiable) for fault in found)
-    assert sum("too many logins" in str(fault) for fault in found) == 17
+    found = [("key", "x"), ("key", "y"), ("key", "a")]
+    assert run(known.presser(found, HERE)).username == "ann"
+    kind, login = run(known.stopper(found, HERE))
+    assert (kind, login.username, now[0], base.asked) == ("key", "ann", 100.0, 1)
+
+
+def test_of_several_credentials_any_is_good_and_who_is_found_waits_for_no_other(known, base, monkeypatch):
+    hangs = threading.Event()
+    known.learn("slow", lambda secret: hangs.wait(60) and None)
+    monkeypatch.setattr(known, "_wait", asyncio.wait)
+    monkeypatch.setattr(module, "_PATIENCE_S", 600.0)
+    monkeypatch.setattr(module, "_TURN_S", 600.0)
+    found = [("slow", "x"), ("key", "y"), ("key", "a")]
+    assert run(known.presser(found, HERE)).username == "ann"
+    hangs.set()
+    assert run(known.stopper(found, HERE))[1].username == "ann"
+    assert run(known.presser(found[:2], HERE)) is None
+    base.fault = OperationalError("gone")
+    with pytest.raises(Unverifiable):
+        run(known.presser([("slow", "z"), ("key", "new")], HERE))
+
+
+@pytest.mark.parametrize("kind", [SESSION, TOKEN])
+def test_who_presses_is_one_question_whatever_the_date_and_a_stop_goes_by_the_date(known, base, kind):
+    known.learn(kind, lambda secret: None)
+    known.learn(f"{kind} of any age", base)
+    assert run(known.presser([(kind, "a")], HERE)).username == "ann"
+    assert run(known.stopper([(kind, "a")], HERE)) is None
+    assert run(known.presser([(kind, "a")], HERE)).username == "ann"
+    assert base.asked == 1
+
+
+@given(
+    crowd=st.lists(st.tuples(st.sampled_from("ABC"), st.integers(0, 30)), max_size=80),
+    remembered=st.lists(st.integers(0, 5), min_size=1, max_size=6),
+)
+def test_nobody_who_is_remembered_waits_behind_anybody_who_is_not(crowd, remembered):
+    now, closed = [100.0], threading.Event()
+    known = Credentials(clock=lambda: now[0])
+    users = {f"known {number}": Person("ann") for number in range(6)}
+    known.learn("key", lambda secret: users.get(secret) or (closed.wait(60) and None))
+    with mock.patch.object(module.connection, "close"):
+        for secret in users:
+            known.look("key", secret)
+        now[0] += 60.0
+        for share, number in crowd:
+            known._check("key", f"made up {number}", share)
+        for number in remembered:
+            fresh = known._check("key", f"known {number}").result(60)
+            assert (fresh.username, fresh.checked) == ("ann", now[0])
+        asked = list(known._asked.values())
+        closed.set()
+        assert all(answer.result(60) is None for answer in asked)
+
+
+def test_a_crowd_waits_behind_itself_and_is_turned_away_where_there_is_no_room(known, base, monkeypatch):
+    crowd, more = "203.0.113.9", "198.51.100.4"
+    known._strangers = Lookups(1, most=4)
+
+    async def pressed():
+        base.answers.clear()
+        monkeypatch.setattr(known, "_wait", asyncio.wait)
+        monkeypatch.setattr(module, "_PATIENCE_S", 600.0)
+        monkeypatch.setattr(module, "_TURN_S", 600.0)
+        asked = [asyncio.create_task(known.presser([("key", f"x{n}")], crowd)) for n in range(5)]
+        while base.asked == 0:  # the first has its turn, four wait
+            await asyncio.sleep(0)
+        refused = asyncio.create_task(known.presser([("key", "x5")], crowd))
+        ann = asyncio.create_task(known.presser(KEY, more))
+        await asyncio.sleep(0)
+        base.answers.set()
+        return await asyncio.gather(*asked, refused, ann, return_exceptions=True)
+
+    *asked, refused, ann = run(pressed())
+    assert ann.username == "ann"
+    assert isinstance(refused, Busy)
+    assert "too many logins from this address" in str(refused)
+    assert [isinstance(one, Busy) for one in asked] == [False] * 4 + [True], "the newest gives way"
+    assert base.questions.index("a") == 2
 
 
 def test_so_many_are_remembered(known, base, monkeypatch):

@@ -142,10 +142,10 @@ def test_everything_else_is_said_to_be_at_the_web(live, ann):
 @pytest.mark.parametrize(
     ("given", "named"),
     [
-        ({"page": "p1"}, "body.uuid: Field required"),
-        ({"page": "p1", "uuid": "5"}, "body.uuid = '5': "),
-        ({"page": "a b", "uuid": str(uuid4())}, "body.page = 'a b': "),
-        ({"page": "p1", "uuid": str(uuid4()), "epoch": -1}, "body.epoch = -1: "),
+        ({"page": "p1"}, "uuid: Field required"),
+        ({"page": "p1", "uuid": "5"}, "uuid = '5': "),
+        ({"page": "a b", "uuid": str(uuid4())}, "page = 'a b': "),
+        ({"page": "p1", "uuid": str(uuid4()), "epoch": -1}, "epoch = -1: "),
     ],
 )
 @pytest.mark.parametrize("kind", ["stop", "halt"])

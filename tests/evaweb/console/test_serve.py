@@ -25,14 +25,14 @@ MANAGE = Path(__file__).parents[3] / "manage.py"
 
 
 @contextmanager
-def served(folder, *options, path=None, command="serve"):
+def served(folder, *options, path=None, command="serve", program=MANAGE):
     """A web process on a free port, or that for stops, and what it announced; killed where the test forgot it."""
     environment = os.environ | {"EVA_DATA_DIR": str(folder), "DJANGO_SETTINGS_MODULE": "evaweb.settings"}
     if path is not None:
         environment["PYTHONPATH"] = str(path)
     subprocess.run([sys.executable, MANAGE, "migrate", "-v0"], env=environment, check=True)
     process = subprocess.Popen(
-        [sys.executable, MANAGE, command, "--port", "0", *options],
+        [sys.executable, program, command, "--port", "0", *options],
         env=environment,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,

@@ -1,0 +1,20 @@
+"""manage.py where nobody gives the database up: on a busy machine it only seems to be gone."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+os.environ["DJANGO_SETTINGS_MODULE"] = "evaweb.settings"
+
+import django
+
+django.setup()
+
+from django.core.management import execute_from_command_line
+
+from evaweb import credentials
+
+if __name__ == "__main__":
+    credentials._PATIENCE_S = credentials._TURN_S = 600.0
+    execute_from_command_line(sys.argv)
