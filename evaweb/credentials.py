@@ -13,7 +13,7 @@ import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
@@ -71,6 +71,9 @@ class Login:
     def account(self) -> Any:
         """As rows refer to it, without asking the database."""
         return get_user_model()(pk=self.pk, username=self.username)
+
+
+_Said = Login | Unverifiable | Busy | None
 
 
 class Credentials:
@@ -204,12 +207,17 @@ class Credentials:
         answer.add_done_callback(_read)
         return known
 
-    async def _stranger(self, kind: str, secret: str, share: str) -> Login | Unverifiable | Busy | None:
-        """Whose credential it is that is not remembered, or why that is not known."""
+    def _stranger(self, kind: str, secret: str, share: str) -> Coroutine[Any, Any, _Said]:
+        """Whose credential it is that is not remembered, or why that is not known; asked about from now on."""
         if self._is_known_as_nobodys((kind, digest(secret))):
+            return self._said_of(None)
+        return self._said_of(self._check(kind, secret, share))
+
+    async def _said_of(self, asked: Future[Login | None] | None) -> _Said:
+        if asked is None:
             return None
         came = self._clock()
-        answer = asyncio.wrap_future(self._check(kind, secret, share))
+        answer = asyncio.wrap_future(asked)
         answer.add_done_callback(_read)
         try:
             while not answer.done():
@@ -273,7 +281,7 @@ def patience(came: float, answered: float, now: float) -> float:
     return min(silent, came + _TURN_S - now)
 
 
-async def _first(asking: Sequence[asyncio.Task[Login | Unverifiable | Busy | None]]) -> Login | None:
+async def _first(asking: Sequence[asyncio.Task[_Said]]) -> Login | None:
     """The first who is somebody; raises Unverifiable at once, and Busy where nothing else is known."""
     busy: Busy | None = None
     for one in asyncio.as_completed(asking):

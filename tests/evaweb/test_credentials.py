@@ -222,11 +222,23 @@ def test_what_was_just_verified_is_not_asked_again(known, base):
     assert base.asked == 1
 
 
+@pytest.fixture
+def patient(known, monkeypatch):
+    """Who waits is no matter of seconds."""
+    monkeypatch.setattr(known, "_wait", asyncio.wait)
+    monkeypatch.setattr(module, "_PATIENCE_S", 600.0)
+    monkeypatch.setattr(module, "_TURN_S", 600.0)
+
+
+@pytest.mark.usefixtures("patient")
 def test_a_flood_of_one_credential_asks_once(known, base):
     async def flood():
-        waiting = [asyncio.create_task(known.presser([("key", "a")], HERE)) for _ in range(500)]
+        waiting = [asyncio.create_task(known.presser(KEY, HERE)) for _ in range(500)]
+        await asyncio.sleep(0)
+        base.answers.set()
         return await asyncio.gather(*waiting)
 
+    base.answers.clear()
     assert {login.username for login in run(flood())} == {"ann"}
     assert base.asked == 1
 
@@ -240,12 +252,10 @@ def test_of_several_credentials_one_that_is_remembered_presses_and_stops_at_once
     assert (kind, login.username, now[0], base.asked) == ("key", "ann", 100.0, 1)
 
 
-def test_of_several_credentials_any_is_good_and_who_is_found_waits_for_no_other(known, base, monkeypatch):
+@pytest.mark.usefixtures("patient")
+def test_of_several_credentials_any_is_good_and_who_is_found_waits_for_no_other(known, base):
     hangs = threading.Event()
     known.learn("slow", lambda secret: hangs.wait(60) and None)
-    monkeypatch.setattr(known, "_wait", asyncio.wait)
-    monkeypatch.setattr(module, "_PATIENCE_S", 600.0)
-    monkeypatch.setattr(module, "_TURN_S", 600.0)
     found = [("slow", "x"), ("key", "y"), ("key", "a")]
     assert run(known.presser(found, HERE)).username == "ann"
     hangs.set()
@@ -289,15 +299,13 @@ def test_nobody_who_is_remembered_waits_behind_anybody_who_is_not(crowd, remembe
         assert all(answer.result(60) is None for answer in asked)
 
 
-def test_a_crowd_waits_behind_itself_and_is_turned_away_where_there_is_no_room(known, base, monkeypatch):
+@pytest.mark.usefixtures("patient")
+def test_a_crowd_waits_behind_itself_and_is_turned_away_where_there_is_no_room(known, base):
     crowd, more = "203.0.113.9", "198.51.100.4"
     known._strangers = Lookups(1, most=4)
 
     async def pressed():
         base.answers.clear()
-        monkeypatch.setattr(known, "_wait", asyncio.wait)
-        monkeypatch.setattr(module, "_PATIENCE_S", 600.0)
-        monkeypatch.setattr(module, "_TURN_S", 600.0)
         asked = [asyncio.create_task(known.presser([("key", f"x{n}")], crowd)) for n in range(5)]
         while base.asked == 0:  # the first has its turn, four wait
             await asyncio.sleep(0)

@@ -8,13 +8,11 @@ import sys
 os.environ["DJANGO_SETTINGS_MODULE"] = "evaweb.settings"
 
 import django
-
-django.setup()
-
 from django.core.management import execute_from_command_line
 
-from evaweb import credentials
-
 if __name__ == "__main__":
+    django.setup()
+    from evaweb import credentials  # not before models are there
+
     credentials._PATIENCE_S = credentials._TURN_S = 600.0
     execute_from_command_line(sys.argv)
