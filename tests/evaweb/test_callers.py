@@ -4,7 +4,7 @@ from ipaddress import ip_network
 
 import pytest
 
-from evaweb.callers import address_of
+from evaweb.callers import address_of, share_of
 
 PROXIES = [ip_network("127.0.0.1"), ip_network("10.1.0.0/16")]
 
@@ -37,3 +37,23 @@ def test_the_last_that_a_proxy_of_ours_has_seen(rf, settings, peer, forwarded, f
 def test_without_a_declared_proxy_nothing_forwarded_is_believed(rf):
     request = rf.get("/", headers={"x-forwarded-for": "198.51.100.1"}, REMOTE_ADDR="127.0.0.1")
     assert address_of(request) == "127.0.0.1"
+
+
+@pytest.mark.parametrize(
+    ("peer", "forwarded", "found"),
+    [
+        ("192.0.2.7", [], "192.0.2.7"),
+        ("192.0.2.7", ["198.51.100.1"], "192.0.2.7"),
+        ("127.0.0.1", ["1.1.1.1", "198.51.100.1, 10.1.2.3"], "198.51.100.1"),
+        ("::ffff:127.0.0.1", ["198.51.100.1"], "198.51.100.1"),
+        ("2001:db8:1:2:3::4", [], "2001:db8:1:2::/64"),
+        ("2001:db8:1:2:ffff::", [], "2001:db8:1:2::/64"),
+        (None, [], "nowhere"),
+    ],
+)
+def test_the_share_of_who_asks_is_that_of_the_address_and_of_a_whole_network_of_ipv6(
+    settings, peer, forwarded, found
+):
+    settings.EVA_PROXIES = PROXIES
+    headers = [(b"x-forwarded-for", value.encode()) for value in forwarded]
+    assert share_of({"headers": headers, "client": [peer, 4000] if peer else None}) == found

@@ -1,3 +1,4 @@
+import re
 import sqlite3
 import stat
 import subprocess
@@ -71,6 +72,21 @@ def test_the_key_is_made_once_and_is_its_users_alone(monkeypatch, tmp_path):
     assert stat.S_IMODE((tmp_path / "secret_key").stat().st_mode) == 0o600
     monkeypatch.setenv("EVA_SECRET_KEY", "given")
     assert environment.secret_key(tmp_path) == "given"
+
+
+def test_the_id_of_a_lab_is_made_once_and_names_cookies(tmp_path):
+    made = environment.lab_id(tmp_path)
+    assert re.fullmatch("[0-9a-f]{8}", made)
+    assert environment.lab_id(tmp_path) == made
+    (tmp_path / "lab_id").write_text("Bench3\n")
+    assert environment.lab_id(tmp_path) == "Bench3"
+
+
+@pytest.mark.parametrize("given", ["", "a b", "a;b", "é", "x" * 33])
+def test_an_id_that_names_no_cookie_is_refused(tmp_path, given):
+    (tmp_path / "lab_id").write_text(given, "utf-8")
+    with pytest.raises(ImproperlyConfigured, match=r"lab_id.*remove it, and everybody logs in anew"):
+        environment.lab_id(tmp_path)
 
 
 def test_a_private_file_is_made_for_its_user_alone_and_left_as_it_is_where_it_is(tmp_path):

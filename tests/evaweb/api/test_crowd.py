@@ -44,7 +44,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def port(folder):
-    with served(folder, command="stops", program=PATIENT) as (_, address):
+    with served(folder, command="stops", program=PATIENT, path=MANAGE.parent) as (_, address):
         yield address["port"]
 
 

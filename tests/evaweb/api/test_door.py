@@ -22,6 +22,7 @@ from evaweb.api.models import Token
 from evaweb.api.tokens import token_create
 from evaweb.asgi import application
 from evaweb.credentials import credentials
+from evaweb.lookups import Lookups
 from evaweb.rarely import Rarely
 from evaweb.stations import leases
 from evaweb.stations.models import Command
@@ -196,6 +197,46 @@ def test_what_else_a_browser_sends_hides_no_session(live, ann, runtime, beside):
         == 200
     )
     assert [command.user for command in runtime.pressed] == ["ann"]
+
+
+@pytest.mark.parametrize("order", [slice(None), slice(None, None, -1)])
+def test_of_several_cookies_of_a_name_any_is_good(live, ann, runtime, order):
+    browser = Client()
+    browser.force_login(ann)
+    connections.close_all()
+    sessions = [f"{NAME}=elsewhere", f"{NAME}={browser.cookies[NAME].value}"][order]
+    tokens = [f"{CSRF}={letter * 32}" for letter in "ab"][order]
+    given = {"cookie": "; ".join(sessions + tokens), "x-csrftoken": "a" * 32}
+    assert post(f"{live.name}/estop", **given)[0] == 200
+    assert [command.user for command in runtime.pressed] == ["ann"]
+    halt = {"uuid": str(uuid4()), "kind": "halt", "page": "p1"}
+    assert post(f"{live.name}/commands", halt, **given)[0] in (200, 409)
+    assert post(f"{live.name}/commands", halt, **{**given, "x-csrftoken": "c" * 32})[0] == 403
+    assert [command.kind for command in runtime.commands] == ["halt"]
+
+
+@pytest.mark.parametrize("what", ["estop", "commands"])
+def test_who_has_no_turn_is_told_to_come_again_and_whoever_is_remembered_stops(
+    live, ann, token, runtime, monkeypatch, what
+):
+    """The database answers, and others from that address are before them."""
+    assert post(f"{live.name}/estop", token=token)[0] == 200
+    full, begun, turn = Lookups(1, most=1), threading.Event(), threading.Event()
+    full.ask("127.0.0.1", lambda: begun.set() or turn.wait(60))
+    assert begun.wait(60)
+    full.ask("127.0.0.1", lambda: None)
+    monkeypatch.setattr(credentials, "_strangers", full)
+    body = {"uuid": str(uuid4()), "kind": "halt", "page": "p1"}
+    status, answer, told = asked("POST", f"{live.name}/{what}", body, token="eva_unknown")
+    assert (status, told["retry-after"]) == (503, "1")
+    assert "too many logins from this address are looked up at once" in answer["error"]
+    assert "USE THE HARDWARE STOP" in answer["error"]
+    assert asked("GET", f"{live.name}/estop", token="eva_unknown")[0] == 503
+    assert (len(runtime.pressed), runtime.commands) == (1, [])
+    both = {"token": token, "cookie": f"{NAME}=unknown"}
+    assert post(f"{live.name}/{what}", {**body, "uuid": str(uuid4())}, **both)[0] in (200, 409)
+    turn.set()
+    assert len(runtime.pressed) + len(runtime.commands) == 2
 
 
 def test_a_session_whose_time_is_over_presses_the_e_stop_and_nothing_else(live, ann, runtime):

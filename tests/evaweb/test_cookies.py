@@ -1,0 +1,51 @@
+"""Several cookies of one name, of which one is good."""
+
+from __future__ import annotations
+
+import pytest
+from django.conf import settings
+from django.test import Client
+
+from evaweb.cookies import cookies_of
+
+NAME = settings.SESSION_COOKIE_NAME
+
+
+@pytest.mark.parametrize(
+    ("headers", "found"),
+    [
+        ([], []),
+        (["a=1"], ["1"]),
+        (["a=1; a=2; b=3; a=1"], ["1", "2"]),
+        (["a=1; b", "c; a=2;a="], ["1", "2"]),
+        ([" a = 1 ; A=2; aa=3; =a"], ["1"]),
+        ([f"a={number}" for number in range(100)], [str(number) for number in range(8)]),
+    ],
+)
+def test_all_that_cookies_of_a_name_say_is_found_in_order_and_within_bounds(headers, found):
+    assert cookies_of(headers, "a") == found
+
+
+def test_this_labs_cookies_are_named_as_no_other_labs():
+    names = {settings.SESSION_COOKIE_NAME, settings.CSRF_COOKIE_NAME}
+    assert len({name.removeprefix("eva_session_").removeprefix("eva_csrf_") for name in names}) == 1
+    assert not names & {"sessionid", "csrftoken"}
+
+
+@pytest.mark.parametrize("order", ["{}; {}=of-elsewhere", "{1}=of-elsewhere; {0}"])
+def test_a_page_is_shown_to_whose_session_is_any_of_them(ann, order):
+    browser = Client()
+    browser.force_login(ann)
+    mine = f"{NAME}={browser.cookies[NAME].value}"
+    said = {"cookie": order.format(mine, NAME)}
+    assert Client().get("/api/v1/me", headers=said).json()["username"] == "ann"
+    neither = {"cookie": f"{NAME}=of-elsewhere; {NAME}=of-nowhere"}
+    assert Client().get("/api/v1/me", headers=neither).status_code == 401
+
+
+def test_a_login_sets_this_labs_cookies_alone(ann):
+    ann.set_password("s")
+    ann.save()
+    browser = Client()
+    assert browser.post("/login/", {"username": "ann", "password": "s"}).status_code == 302
+    assert set(browser.cookies) == {settings.SESSION_COOKIE_NAME, settings.CSRF_COOKIE_NAME}
