@@ -106,6 +106,8 @@ class Credentials:
         with connection.execute_wrapper(self._heard):
             user = self._owners[kind](secret)
         if user is None:
+            if kind in OF_ANY_AGE and self.recall(kind, secret) is not None:
+                self.look(OF_ANY_AGE[kind], secret)  # whose time is over presses as before: at once
             self._is_nobodys((kind, digest(secret)))
         else:
             self.note(kind, secret, user)
@@ -181,7 +183,7 @@ class Credentials:
 
         As the database says, or as it said last where it does not answer. None: nobody's. Raises Unverifiable, Busy.
         """
-        fault: Exception | None = None
+        fault: Busy | None = None
         for kind, secret in sorted(found, key=lambda one: self.recall(*one) is None):
             known = self.recall(kind, secret)
             if known is None:
@@ -190,6 +192,8 @@ class Credentials:
                 login = known if self._fresh(known) else await self._checked(kind, secret, known)
             if isinstance(login, Login):
                 return kind, login
+            if isinstance(login, Unverifiable):
+                raise login
             fault = fault or login
         if fault is not None:
             raise fault
@@ -220,14 +224,14 @@ class Credentials:
         answer = asyncio.wrap_future(asked)
         answer.add_done_callback(_read)
         try:
-            while not answer.done():
+            while not asked.done():  # which the loop may not have noticed yet
                 await self._wait({answer}, timeout=patience(came, self._answered_at, self._clock()))
         except (Unverifiable, Busy) as fault:
             return fault
-        failed = answer.exception()
+        failed = asked.exception()
         if isinstance(failed, Crowded):
             return Busy(str(failed))
-        return answer.result() if failed is None else Unverifiable(f"the database does not answer: {failed}")
+        return asked.result() if failed is None else Unverifiable(f"the database does not answer: {failed}")
 
     def _is_known_as_nobodys(self, key: _Key) -> bool:
         with self._lock:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future, ThreadPoolExecutor
 from threading import Lock
 from typing import Generic, TypeVar
 
+log = logging.getLogger(__name__)
 T = TypeVar("T")
 _MOST = 1024  # that wait, of all shares together
 
@@ -44,7 +46,10 @@ class Lookups(Generic[T]):
         if turned_away is not None:
             turned_away.set_exception(Crowded())
         if turned_away is None:  # else a thread is promised to the one that gave way
-            self._threads.submit(self._next)
+            try:
+                self._threads.submit(self._next)
+            except RuntimeError as error:  # no more threads: it waits for those that there are
+                log.error("%s", error)
         return answer
 
     def _place_for(self, share: Hashable, answer: Future[T]) -> Future[T] | None:

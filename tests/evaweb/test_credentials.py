@@ -276,6 +276,36 @@ def test_who_presses_is_one_question_whatever_the_date_and_a_stop_goes_by_the_da
     assert base.asked == 1
 
 
+@pytest.mark.parametrize("ask", ["presser", "stopper", "look"])
+def test_who_is_remembered_when_their_time_is_over_presses_at_once_all_the_same(known, base, now, ask):
+    ends = {"a": Person("ann")}
+    known.learn(SESSION, ends.get)
+    known.learn("session of any age", base)
+    known.look(SESSION, "a")
+    ends.clear()
+    now[0] += 60.0
+    found = [(SESSION, "a")]
+    if ask == "look":
+        known.look(SESSION, "a")
+    else:
+        run(getattr(known, ask)(found, HERE))
+    known._check(SESSION, "a").result(60)
+    base.answers.clear()
+    assert run(known.presser(found, HERE)).username == "ann"
+    assert (known.recall(SESSION, "a"), now[0]) == (None, 160.0)
+
+
+def test_without_another_thread_a_press_is_not_lost(known, base, now, monkeypatch):
+    def none(work):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(known._strangers._threads, "submit", none)
+    base.answers.clear()
+    with pytest.raises(Unverifiable):
+        presses(known)
+    assert now[0] == 100.5
+
+
 @given(
     crowd=st.lists(st.tuples(st.sampled_from("ABC"), st.integers(0, 30)), max_size=80),
     remembered=st.lists(st.integers(0, 5), min_size=1, max_size=6),
