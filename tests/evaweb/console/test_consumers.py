@@ -20,6 +20,7 @@ from evaweb.binary_frames import decode
 from evaweb.console import consumers
 from evaweb.console import hub as hubs
 from evaweb.credentials import credentials
+from evaweb.lookups import Lookups
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
 from evaweb.stations.runtime_client import StationWire
@@ -790,3 +791,50 @@ def test_a_page_that_opens_while_the_database_is_away_can_stop(live, ann, runtim
     assert [command.user for command in runtime.pressed] == ["ann" if remembered else "unverified"]
     row = Command.objects.get(kind="estop")
     assert (row.user, "unverified" in row.args) == ((ann, False) if remembered else (None, True))
+
+
+@pytest.mark.parametrize("order", [slice(None), slice(None, None, -1)])
+def test_a_page_with_several_cookies_of_that_name_is_whose_session_is_any_of_them(live, ann, runtime, order):
+    name = settings.SESSION_COOKIE_NAME
+    cookies = [f"{name}=elsewhere", f"{name}={_cookie(ann)}"][order]
+
+    async def scenario():
+        page = Page(live.name, ann)
+        page._headers.append((b"cookie", "; ".join(cookies).encode()))
+        await page.open()
+        assert (await page.told("hello"))["user"] == "ann"
+        await page.say(type="estop", uuid=str(uuid4()), why="smoke")
+        assert (await page.told("ack"))["status"] == "done"
+        await page.close()
+        await _written()
+
+    run(scenario())
+    assert [command.user for command in runtime.pressed] == ["ann"]
+
+
+def test_a_page_that_has_no_turn_to_be_looked_up_is_told_so_and_presses_nothing(
+    live, ann, runtime, monkeypatch
+):
+    def gone(*given):
+        raise OperationalError("gone")
+
+    monkeypatch.setattr(consumers, "_admitted", gone)
+    full, begun, turn = Lookups(1, most=1), threading.Event(), threading.Event()
+    full.ask("nowhere", lambda: begun.set() or turn.wait(60))
+    assert begun.wait(60)
+    full.ask("nowhere", lambda: None)
+    monkeypatch.setattr(credentials, "_strangers", full)
+
+    async def scenario():
+        page = await Page(live.name, ann).open()
+        for kind in ("estop", "halt"):
+            await page.say(type=kind, uuid=str(uuid4()), epoch=1)
+            said = await page.told("ack")
+            assert (said["kind"], said["status"]) == (kind, "failed")
+            assert "too many logins from this address are looked up at once" in said["reason"]
+            assert ("USE THE HARDWARE STOP" in said["reason"]) == (kind == "estop")
+        turn.set()
+        await page.close()
+
+    run(scenario())
+    assert (runtime.pressed, runtime.commands) == ([], [])
