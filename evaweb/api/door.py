@@ -102,7 +102,7 @@ class StopDoor:
         except EvaError as fault:
             answered = (fault.status, {"error": str(fault)})
         except Busy as fault:
-            answered = (503, {"error": f"{fault}: press or stop again; {stops.HARDWARE_STOP}"})
+            answered = (503, {"error": f"{fault}: stop again; the e-stop works"})
             told.append(_BUSY)
         except Exception as fault:  # whatever it is: who stops must be told
             log.exception("a stop at %s was not answered", scope["path"][:200])
@@ -172,7 +172,7 @@ async def _estop(scope: dict[str, Any], station: str, said: Mapping[str, Any]) -
     unverified, username, user = "", UNVERIFIED, None
     try:
         login = await _presser(scope)
-    except Unverifiable as fault:
+    except (Unverifiable, Busy) as fault:  # no crowd refuses an e-stop
         unverified = str(fault)
         log.error("an e-stop of %s is obeyed, of nobody knows whom: %s", station, fault)
     else:

@@ -57,9 +57,7 @@ class Stopping:
     async def _press_of(self, request: EStop, at: datetime) -> None:
         try:
             login = await credentials.presser(self._found, self._share)
-        except Busy as fault:
-            self._refuse(request, f"{stops.HARDWARE_STOP}: {fault}")
-        except Unverifiable as fault:
+        except (Unverifiable, Busy) as fault:  # no crowd refuses an e-stop
             log.error("an e-stop of %s is obeyed, of nobody knows whom: %s", self._station, fault)
             self._press(request, None, at, str(fault))
         else:
@@ -70,14 +68,11 @@ class Stopping:
         try:
             known = await credentials.stopper(self._found, self._share)
         except (Unverifiable, Busy) as fault:
-            self._refuse(request, f"{fault}: who may stop is not known; the e-stop works")
+            reason = f"{fault}: who may stop is not known; the e-stop works"
+            self._acknowledge(request.kind, request.uuid, stops.Answer(CommandStatus.FAILED, reason))
         else:
             if known is not None:
                 self._stop(request, known[1], at)
-
-    def _refuse(self, request: EStop | Stop, reason: str) -> None:
-        kind = "estop" if isinstance(request, EStop) else request.kind
-        self._acknowledge(kind, request.uuid, stops.Answer(CommandStatus.FAILED, reason))
 
     def _press(self, request: EStop, login: Login | None, at: datetime, unverified: str = "") -> None:
         why, uuid = request.why, request.uuid

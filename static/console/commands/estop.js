@@ -9,9 +9,6 @@ import { EStopState } from "./estop_state.js";
 
 const ACK_MS = 500;
 const ASK_MS = 5000;
-const BUSY = 503; // whoever answers it does not know yet who presses
-const AGAIN_MS = 1000;
-const MOST_AGAIN = 5;
 const TEXT_FIELDS = 'textarea, [contenteditable="true"], input:not([type]), input[type="text"], input[type="search"], input[type="number"], input[type="password"], input[type="email"], input[type="url"]';
 const WORDS = {
   pressed: { kind: "pressed", text: "E-stop pressed …" },
@@ -105,15 +102,13 @@ export class EStop {
     for (const address of press.left) this.#post(id, press, address);
   }
 
-  async #post(id, press, address, again = MOST_AGAIN) {
+  async #post(id, press, address) {
     press.left.delete(address);
     press.ways += 1;
     try {
       this.acknowledged({ status: "done", ...(await post(address, { uuid: id, why: press.why }, { simple: true })), uuid: id });
     } catch (error) {
       this.acknowledged({ uuid: id, status: "failed", reason: error.message });
-      if (error.status !== BUSY || !again) return;
-      setTimeout(() => this.#state.waits(id) && this.#post(id, press, address, again - 1), AGAIN_MS);
     }
   }
 
