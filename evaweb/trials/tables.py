@@ -13,6 +13,7 @@ import pydantic
 from django.core.exceptions import ValidationError
 
 from runtime.config.schema import PolicyConfig
+from runtime.core.plugins import parts
 
 _TAG = re.compile(r"[A-Za-z0-9_.:/+-]{1,40}")
 _PLACES = {"block": ("x", "y", "yaw in degrees"), "plate": ("x", "y")}
@@ -108,8 +109,7 @@ def _table(config: type[pydantic.BaseModel], way: tuple[str | int, ...]) -> type
 
 @cache
 def _kinds() -> dict[str, type[pydantic.BaseModel]]:
-    union = get_args(PolicyConfig)[0] if get_args(PolicyConfig) else PolicyConfig
-    kinds = {config.model_fields["kind"].default: config for config in get_args(union) or (union,)}
+    kinds = {config.model_fields["kind"].default: config for config in parts(PolicyConfig)}
     return {kind: config for kind, config in kinds.items() if kind != "none"}  # no policy is no checkpoint
 
 

@@ -17,6 +17,7 @@ from pydantic.fields import FieldInfo
 
 from robots.broken_pipe import unread_ends
 from runtime.config.schema import Deployment
+from runtime.core.plugins import parts
 
 Schema = Mapping[str, Any]
 
@@ -61,7 +62,7 @@ def _models(path: str, annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]
     elif get_origin(annotation) is dict:
         yield from _models(f"{path}.NAME", get_args(annotation)[1])
     else:
-        for part in get_args(annotation):
+        for part in parts(annotation):
             yield from _models(path, part)
 
 

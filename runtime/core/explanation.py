@@ -11,6 +11,8 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from runtime.core.plugins import OneOf, variants
+
 Key = tuple[str, ...]
 _SECRET = re.compile(
     r"pass|secret|token|private", re.IGNORECASE
@@ -53,7 +55,7 @@ def _sentence(
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         where = origin.get((*key, "kind"), where)
         given = f"= {error['input']['kind']!r:.200}" if "kind" in error["input"] else "is missing"
-        return f"{where}: {name}.kind {given}: must be one of {', '.join(_kinds(key, tree, root))}"
+        return f"{where}: {name}.kind {given}: must be one of {error['ctx']['expected_tags']}"
     if kind == "secret":
         return f"{where}: {name}: {error['msg']}"
     if kind in ("model_type", "model_attributes_type", "dict_type"):
@@ -83,20 +85,18 @@ def _allowed(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[s
     return sorted({name for model in _tables(key, tree, root) for name in model.model_fields})
 
 
-def _kinds(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[str]:
-    """The kinds that the table at `key` may be of."""
-    return [repr(model.model_fields["kind"].default) for model in _tables(key, tree, root)]
-
-
 def _tables(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[type[BaseModel]]:
     """What the table at `key` may be: one model where its kind says so, else each it could be."""
     annotations: list[Any] = [root]
     at: Any = tree
     for name in key:
-        annotations = [found for annotation in annotations for found in _under(name, annotation)]
         at = at.get(name) if isinstance(at, Mapping) else None
-        chosen = [model for model in _models(annotations) if _is_of_kind(model, at)]
-        annotations = list(chosen or annotations)
+        annotations = [
+            chosen
+            for annotation in annotations
+            for found in _under(name, annotation)
+            for chosen in _chosen(found, at)
+        ]
     return _models(annotations)
 
 
@@ -110,9 +110,14 @@ def _under(name: str, annotation: Any) -> list[Any]:
     return [found for part in get_args(annotation) for found in _under(name, part)]
 
 
-def _is_of_kind(model: type[BaseModel], table: Any) -> bool:
-    declared = model.model_fields.get("kind")
-    return declared is not None and isinstance(table, Mapping) and table.get("kind") == declared.default
+def _chosen(annotation: Any, table: Any) -> list[Any]:
+    """The annotation, that of the kind that `table` names where there are several; [] where it names none."""
+    if isinstance(annotation, type) and issubclass(annotation, OneOf):
+        kind = table.get("kind") if isinstance(table, Mapping) else None
+        return [annotation.config(kind)] if kind in variants(annotation.package) else []
+    if get_origin(annotation) in (dict, list) or not get_args(annotation):
+        return [annotation]
+    return [found for part in get_args(annotation) for found in _chosen(part, table)]
 
 
 def _models(annotations: Sequence[Any]) -> list[type[BaseModel]]:

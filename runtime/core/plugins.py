@@ -1,46 +1,116 @@
-"""Finds the variants of a part: every public module of its package that declares a `Config`."""
+"""Variants of a part, each a module that is imported by name, and only where a deployment names its kind."""
 
 from __future__ import annotations
 
 import functools
 import importlib
-import pkgutil
-from functools import reduce
-from operator import or_
+import importlib.util
+from collections.abc import Iterator, Mapping
 from types import ModuleType
-from typing import Annotated, Any
+from typing import Any, ClassVar, get_args
 
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
+from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
 from runtime.core.errors import ConfigurationError
 
 
-@functools.cache
-def variants(package: str) -> dict[str, ModuleType]:
-    """The modules of `package` by their `kind`; adding a file there is all it takes to add a variant.
+class Variants(Mapping[str, ModuleType]):
+    """The modules of a package by their `kind`, as its table KINDS names them; each is imported when it is asked for.
 
-    Raises ConfigurationError where two modules claim the same kind.
+    Raises ConfigurationError, which names file and cause, for one that cannot be imported.
     """
-    root = importlib.import_module(package)
-    found: dict[str, ModuleType] = {}
-    for info in pkgutil.iter_modules(root.__path__):
-        if info.name.startswith("_"):
-            continue
-        module = importlib.import_module(f"{package}.{info.name}")
-        if not hasattr(module, "Config"):
-            continue
-        kind = module.Config.model_fields["kind"].default
-        if kind in found:
+
+    def __init__(self, package: str) -> None:
+        self._package = package
+        self._modules: Mapping[str, str] = importlib.import_module(package).KINDS
+
+    def __getitem__(self, kind: str) -> ModuleType:
+        name = self._modules[kind]
+        try:
+            return importlib.import_module(name)
+        except Exception as error:  # of code that may be anybody's: it is told where a deployment names it
+            found = importlib.util.find_spec(name)
             raise ConfigurationError(
-                f"{module.__name__} declares the kind {kind!r}, which is {found[kind].__name__}'s; "
-                f"allowed: any but {', '.join(found)}"
-            )
-        found[kind] = module
-    return found
+                f"{self._package.rpartition('.')[2]}: the kind {kind!r} cannot be loaded: "
+                f"{name if found is None else found.origin}: {type(error).__name__}: {error}"
+            ) from error
+
+    def __contains__(self, kind: object) -> bool:
+        return kind in self._modules
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._modules)
+
+    def __len__(self) -> int:
+        return len(self._modules)
+
+
+@functools.cache
+def variants(package: str) -> Variants:
+    """The variants that `package` names in its table KINDS."""
+    return Variants(package)
+
+
+class UnreadSection(BaseModel):
+    """A table that this process has no use for: as it was written, by its kind, with nothing of it loaded."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    kind: str
+
+
+class OneOf:
+    """The type of a table of one of a package's kinds, told apart by `kind`.
+
+    A kind is imported when a table names it. A package that the context of the validation has under `unread` is
+    left alone: its tables become an UnreadSection each.
+    """
+
+    package: ClassVar[str]
+
+    @classmethod
+    def config(cls, kind: str) -> type[BaseModel]:
+        """The model of the tables of a kind."""
+        found: type[BaseModel] = variants(cls.package)[kind].Config
+        return found
+
+    @classmethod
+    def configs(cls) -> tuple[type[BaseModel], ...]:
+        """The models of all kinds: imports them all."""
+        return tuple(cls.config(kind) for kind in variants(cls.package))
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.with_info_plain_validator_function(cls._validated)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"description": "A table of one of several kinds."}
+
+    @classmethod
+    def _validated(cls, table: Any, info: ValidationInfo) -> BaseModel:
+        if isinstance(table, BaseModel):
+            return table
+        if not isinstance(table, Mapping):
+            raise PydanticKnownError("model_attributes_type")
+        if cls.package in (info.context or {}).get("unread", ()):
+            return UnreadSection.model_validate(table)
+        kind, known = table.get("kind"), variants(cls.package)
+        if not isinstance(kind, str) or kind not in known:
+            tags = ", ".join(map(repr, known))
+            context = {"discriminator": "'kind'", "tag": str(kind), "expected_tags": tags}
+            raise PydanticKnownError("union_tag_invalid", context)
+        return cls.config(kind).model_validate(table)
 
 
 def union(package: str) -> Any:
-    """The union of the variants' Configs, told apart by `kind`; a new file in the package joins by itself."""
-    configs = [module.Config for module in variants(package).values()]
-    made = reduce(or_, configs)
-    return Annotated[made, Field(discriminator="kind")] if len(configs) > 1 else made
+    """The type of a table of one of the package's kinds."""
+    return type("OneOf", (OneOf,), {"package": package, "__doc__": OneOf.__doc__})
+
+
+def parts(annotation: Any) -> tuple[Any, ...]:
+    """What an annotation is made of: the models of all kinds of a table that has kinds, else its arguments."""
+    if isinstance(annotation, type) and issubclass(annotation, OneOf):
+        return annotation.configs()
+    return get_args(annotation)

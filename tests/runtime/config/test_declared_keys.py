@@ -15,6 +15,7 @@ from pydantic import BaseModel
 from robots.description import RobotTable
 from robots.robot import Gripper, Group, Robot
 from runtime.config.schema import Deployment
+from runtime.core.plugins import parts
 from tests.runtime.reading import Reads, reads_of
 
 ROOT = Path(__file__).parents[3]
@@ -78,7 +79,7 @@ def _tables(annotation: Any, seen: list[type]) -> None:
         seen.append(annotation)
         for inner in _fields(annotation).values():
             _tables(inner, seen)
-    for part in typing.get_args(annotation):
+    for part in parts(annotation):
         _tables(part, seen)
 
 
