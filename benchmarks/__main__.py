@@ -21,6 +21,7 @@ _BENCHMARKS = (
     "replay",
     "results",
     "soak",
+    "start",
     "strategies",
     "wires",
 )

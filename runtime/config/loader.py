@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,10 +63,15 @@ def assigned(
     return resolve(tree, origin, source)
 
 
-def resolve(tree: Mapping[str, Any], origin: Mapping[Key, str], source: str) -> Resolved:
-    """Check a tree of settings; `origin` says which file or option each key came from."""
+def resolve(
+    tree: Mapping[str, Any], origin: Mapping[Key, str], source: str, unread: Collection[str] = ()
+) -> Resolved:
+    """Check a tree of settings; `origin` says which file or option each key came from.
+
+    Tables whose kinds are in one of the packages `unread` are kept as they are.
+    """
     try:
-        deployment = Deployment.model_validate(tree)
+        deployment = Deployment.model_validate(tree, context={"unread": unread})
     except ValidationError as invalid:
         raise ConfigurationError(explanation(invalid, Deployment, tree, source, origin)) from None
     except ConfigurationError as error:  # of a variant's own check, which knows no file

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from runtime.core import logs as log
@@ -19,13 +20,13 @@ class Member(Membership):
     plan: StationSpec
 
 
-def join(process: str, pictures: bool = True) -> Member:
-    """Read what the supervisor handed over on the command line."""
+def join(process: str, pictures: bool = True, unread: Collection[str] = ()) -> Member:
+    """Read what the supervisor handed over on the command line; `unread` as by `planned`."""
     parser = argparse.ArgumentParser(prog=f"runtime.{process}", description="started by the supervisor")
     parser.add_argument("--resolved", required=True)
     parser.add_argument("--page", required=True, type=int)
     parser.add_argument("--boot", required=True)
     given = parser.parse_args()
     log.start(process)
-    made = planned(given.resolved)
+    made = planned(given.resolved, unread)
     return Member(SharedState.attach(made.layout, given.page, pictures), given.boot, Lifeline(), made)

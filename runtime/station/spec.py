@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 import robots
 from robots import Robot
-from runtime.cameras.attaching import attached, check
 from runtime.config import collection
 from runtime.config import loader as deployment
 from runtime.config.loader import Resolved
@@ -22,19 +23,18 @@ from runtime.core.errors import ConfigurationError, RuntimeFault, SetupError
 from runtime.core.plugins import variants
 from runtime.core.pose_format import refuse_format
 from runtime.ipc.shared_state import SharedStateLayout
-from runtime.kinematics.base import Kinematics
-from runtime.kinematics.forward import ChainForward
 from runtime.motion.timeline import DimensionKinds
-from runtime.policies.base import Policy
-from runtime.policies.tunnel.policy import through_tunnel
-from runtime.safety.filter import Limits
-from runtime.spaces.conversion import ActionSpaces
-from runtime.spaces.end_effectors import EndEffectors
-from runtime.spaces.pose_rows import PoseRows
-from runtime.spaces.published_poses import PosePublisher
-from runtime.teleoperators.base import Leader
-from runtime.teleoperators.relay import NodeLed, Relay
-from runtime.transports.base import Capabilities, Source
+from runtime.safety.limits import Limits
+
+# What a process does not make it does not load: these are imported where they are made.
+if TYPE_CHECKING:
+    from runtime.kinematics.base import Kinematics
+    from runtime.policies.base import Policy
+    from runtime.spaces.conversion import ActionSpaces
+    from runtime.spaces.end_effectors import EndEffectors
+    from runtime.spaces.published_poses import PosePublisher
+    from runtime.teleoperators.base import Leader
+    from runtime.transports.base import Capabilities, Source
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +76,8 @@ class StationSpec:
 
     def new_policy(self, clock: Clock) -> Policy:
         """The policy, not yet connected; raises RuntimeFault where it does not fit the robot, or cannot be made."""
+        from runtime.policies.tunnel.policy import through_tunnel
+
         if self.collecting:
             return self._teleoperation(clock)
         settings = self.deployment.policy
@@ -92,6 +94,8 @@ class StationSpec:
 
     def _teleoperation(self, clock: Clock) -> Policy:
         """What is asked while a person drives the robot."""
+        from runtime.teleoperators.relay import NodeLed, Relay
+
         wanted = self.deployment.collection
         if wanted is None:
             raise ConfigurationError("this deployment has no [collection]: it says nothing of who leads")
@@ -134,6 +138,8 @@ class StationSpec:
 
         The transport is told of a robot without these: it must not wait for them. What it leaves out itself stays.
         """
+        from runtime.cameras.attaching import attached
+
         settings, delivered = self.deployment, set(self._delivered)
         own = settings.cameras.keys() & delivered
         robot = replace(self.robot, cameras=tuple(c for c in self.robot.cameras if c.key not in own))
@@ -176,10 +182,15 @@ class StationSpec:
 
     def spaces(self, kinematics: Kinematics | None = None) -> ActionSpaces:
         """The robot's action spaces, with these kinematics of it or with its own."""
+        from runtime.spaces.conversion import ActionSpaces
+
         return ActionSpaces(self.robot, kinematics or self.kinematics(), self.rate)
 
     def end_effectors(self) -> EndEffectors:
         """Where joints put the robot's end effectors: all that processes need that solve nothing."""
+        from runtime.kinematics.forward import ChainForward
+        from runtime.spaces.end_effectors import EndEffectors
+
         return EndEffectors(self.robot, ChainForward(self.robot))
 
     def publication(self) -> PosePublisher | None:
@@ -187,20 +198,18 @@ class StationSpec:
         wanted = self.deployment.publication
         if wanted.space == "joint":
             return None
+        from runtime.spaces.pose_rows import PoseRows
+        from runtime.spaces.published_poses import PosePublisher
+
         return PosePublisher(PoseRows(wanted.pose, self.robot, "publication.pose"), self.end_effectors())
 
 
 def plan(resolved: Resolved) -> StationSpec:
     """Check that the parts of a deployment fit each other; raises ConfigurationError or SetupError."""
-    settings = resolved.deployment
-    try:
-        grippers = {
-            name: robots.GripperChoice(**given.model_dump()) for name, given in settings.grippers.items()
-        }
-        robot = robots.load(settings.robot, settings.groups, grippers)
-    except robots.RobotError as error:
-        raise ConfigurationError(str(error)) from None
-    made = StationSpec(resolved, robot)
+    from runtime.cameras.attaching import check
+
+    settings, made = resolved.deployment, unchecked(resolved)
+    robot = made.robot
     if settings.setup.pose not in robot.poses:
         raise ConfigurationError(
             f"setup.pose = {settings.setup.pose!r}: {robot.name} has {', '.join(sorted(robot.poses))}"
@@ -232,6 +241,19 @@ def plan(resolved: Resolved) -> StationSpec:
     return made
 
 
+def unchecked(resolved: Resolved) -> StationSpec:
+    """A deployment with its robot, whose parts are known to fit each other; ConfigurationError for no such robot."""
+    settings = resolved.deployment
+    try:
+        grippers = {
+            name: robots.GripperChoice(**given.model_dump()) for name, given in settings.grippers.items()
+        }
+        robot = robots.load(settings.robot, settings.groups, grippers)
+    except robots.RobotError as error:
+        raise ConfigurationError(str(error)) from None
+    return StationSpec(resolved, robot)
+
+
 def _check_collection(made: StationSpec) -> None:
     """A node that drives by itself must be one that can be told to, and to leave off, and says what it applied."""
     wanted, capabilities = made.deployment.collection, made.capabilities
@@ -257,6 +279,8 @@ def _check_publication(made: StationSpec) -> None:
     if wanted.space == "joint":
         refuse_format(wanted.pose, "publication.pose")
         return
+    from runtime.spaces.pose_rows import PoseRows
+
     PoseRows(wanted.pose, made.robot, "publication.pose")
     if capabilities.poses and wanted.pose not in capabilities.poses:
         raise SetupError(
@@ -265,6 +289,9 @@ def _check_publication(made: StationSpec) -> None:
         )
 
 
-def planned(path: str) -> StationSpec:
-    """The plan of the resolved deployment that a supervisor wrote there."""
-    return plan(deployment.resolve(json.loads(Path(path).read_text("utf-8")), {}, path))
+def planned(path: str, unread: Collection[str] = ()) -> StationSpec:
+    """The plan of the resolved deployment that a supervisor has checked and wrote there.
+
+    Tables of the packages `unread` stay as they are written, and none of their kinds is loaded.
+    """
+    return unchecked(deployment.resolve(json.loads(Path(path).read_text("utf-8")), {}, path, unread))

@@ -26,6 +26,8 @@ from runtime.transports.base import Sink
 
 log = logging.getLogger(__name__)
 _LATENESS_KEPT = 2000
+# Of a deployment, what others make: what is wrong with its modules costs control nothing.
+_UNREAD = ("runtime.policies", "runtime.teleoperators", "runtime.cameras", "runtime.kinematics")
 
 
 def make_tick(plan: StationSpec, page: SharedState, sink: Sink, now: Callable[[], float]) -> Tick:
@@ -117,7 +119,7 @@ class Loop:
 
 def main() -> None:
     """Tick until the supervisor is gone, then hold for a while, then end."""
-    member = join("control", pictures=False)
+    member = join("control", pictures=False, unread=_UNREAD)
     plan, page = member.plan, member.page
     clock = MonotonicClock()
     for _ in page.rings["orders"].drain():

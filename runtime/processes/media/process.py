@@ -47,6 +47,14 @@ from runtime.recording.episode import EpisodeJournal
 from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
+# Of a deployment, what others make: what is wrong with its modules costs no recording.
+_UNREAD = (
+    "runtime.policies",
+    "runtime.teleoperators",
+    "runtime.cameras",
+    "runtime.kinematics",
+    "runtime.strategies",
+)
 _REPORT_PERIOD = 0.2
 _PERIOD_S = 0.002  # between two looks at what the family says
 _LAST_S = 8.0  # for the last episode, before the supervisor's patience ends
@@ -292,7 +300,7 @@ def main() -> None:
     """Run media until the supervisor is gone."""
     heap.keep()
     descriptors.allow_all()
-    member = join("media")
+    member = join("media", unread=_UNREAD)
     plan, page = member.plan, member.page
     clock = MonotonicClock()
     page.beat("media", clock.now())

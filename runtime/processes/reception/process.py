@@ -20,6 +20,8 @@ from runtime.station.spec import StationSpec
 from runtime.transports.base import Source
 
 log = logging.getLogger(__name__)
+# Of a deployment, what others make: what is wrong with its modules keeps nobody from seeing the robot.
+_UNREAD = ("runtime.policies", "runtime.teleoperators", "runtime.kinematics", "runtime.strategies")
 _REPORT_PERIOD = 0.2
 _WAIT_S = 0.005  # for an observation, until media is heard again
 _RETRY_S = 1.0  # between two tries to connect
@@ -129,7 +131,7 @@ class Reception:
 def main() -> None:
     """Receive until the supervisor is gone, and control with it."""
     heap.keep()
-    member = join("reception")
+    member = join("reception", unread=_UNREAD)
     page, clock = member.page, MonotonicClock()
     page.beat("reception", clock.now())
     scheduling = _scheduling(member.plan)  # before there are other threads, which are to have the same

@@ -1,0 +1,139 @@
+"""From `python -m runtime` of the tabletop deployment to its first snapshot in the state idle, and what that takes.
+
+The bench runs already, and every file has been read before. Processor time and memory are those of each process when
+the snapshot came; modules are those that it had loaded when it ended.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import psutil
+
+from benchmarks.report import Figure, Report
+from runtime.clients.client import StationClient
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.bus import Endpoints
+from tests.crash.lab import ROOT, Lab
+
+PROGRAMS = {
+    "supervisor": "runtime.__main__",
+    "control": "runtime.processes.control.process",
+    "main": "runtime.processes.coordinator.process",
+    "reception": "runtime.processes.reception.process",
+    "media": "runtime.processes.media.process",
+    "guard": "runtime.processes.guard.process",
+}
+_LOADED = Path(__file__).parent / "loaded"
+_STARTS = 5
+_PATIENCE_S = 120.0
+_POLL_S = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class StartedStation:
+    """A station that is idle: its client, its processes, and how long it took to come there [s]."""
+
+    client: StationClient
+    processes: Mapping[str, psutil.Process]
+    seconds: float
+
+
+@contextmanager
+def started(
+    node: Mapping[str, str], folder: Path, *assignments: str, broken: str = ""
+) -> Iterator[StartedStation]:
+    """The tabletop's station at `node`; afterwards `folder`/loaded has a file of modules for each program.
+
+    `broken` are modules, with commas, that none of its processes can import.
+    """
+    (folder / "loaded").mkdir(parents=True)
+    settings = (
+        f'transport.sub_endpoint="{node["obs_endpoint"]}"',
+        f'transport.pub_endpoint="{node["action_endpoint"]}"',
+        f'data_dir="{folder}"',
+        "recording.min_free_bytes=0",
+        *assignments,
+    )
+    path = os.pathsep.join(filter(None, (str(_LOADED), os.environ.get("PYTHONPATH"))))
+    environment = os.environ | {"PYTHONPATH": path, "EVA_LOADED": str(folder / "loaded"), "EVA_BROKEN": broken}
+    sets = [part for setting in settings for part in ("--set", setting)]
+    begun = time.monotonic()
+    with (folder / "station.log").open("w") as log:
+        family = subprocess.Popen(
+            [sys.executable, "-m", "runtime", "deployments/tabletop.toml", *sets],
+            stderr=log,
+            cwd=ROOT,
+            env=environment,
+        )
+    client = StationClient(folder / "stations" / "bench-1", holder="benchmark")
+    try:
+        _await_idle(client, family, folder)
+        seconds = time.monotonic() - begun
+        pids = {**Endpoints(folder / "stations" / "bench-1").read("supervisor"), "supervisor": family.pid}
+        yield StartedStation(client, {name: psutil.Process(int(pids[name])) for name in PROGRAMS}, seconds)
+    finally:
+        client.close()
+        family.send_signal(signal.SIGTERM)
+        family.wait(_PATIENCE_S)
+
+
+def _await_idle(client: StationClient, family: subprocess.Popen[bytes], folder: Path) -> None:
+    until = time.monotonic() + _PATIENCE_S
+    while time.monotonic() < until and family.poll() is None:
+        try:
+            if client.status(_POLL_S * 10)["state"] == "idle":
+                return
+        except RuntimeFault:
+            time.sleep(_POLL_S)
+    raise SystemExit(f"the station did not become idle: {(folder / 'station.log').read_text()[-2000:]}")
+
+
+def loaded(folder: Path, process: str) -> list[str]:
+    """Names of the modules that a process of a station in `folder` had loaded when it ended."""
+    return (folder / "loaded" / PROGRAMS[process]).read_text().split()
+
+
+def _once(node: Mapping[str, str], folder: Path) -> dict[str, Any]:
+    with started(node, folder) as station:
+        row: dict[str, Any] = {"station_ready_s": station.seconds}
+        for name, process in station.processes.items():
+            used = process.cpu_times()
+            row[f"cpu_s.{name}"] = used.user + used.system
+            row[f"memory_mb.{name}"] = process.memory_full_info().pss / 1e6
+    return row | {f"modules.{name}": len(loaded(folder, name)) for name in PROGRAMS}
+
+
+def measure(seconds: float) -> Report:
+    """`station_ready_s`, and for each process `cpu_s.PROCESS`, `modules.PROCESS` and `memory_mb.PROCESS`; medians of 5.
+
+    `seconds` means nothing here.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        lab = Lab(Path(name))
+        try:
+            lab.node()
+            node = lab.addresses["node"]
+            rows = [_once(node, Path(name) / str(start)) for start in range(1 + _STARTS)][1:]
+        finally:
+            for child in lab.children.values():
+                child.stdin.close()
+                child.wait(_PATIENCE_S)
+    middle = {key: median(row[key] for row in rows) for key in rows[0]}
+    units = {"station_ready_s": "s", "cpu_s": "s", "modules": "", "memory_mb": "MB"}
+    figures = [
+        Figure(key, value, units[key.partition(".")[0]], "<= 2" if key == "station_ready_s" else "")
+        for key, value in sorted(middle.items(), key=lambda item: (item[0] != "station_ready_s", item[0]))
+    ]
+    return Report("start", figures, rows)
