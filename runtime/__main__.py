@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from robots.broken_pipe import unread_ends
-from runtime.clients import headless
 from runtime.config import loader as deployment
 from runtime.config.loader import Resolved
 from runtime.core import environment
@@ -20,8 +19,6 @@ from runtime.core import logs as log
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.ipc.lifeline import Lifeline
-from runtime.processes.coordinator.session.transitions import State
-from runtime.processes.lockstep import lockstep
 from runtime.processes.supervisor.supervisor import Supervisor
 from runtime.station.rerun import data_folder, rerun
 from runtime.station.spec import StationSpec, plan
@@ -39,8 +36,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ).close()  # what does not fit it is said here, not by a main that dies
         _require_encoder(made)
         if given.headless:
+            from runtime.clients import headless
+
             headless.check(made)
         if given.lockstep:
+            from runtime.processes.lockstep import lockstep
+
             lockstep.check(made)
     except RuntimeFault as fault:
         print(fault, file=sys.stderr)
@@ -115,6 +116,9 @@ def _check(made: StationSpec) -> int:
 
 def run_in_lockstep(made: StationSpec) -> int:
     """Run, print how it went, export it, publish what ended well; returns the exit code."""
+    from runtime.processes.coordinator.session.transitions import State
+    from runtime.processes.lockstep import lockstep
+
     done = lockstep.run(made)
     episode = done.episode
     print(f"{done.state}: {done.reason}")
