@@ -67,7 +67,11 @@ def started(
         *assignments,
     )
     path = os.pathsep.join(filter(None, (str(_LOADED), os.environ.get("PYTHONPATH"))))
-    environment = os.environ | {"PYTHONPATH": path, "EVA_LOADED": str(folder / "loaded"), "EVA_BROKEN": broken}
+    environment = os.environ | {
+        "PYTHONPATH": path,
+        "EVA_LOADED": str(folder / "loaded"),
+        "EVA_BROKEN": broken,
+    }
     sets = [part for setting in settings for part in ("--set", setting)]
     begun = time.monotonic()
     with (folder / "station.log").open("w") as log:

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from runtime.cameras.attached import Attached
 from runtime.cameras.base import Address, Camera, CameraSettings
-from runtime.cameras.file import Config as FileConfig
 from runtime.cameras.live import LiveCamera
-from runtime.cameras.playing import FileCamera
 from runtime.core.clock import Clock, VirtualClock
 from runtime.core.errors import ConfigurationError, SetupError
 from runtime.core.plugins import variants
@@ -43,9 +41,11 @@ def attached(source: Source, cameras: Mapping[str, Any], clock: Clock) -> Source
 
 
 def _camera(key: str, settings: CameraSettings, clock: Clock, virtual: bool) -> Camera:
-    if isinstance(settings, FileConfig):
-        return FileCamera(key, settings, clock, threaded=not virtual)
     kind = str(settings.kind)  # type: ignore[attr-defined]  # every variant has one
+    if kind == "file":
+        from runtime.cameras.playing import FileCamera
+
+        return FileCamera(key, settings, clock, threaded=not virtual)
     if virtual:
         raise SetupError(
             f"cameras.{key}: kind {kind!r} goes on by itself, and lockstep has no real time; allowed there: 'file'"

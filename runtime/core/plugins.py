@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 import importlib
-import importlib.util
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar, get_args
 
@@ -23,17 +23,19 @@ class Variants(Mapping[str, ModuleType]):
 
     def __init__(self, package: str) -> None:
         self._package = package
-        self._modules: Mapping[str, str] = importlib.import_module(package).KINDS
+        root = importlib.import_module(package)
+        self._folder = Path(root.__path__[0])
+        self._modules: Mapping[str, str] = root.KINDS
 
     def __getitem__(self, kind: str) -> ModuleType:
         name = self._modules[kind]
         try:
             return importlib.import_module(name)
         except Exception as error:  # of code that may be anybody's: it is told where a deployment names it
-            found = importlib.util.find_spec(name)
+            file = self._folder / f"{name.rpartition('.')[2]}.py"
             raise ConfigurationError(
-                f"{self._package.rpartition('.')[2]}: the kind {kind!r} cannot be loaded: "
-                f"{name if found is None else found.origin}: {type(error).__name__}: {error}"
+                f"{self._package.rpartition('.')[2]}: the kind {kind!r} cannot be loaded: {file}: "
+                f"{type(error).__name__}: {error}"
             ) from error
 
     def __contains__(self, kind: object) -> bool:
@@ -85,7 +87,9 @@ class OneOf:
         return core_schema.with_info_plain_validator_function(cls._validated)
 
     @classmethod
-    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(
+        cls, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
         return {"description": "A table of one of several kinds."}
 
     @classmethod

@@ -138,12 +138,14 @@ class StationSpec:
 
         The transport is told of a robot without these: it must not wait for them. What it leaves out itself stays.
         """
-        from runtime.cameras.attaching import attached
-
         settings, delivered = self.deployment, set(self._delivered)
         own = settings.cameras.keys() & delivered
         robot = replace(self.robot, cameras=tuple(c for c in self.robot.cameras if c.key not in own))
         source: Source = self.transport.source(settings.transport, robot, clock)
+        if not settings.cameras:
+            return source
+        from runtime.cameras.attaching import attached
+
         return attached(source, settings.cameras, clock)
 
     @property
@@ -206,8 +208,6 @@ class StationSpec:
 
 def plan(resolved: Resolved) -> StationSpec:
     """Check that the parts of a deployment fit each other; raises ConfigurationError or SetupError."""
-    from runtime.cameras.attaching import check
-
     settings, made = resolved.deployment, unchecked(resolved)
     robot = made.robot
     if settings.setup.pose not in robot.poses:
@@ -229,7 +229,10 @@ def plan(resolved: Resolved) -> StationSpec:
             f"recording.heights: {', '.join(strange)} are no cameras of this station; "
             f"allowed: {', '.join(made.cameras)}"
         )
-    check(settings.cameras, robot)
+    if settings.cameras:
+        from runtime.cameras.attaching import check
+
+        check(settings.cameras, robot)
     collection.check(settings.collection, made.cameras)
     _check_publication(made)
     _check_collection(made)
