@@ -114,7 +114,11 @@ def _chosen(annotation: Any, table: Any) -> list[Any]:
     """The annotation, that of the kind that `table` names where there are several; [] where it names none."""
     if isinstance(annotation, type) and issubclass(annotation, OneOf):
         kind = table.get("kind") if isinstance(table, Mapping) else None
-        return [annotation.config(kind)] if kind in variants(annotation.package) else []
+        return (
+            [annotation.config(kind)]
+            if isinstance(kind, str) and kind in variants(annotation.package)
+            else []
+        )
     if get_origin(annotation) in (dict, list) or not get_args(annotation):
         return [annotation]
     return [found for part in get_args(annotation) for found in _chosen(part, table)]

@@ -72,7 +72,7 @@ def test_a_module_that_cannot_be_imported_is_named_with_its_cause_where_its_kind
     assert f"{name}/broken.py: {cause}" in str(refused.value)
 
 
-@pytest.mark.parametrize("table", [{"kind": "pigeon"}, {"kind": 3}, {}])
+@pytest.mark.parametrize("table", [{"kind": "pigeon"}, {"kind": 3}, {"kind": []}, {}])
 def test_a_kind_that_is_none_is_told_with_those_that_are(package, table):
     name = package(wire=MODULE.format(kind="wire"))
     with pytest.raises(ValidationError) as refused:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,19 @@ def test_another_policy_takes_the_place_of_the_former_which_is_closed_first(tmp_
     assert former.calls[-1] == "close"
     station.close()
     assert other.calls[-1] == "close"
+
+
+def test_a_policy_whose_module_cannot_be_loaded_is_refused_by_name_and_the_station_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "runtime.policies.starvla", None)
+    station = Station(plan(tmp_path)).ready()
+    with pytest.raises(SetupError, match=r"'starvla' cannot be loaded: .*starvla.py: ModuleNotFoundError"):
+        station.command("setup", policy={"kind": "starvla", "url": "ws://127.0.0.1:1"})
+    station.command("run")
+    station.go(20)
+    assert station.state is State.RUNNING
+    station.close()
 
 
 def test_the_same_policy_is_kept_and_connected_anew(tmp_path: Path) -> None:
