@@ -43,8 +43,10 @@ def attached(source: Source, cameras: Mapping[str, Any], clock: Clock) -> Source
 def _camera(key: str, settings: CameraSettings, clock: Clock, virtual: bool) -> Camera:
     kind = str(settings.kind)  # type: ignore[attr-defined]  # every variant has one
     if kind == "file":
+        from runtime.cameras.file import Config
         from runtime.cameras.playing import FileCamera
 
+        assert isinstance(settings, Config)
         return FileCamera(key, settings, clock, threaded=not virtual)
     if virtual:
         raise SetupError(
