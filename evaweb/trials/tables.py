@@ -12,8 +12,7 @@ from typing import Any, get_args
 import pydantic
 from django.core.exceptions import ValidationError
 
-from runtime.config.schema import PolicyConfig
-from runtime.core.plugins import parts
+from runtime.config.schema import policy_tables
 
 _TAG = re.compile(r"[A-Za-z0-9_.:/+-]{1,40}")
 _PLACES = {"block": ("x", "y", "yaw in degrees"), "plate": ("x", "y")}
@@ -109,7 +108,7 @@ def _table(config: type[pydantic.BaseModel], way: tuple[str | int, ...]) -> type
 
 @cache
 def _kinds() -> dict[str, type[pydantic.BaseModel]]:
-    kinds = {config.model_fields["kind"].default: config for config in parts(PolicyConfig)}
+    kinds = {config.model_fields["kind"].default: config for config in policy_tables()}
     return {kind: config for kind, config in kinds.items() if kind != "none"}  # no policy is no checkpoint
 
 

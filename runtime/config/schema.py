@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from runtime.config.collection import CollectionSettings
 from runtime.core.errors import ConfigurationError
-from runtime.core.plugins import union, variants
+from runtime.core.plugins import parts, union, variants
 from runtime.core.pose_format import PoseFormat
 from runtime.core.settings import Settings
 from runtime.core.types import Space
@@ -55,6 +55,11 @@ _NO_PORTS = (
     "the bus has no ports any more, but Unix sockets that this account alone can reach, in $XDG_RUNTIME_DIR/eva-web "
     "(docs/security.md): leave it out"
 )
+
+
+def policy_tables() -> tuple[type[Settings], ...]:
+    """What a [policy] table may be: one model for each kind."""
+    return parts(PolicyConfig)
 
 
 class ControlSettings(Settings):
