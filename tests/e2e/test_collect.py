@@ -95,7 +95,7 @@ def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(an
     page.fill("#session-target", "5")
     page.locator("[data-collect=open]").click()
     page.locator("[data-session-uuid]").wait_for()
-    assert TASK in page.locator(".prompt").inner_text()
+    page.locator(".prompt", has_text=TASK).wait_for()
     page.fill("#seed", "1")
     page.keyboard.press("Enter")
     ann.key("u")
@@ -179,7 +179,7 @@ def test_what_went_wrong_is_discarded_and_recorded_again_also_with_a_gamepad(ann
     ann.key("m")
     page.locator(".pad-row[data-action=fail] button").click()
     press(5)
-    assert "RB (5)" in page.locator(".pad-row[data-action=fail] .pad-button").inner_text()
+    page.locator(".pad-row[data-action=fail] .pad-button", has_text="RB (5)").wait_for()
     page.evaluate("window.held = null")
     ann.key("m")
 

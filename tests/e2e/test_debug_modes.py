@@ -120,7 +120,7 @@ def test_strategy_and_prompt_are_switched_while_the_robot_moves(ready):
     assert (found["task"], found["state"]) == ("put it on the plate, slowly", "running")
     page.fill("#parameter-ensemble_horizon", "0")
     ready.says("[data-tune=edited]", "a whole number from 1")
-    assert page.locator("[data-command=tune]").get_attribute("aria-disabled") == "true"
+    page.locator("[data-command=tune][aria-disabled=true]").wait_for()
     page.locator("[data-tune=undo]").click()
     page.locator("[data-tune=deployed]").click()
     ready.keys("d")

@@ -251,12 +251,12 @@ def test_a_page_outlives_the_web_and_says_meanwhile_that_nothing_is_known(demo, 
     with suspended(demo.child.pid):
         os.kill(demo.pid("serve"), signal.SIGKILL)
         commanding.reaches("NO CONNECTION")
-        assert "nothing is known" in page.locator("#situation").inner_text().lower()
-        assert page.locator("[data-prepare]").get_attribute("aria-disabled") == "true"
+        page.locator("#situation", has_text="nothing is known").wait_for()
+        page.locator("[data-prepare][aria-disabled=true]").wait_for()
     commanding.at_rest()
     commanding.cameras_live()
     commanding.take_again()
-    assert page.locator("[data-prepare]").get_attribute("aria-disabled") == "false"
+    page.locator("[data-prepare][aria-disabled=false]").wait_for()
 
 
 @contextmanager

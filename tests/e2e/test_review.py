@@ -58,7 +58,7 @@ def test_an_episode_is_reviewed_by_keyboard_and_the_next_one_comes(reviewer, pat
     assert band["width"] / axis["width"] == pytest.approx(20 / built.FRAMES, abs=0.01)
     keys.press("g")
     eventually(lambda: "row 40 of" in page.locator("#time").inner_text(), 10, "the flag's first row is shown")
-    assert "cam_high is black" in page.locator("#flag-here").inner_text()
+    page.locator("#flag-here", has_text="cam_high is black").wait_for()
 
     keys.press("[")
     for _ in range(10):
@@ -77,9 +77,9 @@ def test_an_episode_is_reviewed_by_keyboard_and_the_next_one_comes(reviewer, pat
     keys.press("f")
     eventually(lambda: page.locator("#review-state").inner_text() == "fail by ann", 10, "the verdict stands")
     keys.press("?")
-    assert page.locator("#review-keys").is_visible()
+    page.locator("#review-keys").wait_for()
     keys.press("Escape")
-    eventually(lambda: not page.locator("#review-keys").is_visible(), 10, "the list of keys is closed")
+    page.locator("#review-keys").wait_for(state="hidden")
 
     said = reviewer.api(f"episodes/{newer}/reviews")
     assert [(one["verdict"], one["note"]) for one in said["reviews"]] == [
