@@ -48,7 +48,12 @@ class BenchPage:
         if not mine.is_visible():
             self.take()
 
+    def answered(self, command):
+        """What was pressed has its answer: until then the same again would not be sent."""
+        self.page.locator(f"[data-command={command}][data-pressed]").first.wait_for(state="detached")
+
     def press(self, command):
+        self.answered(command)
         self.page.locator(f"[data-command={command}]:visible:enabled").first.click()
 
     def api(self, path):

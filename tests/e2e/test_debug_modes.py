@@ -47,6 +47,7 @@ def test_the_set_up_shows_its_stages_and_can_be_cancelled_and_repeated(bench, pa
     finally:
         os.kill(policy, signal.SIGCONT)
     assert "cancelled" in bench.snapshot()["reason"]
+    bench.answered("setup")  # the station may have begun, and ended, before the page hears that it was asked
     bench.keys("u")
     bench.reaches("READY")
     bench.quiet("[data-stages]")

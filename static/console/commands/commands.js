@@ -123,7 +123,10 @@ export class Commands {
       this.say(`${verb(kind)}: ${button.title}`, "refused");
       return;
     }
-    if (this.#pending.has(kind) && !STOPPING.includes(kind)) return;
+    if (this.#pending.has(kind) && !STOPPING.includes(kind)) {
+      this.say(`${verb(kind)}: pressed already, and not answered yet`, "pressed");
+      return;
+    }
     this.#pending.add(kind);
     button.dataset.pressed = "";
     const beside = { trial, checkpoint: checkpoint && document.querySelector(checkpoint).value, replay: replay && JSON.parse(replay) };

@@ -1,4 +1,4 @@
-"""What pages say of stops whose answers come late: run by Node on a stand-in of the page."""
+"""What pages say of commands whose answers come late: run by Node on a stand-in of the page."""
 
 from __future__ import annotations
 
@@ -248,3 +248,23 @@ def test_an_answer_to_an_earlier_stop_is_not_said_of_the_later_one() -> None:
         return kinds;
         """,
     ) == ["pressed", "pressed", "unknown", "unknown", "accepted"]
+
+
+def test_a_button_that_is_pressed_before_its_first_press_is_answered_says_so_and_sends_nothing() -> None:
+    assert run(
+        "../site/identity.js",
+        STOPS
+        + """
+        let click;
+        document.addEventListener = (_, take) => { click = take; };
+        new Commands(store, socket, way);
+        const button = { dataset: { command: "setup" }, attributes: [], getAttribute: () => "false" };
+        const press = async () => { click({ target: { closest: () => button } }); await settled(); };
+        await press(); await said();
+        line.textContent = "Stop: done";
+        await press(); kinds.push(line.textContent, posts.length);
+        posts[0]({ status: "accepted" }); await said();
+        await press(); await said(); kinds.push(posts.length);
+        return kinds;
+        """,
+    ) == ["pressed", "Set up: pressed already, and not answered yet", 1, "accepted", "pressed", 2]
