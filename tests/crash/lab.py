@@ -23,11 +23,12 @@ class Lab:
     patience = 60.0  # for whatever the station does in its own time [s]
     ending = 15.0  # for its end [s]
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, addresses=None):
+        """`addresses` are of the node and the policy server of another lab, which outlive this one."""
         self.folder = folder
         self.data = folder / "data"
         self.children = {}
-        self.addresses = {}
+        self.addresses = dict(addresses or {})
         self.supervisor = self.client = None
 
     def start(self, name, module, *arguments, stdout=subprocess.PIPE):
@@ -92,9 +93,9 @@ class Lab:
 
     def up(self, *assignments):
         """Node, server and station, connected and idle."""
-        if "node" not in self.children:
+        if "node" not in self.addresses:
             self.node()
-        if "server" not in self.children:
+        if "server" not in self.addresses:
             self.server()
         self.station(*assignments)
         self.reach("idle")

@@ -8,11 +8,26 @@ import time
 import pytest
 
 from runtime.recording.reader import open_episode
-from tests.crash.lab import ROOT
+from tests.crash.lab import ROOT, Lab
 from tests.processes import alive, eventually
 
 pytestmark = pytest.mark.slow
 FAMILY = ("control", "main", "reception", "media", "guard")
+
+
+@pytest.fixture(scope="module")
+def peers(tmp_path_factory):
+    """The addresses of a node and a policy server: nothing here ends them, each test's station alone."""
+    made = Lab(tmp_path_factory.mktemp("peers")).node().server()
+    yield made.addresses
+    made.close()
+
+
+@pytest.fixture
+def lab(tmp_path, peers):
+    made = Lab(tmp_path, peers)
+    yield made
+    made.close()
 
 
 def to_state(lab, state):
@@ -133,7 +148,6 @@ def test_a_second_supervisor_for_the_same_station_is_refused(lab):
         capture_output=True,
         text=True,
         cwd=ROOT,
-        timeout=30,
     )
     assert second.returncode == 1
     assert "station 'demo' is already running" in second.stderr

@@ -177,7 +177,6 @@ def headless(lab, *assignments):
         capture_output=True,
         text=True,
         cwd=ROOT,
-        timeout=60,
     )
 
 

@@ -25,7 +25,6 @@ def demo(tmp_path_factory):
         env={**os.environ, "EVA_DATA_DIR": str(folder / "data")},
         capture_output=True,
         text=True,
-        timeout=110,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done, json.loads((folder / "out.json").read_text())

@@ -34,7 +34,6 @@ def run(module: str, body: str, given: Any = None) -> Any:
         input=json.dumps(given),
         capture_output=True,
         text=True,
-        timeout=30,
         check=False,
     )
     assert found.returncode == 0, found.stderr

@@ -103,7 +103,6 @@ def python(code, **environment):
         [sys.executable, "-c", code],
         capture_output=True,
         text=True,
-        timeout=30,
         env={**os.environ, **environment},
     )
 

@@ -37,7 +37,7 @@ def run(body, button):
     given = json.dumps({"module": MODULE.as_uri(), "button": button})
     script = f"const given = {given};{_PAGE}{body};{_HEARD}console.log(JSON.stringify({{found, faults}}));"
     done = subprocess.run(
-        [NODE, "--input-type=module", "-e", script], capture_output=True, text=True, timeout=30, check=False
+        [NODE, "--input-type=module", "-e", script], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

@@ -64,7 +64,7 @@ class Terminal:
             assert f"RUNNING ({mode}" in self("wait", IDLE_PHASE[mode])
             yield
             self("stop")
-            out, err = run.communicate(timeout=15)
+            out, err = run.communicate()
             assert (run.returncode, err) == (0, "")
             assert "READY" in out.splitlines()[-1]
         finally:

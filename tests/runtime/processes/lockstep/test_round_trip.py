@@ -107,7 +107,6 @@ def trip(tmp_path_factory: pytest.TempPathFactory) -> RoundTrip:
         cwd=REPOSITORY,
         capture_output=True,
         text=True,
-        timeout=100,
         check=False,
     )
     assert done.returncode == 0, done.stderr
