@@ -14,7 +14,7 @@ import numpy as np
 
 import robots
 from robots import Robot
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.clock import Clock
 from runtime.core.types import ActionChunk, Conditioning, Float64, Observation, UInt8
 from runtime.policies.base import Policy, PolicyInfo
@@ -28,7 +28,7 @@ from runtime.sim.plant import Plant
 from runtime.sim.render import Renderer
 from runtime.sim.surroundings import Surroundings
 from runtime.sim.tabletop import Reset
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from runtime.station.spec import StationSpec
 from runtime.transports import zmq
 from runtime.transports.base import Capabilities
@@ -153,7 +153,7 @@ class ConveyorPlan(StationSpec):
         return Seeing(script, self.gallery)
 
 
-def plan(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -> ConveyorPlan:
+def spec_of(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -> ConveyorPlan:
     """A station at the belt whose course is that of `seed`; nothing is recorded."""
     tree: dict[str, Any] = {
         "station": "conveyor",
@@ -167,6 +167,6 @@ def plan(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -> Conv
         "recording": {"enabled": False},
         "lockstep": {"delay_ticks": delay},
     }
-    made = family.plan(deployment.resolve(tree, {}, "moving_target"))
+    made = station_spec.spec_of(loader.resolve(tree, {}, "moving_target"))
     gallery = Gallery(made.robot, Conveyor(made.robot, seed))
     return ConveyorPlan(made.resolved, made.robot, gallery, {})

@@ -87,8 +87,8 @@ class OpenPage:
         identity, answers = str(uuid4()), queue.SimpleQueue[Press]()
         ways = (self.over_the_socket, self._way.press)
         for way in ways:
-            asking = lambda way=way: answers.put(way(why, identity))  # noqa: E731
-            threading.Thread(target=asking, daemon=True).start()
+            requests = lambda way=way: answers.put(way(why, identity))  # noqa: E731
+            threading.Thread(target=requests, daemon=True).start()
         pressed = [answers.get()]
         while pressed[-1].status != _DONE and len(pressed) < len(ways):
             pressed.append(answers.get())

@@ -28,7 +28,7 @@ import zmq
 from benchmarks.labs import STATION, Processors, RunningLab, busy_lab, only_episode, set_up, watch
 from benchmarks.report import Figure, Report
 from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.recording.reader import Episode
 
 SECONDS = 60.0
@@ -161,7 +161,7 @@ def _shortest_way(endpoint: str) -> float:
             if socket.poll(int(left * 1000)):
                 payload = socket.recv()
                 arrived = time.monotonic()
-                ways.append(arrived - float(codecs.unpack(payload)["t"]))
+                ways.append(arrived - float(msgpack_arrays.unpack(payload)["t"]))
     if not ways:
         raise SystemExit(f"the node at {endpoint} says nothing")
     return min(ways)

@@ -92,17 +92,17 @@ def _run(
     lab: RunningLab, sleepers: Sequence[Sequence[str]], seconds: float
 ) -> tuple[Mapping[str, Any], list[Any], dict[str, Any]]:
     """One run that is watched; the state afterwards, what the loops beside it measured, what it took."""
-    with closing(LivePage(lab.visitor, STATION)) as page:
-        set_up(page)
+    with closing(LivePage(lab.visitor, STATION)) as shared:
+        set_up(shared)
         watching = watch(lab.visitor, seconds + 2 * _MARGIN_S, reading=VIEWERS)
         loops = [_sleeper(arguments, lab.environment) for arguments in sleepers]
-        page.command("run")
-        page.wait(lambda state: state["state"] == "running", 10.0, "starting the run")
+        shared.command("run")
+        shared.wait(lambda state: state["state"] == "running", 10.0, "starting the run")
         processors, scheduler = (
             Processors(lab.process),
             Scheduling(lab.process, "runtime.processes.control.process"),
         )
-        state = page.wait(lambda state: state["state"] != "running", seconds + 30.0, "the run")
+        state = shared.wait(lambda state: state["state"] != "running", seconds + 30.0, "the run")
         percent, scheduled = processors.percent(), scheduler.figures()
         watching.communicate()
     if state["state"] != "ready":

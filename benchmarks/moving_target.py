@@ -33,7 +33,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.conveyor_station import plan
+from benchmarks.conveyor_station import spec_of
 from benchmarks.report import Figure, Report
 from runtime.core.types import Float64
 from runtime.processes.coordinator.session.machine import State
@@ -120,7 +120,7 @@ def chase(strategy: Mapping[str, Any], delay: int, seed: int) -> Chased:
     """One episode in lockstep, to the end of the course; one that never begins has no share of it."""
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
-        made = plan(Path(folder), strategy, delay, seed)
+        made = spec_of(Path(folder), strategy, delay, seed)
         with closing(Lockstep(made)) as station:
             commanded = _follow(station, made.conveyor)
             state, rate = str(station.main.session.state), made.rate
@@ -150,11 +150,11 @@ def _follow(station: Lockstep, conveyor: Conveyor) -> Float64:
 
     def over() -> bool:
         if conveyor.running:
-            commanded.append(np.array(station.page.control.read()["commanded"], np.float64))
+            commanded.append(np.array(station.shared.control.read()["commanded"], np.float64))
         return conveyor.over or station.clock.now() > end
 
     station.until(over, 2 * (_ARRIVING_S + COURSE_S), "the course")
-    return np.array(commanded).reshape(-1, station.plan.robot.dim)[:, ~station.plan.limits.grippers]
+    return np.array(commanded).reshape(-1, station.spec.robot.dim)[:, ~station.spec.limits.grippers]
 
 
 def _acceleration(commanded: Float64) -> float:

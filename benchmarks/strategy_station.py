@@ -16,14 +16,14 @@ from benchmarks.reference import DIM, Reference, answering, chunks_of, disagreei
 from benchmarks.step_loop import Policy as Answering
 from benchmarks.step_loop import StepLoop
 from robots import Robot
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.clock import Clock
 from runtime.core.plugins import variants
 from runtime.core.types import ActionChunk, Conditioning, Float32, Float64, Observation, RobotCommand
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.processes.coordinator.session.machine import State
 from runtime.processes.lockstep.lockstep import Lockstep
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from runtime.station.spec import StationSpec
 from runtime.transports.base import Capabilities, Sink, Source
 
@@ -132,14 +132,14 @@ class Case:
 def compare(case: Case) -> tuple[int, int]:
     """How many actions of the policy the station planned, and how many of them the step loop has otherwise."""
     with tempfile.TemporaryDirectory() as folder:
-        plan = _plan(Path(folder), case)
-        start = plan.robot.poses["ready"].astype(np.float64)
+        spec = _plan(Path(folder), case)
+        start = spec.robot.poses["ready"].astype(np.float64)
         answer = _answer(start, case)
-        plan.made["policy"] = Known(answer, case.horizon)
-        first, planned = _run(plan)
+        spec.made["policy"] = Known(answer, case.horizon)
+        first, planned = _run(spec)
     module = variants("runtime.strategies")[case.strategy]
     config = module.Config.model_validate(case.section)
-    loop = StepLoop(module, config, answer, lambda number: case.delay, plan.rate, start, plan.dims)
+    loop = StepLoop(module, config, answer, lambda number: case.delay, spec.rate, start, spec.dims)
     meant = [tick for tick in loop.run(_TICKS).executed if tick.makers]
     other = [
         tick
@@ -149,10 +149,10 @@ def compare(case: Case) -> tuple[int, int]:
     return len(meant), len(other)
 
 
-def _run(plan: KnownPlan) -> tuple[int, Mapping[int, Float32]]:
+def _run(spec: KnownPlan) -> tuple[int, Mapping[int, Float32]]:
     """The step of the run's first observation, and by control step what was planned, before safety."""
     planned: dict[int, Float32] = {}
-    with closing(Lockstep(plan)) as station:
+    with closing(Lockstep(spec)) as station:
         session = station.main.session
         station.connect()
         station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
@@ -162,12 +162,12 @@ def _run(plan: KnownPlan) -> tuple[int, Mapping[int, Float32]]:
         end = station.step + _TICKS + 1
 
         def over() -> bool:
-            status = station.page.control.read()
+            status = station.shared.control.read()
             planned[int(status["step"])] = status["smoothed"].copy()
             return station.step >= end
 
         station.until(over, 60.0, "the run")
-        return plan.made["policy"].first, planned
+        return spec.made["policy"].first, planned
 
 
 def _answer(start: Float64, case: Case) -> Answering:
@@ -204,5 +204,5 @@ def lockstep_deployment(data: Path, robot: str, strategy: dict[str, Any], rate: 
 def _plan(data: Path, case: Case) -> KnownPlan:
     tree = lockstep_deployment(data, "agilex_piper", case.section, case.control_hz)
     tree["lockstep"] = {"delay_ticks": case.delay}
-    made = family.plan(deployment.resolve(tree, {}, "strategies"))
+    made = station_spec.spec_of(loader.resolve(tree, {}, "strategies"))
     return KnownPlan(made.resolved, made.robot, {})

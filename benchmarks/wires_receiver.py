@@ -38,7 +38,7 @@ class Receiving:
 
     robot: str
     transport: Mapping[str, Any]
-    page: int
+    shared: int
     cameras: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     fast: bool = False
 
@@ -67,10 +67,10 @@ def main(text: str) -> None:
     robot = robots.load(given.robot)
     clock = VirtualClock() if given.fast else MonotonicClock()
     player = _Player()
-    page = SharedState.attach(layout(robot), given.page)
+    shared = SharedState.attach(layout(robot), given.shared)
     with contextlib.closing(source(given, robot, clock)) as opened:
         intake = ObservationReceiver(
-            page, opened, clock, _say, lambda observation, numbers: player.see(observation)
+            shared, opened, clock, _say, lambda observation, numbers: player.see(observation)
         )
         opened.connect()
         opened.begin_run()

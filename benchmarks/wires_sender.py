@@ -80,7 +80,7 @@ class NotingServer(MjpegServer):
 
 
 @unread_ends
-def main(file: str, page: str, module: str, *arguments: str) -> int:
+def main(file: str, shared: str, module: str, *arguments: str) -> int:
     """The exit code of the simulated robot."""
     if module == "cameras":
         return _cameras(Path(file), arguments)
@@ -88,7 +88,7 @@ def main(file: str, page: str, module: str, *arguments: str) -> int:
     plain = simulated.run
 
     def run(ticking: node.Ticking, clock: Clock, rate: float, told: Event) -> None:
-        noting = Noting(ticking, clock, _pace(page, arguments, clock) if page else None)
+        noting = Noting(ticking, clock, _pace(shared, arguments, clock) if shared else None)
         plain(noting, clock, rate, told)
         Path(file).write_text(json.dumps(noting.times), "utf-8")
 
@@ -97,9 +97,9 @@ def main(file: str, page: str, module: str, *arguments: str) -> int:
     return code
 
 
-def _pace(page: str, arguments: Sequence[str], clock: Clock) -> Pace:
+def _pace(shared: str, arguments: Sequence[str], clock: Clock) -> Pace:
     robot = robots.load(arguments[arguments.index("--robot") + 1])
-    attached = SharedState.attach(layout(robot), int(page))
+    attached = SharedState.attach(layout(robot), int(shared))
     return Pace(lambda: int(attached.observation.read()["picture_number"].min()), clock)
 
 

@@ -60,14 +60,14 @@ def _measured(case: Case, seconds: float) -> Row:
 
 def live(case: Case, seconds: float) -> Row:
     """What a control loop sees of pictures that come at their usual rate, and what receiving them takes."""
-    with _staged(case, FPS, _LIVE) as (stage, page):
+    with _staged(case, FPS, _LIVE) as (stage, shared):
         wired = case.open(stage)
         receiver = _receiving(stage, wired, fast=False)
-        _await(page, receiver, 1)
+        _await(shared, receiver, 1)
         time.sleep(_SETTLE_S)
         watched = psutil.Process(receiver.pid)
         before, begun = _processor(watched), time.monotonic()
-        looks, arrivals = _look(page, seconds)
+        looks, arrivals = _look(shared, seconds)
         took = time.monotonic() - begun
         used = (_processor(watched) - before) / took
         faults, sent = _ended(receiver), stage.sent()
@@ -83,13 +83,13 @@ def live(case: Case, seconds: float) -> Row:
 
 def idle(case: Case, seconds: float, frames: int = IDLE_FRAMES) -> Row:
     """How much memory the receiving side takes more after so many pictures of each camera, or so long, than before."""
-    with _staged(case, _FLOOD_HZ, _FLOOD, hurried=True) as (stage, page):
+    with _staged(case, _FLOOD_HZ, _FLOOD, hurried=True) as (stage, shared):
         wired = case.open(stage)
         receiver = _receiving(stage, wired, fast=case.played)
         watched = psutil.Process(receiver.pid)
-        first = _await(page, receiver, min(_WARM_FRAMES, frames // 2))
+        first = _await(shared, receiver, min(_WARM_FRAMES, frames // 2))
         warm = _resident(watched)
-        last = _await(page, receiver, frames, seconds)
+        last = _await(shared, receiver, frames, seconds)
         grown = _resident(watched) - warm
         faults = _ended(receiver)
     minutes = (last - first) / (60.0 * FPS)
@@ -107,25 +107,27 @@ def _staged(
 ) -> Iterator[tuple[Stage, SharedState]]:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        page, descriptor = SharedState.create(layout(robots.load(case.robot)))
+        shared, descriptor = SharedState.create(layout(robots.load(case.robot)))
         stack.callback(os.close, descriptor)
-        yield Stage(stack, folder, rate, size, case.robot, descriptor, hurried), page
+        yield Stage(stack, folder, rate, size, case.robot, descriptor, hurried), shared
 
 
 def _receiving(stage: Stage, wired: Wired, fast: bool) -> subprocess.Popen[str]:
     """The process that fills the page."""
-    given = Receiving(stage.robot, wired.transport, stage.page, wired.cameras, fast)
+    given = Receiving(stage.robot, wired.transport, stage.shared, wired.cameras, fast)
     command = [sys.executable, "-m", "benchmarks.wires_receiver", given.text()]
-    return stage.stack.enter_context(process(command, stage.page))
+    return stage.stack.enter_context(process(command, stage.shared))
 
 
-def _await(page: SharedState, receiver: subprocess.Popen[str], frames: int, seconds: float = math.inf) -> int:
+def _await(
+    shared: SharedState, receiver: subprocess.Popen[str], frames: int, seconds: float = math.inf
+) -> int:
     """How many pictures of every camera are in the page, once it is so many or so long; SystemExit where none come."""
     seen, since = 0, time.monotonic()
     latest = since + seconds
     while seen < frames and time.monotonic() < latest:
         time.sleep(0.02)
-        now = int(page.observation.read()["picture_number"].min())
+        now = int(shared.observation.read()["picture_number"].min())
         if now > seen:
             seen, since = now, time.monotonic()
         if receiver.poll() is not None or time.monotonic() - since > PATIENCE_S:
@@ -140,22 +142,22 @@ Look = list[
 ]  # per camera: the picture's head, when it was captured, and now
 
 
-def _look(page: SharedState, seconds: float) -> tuple[list[Look], int]:
+def _look(shared: SharedState, seconds: float) -> tuple[list[Look], int]:
     """What a control loop sees at each of its ticks, and how many observations came meanwhile."""
     clock = MonotonicClock()
-    first = int(page.observation.read()["sequence"])
+    first = int(shared.observation.read()["sequence"])
     looks: list[Look] = []
     start = clock.now()
     for tick in range(int(seconds * _LOOKS_HZ)):
         clock.sleep_until(start + tick / _LOOKS_HZ)
-        now, record = clock.now(), page.observation.read()
+        now, record = clock.now(), shared.observation.read()
         look: Look = []
-        for index, camera in enumerate(page.layout.cameras):
-            picture = page.pictures[camera].read(int(record["picture_number"][index]))
+        for index, camera in enumerate(shared.layout.cameras):
+            picture = shared.pictures[camera].read(int(record["picture_number"][index]))
             captured = float(record["picture_captured"][index])
             look.append((None if picture is None else marks(picture), captured, now))
         looks.append(look)
-    return looks, int(page.observation.read()["sequence"]) - first
+    return looks, int(shared.observation.read()["sequence"]) - first
 
 
 def marks(picture: UInt8) -> UInt8:

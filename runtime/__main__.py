@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from robots.broken_pipe import unread_ends
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.config.loader import Resolved
 from runtime.core import environment
 from runtime.core import logs as log
@@ -21,7 +21,7 @@ from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.ipc.lifeline import Lifeline
 from runtime.processes.supervisor.supervisor import Supervisor
 from runtime.station.rerun import data_folder, rerun
-from runtime.station.spec import StationSpec, plan
+from runtime.station.spec import StationSpec, spec_of
 
 
 @unread_ends
@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = _parser().parse_args(arguments)
     log.start("supervisor")
     try:
-        made = plan(_resolved(given))
+        made = spec_of(_resolved(given))
         made.new_policy(
             MonotonicClock()
         ).close()  # what does not fit it is said here, not by a main that dies
@@ -91,7 +91,7 @@ def _resolved(given: argparse.Namespace) -> Resolved:
     if given.from_run is None and given.data_dir is not None:
         raise ConfigurationError("--data-dir belongs to --from-run; for a file it is --set data_dir=DIR")
     if given.from_run is None:
-        return deployment.load(given.deployment, given.assignments)
+        return loader.load(given.deployment, given.assignments)
     found = rerun(given.from_run, data_folder(given.data_dir), given.assignments)
     print(*found.lines, sep="\n", flush=True)
     return found.resolved

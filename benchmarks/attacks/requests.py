@@ -113,7 +113,7 @@ def _again_and_again(target: Target, at_once: int, ask: Callable[[Target, int], 
     """Ask from so many threads, each again when it has its answer; how often which came."""
     done: Counter[str] = Counter()
 
-    def asking() -> None:
+    def requests() -> None:
         for number in count():
             try:
                 done[ask(target, number)] += 1
@@ -122,7 +122,7 @@ def _again_and_again(target: Target, at_once: int, ask: Callable[[Target, int], 
                 target.ended.wait(0.05)
 
     for _ in range(at_once):
-        threading.Thread(target=asking, daemon=True).start()
+        threading.Thread(target=requests, daemon=True).start()
     target.begun()
     target.ended.wait()
     return done

@@ -32,10 +32,10 @@ class Body(NamedTuple):
 def body(name: str, groups: tuple[str, ...] | None = None) -> Body:
     """The robot `name` with these of its groups."""
     robot = robots.load(name, groups and list(groups))
-    plan = StationSpec.__new__(StationSpec)
-    object.__setattr__(plan, "robot", robot)
+    spec = StationSpec.__new__(StationSpec)
+    object.__setattr__(spec, "robot", robot)
     ready = robot.poses["ready"].astype(np.float64)
-    return Body(name, plan.limits, plan.dims, switches(robot), ready)
+    return Body(name, spec.limits, spec.dims, switches(robot), ready)
 
 
 def drawn(rng: np.random.Generator) -> Body:

@@ -63,7 +63,7 @@ class Scenario(Bench):
         """Something, now and then."""
         if self.rng.random() < 0.06:
             kinds = ["follow", "follow", "motion", "hold", "estop", "push", "sim", "yield", "lock"]
-            stopped = self.page.estop is EStop.LATCHED and self.rng.random() < 0.5
+            stopped = self.shared.estop is EStop.LATCHED and self.rng.random() < 0.5
             getattr(self, "_clear" if stopped else f"_{self.rng.choice(kinds)}")()
         self.sound = 0 if self.fault else self.sound + 1
         # The first samples, and those after a gap, cannot be told from sound ones by their numbers.
@@ -115,10 +115,10 @@ class Scenario(Bench):
         self.lock(*np.where(locked, self._anything(0.0), np.nan))
 
     def _estop(self) -> None:
-        self.page.set_estop(EStop.LATCHED)
+        self.shared.set_estop(EStop.LATCHED)
 
     def _clear(self) -> None:
-        self.page.set_estop(EStop.CLEAR)
+        self.shared.set_estop(EStop.CLEAR)
 
     def _push(self) -> None:
         self.pushed, self.wish = bool(self.rng.random() < 0.5), self._somewhere(1.2)
@@ -155,7 +155,7 @@ class Scenario(Bench):
         """One tick: the robot is seen, told, and moves."""
         self._begun = True
         for process in ("main", "guard"):
-            self.page.beat(process, self.clock.now())
+            self.shared.beat(process, self.clock.now())
         self.happen()
         self.observe(qpos=self.read().astype(np.float32))
         before = len(self.sink.sent)
@@ -280,7 +280,7 @@ class EncoderOff(Bench):
         self.say("motion", goal=self.body)
         self.run(10)
         if self._stopped:
-            self.page.set_estop(EStop.LATCHED)
+            self.shared.set_estop(EStop.LATCHED)
             self.run(20)
         begins, found = self.sent[-1], set[str]()
         told = len(self.sent)
@@ -320,7 +320,7 @@ class EncoderOff(Bench):
         if self._stopped and self.behaviour != "estop":
             found.add(f"does not stand under the e-stop: {self.behaviour}")
         near = np.abs(difference(read, told, self.dims.wrapping)) <= self.safety.following_error + 1e-4
-        if not self.page.doubt and not near[places].all():
+        if not self.shared.doubt and not near[places].all():
             found.add("a run may begin although the joint is not where it is held")
         return found
 

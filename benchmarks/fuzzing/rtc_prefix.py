@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.strategy_station import KnownPlan, Obedient, lockstep_deployment
 from robots import Robot
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError
 from runtime.core.types import EEF_WIDTH, ActionChunk, Conditioning, Float64, Observation
@@ -30,7 +30,7 @@ from runtime.processes.coordinator.inference.worker import LockstepRunner
 from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.lockstep.lockstep import Around, Lockstep
 from runtime.spaces.end_effectors import EndEffectors
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 
 _TICKS = 240
 _HAIR = 1e-6  # of a step
@@ -100,9 +100,9 @@ def once(seed: int) -> list[str]:
     """Run the scenario of this seed on the virtual clock; each violation in a sentence, none where all is well."""
     made, random = scenario(seed), np.random.default_rng([seed, 1])
     with tempfile.TemporaryDirectory() as folder:
-        plan = _plan(Path(folder), made)
-        keeper = plan.made["policy"] = Keeper(made, plan, random)
-        planned = _run(plan, made, random)
+        spec = _plan(Path(folder), made)
+        keeper = spec.made["policy"] = Keeper(made, spec, random)
+        planned = _run(spec, made, random)
     return [f"seed {seed}: {text}" for text in _violations(made, keeper, planned)]
 
 
@@ -156,16 +156,16 @@ class Declared:
 class Keeper(Policy):
     """Wanders about where it stands; continues what it is told, where it keeps the contract."""
 
-    def __init__(self, made: Scenario, plan: SeldomPlan, random: np.random.Generator) -> None:
+    def __init__(self, made: Scenario, spec: SeldomPlan, random: np.random.Generator) -> None:
         self._made, self._random = made, random
-        self._robot = plan.robot
-        self._eef = EndEffectors(plan.robot, ChainForward(plan.robot))
-        self.stands = plan.robot.poses["ready"].astype(np.float64)
+        self._robot = spec.robot
+        self._eef = EndEffectors(spec.robot, ChainForward(spec.robot))
+        self.stands = spec.robot.poses["ready"].astype(np.float64)
         if made.endless:
             self.stands[0] = np.pi - 0.02
-        self._scale = random.uniform(0.3, 3.0, plan.robot.dim)
-        self._shift = random.uniform(-1.0, 1.0, plan.robot.dim)
-        self._switched = [] if made.space == "eef" else list(plan.robot.binary_dims)
+        self._scale = random.uniform(0.3, 3.0, spec.robot.dim)
+        self._shift = random.uniform(-1.0, 1.0, spec.robot.dim)
+        self._switched = [] if made.space == "eef" else list(spec.robot.binary_dims)
         self.declared: list[Declared] = []
 
     def connect(self) -> PolicyInfo:
@@ -276,7 +276,7 @@ class Keeper(Policy):
 def _plan(data: Path, made: Scenario) -> SeldomPlan:
     tree = lockstep_deployment(data, made.robot, made.strategy, made.control_hz)
     tree["faults"] = {"policy_lost": "slow", "patience_s": 1000.0}
-    planned = family.plan(deployment.resolve(tree, {}, "prefix"))
+    planned = station_spec.spec_of(loader.resolve(tree, {}, "prefix"))
     robot = planned.robot
     if made.endless:
         lower, upper = robot.lower.copy(), robot.upper.copy()
@@ -305,10 +305,10 @@ class Planned:
         return max((off for at, off in self.missed.items() if step - 2 * horizon <= at <= step), default=0.0)
 
 
-def _run(plan: SeldomPlan, made: Scenario, random: np.random.Generator) -> Planned:
+def _run(spec: SeldomPlan, made: Scenario, random: np.random.Generator) -> Planned:
     planned = Planned({}, set(), {}, set(), {}, 0)
     around = Around(runner=Late(*made.delay, random))
-    with closing(Lockstep(plan, around=around)) as station:
+    with closing(Lockstep(spec, around=around)) as station:
         session = station.main.session
         station.connect()
         station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
@@ -318,7 +318,7 @@ def _run(plan: SeldomPlan, made: Scenario, random: np.random.Generator) -> Plann
         end = station.step + _TICKS
 
         def over() -> bool:
-            status = station.page.control.read()
+            status = station.shared.control.read()
             row, step = status["smoothed"].astype(np.float64), int(status["step"])
             if np.isfinite(row).all():
                 planned.rows[step] = row

@@ -31,9 +31,9 @@ _SILENT = frozenset(
 RESULT_NAME = "headless.json"
 
 
-def drive(plan: StationSpec, client: StationClient) -> dict[str, Any]:
+def drive(spec: StationSpec, client: StationClient) -> dict[str, Any]:
     """One run from start to published dataset; returns what came of it. Raises RuntimeFault with the reason."""
-    check(plan)
+    check(spec)
     attended = Attended(client)
     attended.begin()
     status = attended.run()
@@ -45,7 +45,7 @@ def drive(plan: StationSpec, client: StationClient) -> dict[str, Any]:
         result = _result(status, how, attended.seconds)
         well = well and status["last_run"].get("status", "finished") == "finished"
         if result["episode_path"]:
-            result |= _keep(plan, Path(result["episode_path"]), well)
+            result |= _keep(spec, Path(result["episode_path"]), well)
     except RuntimeFault as fault:  # on top of why the run ended
         raise RuntimeFault(f"the run ended ({how}), but then: {fault}") from None
     print("\n".join(summary(result)), flush=True)
@@ -54,9 +54,9 @@ def drive(plan: StationSpec, client: StationClient) -> dict[str, Any]:
     return result
 
 
-def check(plan: StationSpec) -> None:
+def check(spec: StationSpec) -> None:
     """Raise SetupError for a mode that needs a person."""
-    mode, station = plan.deployment.run.mode, plan.deployment.station
+    mode, station = spec.deployment.run.mode, spec.deployment.station
     if mode not in MODES:
         raise SetupError(
             f"run.mode = {mode!r} needs a person; headless: {', '.join(MODES)}. Start the station without "
@@ -172,21 +172,21 @@ def _of_episode(path: Path) -> dict[str, Any]:
     }
 
 
-def _keep(plan: StationSpec, episode: Path, well: bool) -> dict[str, Any]:
+def _keep(spec: StationSpec, episode: Path, well: bool) -> dict[str, Any]:
     """Export the streams of any run; publish what ended well and moved a robot. Raises RuntimeFault."""
     from runtime.recording.export import export
 
-    result: dict[str, Any] = {"export_path": str(export(episode, plan.deployment.data))}
-    if well and plan.deployment.publish.dataset and plan.deployment.run.mode != "sim":
-        result |= _publish(plan, episode)
+    result: dict[str, Any] = {"export_path": str(export(episode, spec.deployment.data))}
+    if well and spec.deployment.publish.dataset and spec.deployment.run.mode != "sim":
+        result |= _publish(spec, episode)
     return result
 
 
-def _publish(plan: StationSpec, episode: Path) -> dict[str, Any]:
+def _publish(spec: StationSpec, episode: Path) -> dict[str, Any]:
     from runtime.datasets.published import publish
 
-    dataset = plan.deployment.data / str(plan.deployment.publish.dataset)
-    published = publish(episode, dataset, version=plan.deployment.publish.version)
+    dataset = spec.deployment.data / str(spec.deployment.publish.dataset)
+    published = publish(episode, dataset, version=spec.deployment.publish.version)
     return {
         "dataset_path": str(published.dataset),
         "episode_index": published.episode_index,
@@ -228,11 +228,11 @@ def main() -> int:
     parser.add_argument("--boot", required=True)
     given = parser.parse_args()
     log.start("headless")
-    plan = planned(given.resolved)
-    station_dir = plan.deployment.station_dir
+    spec = planned(given.resolved)
+    station_dir = spec.deployment.station_dir
     client = StationClient(station_dir, holder=f"headless:{given.boot}")
     try:
-        result = drive(plan, client)
+        result = drive(spec, client)
     except RuntimeFault as fault:
         print(f"error: {fault}", file=sys.stderr)
         (station_dir / RESULT_NAME).write_text(json.dumps({"error": str(fault)}), "utf-8")

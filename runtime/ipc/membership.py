@@ -15,10 +15,10 @@ _OUTLIVES_S = 1.0
 class Membership:
     """The shared state, the name of this start of the station, and the lifeline to its supervisor."""
 
-    page: SharedState
+    shared: SharedState
     boot: str
     lifeline: Lifeline
 
     def needed(self, now: float) -> bool:
         """Whether there is still something to do for who outlives control: until then the supervisor may be gone."""
-        return not self.lifeline.cut or self.page.alive("control", now, _OUTLIVES_S)
+        return not self.lifeline.cut or self.shared.alive("control", now, _OUTLIVES_S)

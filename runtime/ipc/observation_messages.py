@@ -17,8 +17,8 @@ _SAME = (
 class SlotPictures(Mapping[str, UInt8]):
     """Pictures by camera, copied out of their slots when they are asked for: one that was overwritten is a KeyError."""
 
-    def __init__(self, page: SharedState, numbers: Mapping[str, int]) -> None:
-        self._page = page
+    def __init__(self, shared: SharedState, numbers: Mapping[str, int]) -> None:
+        self._page = shared
         self._numbers = numbers
 
     def __getitem__(self, camera: str) -> UInt8:
@@ -45,8 +45,8 @@ def as_message(observation: Observation, numbers: Mapping[str, int]) -> Observed
     return Observed(**told, pictures={camera: numbers[camera] for camera in observation.pictures})
 
 
-def as_observation(message: Observed, page: SharedState) -> Observation:
+def as_observation(message: Observed, shared: SharedState) -> Observation:
     """The observation that a message tells of."""
     return Observation(
-        **{name: getattr(message, name) for name in _SAME}, pictures=SlotPictures(page, message.pictures)
+        **{name: getattr(message, name) for name in _SAME}, pictures=SlotPictures(shared, message.pictures)
     )

@@ -34,8 +34,8 @@ class LatestObservation:
 class ObservationReader:
     """Reads the page; an observation that is still the newest is not read again."""
 
-    def __init__(self, page: SharedState) -> None:
-        self._page = page
+    def __init__(self, shared: SharedState) -> None:
+        self._page = shared
         self._version = -1
         self._seen: LatestObservation
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock
 from runtime.core.errors import CodecError, ConfigurationError, PolicyError, WrongProtocolError
 from runtime.core.types import ActionChunk, Conditioning, Float32, Observation
@@ -109,7 +109,7 @@ class OpenpiPolicy(WebsocketPolicy):
         """
         shown = self.request(observation)
         with self._lock:
-            request = codecs.pack(self._dialect.request(shown, conditioning))
+            request = msgpack_arrays.pack(self._dialect.request(shown, conditioning))
             self._require_open()
             answer, round_trip = self._exchange(request)
             result = self._result(self._unpacked(answer, "an answer"))
@@ -146,7 +146,7 @@ class OpenpiPolicy(WebsocketPolicy):
     def _doubt(self, request: bytes, answer: bytes, took: float) -> str:
         """Also where it came sooner than the server says that it took: then it was under way before the question."""
         with contextlib.suppress(CodecError):  # `infer` says so
-            reply = codecs.unpack(answer, ANSWER_LIMIT)
+            reply = msgpack_arrays.unpack(answer, ANSWER_LIMIT)
             said = _timing(reply).get("server.infer_ms", 0.0) if isinstance(reply, dict) else 0.0
             if took < _SOONER * said:
                 return "the answer came sooner than the server says that its inference took"

@@ -11,7 +11,7 @@ import uuid
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock
 from runtime.core.errors import ContradictionError, PolicyError, ServerSaysError, WrongProtocolError
 from runtime.core.types import ActionChunk, Conditioning, Observation
@@ -77,7 +77,9 @@ class RoboarenaPolicy(WebsocketPolicy):
         with self._lock:
             self._reopen()
             self._end_session()
-            request = codecs.pack(self._shown.of(observation) | self._session_field() | {"endpoint": "infer"})
+            request = msgpack_arrays.pack(
+                self._shown.of(observation) | self._session_field() | {"endpoint": "infer"}
+            )
             self._asked = True
             answer, round_trip = self._exchange(request)
             reply = self._value(answer, "an answer")
@@ -115,7 +117,7 @@ class RoboarenaPolicy(WebsocketPolicy):
     def _end_session(self) -> None:
         if self._ending is None:
             return
-        request = codecs.pack(self._ending | {"endpoint": "reset"})
+        request = msgpack_arrays.pack(self._ending | {"endpoint": "reset"})
         answer = self._link.acknowledged(request, self._config.reset_deadline, ACKNOWLEDGED)
         self._last = None  # no answer of before can follow
         if answer is not None:

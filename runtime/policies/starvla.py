@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock
 from runtime.core.errors import (
     ActionSpaceError,
@@ -120,7 +120,7 @@ class StarvlaPolicy(WebsocketPolicy):
                 self._link.leave()
             self._require_open()
             envelope = self._envelope("infer") | {"payload": self.payload(observation)}
-            answer, round_trip = self._exchange(codecs.pack(envelope))
+            answer, round_trip = self._exchange(msgpack_arrays.pack(envelope))
             self._spoken = time.monotonic()
             reply = self._unpacked(answer, "an answer")
             self._require_answered(reply, envelope)
@@ -182,7 +182,9 @@ class StarvlaPolicy(WebsocketPolicy):
 
     def _ping(self, seconds: float) -> None:
         envelope = self._envelope("ping")
-        reply = self._unpacked(self._link.exchange(codecs.pack(envelope), seconds), "an answer to a ping")
+        reply = self._unpacked(
+            self._link.exchange(msgpack_arrays.pack(envelope), seconds), "an answer to a ping"
+        )
         self._require_answered(reply, envelope)
         self._spoken = time.monotonic()
 

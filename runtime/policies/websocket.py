@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.environment import secret
 from runtime.core.errors import CodecError, PolicyError, WrongProtocolError
 from runtime.core.machine_names import Variable
@@ -163,7 +163,7 @@ class WebsocketPolicy(Policy):
 
     def _value(self, payload: bytes, what: str) -> Any:
         try:
-            return codecs.unpack(payload, ANSWER_LIMIT)
+            return msgpack_arrays.unpack(payload, ANSWER_LIMIT)
         except CodecError as error:
             self._link.leave()
             raise WrongProtocolError(

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from robots.broken_pipe import unread_ends
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.config.loader import Resolved
 from runtime.core import environment
 from runtime.core import logs as log
@@ -28,7 +28,7 @@ from runtime.preflight.report import Report
 from runtime.preflight.verdict import Stage, Verdict
 from runtime.station.permissions import require_named
 from runtime.station.preflight_child import patience
-from runtime.station.spec import plan
+from runtime.station.spec import spec_of
 
 _LOOK_S = 0.2
 _LONGEST_S = 3600.0
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error("give one of the two: a deployment file, or --given")
     if given.given:
         return _for_a_parent()
-    report = preflight(lambda: deployment.load(given.deployment, given.assignments), given.deadline)
+    report = preflight(lambda: loader.load(given.deployment, given.assignments), given.deadline)
     print(json.dumps(report.plain(), indent=1) if given.json else "\n".join(report.lines()))
     return exit_code(report)
 
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def preflight(resolved: Any, deadline: float | None = None) -> Report:
     """The report about what `resolved()` returns, within `deadline` seconds, None: the policy's own deadlines."""
     try:
-        made = plan(resolved())
+        made = spec_of(resolved())
     except RuntimeFault as fault:
         return Report(Verdict.MISCONFIGURED, Stage.RESOLVE, str(fault), Verdict.MISCONFIGURED.advice)
     return Course(made).run(patience(made.deployment) if deadline is None else deadline)
@@ -107,14 +107,14 @@ def _for_a_parent() -> int:
 def _asked_for(asked: Mapping[str, Any]) -> Resolved:
     changes = asked.get("changes", {})
     if "tree" in asked:  # the station has seen to who may ask for what
-        base = deployment.resolve(asked["tree"], {}, "the station's deployment")
-        return deployment.changed(base, changes, "the checkpoint")
+        base = loader.resolve(asked["tree"], {}, "the station's deployment")
+        return loader.changed(base, changes, "the checkpoint")
     if "deployment" not in asked:
         raise ConfigurationError(
             f"preflight: given {', '.join(asked) or 'nothing'}; needed: tree or deployment"
         )
-    base = deployment.load(Path(asked["deployment"]))
-    resolved = deployment.changed(base, changes, "the checkpoint")
+    base = loader.load(Path(asked["deployment"]))
+    resolved = loader.changed(base, changes, "the checkpoint")
     require_named(base.deployment, resolved.deployment)
     return resolved
 

@@ -78,8 +78,8 @@ class Timed(Policy):
 class Course:
     """One preflight of one plan; `run` once. It has no transport: no action can go anywhere."""
 
-    def __init__(self, plan: StationSpec, clock: Clock | None = None) -> None:
-        self._plan = plan
+    def __init__(self, spec: StationSpec, clock: Clock | None = None) -> None:
+        self._plan = spec
         self._clock = clock or MonotonicClock()
         self._begun = self._clock.now()
         self._policy: Timed | None = None
@@ -134,16 +134,16 @@ class Course:
         return None
 
     def _go(self) -> None:
-        plan, runner = self._plan, LockstepRunner(0)
-        if plan.deployment.recording.enabled:
-            trial.require(plan.deployment.recording)
-        strategy = strategy_of(plan)
-        policy = self._policy = Timed(plan.new_policy(self._clock), self._clock)
+        spec, runner = self._plan, LockstepRunner(0)
+        if spec.deployment.recording.enabled:
+            trial.require(spec.deployment.recording)
+        strategy = strategy_of(spec)
+        policy = self._policy = Timed(spec.new_policy(self._clock), self._clock)
         info = runner.submit(policy.connect).result()
-        check_info(info, plan, strategy.query.continues)
-        kinematics = Loading(ChainForward(plan.robot), self._kinematics, runner.aside)
-        spaces, subject = plan.spaces(kinematics), Subject(plan, self._clock)
-        asking = PolicyRequests(policy, plan.deployment.task, spaces, subject, runner, self._clock)
+        check_info(info, spec, strategy.query.continues)
+        kinematics = Loading(ChainForward(spec.robot), self._kinematics, runner.aside)
+        spaces, subject = spec.spaces(kinematics), Subject(spec, self._clock)
+        asking = PolicyRequests(policy, spec.deployment.task, spaces, subject, runner, self._clock)
         for _ in range(2):  # the first resets before it asks
             answered = self._answered = asking.ask(k_max=strategy.parameters.k_max).result()
         asking.note(answered)
@@ -176,8 +176,8 @@ class Course:
         return report
 
     def _report(self, verdict: Verdict, stage: Stage, sentence: str) -> Report:
-        plan, policy = self._plan, self._policy
-        settings = plan.deployment
+        spec, policy = self._plan, self._policy
+        settings = spec.deployment
         info = policy.info if policy else None
         chunk = self._chunk(self._answered) if self._answered else None
         return Report(
@@ -188,8 +188,8 @@ class Course:
             kind=settings.policy.kind,
             endpoint=str(getattr(settings.policy, "url", "")),
             name=info.name if info else "",
-            robot=plan.robot.name,
-            control_rate=plan.rate,
+            robot=spec.robot.name,
+            control_rate=spec.rate,
             task=settings.task,
             seconds=self._clock.now() - self._begun,
             calls=tuple(policy.calls) if policy else (),
@@ -213,17 +213,17 @@ class Course:
         return [call.ms for call in self._policy.calls if call.name == "infer"][-1] if self._policy else 0.0
 
     def _chunk(self, answered: PolicyResponse) -> Chunk:
-        plan, chunk, made = self._plan, answered.chunk, answered.made
-        first = first_action(made.meant, np.asarray(answered.observation.qpos, np.float64), plan)
-        beyond = (plan.limits.outside(made.rows) > _TOLERANCE).any(axis=1)
-        rate = chunk.rate or plan.rate
+        spec, chunk, made = self._plan, answered.chunk, answered.made
+        first = first_action(made.meant, np.asarray(answered.observation.qpos, np.float64), spec)
+        beyond = (spec.limits.outside(made.rows) > _TOLERANCE).any(axis=1)
+        rate = chunk.rate or spec.rate
         return Chunk(
             rows=len(chunk.actions),
             width=chunk.actions.shape[1],
             space=chunk.space,
             mode=chunk.mode,
             rate=rate,
-            seconds=len(made.rows) / plan.rate,
+            seconds=len(made.rows) / spec.rate,
             command_rows=len(made.rows),
             joints=made.rows.shape[1],
             first_away=first["distance"],

@@ -20,12 +20,12 @@ class Subject:
 
     simulated = False
 
-    def __init__(self, plan: StationSpec, clock: Clock) -> None:
-        self._plan = plan
+    def __init__(self, spec: StationSpec, clock: Clock) -> None:
+        self._plan = spec
         self._clock = clock
         self._begun = clock.now()
         self._number = 0
-        self._pictures = pictures(plan)
+        self._pictures = pictures(spec)
 
     def now(self, prompt: str, pictures: bool = True) -> Observation:
         """The robot now."""
@@ -49,12 +49,12 @@ class Subject:
         return None
 
 
-def pictures(plan: StationSpec) -> dict[str, UInt8]:
+def pictures(spec: StationSpec) -> dict[str, UInt8]:
     """Grey noise [H, W, 3] for each camera of the deployment, in the size that it says, the same on every call."""
     noise = np.random.default_rng(0)
     made: dict[str, UInt8] = {}
-    for key in plan.cameras:
-        width, height = getattr(plan.deployment.cameras.get(key), "size", None) or (_WIDTH, _HEIGHT)
+    for key in spec.cameras:
+        width, height = getattr(spec.deployment.cameras.get(key), "size", None) or (_WIDTH, _HEIGHT)
         grain = noise.integers(-_GRAIN, _GRAIN + 1, (height, width, 3))
         made[key] = (_GREY + grain).astype(np.uint8)
         made[key].flags.writeable = False

@@ -17,7 +17,7 @@ from runtime.station.spec import StationSpec, planned
 class Member(Membership):
     """One process of a station: what it works with."""
 
-    plan: StationSpec
+    spec: StationSpec
 
 
 def join(process: str, pictures: bool = True, unread: Collection[str] = ()) -> Member:
@@ -29,4 +29,4 @@ def join(process: str, pictures: bool = True, unread: Collection[str] = ()) -> M
     given = parser.parse_args()
     log.start(process)
     made = planned(given.resolved, unread)
-    return Member(SharedState.attach(made.layout, given.page, pictures), given.boot, Lifeline(), made)
+    return Member(SharedState.attach(made.layout, given.shared, pictures), given.boot, Lifeline(), made)

@@ -15,7 +15,7 @@ from typing import Any
 import zmq
 
 from robots.broken_pipe import unread_ends
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.transports.node_messages import DRIVE_FAULT_LENGTH, DRIVE_FAULTS_LIMIT
 
 WORDS = ("drives_disable", "drives_enable", "drives_fault")
@@ -65,7 +65,7 @@ def tell(endpoint: str, word: str, fault: str = "") -> bool:
         socket.connect(endpoint)
         if not socket.poll(int(_PATIENCE_S * 1000)):  # the node's subscription: from now on it hears us
             return False
-        socket.send(codecs.pack({"t": 0.0, "target": word, "fault": fault}))
+        socket.send(msgpack_arrays.pack({"t": 0.0, "target": word, "fault": fault}))
         return True
     finally:
         socket.close()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import numpy as np
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import ClockMap
 from runtime.core.errors import CodecError
 from runtime.core.types import Float64
@@ -95,7 +95,7 @@ class Gate:
 
     def _message(self, payload: bytes) -> dict[Any, Any] | None:
         try:
-            message = codecs.unpack(payload, _MESSAGE_LIMIT)
+            message = msgpack_arrays.unpack(payload, _MESSAGE_LIMIT)
         except CodecError:
             message = None
         if not isinstance(message, dict) or not isinstance(message.get("target", "real"), str):

@@ -17,7 +17,7 @@ import numpy as np
 import zmq
 
 from robots.broken_pipe import unread_ends
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault
 from runtime.core.types import Float64
@@ -66,7 +66,9 @@ class SimulatedLeader:
     def message(self, now: float) -> bytes:
         """What it publishes."""
         parts = self._robot.split(self.at(now)).items()
-        return codecs.pack({"t": now, "state": {name: part.astype(np.float32) for name, part in parts}})
+        return msgpack_arrays.pack(
+            {"t": now, "state": {name: part.astype(np.float32) for name, part in parts}}
+        )
 
 
 class Publishing:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock
 from runtime.core.types import Observation, RobotCommand, UInt8
 from runtime.sim.node import Node
@@ -76,7 +76,7 @@ class Link(Source, Sink):
         self._node.close()
 
     def _say(self, message: dict[str, Any]) -> None:
-        self._commands.append(codecs.pack(message | {"master": _NAME}))
+        self._commands.append(msgpack_arrays.pack(message | {"master": _NAME}))
 
 
 def _rgb(bgr: UInt8) -> UInt8:

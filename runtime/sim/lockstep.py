@@ -20,7 +20,7 @@ from typing import Any
 import robots
 from robots import Robot
 from robots.broken_pipe import unread_ends
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core import environment
 from runtime.core import logs as log
 from runtime.core.clock import Clock, VirtualClock
@@ -31,7 +31,7 @@ from runtime.sim.link import Link
 from runtime.sim.node import Node
 from runtime.sim.node import parser as node_parser
 from runtime.sim.surroundings import Surroundings
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from runtime.station.spec import StationSpec
 from runtime.transports import zmq
 
@@ -86,7 +86,7 @@ def station(
     path: Path, assignments: Sequence[str], seed: int, clock: VirtualClock, bench: str = "tabletop"
 ) -> ServedLockstep:
     """The station of a deployment at its bench, laid out by `seed`; RuntimeFault where it cannot be."""
-    made = family.plan(deployment.load(path, assignments))
+    made = station_spec.spec_of(loader.load(path, assignments))
     options = node_parser().parse_args(["--robot", made.robot.name, "--bench", bench, "--seed", str(seed)])
     around = surroundings.surroundings(made.robot, options)
     return ServedLockstep(planned(made, clock, around, options), clock, Rested(around.truth, clock))

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from robots.broken_pipe import unread_ends
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault, SetupError
 from runtime.core.types import Float64, UInt8
@@ -93,7 +93,7 @@ class Node:
         self._obey(payloads)
         self._move(seconds)
         every = self._options.malformed_every
-        payload = codecs.pack(self._observation())
+        payload = msgpack_arrays.pack(self._observation())
         if every and self._sequence % every == every - 1:
             payload = _GARBAGE
         self._sequence += 1

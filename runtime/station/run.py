@@ -91,7 +91,7 @@ class Run:
 class Provenance:
     """What every manifest says of the station as it was last set up; `plan` is the one in force since then."""
 
-    plan: StationSpec
+    spec: StationSpec
     boot: str
     checkpoint: Mapping[str, Any] = field(
         default_factory=dict
@@ -102,7 +102,7 @@ class Provenance:
 
     def manifest(self, mode: str, info: PolicyInfo | None, sim_state: str = "") -> dict[str, Any]:
         """The manifest of a new episode, without what only media knows; `sim_state` where the mode is sim."""
-        settings = self.plan.deployment
+        settings = self.spec.deployment
         return {
             "uuid": str(uuid.uuid4()),
             "station": settings.station,
@@ -120,8 +120,8 @@ class Provenance:
             "policy": {"kind": settings.policy.kind, "name": info.name, "metadata": dict(info.metadata)}
             if info
             else {"kind": settings.policy.kind},
-            "configuration": dict(self.plan.resolved.tree),
-            "configuration_hash": self.plan.resolved.digest,
+            "configuration": dict(self.spec.resolved.tree),
+            "configuration_hash": self.spec.resolved.digest,
             "versions": self.versions,
             "git": dict(self.git),
             "asked_wall": time.time(),

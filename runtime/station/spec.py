@@ -14,8 +14,7 @@ import numpy as np
 
 import robots
 from robots import Robot
-from runtime.config import collection
-from runtime.config import loader as deployment
+from runtime.config import collection, loader
 from runtime.config.loader import Resolved
 from runtime.config.schema import Deployment
 from runtime.core.clock import Clock
@@ -206,7 +205,7 @@ class StationSpec:
         return PosePublisher(PoseRows(wanted.pose, self.robot, "publication.pose"), self.end_effectors())
 
 
-def plan(resolved: Resolved) -> StationSpec:
+def spec_of(resolved: Resolved) -> StationSpec:
     """Check that the parts of a deployment fit each other; raises ConfigurationError or SetupError."""
     settings, made = resolved.deployment, unchecked(resolved)
     robot = made.robot
@@ -297,4 +296,4 @@ def planned(path: str, unread: Collection[str] = ()) -> StationSpec:
 
     Tables of the packages `unread` stay as they are written, and none of their kinds is loaded.
     """
-    return unchecked(deployment.resolve(json.loads(Path(path).read_text("utf-8")), {}, path, unread))
+    return unchecked(loader.resolve(json.loads(Path(path).read_text("utf-8")), {}, path, unread))

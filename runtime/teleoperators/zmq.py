@@ -15,7 +15,7 @@ import numpy as np
 import zmq
 from pydantic import model_validator
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock
 from runtime.core.errors import CodecError, ConfigurationError, TransportError
 from runtime.core.settings import Settings
@@ -128,7 +128,7 @@ class ZmqLeader(Leader):
             self._take(joints, self._clock.now())
 
     def _understood(self, payload: bytes) -> tuple[float, np.ndarray]:
-        message = codecs.unpack(payload, _LIMIT)
+        message = msgpack_arrays.unpack(payload, _LIMIT)
         if not isinstance(message, dict):
             raise CodecError(f"the leader's message is a {type(message).__name__}; expected a map")
         stamp, state = message.get("t"), message.get("state")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 from pydantic import ConfigDict, JsonValue, TypeAdapter, ValidationError
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.errors import CodecError
 from runtime.core.types import EEF_WIDTH, Float32, UInt8
 
@@ -103,7 +103,7 @@ class NodeMessages:
 
     def _message(self, payload: bytes | memoryview) -> dict[Any, Any]:
         try:
-            message = codecs.unpack(payload, self._limit)
+            message = msgpack_arrays.unpack(payload, self._limit)
         except CodecError as error:
             raise MessageRefused("malformed", str(error)) from error
         if not isinstance(message, dict):
@@ -214,7 +214,7 @@ def _truth(name: str, given: object) -> Mapping[str, Any]:
         error = invalid.errors()[0]
         where = ".".join(map(str, (name, *error["loc"][:1])))
         raise MessageRefused("malformed", f"{where}: {error['msg']}") from None
-    size = len(codecs.pack(truth))
+    size = len(msgpack_arrays.pack(truth))
     if size > TRUTH_LIMIT:
         raise MessageRefused("malformed", f"{name} has {size} bytes; expected at most {TRUTH_LIMIT}")
     reset, milestones, success = truth.get("reset"), truth.get("milestones"), truth.get("success")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zmq
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock
 from runtime.core.errors import TransportError
 from runtime.core.types import Float32, RobotCommand
@@ -83,7 +83,7 @@ class NodeSink(Sink):
         self._sequence += 1
         message |= {"master": self.master, "seq": self._sequence}
         with contextlib.suppress(zmq.Again):  # the newest command counts; the next one comes in a tick
-            self._socket.send(codecs.pack(message), zmq.NOBLOCK)
+            self._socket.send(msgpack_arrays.pack(message), zmq.NOBLOCK)
 
     def close(self) -> None:
         """Close the socket; what has not left yet is forgotten."""

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import robots
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.errors import CodecError
 from runtime.policies.async_inference import messages, pickles
 from runtime.policies.async_inference.tensors import Tensors
@@ -115,7 +115,7 @@ class Reading(NamedTuple):
 
 
 READERS = {
-    "openpi": Reading(codecs.unpack, [vector(name) for name in OPENPI]),
+    "openpi": Reading(msgpack_arrays.unpack, [vector(name) for name in OPENPI]),
     "gr00t": Reading(lambda data: groot.unpack(data, 2**20), [vector(name) for name in (*NPY, *MNP)]),
     "lerobot_message": Reading(messages.actions, [messages.setup(vector(PICKLED_ACTIONS[0]))]),
     "lerobot_pickle": Reading(

@@ -13,7 +13,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, ConnectionClosedOK
 from websockets.sync.server import ServerConnection
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.errors import (
     ContradictionError,
     PolicyError,
@@ -283,7 +283,7 @@ def test_a_server_is_left_with_a_close_frame(end: str) -> None:
     ended: list[ConnectionClosed] = []
 
     def converse(connection: ServerConnection) -> None:
-        connection.send(codecs.pack({"action_dim": 99} if end == "refused" else {}))
+        connection.send(msgpack_arrays.pack({"action_dim": 99} if end == "refused" else {}))
         try:
             while True:
                 connection.recv()

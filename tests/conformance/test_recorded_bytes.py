@@ -14,7 +14,7 @@ import pytest
 import zmq
 
 import robots
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.errors import CodecError, PolicyError, ServerSaysError, WrongProtocolError
 from runtime.core.types import Conditioning
 from runtime.policies.async_inference import messages, pickles
@@ -85,8 +85,8 @@ def test_every_recorded_message_is_among_these() -> None:
 @pytest.mark.parametrize("name", OPENPI)
 def test_openpis_arrays_are_read_and_written_the_same_by_the_clients_and_by_the_stand_ins(name: str) -> None:
     recorded = vector(name)
-    read = codecs.unpack(recorded)
-    assert codecs.pack(read) == recorded
+    read = msgpack_arrays.unpack(recorded)
+    assert msgpack_arrays.pack(read) == recorded
     assert stand_in.packed(stand_in.unpacked(recorded)) == recorded
     assert same(read, stand_in.unpacked(recorded))
 
@@ -117,7 +117,7 @@ def test_lerobots_requests_are_no_actions(name: str) -> None:
 def test_a_message_cut_anywhere_is_refused(name: str) -> None:
     recorded = vector(name)
     unpack: Callable[[bytes], Any] = (
-        codecs.unpack if name in OPENPI else lambda data: groot.unpack(data, LIMIT)
+        msgpack_arrays.unpack if name in OPENPI else lambda data: groot.unpack(data, LIMIT)
     )
     for size in range(len(recorded)):
         with pytest.raises(CodecError):
@@ -147,14 +147,14 @@ OBSERVATION = {
 
 
 def test_the_second_request_with_prev_action_is_the_recorded_one() -> None:
-    before = codecs.unpack(vector("openpi_infer_reply"))["origin_actions"]
+    before = msgpack_arrays.unpack(vector("openpi_infer_reply"))["origin_actions"]
     request = PrevAction().request(OBSERVATION, Conditioning(np.array(before), 1, 1, 3))
-    assert codecs.pack(request) == vector("rtc_a_request_next")
-    assert codecs.pack(PrevAction().request(OBSERVATION, None)) == vector("openpi_infer_request")
+    assert msgpack_arrays.pack(request) == vector("rtc_a_request_next")
+    assert msgpack_arrays.pack(PrevAction().request(OBSERVATION, None)) == vector("openpi_infer_request")
 
 
 def test_an_envelope_has_all_that_the_recorded_one_has() -> None:
-    recorded = codecs.unpack(vector("rtc_d_request_raw"))
+    recorded = msgpack_arrays.unpack(vector("rtc_d_request_raw"))
     rows = np.concatenate([np.zeros((1, 2), np.float32), recorded["rtc"]["prev_chunk_left_over"]])
     dialect = AsyncRtc(recorded["rtc"]["prefix_attention_schedule"], recorded["rtc"]["max_guidance_weight"])
     dialect._number, dialect._horizon = 6, 50
@@ -165,7 +165,7 @@ def test_an_envelope_has_all_that_the_recorded_one_has() -> None:
 
 
 def test_a_first_envelope_has_no_rtc() -> None:
-    recorded = codecs.unpack(vector("rtc_d_request_jpeg_first"))
+    recorded = msgpack_arrays.unpack(vector("rtc_d_request_jpeg_first"))
     request = AsyncRtc("exp", 10.0).request({}, None)
     assert list(request) == list(recorded)
     assert request["rtc"] is recorded["rtc"] is None
@@ -175,11 +175,11 @@ def test_a_first_envelope_has_no_rtc() -> None:
 def test_the_recorded_answer_to_an_envelope_is_read_and_only_under_its_number() -> None:
     dialect = AsyncRtc("exp", 10.0)
     dialect._number = 7
-    result = dialect.result(codecs.unpack(vector("rtc_d_reply")))
+    result = dialect.result(msgpack_arrays.unpack(vector("rtc_d_reply")))
     np.testing.assert_array_equal(result["actions"], np.arange(6, dtype=np.float32).reshape(3, 2))
     dialect._number = 8
     with pytest.raises(WrongProtocolError, match="request_id 7"):
-        dialect.result(codecs.unpack(vector("rtc_d_reply")))
+        dialect.result(msgpack_arrays.unpack(vector("rtc_d_reply")))
 
 
 def test_the_recorded_error_in_an_envelope_is_the_servers_own() -> None:
@@ -188,7 +188,7 @@ def test_the_recorded_error_in_an_envelope_is_the_servers_own() -> None:
         "aa726571756573745f696407a56572726f72ad54726163656261636b202e2e2e"
     )
     with pytest.raises(ServerSaysError, match="reports an error: Traceback"):
-        AsyncRtc("exp", 10.0).result(codecs.unpack(recorded))
+        AsyncRtc("exp", 10.0).result(msgpack_arrays.unpack(recorded))
 
 
 # Short messages
@@ -212,7 +212,7 @@ def test_both_acknowledgements_of_a_reset_are_told_from_errors(
     acknowledgement: str | bytes, accepted: bool
 ) -> None:
     asked: list[bytes] = []
-    metadata = codecs.unpack(vector("roboarena_metadata")) | {
+    metadata = msgpack_arrays.unpack(vector("roboarena_metadata")) | {
         "needs_session_id": False,
         "n_external_cameras": 1,
     }
@@ -244,7 +244,7 @@ def test_both_acknowledgements_of_a_reset_are_told_from_errors(
     ],
 )
 def test_recorded_errors_are_maps_with_a_sentence(name: str, says: str) -> None:
-    message = codecs.unpack(bytes.fromhex(says))
+    message = msgpack_arrays.unpack(bytes.fromhex(says))
     sentence = message["message"] if name == "vllm" else message["error"]["message"]
     assert sentence in ("Invalid request payload", "bad key")
     metadata = {"needs_wrist_camera": True} if name == "vllm" else {"env": "starvla_policy_server"}
@@ -332,7 +332,9 @@ def test_a_starvla_server_of_before_may_2026_is_spoken_to() -> None:
     def answer(request: Any) -> object:
         if request["type"] == "ping":
             return {"status": "ok", "ok": True, "type": "ping", "request_id": request["request_id"]}
-        return codecs.unpack(vector("starvla_old_infer_reply")) | {"request_id": request["request_id"]}
+        return msgpack_arrays.unpack(vector("starvla_old_infer_reply")) | {
+            "request_id": request["request_id"]
+        }
 
     asked: list[bytes] = []
     with (
@@ -343,7 +345,9 @@ def test_a_starvla_server_of_before_may_2026_is_spoken_to() -> None:
         rows = policy.infer(seen(ARM)).actions
     expected = 1 + np.minimum(np.arange(14, dtype=np.float32).reshape(2, 7) / 8, 1)
     np.testing.assert_allclose(rows, expected)
-    assert codecs.unpack(asked[1])["payload"].keys() == {"examples"}  # nobody said whose statistics there are
+    assert msgpack_arrays.unpack(asked[1])["payload"].keys() == {
+        "examples"
+    }  # nobody said whose statistics there are
 
 
 def test_gr00ts_short_requests_are_the_recorded_ones() -> None:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import PolicyError
 from runtime.core.plugins import variants
@@ -29,11 +29,11 @@ def outcome(call: Callable[[], Any]) -> Any:
 def _pieces() -> st.SearchStrategy[bytes]:
     """Noise, and real messages cut short or with a byte turned."""
     real = [
-        codecs.pack({"actions": np.zeros((2, 8), np.float32)}),
-        codecs.pack(
+        msgpack_arrays.pack({"actions": np.zeros((2, 8), np.float32)}),
+        msgpack_arrays.pack(
             {"status": "ok", "ok": True, "request_id": "infer-2", "data": {"actions": np.zeros((1, 2, 8))}}
         ),
-        codecs.pack(np.zeros((2, 8), np.float32)),
+        msgpack_arrays.pack(np.zeros((2, 8), np.float32)),
     ]
     cut = st.sampled_from(real).flatmap(lambda m: st.integers(0, len(m) - 1).map(lambda n: m[:n]))
     turned = st.tuples(st.sampled_from(real), st.integers(0, 10_000), st.integers(1, 255)).map(

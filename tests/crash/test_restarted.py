@@ -9,7 +9,7 @@ import pytest
 import zmq
 
 from benchmarks.fuzzing.bodies import body
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.safety.settings import SafetySettings
 from tests.crash.lab import FREE, ROBOT
 from tests.processes import eventually
@@ -39,7 +39,7 @@ class Tap:
         while not self._over.is_set():
             if self._incoming.poll(50):
                 payload = self._incoming.recv()
-                message = codecs.unpack(payload, 1 << 20)
+                message = msgpack_arrays.unpack(payload, 1 << 20)
                 if message["target"] == "real":
                     self.controls.setdefault(message["master"], []).append(message["action"].astype(float))
                 self._onward.send(payload)

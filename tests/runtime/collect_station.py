@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError
 from runtime.core.types import Float64, Observation
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from runtime.teleoperators.base import Leader
 from runtime.transports.base import Capabilities
-from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, StubRobot, on_time, plan
+from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, StubRobot, on_time, spec_of
 
 
 class HeldLeader(Leader):
@@ -126,6 +126,6 @@ def collecting(data: Path, source: str = "relay", **changes: Any) -> CollectStat
     on_top: dict[str, Any] = {"collection": {"source": source, **leader, **changes}}
     if source == "node":  # a recording drives no robot, and its deployment is refused
         on_top["transport"] = {"kind": "zmq"}
-    resolved = deployment.changed(plan(data, **tables).resolved, on_top, "test")
-    robot = family.plan(resolved).robot
+    resolved = loader.changed(spec_of(data, **tables).resolved, on_top, "test")
+    robot = station_spec.spec_of(resolved).robot
     return CollectStation(CollectPlan(resolved, robot, {}, STANDS, on_time, "joint", "", True, False))

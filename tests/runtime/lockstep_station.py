@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.errors import PolicyError
 from runtime.core.types import ActionChunk, Conditioning, Float64, Observation, RobotCommand, Space
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from runtime.station.spec import StationSpec
 from runtime.transports.base import Capabilities, Sink, Source
 from tests.runtime.recording.samples import numbered
@@ -38,18 +38,18 @@ def ramp(first: int, count: int, speed: float = 0.002) -> Float64:
 class StubRobot(Source, Sink):
     """Goes wherever it is told, at once; each observation shows its own number on every camera."""
 
-    def __init__(self, plan: StubPlan, clock: Any) -> None:
-        self._plan, self._clock = plan, clock
-        self.position = plan.start.copy()
+    def __init__(self, spec: StubPlan, clock: Any) -> None:
+        self._plan, self._clock = spec, clock
+        self.position = spec.start.copy()
         self.commands: list[RobotCommand] = []
         self.blocked = False
         self.silent = False
-        self.cameras = [camera.key for camera in plan.robot.cameras]
+        self.cameras = [camera.key for camera in spec.robot.cameras]
         self.picture = numbered
         self.bias: Float64 = np.zeros(DIM)  # it stands beside where it is told to go
         self.misread: Float64 = np.zeros(DIM)  # by how much its encoders are off
         self.told: list[tuple[str, dict[str, Any]]] = []
-        self.wordless = not plan.simulated
+        self.wordless = not spec.simulated
         self.deaf = 0  # control words that are lost on their way to it
         self.truth: dict[str, Any] | None = None
         self.drives: dict[str, Any] | None = None
@@ -97,8 +97,8 @@ class StubRobot(Source, Sink):
 class StubPolicy(Policy):
     """Answers with what `rows(observation, number)` says; `number` counts the answers since the reset."""
 
-    def __init__(self, plan: StubPlan) -> None:
-        self._plan = plan
+    def __init__(self, spec: StubPlan) -> None:
+        self._plan = spec
         self.calls: list[str] = []
         self.number = 0
         self.first: int | None = None  # step of the first observation since the reset
@@ -167,7 +167,7 @@ class StubPlan(StationSpec):
         return self.built["policy"]
 
 
-def plan(
+def spec_of(
     data: Path,
     rows: Rows = on_time,
     strategy: str = "async",
@@ -194,7 +194,7 @@ def plan(
     }
     for table, values in settings.items():
         tree[table] = {**tree.get(table, {}), **values} if isinstance(values, dict) else values
-    made = family.plan(deployment.resolve(tree, {}, "test"))
+    made = station_spec.spec_of(loader.resolve(tree, {}, "test"))
     return StubPlan(made.resolved, made.robot, {}, start, rows, space, absent, moves_robot, simulated)
 
 

@@ -89,8 +89,8 @@ class Bench:
         self.dim = len(limits.names)
         layout = SharedStateLayout(self.dim, 8, ("cam",), 300)
         shared = mmap.mmap(-1, SharedState.size(layout))
-        self.page, self.clock, self.sink = SharedState(layout, shared), VirtualClock(100.0), RecordingSink()
-        self.page.set_estop(EStop.CLEAR)
+        self.shared, self.clock, self.sink = SharedState(layout, shared), VirtualClock(100.0), RecordingSink()
+        self.shared.set_estop(EStop.CLEAR)
         self.step, self.order, self.sequence = 0, 0, 0
         self.dims = dims or DimensionKinds()
         self.chosen: Strategy = strategy(chosen or {"kind": "async"}, self.dims)
@@ -122,7 +122,7 @@ class Bench:
             self.observe()
             self.tick(self.step, self.clock.now())
             self.clock.advance(PERIOD)
-        for ring in self.page.rings.values():
+        for ring in self.shared.rings.values():
             list(ring.drain())
 
     def new_tick(self) -> Tick:
@@ -137,7 +137,7 @@ class Bench:
             switches=self.switches,
         )
         safety = SafetyFilter(self.safety, self.limits, self._judged)
-        return Tick(self.page, self.sink, safety, self.chosen, settings, self.clock.now)
+        return Tick(self.shared, self.sink, safety, self.chosen, settings, self.clock.now)
 
     def _judged(self, action: Float64) -> tuple[str, ...]:
         """Safety looks whether a policy's action leaves the workspace: the last moment before it is sent."""
@@ -154,12 +154,12 @@ class Bench:
             "qpos": self.measured.astype(np.float32),
             "pictures": {},
         }
-        self.page.publish_observation(Observation(**(fields | changes)), {"cam": self.sequence})
+        self.shared.publish_observation(Observation(**(fields | changes)), {"cam": self.sequence})
 
     # --- what main posts -----------------------------------------------------------------------------------
 
     def post(self, message: Message) -> None:
-        assert self.page.rings["orders"].push(encode(message))
+        assert self.shared.rings["orders"].push(encode(message))
 
     def say(self, kind: Any, **fields: Any) -> None:
         self.order += 1
@@ -183,8 +183,8 @@ class Bench:
         self._begun = True
         for _ in range(ticks):
             if self.alive:
-                self.page.beat("main", self.clock.now())
-                self.page.beat("guard", self.clock.now())
+                self.shared.beat("main", self.clock.now())
+                self.shared.beat("guard", self.clock.now())
             if self.feed:
                 self.observe()
             self.tick(self.step, self.clock.now())
@@ -199,7 +199,7 @@ class Bench:
 
     def told(self) -> list[Event | ChunkMerged]:
         """Everything that main was told since the last call."""
-        messages = [decode(payload) for payload in self.page.rings["control_events"].drain()]
+        messages = [decode(payload) for payload in self.shared.rings["control_events"].drain()]
         return [message for message in messages if isinstance(message, Event | ChunkMerged)]
 
     def said(self, kind: str | None = None, quiet: Sequence[str] = ("limited", "limited_sum")) -> list[Event]:
@@ -210,12 +210,12 @@ class Bench:
         ]
 
     def records(self) -> list[TickDone]:
-        payloads = map(decode, self.page.rings["ticks"].drain())
+        payloads = map(decode, self.shared.rings["ticks"].drain())
         return [message for message in payloads if isinstance(message, TickDone)]
 
     @property
     def status(self) -> Any:
-        return self.page.control.read()
+        return self.shared.control.read()
 
     @property
     def behaviour(self) -> str:

@@ -187,14 +187,14 @@ class RobotActuator(Actuator):
     """The robot itself, behind a transport. A restarted control goes on from the last command, at rest."""
 
     def __init__(
-        self, page: SharedState, sink: Sink, settings: TickSettings, clock: Callable[[], float]
+        self, shared: SharedState, sink: Sink, settings: TickSettings, clock: Callable[[], float]
     ) -> None:
         super().__init__(settings)
-        self._page = page
+        self._page = shared
         self._sink = sink
         self._clock = clock
         self._limiter = CommandLimiter(settings.limits, settings.safety) if settings.guarded else None
-        before = page.control.read()
+        before = shared.control.read()
         self.engaged = bool(before["engaged"])
         self.commanded = np.array(before["commanded"], np.float64)
 

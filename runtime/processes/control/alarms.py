@@ -15,11 +15,11 @@ _AGREES_S = 1.0  # that a joint reads where it is told to be, before its reading
 _THERE = 1e-6  # [rad]
 
 
-def silent_sibling(page: SharedState, now: float, allowed: float) -> str:
+def silent_sibling(shared: SharedState, now: float, allowed: float) -> str:
     """The process whose heartbeat is older than `allowed` seconds, in a sentence; "" where none is."""
     for process in ("main", "guard"):
-        if not page.alive(process, now, allowed):
-            return f"no sign of life from {process} {page.silence(process, now)}"
+        if not shared.alive(process, now, allowed):
+            return f"no sign of life from {process} {shared.silence(process, now)}"
     return ""
 
 

@@ -16,8 +16,8 @@ Say = Callable[[str, str, Mapping[str, object]], None]
 class SubscriberCheck:
     """Asks the sink now and then who does not take commands; the event has all of them under `unheard`."""
 
-    def __init__(self, page: SharedState, sink: Sink, say: Say) -> None:
-        self._page, self._sink, self._say = page, sink, say
+    def __init__(self, shared: SharedState, sink: Sink, say: Say) -> None:
+        self._page, self._sink, self._say = shared, sink, say
         self._next = float("-inf")
         self._told: dict[str, str] = {}
 

@@ -30,27 +30,27 @@ _LATENESS_KEPT = 2000
 _UNREAD = ("runtime.policies", "runtime.teleoperators", "runtime.cameras", "runtime.kinematics")
 
 
-def make_tick(plan: StationSpec, page: SharedState, sink: Sink, now: Callable[[], float]) -> Tick:
+def make_tick(spec: StationSpec, shared: SharedState, sink: Sink, now: Callable[[], float]) -> Tick:
     """The tick of a deployment; the same object in real time and in lockstep."""
-    deployment, limits = plan.deployment, plan.limits
-    workspace = Workspace(plan.robot, deployment.safety.workspace)
-    collisions = Collisions(plan.robot, deployment.safety.collision_margin)
+    deployment, limits = spec.deployment, spec.limits
+    workspace = Workspace(spec.robot, deployment.safety.workspace)
+    collisions = Collisions(spec.robot, deployment.safety.collision_margin)
     return Tick(
-        page,
+        shared,
         sink,
         SafetyFilter(deployment.safety, limits, workspace if workspace.arms else None, collisions),
-        Strategy(deployment.strategy.kind, plan.strategy.merge(deployment.strategy, plan.dims)),
+        Strategy(deployment.strategy.kind, spec.strategy.merge(deployment.strategy, spec.dims)),
         TickSettings(
-            period=1.0 / plan.rate,
+            period=1.0 / spec.rate,
             limits=limits,
-            dims=plan.dims,
+            dims=spec.dims,
             safety=deployment.safety,
             heartbeat_timeout=deployment.control.heartbeat_timeout_s,
             starvation=deployment.faults.starvation,
             starvation_hold=deployment.control.starvation_hold_s,
-            moves_robot=plan.capabilities.moves_robot,
-            switches=switches(plan.robot),
-            publication=plan.publication(),
+            moves_robot=spec.capabilities.moves_robot,
+            switches=switches(spec.robot),
+            publication=spec.publication(),
         ),
         now,
     )
@@ -86,13 +86,13 @@ class Lateness:
 class Loop:
     """Wakes at start + n * period; a tick that was missed is skipped and counted, never caught up."""
 
-    def __init__(self, tick: Tick, page: SharedState, clock: Clock, rate: float, scheduling: str) -> None:
+    def __init__(self, tick: Tick, shared: SharedState, clock: Clock, rate: float, scheduling: str) -> None:
         self._tick = tick
-        self._page = page
+        self._page = shared
         self._clock = clock
         self._period = 1.0 / rate
         self._lateness = Lateness(tick.status, scheduling)
-        self._step = int(page.control.read()["step"]) + 1
+        self._step = int(shared.control.read()["step"]) + 1
         self._start = clock.now() + self._period
         self._n = 0
         self._collect_at = 0.0
@@ -120,17 +120,17 @@ class Loop:
 def main() -> None:
     """Tick until the supervisor is gone, then hold for a while, then end."""
     member = join("control", pictures=False, unread=_UNREAD)
-    plan, page = member.plan, member.page
+    spec, shared = member.spec, member.shared
     clock = MonotonicClock()
-    for _ in page.rings["orders"].drain():
+    for _ in shared.rings["orders"].drain():
         pass  # given to a predecessor that died: its motions are not ours to finish
-    sink: Sink = plan.transport.sink(plan.deployment.transport, plan.robot, clock)
+    sink: Sink = spec.transport.sink(spec.deployment.transport, spec.robot, clock)
     _connect(sink, clock, member.lifeline)
-    tick = make_tick(plan, page, sink, clock.now)
-    settings = plan.deployment.control
+    tick = make_tick(spec, shared, sink, clock.now)
+    settings = spec.deployment.control
     scheduling = realtime.enter(settings.realtime_priority) if settings.realtime == "auto" else "ordinary"
-    log.info("ticking at %g Hz, scheduling %s", plan.rate, scheduling)
-    loop = Loop(tick, page, clock, plan.rate, scheduling)
+    log.info("ticking at %g Hz, scheduling %s", spec.rate, scheduling)
+    loop = Loop(tick, shared, clock, spec.rate, scheduling)
     while not member.lifeline.cut:
         loop.once()
     log.info("the supervisor has ended: holding for %g s, then ending", settings.orphan_hold_s)

@@ -98,16 +98,16 @@ class Nearing:
 class Telemetry:
     """Gathers what a tick has to say, hands it over at its end; a full ring is counted, never waited for."""
 
-    def __init__(self, page: SharedState) -> None:
-        self._page = page
+    def __init__(self, shared: SharedState) -> None:
+        self._page = shared
         self._outbox: list[ChunkMerged | Event] = []
         self._records_lost = 0
         self._step, self.planned = -1, 0.0
         self._woke: float | None = None
         self._corrected = float("-inf")  # when the last check last changed something
         self._smoothed: Float32 | None = None  # of this tick: what was wanted before safety
-        self.status: StatusRecord = np.zeros((), page.layout.control_dtype())  # written whole by every tick
-        self.status[()] = page.control.read()  # counters go on from a predecessor's
+        self.status: StatusRecord = np.zeros((), shared.layout.control_dtype())  # written whole by every tick
+        self.status[()] = shared.control.read()  # counters go on from a predecessor's
         self.limiting = Limiting(self.say)
         self.nearing = Nearing(self.say)
         self.order = 0  # number of the newest order obeyed

@@ -38,26 +38,26 @@ class Tick:
 
     def __init__(
         self,
-        page: SharedState,
+        shared: SharedState,
         sink: Sink,
         safety: SafetyFilter,
         chosen: Strategy,
         settings: TickSettings,
         clock: Callable[[], float],
     ) -> None:
-        self._page = page
+        self._page = shared
         self._safety = safety
         self._strategy = chosen
         self._settings = settings
         self._clock = clock
-        self._eyes = ObservationReader(page)
-        self._report = Telemetry(page)
+        self._eyes = ObservationReader(shared)
+        self._report = Telemetry(shared)
         self._locks = GripperLocks(settings.limits, settings.switches)
         judges = Plausibility if settings.guarded else Unquestioned
         self._plausibility = judges(settings.limits, settings.dims)
         self._displacement = Displacement(settings, self._plausibility)
-        self._actuator = RobotActuator(page, sink, settings, clock)
-        self._hearing = SubscriberCheck(page, sink, self._report.say)
+        self._actuator = RobotActuator(shared, sink, settings, clock)
+        self._hearing = SubscriberCheck(shared, sink, self._report.say)
         # A restarted control goes on holding where its predecessor stood; a new one keeps silent.
         self._robot = self._lane(self._actuator)
         left = bytes(self._report.status["behaviour"]) == Yielded.name.encode()

@@ -27,9 +27,9 @@ log = logging.getLogger(__name__)
 class ControlQueue:
     """Writes orders and chunks; only the thread that owns main's loop may call it."""
 
-    def __init__(self, page: SharedState) -> None:
-        self._page = page
-        self._number = int(page.control.read()["order"])
+    def __init__(self, shared: SharedState) -> None:
+        self._page = shared
+        self._number = int(shared.control.read()["order"])
         self._chunk = 0
 
     def give(

@@ -64,74 +64,83 @@ class Coordinator:
     """One `pump` does everything that is due; lockstep calls it tick by tick."""
 
     def __init__(
-        self, plan: StationSpec, page: SharedState, clock: Clock, runner: Runner, people: Clock | None = None
+        self,
+        spec: StationSpec,
+        shared: SharedState,
+        clock: Clock,
+        runner: Runner,
+        people: Clock | None = None,
     ) -> None:
-        self.page, self.clock = page, clock
+        self.shared, self.clock = shared, clock
         self.people = people or clock  # of leases, and of how long commands are valid: lockstep has another
-        self._facts = facts(plan)
+        self._facts = facts(spec)
         self.boot = str(uuid.uuid4())
-        self._own = plan.resolved
-        settings = plan.deployment
+        self._own = spec.resolved
+        settings = spec.deployment
         self.events = EventLog()
         self.lease = Lease(settings.lease.ttl_s)
-        self._orders = orders = ControlQueue(page)
+        self._orders = orders = ControlQueue(shared)
         self.media_report = MediaReport(0.0, 0, "", 0)
         self.reception_report = ReceptionReport(0.0)
         self.unheard: dict[str, str] = {}  # as by Sink.unheard
-        kinematics = Loading(ChainForward(plan.robot), plan.kinematics, runner.aside)
-        self.spaces = plan.spaces(kinematics)
-        spaces, sight = plan.spaces(kinematics), _sight(plan, page, clock)
-        asking = PolicyRequests(plan.new_policy(clock), settings.task, spaces, sight, runner, clock)
+        kinematics = Loading(ChainForward(spec.robot), spec.kinematics, runner.aside)
+        self.spaces = spec.spaces(kinematics)
+        spaces, policy_observation = spec.spaces(kinematics), _sight(spec, shared, clock)
+        requests = PolicyRequests(
+            spec.new_policy(clock), settings.task, spaces, policy_observation, runner, clock
+        )
         patience = Patience(settings.control.starvation_hold_s, settings.faults.patience_s)
         self.inference = Inference(
-            asking,
-            strategy_of(plan),
-            page,
+            requests,
+            strategy_of(spec),
+            shared,
             self._orders,
             clock,
             patience,
-            RtcPrefix(plan.rate, Mixture(plan.dims, plan.robot)),
+            RtcPrefix(spec.rate, Mixture(spec.dims, spec.robot)),
         )
-        self.setup = SetUp(plan, self.inference, self._orders, page, clock, lambda: self.reception_report)
-        self._watch = HealthMonitor(plan, page, self.lease, clock, self.people, lambda: self.reception_report)
+        self.setup = SetUp(spec, self.inference, self._orders, shared, clock, lambda: self.reception_report)
+        self._watch = HealthMonitor(
+            spec, shared, self.lease, clock, self.people, lambda: self.reception_report
+        )
         control = settings.control
         self._punctuality = TimingReport(
-            page, plan.rate, control.realtime_priority, control.realtime == "auto"
+            shared, spec.rate, control.realtime_priority, control.realtime == "auto"
         )
-        provenance = Provenance(plan, self.boot)
+        provenance = Provenance(spec, self.boot)
         self.runs = Runs(
-            plan,
-            page,
+            spec,
+            shared,
             clock,
             self.inference,
             self._orders,
             provenance,
-            lambda: control_figures(page, plan.rate),
+            lambda: control_figures(shared, spec.rate),
             kinematics.prepare,
         )
-        self.by_hand = ManualControl(plan, page, orders, self.runs, Targets(plan, self.spaces, kinematics))
+        self.manual = ManualControl(spec, shared, orders, self.runs, Targets(spec, self.spaces, kinematics))
         self.collecting = Demonstrations(
-            plan, page, clock, self.inference, self.setup, lambda: self.runs.open, self.say
+            spec, shared, clock, self.inference, self.setup, lambda: self.runs.open, self.say
         )
         parts = Parts(
-            page, clock, orders, self.inference, self.setup, self.runs, self.by_hand, self.collecting
+            shared, clock, orders, self.inference, self.setup, self.runs, self.manual, self.collecting
         )
-        self.operations = SessionActions(plan, parts, self._state, self._watch.absent, self.say)
-        self.preflights = PreflightDesk(lambda: self.plan, plan, self._state, self.say, clock)
+        self.operations = SessionActions(spec, parts, self._state, self._watch.absent, self.say)
+        self.preflights = PreflightDesk(lambda: self.spec, spec, self._state, self.say, clock)
         self.session = SessionMachine(self.operations, self.lease, self.boot, self.people.now)
         self._take_over()
 
     def _take_over(self) -> None:
         """Keep the events from before there was a main, or since one died; act on nothing that was told to that one."""
         for ring in _TO_MAIN:
-            for payload in self.page.rings[ring].drain():
+            for payload in self.shared.rings[ring].drain():
                 if isinstance(message := decode(payload), Event):
                     self._note(message)
 
     @property
-    def plan(self) -> StationSpec:
+    def spec(self) -> StationSpec:
         """As it was last set up or tuned."""
-        return self.operations.plan
+        return self.operations.spec
 
     def _state(self) -> State:
         return self.session.state
@@ -143,9 +152,9 @@ class Coordinator:
 
     def pump(self) -> None:
         """Hear the family, notice what happened, advance set-up and inference."""
-        self.page.beat("main", self.clock.now())
+        self.shared.beat("main", self.clock.now())
         for ring in _TO_MAIN:
-            for payload in self.page.rings[ring].drain():
+            for payload in self.shared.rings[ring].drain():
                 self._hear(decode(payload))
         for noticed in self._watch.notice(self.session.state, self.runs.open):
             self._observe(*noticed)
@@ -162,8 +171,8 @@ class Coordinator:
         """The station's state at this moment."""
         return snapshot(
             View(
-                plan=self.plan,
-                page=self.page,
+                spec=self.spec,
+                shared=self.shared,
                 session=self.session,
                 lease=self.lease,
                 inference=self.inference,
@@ -172,7 +181,7 @@ class Coordinator:
                 media=self.media_report,
                 reception=self.reception_report,
                 unheard=self.unheard,
-                by_hand=self.by_hand,
+                manual=self.manual,
                 collecting=self.collecting,
                 estop=self._watch.estop,
                 boot=self.boot,
@@ -211,17 +220,17 @@ class Coordinator:
     def _unlock(self) -> None:
         """A control that was restarted, or obeys the e-stop, knows of no locks, another may: none, in any case."""
         try:
-            self.by_hand.unlock()
+            self.manual.unlock()
         except RuntimeFault as error:
             log.error("grippers may still be locked: %s", error)
 
     def _hear_event(self, event: Event) -> None:
         self._note(event)
         self.setup.heard(event)
-        settings = self.plan.deployment
+        settings = self.spec.deployment
         if event.kind == "motion_done":
             self.runs.arrived()
-        self.inference.tally.starved += event.kind == "starved"
+        self.inference.metrics.starved += event.kind == "starved"
         if event.kind == "starvation":
             trouble = self.inference.trouble
             stops = settings.faults.starvation == "stop"
@@ -311,9 +320,9 @@ class Coordinator:
 
     def _answer_fault(self, error: RuntimeFault) -> None:
         """Do what the deployment says of a policy that fails: hold, try again for a while, or end the run."""
-        faults, lost = self.plan.deployment.faults, isinstance(error, PolicyLostError)
+        faults, lost = self.spec.deployment.faults, isinstance(error, PolicyLostError)
         answer = faults.policy_lost if lost else faults.policy_error
-        if self.plan.collecting:  # a leader is not asked again by itself: who holds it arms anew
+        if self.spec.collecting:  # a leader is not asked again by itself: who holds it arms anew
             answer = "hold"
         if answer == "slow" and self.inference.retries(error):
             return
@@ -355,8 +364,8 @@ class Coordinator:
 
     def _press(self, command: Command) -> Ack:
         """Raise the flag, whatever goes on and whoever it is; the guard latches it, now or when it is there again."""
-        self.page.rings["presses"].push(encode(command))
-        self.page.set_estop(EStop.LATCHED)
+        self.shared.rings["presses"].push(encode(command))
+        self.shared.set_estop(EStop.LATCHED)
         told = {"uuid": command.uuid, "user": command.user, "role": command.role, "holder": command.holder}
         text = f"estop by {named(command)}: accepted, {why_of(command)}"
         self.say(Event("command", text, self.clock.now(), data=told))
@@ -381,12 +390,12 @@ class Coordinator:
 
     def waits(self, command: Command) -> bool:
         """Whether its answer needs what is still being loaded, so that it is to be handled in a moment."""
-        return command.kind == "aim" and self.by_hand.waits(command.args)
+        return command.kind == "aim" and self.manual.waits(command.args)
 
     def _aim(self, command: Command) -> Ack:
         """Where the robot would go; nothing moves, and anybody may ask."""
         try:
-            return Ack(command.uuid, "done", boot=self.boot, data=self.by_hand.aim(command.args))
+            return Ack(command.uuid, "done", boot=self.boot, data=self.manual.aim(command.args))
         except RuntimeFault as error:
             return Ack(command.uuid, "refused", str(error))
 
@@ -397,6 +406,8 @@ class Coordinator:
         self.inference.runner.close()
 
 
-def _sight(plan: StationSpec, page: SharedState, clock: Clock) -> PolicyObservation:
-    safety = plan.deployment.safety
-    return PolicyObservation(page, clock, SightSettings(plan.rate, safety.joint_age_s, safety.picture_age_s))
+def _sight(spec: StationSpec, shared: SharedState, clock: Clock) -> PolicyObservation:
+    safety = spec.deployment.safety
+    return PolicyObservation(
+        shared, clock, SightSettings(spec.rate, safety.joint_age_s, safety.picture_age_s)
+    )

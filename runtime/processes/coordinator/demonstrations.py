@@ -50,18 +50,18 @@ class Demonstrations:
 
     def __init__(
         self,
-        plan: StationSpec,
-        page: SharedState,
+        spec: StationSpec,
+        shared: SharedState,
         clock: Clock,
         inference: Inference,
         setup: SetUp,
         opened: Callable[[], Run | None],
         say: Callable[[Event], None],
     ) -> None:
-        self._plan = plan
-        self._settings = plan.deployment.collection
-        self._data = plan.deployment.data
-        self._page, self._clock = page, clock
+        self._plan = spec
+        self._settings = spec.deployment.collection
+        self._data = spec.deployment.data
+        self._page, self._clock = shared, clock
         self._inference, self._setup = inference, setup
         self._opened = opened  # the run that is open
         self._say = say
@@ -299,7 +299,7 @@ class Demonstrations:
             "armed": self.armed,
             "why_not": self.why_not,
             "leader": self._leader(),
-            "task": self.task or self._inference.asking.task,
+            "task": self.task or self._inference.requests.task,
             "episode": run.uuid if run is not None else None,
             "last": self.last,
             "dataset": settings.dataset,

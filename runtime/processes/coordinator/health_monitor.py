@@ -37,21 +37,21 @@ class HealthMonitor:
 
     def __init__(
         self,
-        plan: StationSpec,
-        page: SharedState,
+        spec: StationSpec,
+        shared: SharedState,
         lease: Lease,
         clock: Clock,
         people: Clock,
         reception: Callable[[], ReceptionReport],
     ) -> None:
-        self._plan = plan
-        self._page = page
+        self._plan = spec
+        self._page = shared
         self._lease = lease
         self._clock = clock
         self._people = people  # the clock of leases
         self._reception = reception  # what it last reported
-        self._latch = Latch(plan.deployment.station_dir)
-        self._generations = {name: page.generation(name) for name in SIBLINGS}
+        self._latch = Latch(spec.deployment.station_dir)
+        self._generations = {name: shared.generation(name) for name in SIBLINGS}
         self._lease_held = False
         self.estop = ""  # who pressed and why, while it is latched
         self._pressed: float | None = None  # when the flag was seen without its latch

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.clock import Clock
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.command_arguments import (
@@ -37,13 +37,13 @@ from runtime.station.spec import StationSpec
 class Parts:
     """What operations are carried out with."""
 
-    page: SharedState
+    shared: SharedState
     clock: Clock
     orders: ControlQueue
     inference: Inference
     setup: SetUp
     runs: Runs
-    by_hand: ManualControl
+    manual: ManualControl
     collecting: Demonstrations
 
 
@@ -52,17 +52,17 @@ class SessionActions(Effects):
 
     def __init__(
         self,
-        plan: StationSpec,
+        spec: StationSpec,
         parts: Parts,
         state: Callable[[], State],
         absent: Callable[[], str],
         say: Callable[[Event], None],
     ) -> None:
-        self._own = plan  # the deployment's
-        self.plan = plan  # as it was last set up or tuned
-        self.page, self.clock = parts.page, parts.clock
+        self._own = spec  # the deployment's
+        self.spec = spec  # as it was last set up or tuned
+        self.shared, self.clock = parts.shared, parts.clock
         self.inference, self.setup = parts.inference, parts.setup
-        self.runs, self.by_hand, self.collecting = parts.runs, parts.by_hand, parts.collecting
+        self.runs, self.manual, self.collecting = parts.runs, parts.manual, parts.collecting
         self._orders = parts.orders
         self._state, self._absent, self._say = state, absent, say
         self._tuned = False  # since the last set-up
@@ -70,22 +70,22 @@ class SessionActions(Effects):
     # --- set-up and runs -------------------------------------------------------------------------------------
 
     def begin_setup(self, asked: SetUpRequest) -> Told:
-        plan, reset = self._changed(asked), self.setup.bench.of(asked.bench)
+        spec, reset = self._changed(asked), self.setup.bench.of(asked.bench)
         policy = self.inference.policy
-        other = plan.deployment.policy != self.plan.deployment.policy
-        if plan.collecting != self.plan.collecting or (other and not plan.collecting):
-            policy = plan.new_policy(self.clock)
-        self._orders.tune(plan.deployment.strategy.model_dump())
-        self.by_hand.unlock()
+        other = spec.deployment.policy != self.spec.deployment.policy
+        if spec.collecting != self.spec.collecting or (other and not spec.collecting):
+            policy = spec.new_policy(self.clock)
+        self._orders.tune(spec.deployment.strategy.model_dump())
+        self.manual.unlock()
         # Nothing is refused from here on.
         checkpoint = asked.checkpoint.model_dump() if asked.checkpoint else {}
-        self.plan = plan
-        told = replace(self.runs.provenance, plan=plan, checkpoint=checkpoint, bench=reset or {})
+        self.spec = spec
+        told = replace(self.runs.provenance, spec=spec, checkpoint=checkpoint, bench=reset or {})
         self.runs.provenance = told
-        self.inference.exchange(policy, plan.deployment.task)
-        self.inference.tune(strategy_of(plan), plan.deployment.task)
+        self.inference.exchange(policy, spec.deployment.task)
+        self.inference.tune(strategy_of(spec), spec.deployment.task)
         self._tuned = False
-        self.collecting.begin_setup(plan.collecting)
+        self.collecting.begin_setup(spec.collecting)
         self.setup.begin(reset, asked.least)
         return {"bench": reset["id"]} if reset else {}
 
@@ -93,8 +93,8 @@ class SessionActions(Effects):
         """The plan of a set-up; raises RuntimeFault where it is none, or an open recording would not be about it."""
         collects = self._collects(asked)
         changes = asked.changes | ({"strategy": {"kind": "naive"}} if collects else {})
-        resolved = deployment.changed(self._own.resolved, changes, "setup")
-        if self.runs.alone and resolved.digest != self.plan.resolved.digest:
+        resolved = loader.changed(self._own.resolved, changes, "setup")
+        if self.runs.alone and resolved.digest != self.spec.resolved.digest:
             raise RuntimeFault(
                 "a recording is open, whose manifest says another policy or task: record stop first"
             )
@@ -123,7 +123,7 @@ class SessionActions(Effects):
     def cancel_setup(self, reason: str) -> None:
         self.setup.cancel()
         self._orders.give("hold", reason=reason)
-        self.by_hand.stand()
+        self.manual.stand()
 
     def begin_run(self, asked: RunRequest) -> Told:
         self._require_family()
@@ -132,21 +132,21 @@ class SessionActions(Effects):
         mode = self._mode(asked)
         asked = asked.model_copy(update={"mode": mode})
         if mode == "manual":
-            self.by_hand.require_robot("run in the mode manual")
-            self.by_hand.prepare()
+            self.manual.require_robot("run in the mode manual")
+            self.manual.prepare()
         # A control that was restarted during the set-up merges as the deployment says until it is told.
-        self._orders.tune(self.plan.deployment.strategy.model_dump())
+        self._orders.tune(self.spec.deployment.strategy.model_dump())
         collecting = self.collecting
         if mode != "collect":
             return {"episode": self.runs.begin(self.setup.info, asked, command=self.command)}
-        self.by_hand.require_robot("run in the mode collect")
+        self.manual.require_robot("run in the mode collect")
         episode = self.runs.begin(self.setup.info, asked, collecting.manifest(asked), self.command)
         collecting.begun(episode, asked)
         return {"episode": episode}
 
     def _mode(self, asked: RunRequest) -> Mode:
         """The mode of a run; RuntimeFault where the station is not set up for it."""
-        collects, settings = self.plan.collecting, self.plan.deployment
+        collects, settings = self.spec.collecting, self.spec.deployment
         mode = asked.mode or ("collect" if collects else settings.run.mode)
         if collects and mode not in ("collect", "manual"):
             raise RuntimeFault(
@@ -168,49 +168,49 @@ class SessionActions(Effects):
         mode = self._mode(asked)
         if mode != "continuous":
             raise RuntimeFault(f"a trial runs in the mode continuous, and {mode} was asked for")
-        if not self.plan.deployment.recording.enabled:
+        if not self.spec.deployment.recording.enabled:
             raise RuntimeFault(
                 "a trial counts by its recording, and recording.enabled = false; allowed: true"
             )
         if self._tuned:
             raise RuntimeFault("strategy or task were tuned since the set-up: set up again for a trial")
-        if not np.isnan(self.by_hand.grippers.locks).all():
+        if not np.isnan(self.manual.grippers.locks).all():
             raise RuntimeFault("a gripper is locked: unlock it, or set up again for a trial")
 
     # --- what a person does within a run ------------------------------------------------------------
 
     @property
     def situation(self) -> GuardFacts:
-        run, control = self.runs.open, self.page.control.read()
+        run, control = self.runs.open, self.shared.control.read()
         return GuardFacts(
             mode=run.mode if run else None,
             trial=run is not None and run.trial,
             proposed=self.inference.proposal is not None,
             asked=self.inference.asked,
             executing=int(control["remaining"]) > 0,
-            first_action=self.setup.first_action is not None and self.plan.capabilities.moves_robot,
+            first_action=self.setup.first_action is not None and self.spec.capabilities.moves_robot,
             opening=run is not None and run.begun is None,
             approaching=run is not None and run.approaching,
             collection=self.collecting.declared,
-            collecting=self.plan.collecting,
+            collecting=self.spec.collecting,
             armed=self.collecting.armed,
             unled=self.collecting.unled,
-            doubt=self.page.doubt if self.plan.capabilities.moves_robot else "",
+            doubt=self.shared.doubt if self.spec.capabilities.moves_robot else "",
         )
 
     def tune(self, asked: TuneRequest) -> Told:
-        if self.plan.collecting and asked.strategy is not None:
+        if self.spec.collecting and asked.strategy is not None:
             raise RuntimeFault("tune: strategy while the station is set up to collect; allowed: task")
-        plan = tuned(self.plan, asked, self.setup.info)
-        settings = plan.deployment
+        spec = tuned(self.spec, asked, self.setup.info)
+        settings = spec.deployment
         strategy = settings.strategy.model_dump()
         self._orders.tune(strategy)
-        if settings.task != self.plan.deployment.task:
+        if settings.task != self.spec.deployment.task:
             self.setup.first_action = None  # it answered another instruction
-        self.plan, self._tuned = plan, True
-        self.runs.provenance = replace(self.runs.provenance, plan=plan)
-        self.inference.tune(strategy_of(plan), settings.task)
-        data = {"strategy": strategy, "task": settings.task, "hash": plan.resolved.digest}
+        self.spec, self._tuned = spec, True
+        self.runs.provenance = replace(self.runs.provenance, spec=spec)
+        self.inference.tune(strategy_of(spec), settings.task)
+        data = {"strategy": strategy, "task": settings.task, "hash": spec.resolved.digest}
         text = f"strategy {settings.strategy.kind}, task {settings.task!r}"
         self._say(Event("tuned_to", text, self.clock.now(), data=data))
         return {"strategy": strategy, "task": settings.task}
@@ -223,10 +223,10 @@ class SessionActions(Effects):
 
     def cancel(self) -> None:
         self.runs.cancel()
-        self.by_hand.stand()
+        self.manual.stand()
 
     def move(self, asked: MoveRequest) -> Told:
-        return self.by_hand.move(asked)
+        return self.manual.move(asked)
 
     def grip(self, asked: GripperRequest) -> Told:
         run = self.runs.open
@@ -235,14 +235,14 @@ class SessionActions(Effects):
                 f"gripper: {asked.action} would move the robot's own, and the run's mode is sim; allowed: lock, unlock"
             )
         free = run is None or run.mode == "manual" or self._state() is State.HOLDING
-        return self.by_hand.grip(asked, free)
+        return self.manual.grip(asked, free)
 
     def approach(self) -> None:
         made, first = self.inference.proposal, self.setup.first_action
         if self._state() is not State.READY and made is not None:
-            self.runs.approach(self.by_hand.checked("approach", made.rows[0]))
+            self.runs.approach(self.manual.checked("approach", made.rows[0]))
         elif first is not None:
-            self.setup.first_action = self.by_hand.checked("approach", first)
+            self.setup.first_action = self.manual.checked("approach", first)
             self.setup.begin_approach()
 
     # --- demonstrations -----------------------------------------------------------------------------
@@ -267,7 +267,7 @@ class SessionActions(Effects):
 
     def hold(self, reason: str) -> None:
         self.runs.hold(reason)
-        self.by_hand.stand()
+        self.manual.stand()
 
     def resume_run(self) -> None:
         self._require_family()
@@ -275,14 +275,14 @@ class SessionActions(Effects):
 
     def end_run(self, status: str, reason: str) -> None:
         self.runs.end(status, reason)
-        self.by_hand.stand()
+        self.manual.stand()
 
     def go_home(self) -> None:
-        self.by_hand.require_robot("home")
+        self.manual.require_robot("home")
         self.setup.begin_homing()
 
     def release_estop(self) -> None:
-        self.page.ask_release()
+        self.shared.ask_release()
 
     def start_recording(self) -> Told:
         self._require_family()

@@ -21,12 +21,12 @@ _SPARE = 0.001  # [m]
 class PathCheck:
     """The ways of one robot, within its workspace boxes and without collisions."""
 
-    def __init__(self, plan: StationSpec) -> None:
-        safety = plan.deployment.safety
-        self._limits = plan.limits
-        self._wrapping = plan.dims.wrapping
-        self._workspace = Workspace(plan.robot, safety.workspace)
-        self._collisions = Collisions(plan.robot, safety.collision_margin + _SPARE)
+    def __init__(self, spec: StationSpec) -> None:
+        safety = spec.deployment.safety
+        self._limits = spec.limits
+        self._wrapping = spec.dims.wrapping
+        self._workspace = Workspace(spec.robot, safety.workspace)
+        self._collisions = Collisions(spec.robot, safety.collision_margin + _SPARE)
 
     def check(self, what: str, start: Float64, goal: Float64) -> None:
         """RuntimeFault for `what` where the way from `start` to `goal` [D] leaves a box it is in, or links collide."""

@@ -37,7 +37,7 @@ class CommandService:
 
     def __init__(self, main: Coordinator, context: zmq.Context[Any]) -> None:
         self._main = main
-        settings = main.plan.deployment
+        settings = main.spec.deployment
         folder = settings.station_dir
         self._server = CommandServer(context, folder, "commands")
         self._turns = Turns(self._server, STOPPING, _SHARE)
@@ -172,7 +172,7 @@ class CommandService:
             "run": shown.run,
             "state": shown.state,
             "observation_step": shown.observation_step,
-            "step": int(self._main.page.control.read()["step"]),
+            "step": int(self._main.shared.control.read()["step"]),
             "targets": shown.targets,
             "rows": shown.rows.astype(np.float32),
             "poses": self._main.spaces.eef_of(shown.rows),
@@ -187,7 +187,7 @@ class CommandService:
         `simulated` where the robot of a run in simulation was told to be. `chunk` has the largest part in the step
         (-1: none), `chunks` made it, safety has `limited` it.
         """
-        status, seen = self._main.page.control.read(), self._main.page.observation.read()
+        status, seen = self._main.shared.control.read(), self._main.shared.observation.read()
         step = int(status["step"])
         raw, ticked = self._main.inference.raw(step), bool(status["behaviour"])
         nothing = np.full(len(seen["qpos"]), np.nan, np.float32)
@@ -206,7 +206,7 @@ class CommandService:
 
     def _poses(self) -> np.ndarray:
         """End effectors as one float32 frame [2, 8 * arms]: measured, commanded (NaN while nothing is sent)."""
-        status, seen = self._main.page.control.read(), self._main.page.observation.read()
+        status, seen = self._main.shared.control.read(), self._main.shared.observation.read()
         poses = self._main.spaces.eef_of(np.stack([seen["qpos"], status["commanded"]]))
         if not status["engaged"]:
             poses[1] = np.nan
@@ -222,7 +222,7 @@ def main() -> None:
     heap.keep()
     descriptors.allow_all()
     member = join("main")
-    deciding = Coordinator(member.plan, member.page, MonotonicClock(), ThreadRunner())
+    deciding = Coordinator(member.spec, member.shared, MonotonicClock(), ThreadRunner())
     service = CommandService(deciding, zmq.Context.instance())
     while not member.lifeline.cut:
         deciding.pump()

@@ -37,8 +37,8 @@ class Runs:
 
     def __init__(
         self,
-        plan: StationSpec,
-        page: SharedState,
+        spec: StationSpec,
+        shared: SharedState,
         clock: Clock,
         inference: Inference,
         orders: ControlQueue,
@@ -46,8 +46,8 @@ class Runs:
         figures: Callable[[], dict[str, Any]],
         prepared: Callable[[], bool],
     ) -> None:
-        self._plan = plan
-        self._page = page
+        self._plan = spec
+        self._page = shared
         self._clock = clock
         self._inference = inference
         self._orders = orders
@@ -55,7 +55,7 @@ class Runs:
         self._figures = figures  # of control, for the outcome
         self._prepared = prepared  # begins to load what a person needs; whether it is there
         self.open: Run | None = None
-        self._count = int(page.control.read()["run"])
+        self._count = int(shared.control.read()["run"])
         self._alone = ""  # uuid of a recording without a run
         self.last: dict[str, Any] = {}  # how the last run ended
         self.last_episode: dict[str, Any] = {}
@@ -105,7 +105,7 @@ class Runs:
             manifest |= more
         identity = str(manifest["uuid"]) if manifest else str(uuid.uuid4())
         self._tell(BeginEpisode(self._count, manifest))
-        self._inference.asking.sight.simulated = mode == "sim" and sim_state == "simulated"
+        self._inference.requests.policy_observation.simulated = mode == "sim" and sim_state == "simulated"
         self.open = Run(
             self._count,
             identity,
@@ -160,15 +160,15 @@ class Runs:
     def end(self, status: str, reason: str) -> None:
         """Decelerate, hold, close the open run."""
         self._inference.pause()
-        self._inference.asking.sight.simulated = False
+        self._inference.requests.policy_observation.simulated = False
         self._orders.give("hold", reason=reason)
         run, self.open = self.open, None
         if run is not None:
             if run.begun is not None and run.mode not in ("manual", "collect"):
-                self._inference.asking.rest()
+                self._inference.requests.rest()
             seconds = run.elapsed(self._clock.now())
             self.last = {"number": run.number, "uuid": run.uuid, "status": status, "reason": reason}
-            policy = self._inference.tally.figures()
+            policy = self._inference.metrics.figures()
             details = {"run_seconds": seconds, "control": run.figures(self._figures()), "policy": policy}
             details |= {"reached": run.reached} if run.reached else {}
             self.note(EndEpisode(status, reason, details))  # a stop is not refused because media hangs
@@ -205,7 +205,7 @@ class Runs:
             self._orders.give("follow", run=run.number, mode=run.mode)
             self._inference.begin(run.number, fresh, run.mode)
             if run.mode == "collect":  # a leader has moved on while the robot was held: it is engaged anew
-                self._inference.asking.forget()
+                self._inference.requests.forget()
 
     # --- by a person, within a run ---------------------------------------------------------------------------
 

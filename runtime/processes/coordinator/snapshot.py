@@ -29,8 +29,8 @@ from runtime.station.spec import StationSpec
 class View:
     """The parts of main that a snapshot shows, at the moment `now` of the runtime's clock."""
 
-    plan: StationSpec
-    page: SharedState
+    spec: StationSpec
+    shared: SharedState
     session: SessionMachine
     lease: Lease
     inference: Inference
@@ -39,7 +39,7 @@ class View:
     media: MediaReport
     reception: ReceptionReport
     unheard: Mapping[str, str]  # as by Sink.unheard
-    by_hand: ManualControl
+    manual: ManualControl
     collecting: Demonstrations
     estop: str
     boot: str
@@ -54,32 +54,32 @@ def snapshot(view: View) -> dict[str, Any]:
 
     "clock" is the one that commands are valid by; in lockstep it goes on while the runtime's stands.
     """
-    settings, session = view.plan.deployment, view.session
+    settings, session = view.spec.deployment, view.session
     return {
         "boot": view.boot,
         "sequence": session.sequence,
         "clock": view.people,
         "station": settings.station,
-        "robot": view.plan.robot.name,
+        "robot": view.spec.robot.name,
         "state": str(session.state),
         "reason": session.reason,
         "allowed": session.allowed(),
         "guarded": session.guarded(),
         "mode": view.runs.open.mode if view.runs.open else settings.run.mode,
-        "sim_state": "simulated" if view.inference.asking.sight.simulated else "live",
+        "sim_state": "simulated" if view.inference.requests.policy_observation.simulated else "live",
         "phase": _phase(view),
         "stage": str(view.setup.stage),
         "stages": _stages(view),
         "setup_took": dict(view.setup.took),
         "first_action": _first_action(view),
         "proposal": _proposal(view),
-        "grippers": view.by_hand.grippers.told(view.by_hand.commanded()),
+        "grippers": view.manual.grippers.told(view.manual.commanded()),
         "drives": dict(view.reception.drives),
         "collect": view.collecting.shown(),
         "validated": view.setup.validated,
         "task": settings.task,
         "checkpoint": dict(view.runs.provenance.checkpoint),
-        "simulated": view.plan.capabilities.resets_bench,
+        "simulated": view.spec.capabilities.resets_bench,
         "truth": dict(view.reception.truth),
         "transport": settings.transport.kind,
         "policy": {"kind": settings.policy.kind, **_inference(view)},
@@ -96,16 +96,16 @@ def snapshot(view: View) -> dict[str, Any]:
             "unclosed": dict(view.media.unclosed),
         },
         "episode": view.runs.last_episode,
-        "control": control_figures(view.page, view.plan.rate),
+        "control": control_figures(view.shared, view.spec.rate),
         "link": _link(view),
         "newest_event": view.newest_event,
         "facts": dict(view.facts),
     }
 
 
-def facts(plan: StationSpec) -> dict[str, Any]:
+def facts(spec: StationSpec) -> dict[str, Any]:
     """What never changes while a station runs: names, sizes, limits [rad or the gripper's unit], rates [Hz]."""
-    robot, bus = plan.robot, plan.deployment.bus
+    robot, bus = spec.robot, spec.deployment.bus
     return {
         "robot": robot.name,
         "groups": [group.name for group in robot.groups],
@@ -116,21 +116,21 @@ def facts(plan: StationSpec) -> dict[str, Any]:
         "gripper_dims": list(robot.gripper_dims),
         "lower": robot.lower.tolist(),
         "upper": robot.upper.tolist(),
-        "home": robot.poses[plan.deployment.setup.pose].tolist(),
+        "home": robot.poses[spec.deployment.setup.pose].tolist(),
         "velocity": robot.velocity.tolist(),
         "binary_dims": list(robot.binary_dims),
         "poses": sorted(robot.poses),
-        "tasks": list(dict.fromkeys(filter(None, [plan.deployment.task, *plan.deployment.tasks]))),
+        "tasks": list(dict.fromkeys(filter(None, [spec.deployment.task, *spec.deployment.tasks]))),
         "strategies": {kind: sorted(module.USES) for kind, module in variants("runtime.strategies").items()},
-        "strategy": plan.deployment.strategy.model_dump(),
+        "strategy": spec.deployment.strategy.model_dump(),
         "modes": list(get_args(PolicyMode)),
-        "moves_robot": plan.capabilities.moves_robot,
-        "cameras": list(plan.cameras),
-        "rate": plan.rate,
-        "fps": plan.fps,
+        "moves_robot": spec.capabilities.moves_robot,
+        "cameras": list(spec.cameras),
+        "rate": spec.rate,
+        "fps": spec.fps,
         "preview_rate": bus.preview_rate,
-        "recorded": plan.deployment.recording.enabled,
-        "lease_ttl_s": plan.deployment.lease.ttl_s,
+        "recorded": spec.deployment.recording.enabled,
+        "lease_ttl_s": spec.deployment.lease.ttl_s,
     }
 
 
@@ -157,11 +157,11 @@ def _run(view: View) -> dict[str, Any]:
 
 
 def _inference(view: View) -> dict[str, Any]:
-    tally = view.inference.tally
+    metrics = view.inference.metrics
     return {
         "name": view.setup.info.name if view.setup.info else "",
-        "answers": tally.answers,
-        **tally.newest(),
+        "answers": metrics.answers,
+        **metrics.newest(),
         "lost": view.inference.lost_for > 0,
         "retry_in_s": view.inference.retry_in,
         "rtc": view.inference.rtc,
@@ -170,7 +170,7 @@ def _inference(view: View) -> dict[str, Any]:
 
 def _phase(view: View) -> str:
     """What a run that goes on is doing, in one word; "" where none does, or it has not begun."""
-    run, control = view.runs.open, view.page.control.read()
+    run, control = view.runs.open, view.shared.control.read()
     if run is None or run.begun is None or view.session.state is not State.RUNNING:
         return ""
     moving = bytes(control["behaviour"]) == b"motion"
@@ -216,7 +216,7 @@ def _first_action(view: View) -> dict[str, Any]:
     """How far the policy's first action is from where the robot is now; {} where it is not known."""
     if view.setup.first_action is None:
         return {}
-    return first_action(view.setup.first_action, _joints(view), view.plan)
+    return first_action(view.setup.first_action, _joints(view), view.spec)
 
 
 def _proposal(view: View) -> dict[str, Any]:
@@ -224,18 +224,18 @@ def _proposal(view: View) -> dict[str, Any]:
     made = view.inference.proposal
     if made is None:
         return {}
-    first = first_action(made.answered.made.meant, _joints(view), view.plan)
+    first = first_action(made.answered.made.meant, _joints(view), view.spec)
     age = view.now - made.answered.observation.captured.get("joints", view.now)
     return {"chunk": made.number, "rows": len(made.rows), "age_s": age, **first}
 
 
 def _joints(view: View) -> Float64:
-    return np.array(view.page.observation.read()["qpos"], np.float64)
+    return np.array(view.shared.observation.read()["qpos"], np.float64)
 
 
-def control_figures(page: SharedState, rate: float) -> dict[str, Any]:
+def control_figures(shared: SharedState, rate: float) -> dict[str, Any]:
     """What control last did and how well it keeps time."""
-    status = page.control.read()
+    status = shared.control.read()
     return {
         "rate": rate,
         "step": int(status["step"]),
@@ -254,10 +254,10 @@ def control_figures(page: SharedState, rate: float) -> dict[str, Any]:
 
 
 def _link(view: View) -> dict[str, Any]:
-    record = view.page.observation.read()
+    record = view.shared.observation.read()
     never = int(record["sequence"]) == 0
     ages = {"joints": math.inf if never else view.now - float(record["joints_captured"])}
-    for index, camera in enumerate(view.page.layout.cameras):
+    for index, camera in enumerate(view.shared.layout.cameras):
         seen = bool(record["picture_number"][index])
         ages[camera] = view.now - float(record["picture_captured"][index]) if seen else math.inf
     return {

@@ -14,8 +14,8 @@ _LOOK_S = 1.0
 class TimingReport:
     """Looks at control's own figures once a second; `asked`: control asks for the real-time class."""
 
-    def __init__(self, page: SharedState, rate: float, priority: int, asked: bool) -> None:
-        self._page = page
+    def __init__(self, shared: SharedState, rate: float, priority: int, asked: bool) -> None:
+        self._page = shared
         self._rate = rate
         self._priority = priority
         self._asked = asked

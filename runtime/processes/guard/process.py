@@ -35,19 +35,19 @@ class Guard:
     """Presses and releases: the flag, the disk, the answer, then the log; none delays what comes before it."""
 
     def __init__(
-        self, page: SharedState, latch: Latch, clock: Clock, period: float, station: str = ""
+        self, shared: SharedState, latch: Latch, clock: Clock, period: float, station: str = ""
     ) -> None:
-        self._page = page
+        self._page = shared
         self._latch = latch
         self._clock = clock
         self._said = {"station": station}  # so that nobody takes another station's answer for his own
         self._patience = max(0.05, 2.0 * period)
         self._unsaid: list[tuple[int, str]] = []  # level and line, for after the answer
-        self._releases = page.releases  # what was asked for before is void
+        self._releases = shared.releases  # what was asked for before is void
         self._latched: tuple[str, str] | None = None  # by whom and why, as this process has written it
         latched = latch.read()
         # A restarted guard also trusts the flag of its predecessor, which may not have reached the disk.
-        page.set_estop(EStop.LATCHED if latched or page.estop is EStop.LATCHED else EStop.CLEAR)
+        shared.set_estop(EStop.LATCHED if latched or shared.estop is EStop.LATCHED else EStop.CLEAR)
         if latched:
             log.warning("e-stop is latched since before this start, by %s: %s", latched.by, latched.why)
 
@@ -152,8 +152,10 @@ class Desk:
     earlier one.
     """
 
-    def __init__(self, guard: Guard, page: SharedState, context: zmq.Context[Any], station_dir: Path) -> None:
-        self._guard, self._page, self._key = guard, page, Key(station_dir)
+    def __init__(
+        self, guard: Guard, shared: SharedState, context: zmq.Context[Any], station_dir: Path
+    ) -> None:
+        self._guard, self._page, self._key = guard, shared, Key(station_dir)
         self._server = CommandServer(context, station_dir, "estop")
         self._turns = Turns(self._server, (), _SHARE, LONGEST_STOP)
         self._endpoints = Endpoints(station_dir)
@@ -223,12 +225,12 @@ def main() -> None:
     logs.start("guard")
     sizes = json.loads(given.layout)
     layout = SharedStateLayout(**{**sizes, "cameras": tuple(sizes["cameras"])})
-    member = Membership(SharedState.attach(layout, given.page), given.boot, Lifeline())
+    member = Membership(SharedState.attach(layout, given.shared), given.boot, Lifeline())
     clock = MonotonicClock()
-    guard = Guard(member.page, Latch(given.folder), clock, given.period, given.station)
-    desk = Desk(guard, member.page, zmq.Context.instance(), given.folder)
+    guard = Guard(member.shared, Latch(given.folder), clock, given.period, given.station)
+    desk = Desk(guard, member.shared, zmq.Context.instance(), given.folder)
     while member.needed(clock.now()):
-        member.page.beat("guard", clock.now())
+        member.shared.beat("guard", clock.now())
         guard.watch()
         desk.serve(_POLL_S)
     desk.close()

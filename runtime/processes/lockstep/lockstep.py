@@ -65,22 +65,22 @@ class Lockstep:
     """
 
     def __init__(
-        self, plan: StationSpec, clock: VirtualClock | None = None, around: Around | None = None
+        self, spec: StationSpec, clock: VirtualClock | None = None, around: Around | None = None
     ) -> None:
-        self.plan = plan
+        self.spec = spec
         self.clock = clock = clock or VirtualClock()
-        self.page = SharedState(plan.layout, mmap.mmap(-1, SharedState.size(plan.layout)))
-        settings, around = plan.deployment, around or Around()
+        self.shared = SharedState(spec.layout, mmap.mmap(-1, SharedState.size(spec.layout)))
+        settings, around = spec.deployment, around or Around()
         waits = around.waits or clock
-        self.guard = Guard(self.page, Latch(settings.station_dir), waits, 1.0 / plan.rate, settings.station)
-        self._source = plan.source(clock)
-        self._sink = plan.transport.sink(settings.transport, plan.robot, clock)
-        recorder = make_recorder(plan, clock.now, patient=True)
-        self.media = Media(self.page, recorder, clock, around.preview, around.closer, around.on_disk)
-        self.reception = Reception(self.page, self._source, clock, LOCKSTEP)
+        self.guard = Guard(self.shared, Latch(settings.station_dir), waits, 1.0 / spec.rate, settings.station)
+        self._source = spec.source(clock)
+        self._sink = spec.transport.sink(settings.transport, spec.robot, clock)
+        recorder = make_recorder(spec, clock.now, patient=True)
+        self.media = Media(self.shared, recorder, clock, around.preview, around.closer, around.on_disk)
+        self.reception = Reception(self.shared, self._source, clock, LOCKSTEP)
         self._runner = around.runner or LockstepRunner(settings.lockstep.delay_ticks)
-        self.main = Coordinator(plan, self.page, clock, self._runner, around.people)
-        self._tick = make_tick(plan, self.page, self._sink, self.clock.now)
+        self.main = Coordinator(spec, self.shared, clock, self._runner, around.people)
+        self._tick = make_tick(spec, self.shared, self._sink, self.clock.now)
         self.step = 0
 
     def connect(self) -> None:
@@ -92,7 +92,7 @@ class Lockstep:
         """One control period."""
         now = self.clock.now()
         for process in ("control", "guard", "reception", "media"):
-            self.page.beat(process, now)
+            self.shared.beat(process, now)
         self.guard.watch()
         self.reception.pump(0.0)
         self.media.digest()
@@ -106,7 +106,7 @@ class Lockstep:
 
     def _pass(self) -> None:
         """Let time come to the next tick: from the start and not by adding up, so that tick k is at k / rate."""
-        self.clock.sleep_until(self.step / self.plan.rate)
+        self.clock.sleep_until(self.step / self.spec.rate)
 
     def command(self, kind: str, **arguments: Any) -> Ack:
         """Give a command under a lease of lockstep's own; raises SetupError where it is refused."""
@@ -152,14 +152,14 @@ class Lockstep:
         self._sink.close()
 
 
-def check(plan: StationSpec) -> None:
+def check(spec: StationSpec) -> None:
     """Raise SetupError where what is at the other end of the transport goes on by itself.
 
     Its messages are stamped in a time that the virtual clock does not have: a run would only hold, for the age of
     its joints.
     """
-    kind = plan.deployment.transport.kind
-    if getattr(plan.transport, "REAL_TIME", False):
+    kind = spec.deployment.transport.kind
+    if getattr(spec.transport, "REAL_TIME", False):
         known = variants("runtime.transports").items()
         allowed = ", ".join(sorted(name for name, module in known if not getattr(module, "REAL_TIME", False)))
         raise SetupError(
@@ -168,12 +168,12 @@ def check(plan: StationSpec) -> None:
         )
 
 
-def run(plan: StationSpec, longest: float = 3600.0) -> LockstepRun:
+def run(spec: StationSpec, longest: float = 3600.0) -> LockstepRun:
     """Set up, run to the end of the source or of run.duration_s, close; raises RuntimeFault where it cannot.
 
     `longest` bounds the virtual time of the run [s].
     """
-    station = Lockstep(plan)
+    station = Lockstep(spec)
     session = station.main.session
     try:
         station.connect()

@@ -85,12 +85,12 @@ class ServedLockstep(Lockstep):
 
     def __init__(
         self,
-        plan: StationSpec,
+        spec: StationSpec,
         clock: VirtualClock,
         over: Over = lambda running: "",
         people: Clock | None = None,
     ) -> None:
-        settings = plan.deployment
+        settings = spec.deployment
         if settings.control_channel.enabled:
             raise SetupError("control_channel.enabled = true in lockstep, which has none; allowed: false")
         self._people = people or MonotonicClock()
@@ -101,8 +101,8 @@ class ServedLockstep(Lockstep):
         Key(settings.station_dir).secret()
         self._exports = Exports(settings.data, settings.recording.export)
         start_repair(settings.episodes_dir, settings.station, self._exports.start)
-        self._previews = Previews(plan)
-        self._asking = DeclaredRunner(declared(plan.rate))
+        self._previews = Previews(spec)
+        self._asking = DeclaredRunner(declared(spec.rate))
         around = Around(
             runner=self._asking,
             people=self._people,
@@ -111,10 +111,10 @@ class ServedLockstep(Lockstep):
             closer=in_background,
             on_disk=self._exports.start,
         )
-        super().__init__(plan, clock, around)
+        super().__init__(spec, clock, around)
         self._figures = Lateness(self._tick.status, LOCKSTEP)
         context: zmq.Context[Any] = zmq.Context.instance()
-        self._estops = Desk(self.guard, self.page, context, settings.station_dir)
+        self._estops = Desk(self.guard, self.shared, context, settings.station_dir)
         self._service = CommandService(self.main, context)
         self._told_at = -1  # the step that main was last told of how it goes, time standing still
         self._again_at = self._next_at = 0.0  # on the people's clock
@@ -134,7 +134,7 @@ class ServedLockstep(Lockstep):
                 wait = 0.0
                 self.tick()
             elif now >= self._next_at:
-                self._next_at = now + 1.0 / self.plan.rate
+                self._next_at = now + 1.0 / self.spec.rate
                 self.tick()
         else:
             self._stand()
@@ -160,8 +160,8 @@ class ServedLockstep(Lockstep):
             return True
         if self.main.session.state not in (State.IDLE, State.READY):
             return False
-        moving = bytes(self.page.control.read()["behaviour"]) == b"motion"
-        return not (moving or self.main.runs.alone or self.page.rings["orders"].waiting)
+        moving = bytes(self.shared.control.read()["behaviour"]) == b"motion"
+        return not (moving or self.main.runs.alone or self.shared.rings["orders"].waiting)
 
     def _fast(self) -> bool:
         """Whether nobody is waited for, who would want to see it as it happens."""
@@ -198,5 +198,5 @@ class ServedLockstep(Lockstep):
         self._service.close()
         self._estops.close()
         self._previews.close()
-        Endpoints(self.plan.deployment.station_dir).clear()
+        Endpoints(self.spec.deployment.station_dir).clear()
         self._lock.close()

@@ -18,9 +18,9 @@ class Previews:
     One that only stands in further observations is not shown again: who looks sees it grow old.
     """
 
-    def __init__(self, plan: StationSpec) -> None:
-        settings = plan.deployment.bus
-        folder = plan.deployment.station_dir
+    def __init__(self, spec: StationSpec) -> None:
+        settings = spec.deployment.bus
+        folder = spec.deployment.station_dir
         self._publisher = Publisher(zmq.Context.instance(), folder, "cameras", CAMERA_HIGH_WATER)
         self._period = 1.0 / settings.preview_rate if settings.preview_rate else float("inf")
         self._height = settings.preview_height

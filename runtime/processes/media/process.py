@@ -67,14 +67,14 @@ class Media:
 
     def __init__(
         self,
-        page: SharedState,
+        shared: SharedState,
         recorder: Recorder,
         clock: Clock,
         preview: Callable[[Observation], None] = lambda observation: None,
         closer: Callable[[Close], Future[ClosedEpisode]] = at_once,
         on_disk: Callable[[Path], None] = lambda folder: None,
     ) -> None:
-        self._page = page
+        self._page = shared
         self._recorder = recorder
         self._clock = clock
         self._preview = preview
@@ -90,7 +90,7 @@ class Media:
         self._truth: Mapping[str, Any] = {}  # of a simulated bench, as its node last said it
         self._next_report = 0.0
         for ring in ("observations", "minutes", "ticks"):
-            for _ in page.rings[ring].drain():
+            for _ in shared.rings[ring].drain():
                 pass  # addressed to a predecessor that died
         self._ask_source(EndRun())
 
@@ -277,9 +277,9 @@ class Media:
             log.warning("main does not read: %s lost", type(message).__name__)
 
 
-def make_recorder(plan: StationSpec, now: Callable[[], float], patient: bool = False) -> Recorder:
+def make_recorder(spec: StationSpec, now: Callable[[], float], patient: bool = False) -> Recorder:
     """The recorder of a deployment; `patient` waits for encoders, as lockstep may."""
-    robot = plan.robot
+    robot = spec.robot
     described = {
         "name": robot.name,
         "joint_names": list(robot.joint_names),
@@ -288,10 +288,10 @@ def make_recorder(plan: StationSpec, now: Callable[[], float], patient: bool = F
         "dim": robot.dim,
         "eef_dim": robot.eef_dim,
     }
-    root, recording = plan.deployment.episodes_dir, plan.deployment.recording
+    root, recording = spec.deployment.episodes_dir, spec.deployment.recording
     journal = EpisodeJournal(root, recording, patient=patient)
     grid = DatasetGrid(
-        described, plan.layout.cameras, plan.rate, plan.fps, plan.end_effectors().eef_of, recording
+        described, spec.layout.cameras, spec.rate, spec.fps, spec.end_effectors().eef_of, recording
     )
     return Recorder(journal, root, grid, now)
 
@@ -301,20 +301,20 @@ def main() -> None:
     heap.keep()
     descriptors.allow_all()
     member = join("media", unread=_UNREAD)
-    plan, page = member.plan, member.page
+    spec, shared = member.spec, member.shared
     clock = MonotonicClock()
-    page.beat("media", clock.now())
-    exports = Exports(plan.deployment.data, plan.deployment.recording.export)
-    start_repair(plan.deployment.episodes_dir, plan.deployment.station, exports.start)
-    previews = LowPriorityWorker(Previews(plan))  # late on a busy machine, rather than what is recorded
-    media = Media(page, make_recorder(plan, clock.now), clock, previews, in_background, exports.start)
+    shared.beat("media", clock.now())
+    exports = Exports(spec.deployment.data, spec.deployment.recording.export)
+    start_repair(spec.deployment.episodes_dir, spec.deployment.station, exports.start)
+    previews = LowPriorityWorker(Previews(spec))  # late on a busy machine, rather than what is recorded
+    media = Media(shared, make_recorder(spec, clock.now), clock, previews, in_background, exports.start)
     try:
         while not member.lifeline.cut:
             now = clock.now()
-            page.beat("media", now)
+            shared.beat("media", now)
             media.digest()
-            if media.recording and not page.alive("main", now, plan.deployment.control.heartbeat_timeout_s):
-                media.end("interrupted", f"main has given no sign of life {page.silence('main', now)}")
+            if media.recording and not shared.alive("main", now, spec.deployment.control.heartbeat_timeout_s):
+                media.end("interrupted", f"main has given no sign of life {shared.silence('main', now)}")
             clock.sleep_until(now + _PERIOD_S)
     finally:
         media.end("interrupted", "the station's supervisor ended")

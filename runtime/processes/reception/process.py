@@ -47,15 +47,15 @@ class Share:
 class Reception:
     """One `pump` takes what there is; lockstep calls it tick by tick."""
 
-    def __init__(self, page: SharedState, source: Source, clock: Clock, scheduling: str = "") -> None:
-        self._page = page
+    def __init__(self, shared: SharedState, source: Source, clock: Clock, scheduling: str = "") -> None:
+        self._page = shared
         self._clock = clock
         self._scheduling = scheduling
-        self._intake = ObservationReceiver(page, source, clock, self._say, self._hand_on)
+        self._intake = ObservationReceiver(shared, source, clock, self._say, self._hand_on)
         self._begun: RunBegun | None = None  # media is not told yet
         self._next_report = 0.0
         self._missed = 0  # observations that media had no room for
-        for _ in page.rings["source"].drain():
+        for _ in shared.rings["source"].drain():
             pass  # addressed to a predecessor that died
 
     def pump(self, timeout: float) -> None:
@@ -132,17 +132,17 @@ def main() -> None:
     """Receive until the supervisor is gone, and control with it."""
     heap.keep()
     member = join("reception", unread=_UNREAD)
-    page, clock = member.page, MonotonicClock()
-    page.beat("reception", clock.now())
-    scheduling = _scheduling(member.plan)  # before there are other threads, which are to have the same
+    shared, clock = member.shared, MonotonicClock()
+    shared.beat("reception", clock.now())
+    scheduling = _scheduling(member.spec)  # before there are other threads, which are to have the same
     log.info("receiving, scheduling %s", scheduling)
-    source = member.plan.source(clock)
-    reception = Reception(page, source, clock, scheduling)
+    source = member.spec.source(clock)
+    reception = Reception(shared, source, clock, scheduling)
     connected, retry_at = False, 0.0
     share = Share() if scheduling.startswith("FIFO") else None
     while member.needed(clock.now()):
         now = clock.now()
-        page.beat("reception", now)
+        shared.beat("reception", now)
         if share is not None and share.too_much(now, time.process_time()):
             reception.give_way()
             share = None
@@ -156,10 +156,10 @@ def main() -> None:
     source.close()
 
 
-def _scheduling(plan: StationSpec) -> str:
+def _scheduling(spec: StationSpec) -> str:
     """The class that this process got; it asks for one only where what it sees is a robot."""
-    settings = plan.deployment.control
-    if settings.realtime == "off" or not plan.capabilities.moves_robot:
+    settings = spec.deployment.control
+    if settings.realtime == "off" or not spec.capabilities.moves_robot:
         return "ordinary"
     return realtime.enter_below(settings.realtime_priority)
 

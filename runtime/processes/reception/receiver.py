@@ -36,18 +36,18 @@ class ObservationReceiver:
 
     def __init__(
         self,
-        page: SharedState,
+        shared: SharedState,
         source: Source,
         clock: Clock,
         say: Callable[[Event], None],
         hand_on: Callable[[Observation, Mapping[str, int]], None],
     ) -> None:
-        self._page = page
+        self._page = shared
         self._source = source
         self._clock = clock
         self._say, self._hand_on = say, hand_on
-        self._before = int(page.observation.read()["sequence"])  # observations of predecessors
-        self._numbers = {camera: slots.newest for camera, slots in page.pictures.items()}
+        self._before = int(shared.observation.read()["sequence"])  # observations of predecessors
+        self._numbers = {camera: slots.newest for camera, slots in shared.pictures.items()}
         self._ages: deque[float] = deque(maxlen=_AGES_KEPT)
         self._captured: dict[str, float] = {}
         self._arrivals: dict[str, deque[float]] = {}

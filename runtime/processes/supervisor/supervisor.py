@@ -41,10 +41,10 @@ _POLL_S = 0.05
 class Supervisor:
     """One family; everything it starts ends with it, however it ends."""
 
-    def __init__(self, plan: StationSpec, lifeline: Lifeline | None = None) -> None:
-        self._plan = plan
+    def __init__(self, spec: StationSpec, lifeline: Lifeline | None = None) -> None:
+        self._plan = spec
         self._lifeline = lifeline  # of our own parent, where it wants us to end with it
-        self._station_dir = plan.deployment.station_dir
+        self._station_dir = spec.deployment.station_dir
         self._endpoints = Endpoints(self._station_dir)
         self._environment = dict(os.environ)
         self._children: dict[str, subprocess.Popen[bytes]] = {}
@@ -98,25 +98,25 @@ class Supervisor:
         self._endpoints.write("supervisor", {"boot": self.boot, **pids})
 
     def _spawn(self, process: str) -> subprocess.Popen[bytes]:
-        page = () if process == "headless" else ("--page", str(self._page_fd))
+        shared = () if process == "headless" else ("--page", str(self._page_fd))
         return subprocess.Popen(
             [
                 *(sys.executable, "-m", _MODULES[process], "--boot", self.boot),
                 *(self._for_guard() if process == "guard" else ("--resolved", str(self._resolved))),
-                *page,
+                *shared,
             ],
             stdin=self._lifeline_out,
-            pass_fds=(self._page_fd,) if page else (),
+            pass_fds=(self._page_fd,) if shared else (),
             env=self._environment,
             start_new_session=True,  # Ctrl-C reaches the supervisor alone, which ends them in order
         )
 
     def _for_guard(self) -> tuple[str, ...]:
         """Values alone: the guard reads no deployment, which could name what fails to load."""
-        plan = self._plan
+        spec = self._plan
         return (
-            *("--station", plan.deployment.station, "--folder", str(self._station_dir)),
-            *("--period", repr(1.0 / plan.rate), "--layout", json.dumps(asdict(plan.layout))),
+            *("--station", spec.deployment.station, "--folder", str(self._station_dir)),
+            *("--period", repr(1.0 / spec.rate), "--layout", json.dumps(asdict(spec.layout))),
         )
 
     def _spawn_channel(self) -> subprocess.Popen[bytes]:

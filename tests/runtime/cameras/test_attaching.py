@@ -8,10 +8,10 @@ import pytest
 from runtime.cameras.attached import Attached
 from runtime.cameras.attaching import attached
 from runtime.cameras.live import LiveCamera
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.clock import MonotonicClock, VirtualClock
 from runtime.core.errors import ConfigurationError, SetupError
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from runtime.station.spec import StationSpec
 from runtime.transports.node_source import NodeSource
 
@@ -27,12 +27,12 @@ def planned(tmp_path: Path, cameras: dict[str, Any], **transport: Any) -> Statio
         "policy": {"kind": "mock"},
         "cameras": cameras,
     }
-    return family.plan(deployment.resolve(tree, {}, "test.toml"))
+    return station_spec.spec_of(loader.resolve(tree, {}, "test.toml"))
 
 
-def waits_for(plan: StationSpec) -> set[str]:
+def waits_for(spec: StationSpec) -> set[str]:
     """The cameras that the transport itself must deliver."""
-    source = plan.source(MonotonicClock())
+    source = spec.source(MonotonicClock())
     inner = source._source if isinstance(source, Attached) else source
     assert isinstance(inner, NodeSource)
     return set(inner._messages._cameras)
@@ -47,9 +47,9 @@ def test_a_transport_does_not_wait_for_a_camera_that_comes_from_elsewhere(tmp_pa
 
 
 def test_a_camera_that_the_transport_leaves_out_may_come_from_elsewhere(tmp_path: Path) -> None:
-    plan = planned(tmp_path, {"cam_high": HIGH}, disabled_cameras=["cam_high"])
-    assert "cam_high" in plan.cameras
-    assert waits_for(plan) == set(plan.cameras) - {"cam_high"}
+    spec = planned(tmp_path, {"cam_high": HIGH}, disabled_cameras=["cam_high"])
+    assert "cam_high" in spec.cameras
+    assert waits_for(spec) == set(spec.cameras) - {"cam_high"}
 
 
 def test_without_cameras_of_its_own_a_source_is_itself() -> None:
@@ -78,13 +78,13 @@ def test_a_password_is_in_no_manifest_and_in_no_sentence(
 ) -> None:
     monkeypatch.setenv("CAMERA_PASSWORD", "s3cret")
     wanted = {"kind": "rtsp", "url": "rtsp://h/x", "user": "me", "password_env": "CAMERA_PASSWORD"}
-    plan = planned(tmp_path, {"cam_high": wanted})
-    source = plan.source(MonotonicClock())
+    spec = planned(tmp_path, {"cam_high": wanted})
+    source = spec.source(MonotonicClock())
     assert isinstance(source, Attached)
     (camera,) = source._cameras
     assert isinstance(camera, LiveCamera)
     assert "s3cret" in camera._address.url
-    assert "s3cret" not in str(plan.resolved.tree) + repr(camera._address) + str(source.camera_health())
+    assert "s3cret" not in str(spec.resolved.tree) + repr(camera._address) + str(source.camera_health())
 
 
 @pytest.mark.parametrize(

@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.config.collection import CollectionSettings
 from runtime.config.loader import load
 from runtime.config.schema import Deployment
 from runtime.core.errors import ConfigurationError, SetupError
 from runtime.core.plugins import variants
 from runtime.core.settings import Settings
-from runtime.station.spec import plan
+from runtime.station.spec import spec_of
 
 DEPLOYMENTS = Path(__file__).parents[3] / "deployments"
 SMALL = """\
@@ -396,7 +396,7 @@ def test_the_hash_does_not_depend_on_where_or_in_what_order_a_key_stands(write, 
     assert load(small, ["control.rate=30.0"]).digest == digest
     tree = dict(load(top).tree)
     for seed in range(5):
-        assert deployment.resolve(shuffled(tree, seed), {}, "x").digest == digest
+        assert loader.resolve(shuffled(tree, seed), {}, "x").digest == digest
 
 
 def test_a_default_that_is_written_out_is_the_same_deployment(small):
@@ -422,10 +422,10 @@ def test_every_deployment_that_comes_with_it_loads_and_survives_the_way_to_the_f
     }
     resolved = load(path, needed.get(path.name, []))
     handed_over = json.loads(json.dumps(dict(resolved.tree), allow_nan=False))
-    again = deployment.resolve(handed_over, {}, "resolved.json")
+    again = loader.resolve(handed_over, {}, "resolved.json")
     assert (again.deployment, again.digest) == (resolved.deployment, resolved.digest)
     if path.name != "base.toml":
-        assert plan(resolved).robot.name == resolved.deployment.robot
+        assert spec_of(resolved).robot.name == resolved.deployment.robot
 
 
 # --- a plan: the parts fit each other ----------------------------------------------------------------------
@@ -437,7 +437,7 @@ def demo():
 
 
 def planned(path, *assignments):
-    return plan(load(path, assignments))
+    return spec_of(load(path, assignments))
 
 
 def test_report_only_is_refused_where_a_robot_can_move(demo):
@@ -480,26 +480,26 @@ def test_without_a_rate_the_robots_own_counts(demo):
 
 def test_changes_go_on_top_like_a_file_over_what_it_extends(write):
     own = load(write())
-    changed = deployment.changed(own, {"task": "fold", "policy": {"amplitude": 0.1}}, "setup")
+    changed = loader.changed(own, {"task": "fold", "policy": {"amplitude": 0.1}}, "setup")
     assert (changed.deployment.task, changed.deployment.policy.amplitude) == ("fold", 0.1)
     assert changed.deployment.transport == own.deployment.transport
     assert changed.digest != own.digest
-    assert deployment.changed(own, {}, "setup") == own
+    assert loader.changed(own, {}, "setup") == own
     assert own == load(write())
 
 
 def test_a_change_of_kind_replaces_the_table_whole(write):
     own = load(write(SMALL + "amplitude = 0.1\n"))
-    changed = deployment.changed(own, {"policy": {"kind": "openpi", "url": "ws://a:1"}}, "setup")
+    changed = loader.changed(own, {"policy": {"kind": "openpi", "url": "ws://a:1"}}, "setup")
     assert (changed.deployment.policy.kind, changed.deployment.policy.url) == ("openpi", "ws://a:1")
 
 
 def test_a_wrong_change_names_where_it_came_from(write):
     own = load(write())
     with pytest.raises(ConfigurationError, match=r"^setup: policy\.amplitud = 1: unknown key"):
-        deployment.changed(own, {"policy": {"amplitud": 1}}, "setup")
+        loader.changed(own, {"policy": {"amplitud": 1}}, "setup")
     with pytest.raises(ConfigurationError, match=r"^setup: policy\.kind = \[\]: must be one of 'gr00t'"):
-        deployment.changed(own, {"policy": {"kind": []}}, "setup")
+        loader.changed(own, {"policy": {"kind": []}}, "setup")
 
 
 def test_a_policy_may_be_left_out_where_there_is_a_collection_and_nowhere_else(small):

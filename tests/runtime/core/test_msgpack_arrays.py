@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.errors import CodecError
 
 VECTORS = Path(__file__).parents[1] / "vectors"
@@ -60,27 +60,27 @@ def array_map(**changes: object) -> dict[bytes, object]:
 
 @pytest.mark.parametrize(("value", "expected"), BYTES_OF)
 def test_it_packs_the_recorded_bytes(value: object, expected: str) -> None:
-    assert codecs.pack(value) == bytes.fromhex(expected)
+    assert msgpack_arrays.pack(value) == bytes.fromhex(expected)
 
 
 def test_it_reads_and_rewrites_a_recorded_openpi_request_byte_for_byte() -> None:
     recorded = (VECTORS / "openpi_infer_request.bin").read_bytes()
-    request = codecs.unpack(recorded)
+    request = msgpack_arrays.unpack(recorded)
     np.testing.assert_array_equal(request["state"], np.array([0.5, 1.0], np.float32))
     np.testing.assert_array_equal(
         request["images"]["cam_high"], np.arange(12, dtype=np.uint8).reshape(3, 2, 2)
     )
     assert request["prompt"] == "pick"
-    assert codecs.pack(request) == recorded
+    assert msgpack_arrays.pack(request) == recorded
 
 
 def test_it_reads_and_rewrites_a_recorded_openpi_reply_byte_for_byte() -> None:
     recorded = (VECTORS / "openpi_infer_reply.bin").read_bytes()
-    reply = codecs.unpack(recorded)
+    reply = msgpack_arrays.unpack(recorded)
     np.testing.assert_array_equal(reply["actions"], np.array([[0, 0.25], [0.5, 0.75], [1, 1.25]], np.float32))
     np.testing.assert_array_equal(reply["origin_actions"], np.arange(9, dtype=np.float32).reshape(3, 3))
     assert reply["policy_timing"] == {"infer_ms": 1.5}
-    assert codecs.pack(reply) == recorded
+    assert msgpack_arrays.pack(reply) == recorded
 
 
 KINDS = st.one_of(
@@ -96,7 +96,7 @@ ARRAYS = hnp.arrays(KINDS, hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, 
 
 @given(ARRAYS)
 def test_every_array_comes_back_equal_and_read_only(array: np.ndarray[Any, Any]) -> None:
-    returned = codecs.unpack(codecs.pack(array))
+    returned = msgpack_arrays.unpack(msgpack_arrays.pack(array))
     assert returned.dtype == array.dtype
     assert returned.shape == array.shape
     assert returned.tobytes() == array.tobytes()
@@ -105,8 +105,8 @@ def test_every_array_comes_back_equal_and_read_only(array: np.ndarray[Any, Any])
 
 @given(hnp.arrays(np.int32, hnp.array_shapes(min_dims=2, max_dims=3)))
 def test_memory_order_does_not_matter(array: np.ndarray[Any, Any]) -> None:
-    np.testing.assert_array_equal(codecs.unpack(codecs.pack(array.T)), array.T)
-    np.testing.assert_array_equal(codecs.unpack(codecs.pack(array[::2])), array[::2])
+    np.testing.assert_array_equal(msgpack_arrays.unpack(msgpack_arrays.pack(array.T)), array.T)
+    np.testing.assert_array_equal(msgpack_arrays.unpack(msgpack_arrays.pack(array[::2])), array[::2])
 
 
 LEAVES = st.one_of(
@@ -126,18 +126,18 @@ VALUES = st.recursive(
 def test_plain_values_come_back_equal(value: object) -> None:
     marks = ("__ndarray_class__", "__ndarray__", "__npgeneric__")
     if not any(mark in repr(value) for mark in marks):
-        assert codecs.unpack(codecs.pack(value)) == value
+        assert msgpack_arrays.unpack(msgpack_arrays.pack(value)) == value
 
 
 @pytest.mark.parametrize("scalar", [np.float32(1.5), np.int64(-3), np.bool_(True), np.uint8(200)])
 def test_a_numpy_scalar_keeps_its_type(scalar: np.generic) -> None:
-    returned = codecs.unpack(codecs.pack(scalar))
+    returned = msgpack_arrays.unpack(msgpack_arrays.pack(scalar))
     assert returned == scalar
     assert returned.dtype == scalar.dtype
 
 
 def test_a_tuple_becomes_a_list() -> None:
-    assert codecs.unpack(codecs.pack((1, 2))) == [1, 2]
+    assert msgpack_arrays.unpack(msgpack_arrays.pack((1, 2))) == [1, 2]
 
 
 @pytest.mark.parametrize(
@@ -151,19 +151,19 @@ def test_a_tuple_becomes_a_list() -> None:
 )
 def test_it_refuses_to_pack_objects_structures_and_complex_numbers(array: object) -> None:
     with pytest.raises(CodecError, match=r"objects, structures, complex"):
-        codecs.pack(array)
+        msgpack_arrays.pack(array)
 
 
 @pytest.mark.parametrize("value", [object(), {1, 2}, 2**70])
 def test_it_refuses_to_pack_what_the_wire_does_not_know(value: object) -> None:
     with pytest.raises(CodecError, match="cannot pack"):
-        codecs.pack(value)
+        msgpack_arrays.pack(value)
 
 
 @pytest.mark.parametrize("dtype", ["|O", "O", "<c8", "<f4,<f4", "(2,)f4", "|V4"])
 def test_it_refuses_to_unpack_objects_structures_and_complex_numbers(dtype: str) -> None:
     with pytest.raises(CodecError, match=r"refused|dtype"):
-        codecs.unpack(msgpack.packb(array_map(dtype=dtype)))
+        msgpack_arrays.unpack(msgpack.packb(array_map(dtype=dtype)))
 
 
 def test_a_pickled_array_is_refused_without_being_loaded(tmp_path: Path) -> None:
@@ -174,7 +174,7 @@ def test_a_pickled_array_is_refused_without_being_loaded(tmp_path: Path) -> None
         {b"nd": True, b"kind": b"O", b"data": hostile},
     ):
         with pytest.raises(CodecError):
-            codecs.unpack(msgpack.packb(fields))
+            msgpack_arrays.unpack(msgpack.packb(fields))
     assert not witness.exists()
 
 
@@ -198,19 +198,19 @@ def test_a_pickled_array_is_refused_without_being_loaded(tmp_path: Path) -> None
 )
 def test_it_refuses_an_array_that_does_not_fit_its_description(changes: dict[str, Any], says: str) -> None:
     with pytest.raises(CodecError, match=says):
-        codecs.unpack(msgpack.packb(array_map(**changes)))
+        msgpack_arrays.unpack(msgpack.packb(array_map(**changes)))
 
 
 @pytest.mark.parametrize("data", [[1], None, {"a": 1}])
 def test_it_refuses_a_scalar_that_is_none(data: object) -> None:
     with pytest.raises(CodecError, match="scalar's data"):
-        codecs.unpack(msgpack.packb({b"__npgeneric__": True, b"data": data, b"dtype": "<f4"}))
+        msgpack_arrays.unpack(msgpack.packb({b"__npgeneric__": True, b"data": data, b"dtype": "<f4"}))
 
 
 @pytest.mark.parametrize(("data", "dtype"), [("x", "<f4"), (2**63, "|u1"), (1e300, "<f4")])
 def test_it_refuses_a_scalar_that_its_type_cannot_hold(data: object, dtype: str) -> None:
     with pytest.raises(CodecError, match="is no"):
-        codecs.unpack(msgpack.packb({b"__npgeneric__": True, b"data": data, b"dtype": dtype}))
+        msgpack_arrays.unpack(msgpack.packb({b"__npgeneric__": True, b"data": data, b"dtype": dtype}))
 
 
 @pytest.mark.parametrize(
@@ -227,7 +227,7 @@ def test_it_refuses_a_scalar_that_its_type_cannot_hold(data: object, dtype: str)
 )
 def test_it_names_the_dialect_of_a_foreign_array(payload: bytes, dialect: str) -> None:
     with pytest.raises(CodecError, match=dialect):
-        codecs.unpack(payload)
+        msgpack_arrays.unpack(payload)
 
 
 def test_it_names_the_dialect_of_an_array_that_msgpack_numpy_wrote() -> None:
@@ -235,20 +235,20 @@ def test_it_names_the_dialect_of_an_array_that_msgpack_numpy_wrote() -> None:
 
     payload = msgpack.packb({"actions": np.zeros((2, 3))}, default=msgpack_numpy.encode)
     with pytest.raises(CodecError, match="MNP"):
-        codecs.unpack(payload)
+        msgpack_arrays.unpack(payload)
 
 
 def test_it_refuses_a_message_beyond_the_limit() -> None:
-    payload = codecs.pack(np.zeros(1000, np.uint8))
-    assert codecs.unpack(payload, limit=len(payload)).shape == (1000,)
+    payload = msgpack_arrays.pack(np.zeros(1000, np.uint8))
+    assert msgpack_arrays.unpack(payload, limit=len(payload)).shape == (1000,)
     with pytest.raises(CodecError, match=f"{len(payload)} bytes exceeds the limit of 999"):
-        codecs.unpack(payload, limit=999)
+        msgpack_arrays.unpack(payload, limit=999)
 
 
 def outcome(payload: bytes) -> str:
     """Any other exception passes through and fails the test."""
     try:
-        codecs.unpack(payload)
+        msgpack_arrays.unpack(payload)
     except CodecError:
         return "refused"
     return "decoded"
@@ -261,7 +261,9 @@ def test_random_bytes_either_decode_or_raise_a_codec_error(payload: bytes) -> No
 
 @given(st.integers(0, 10_000), st.integers(0, 255))
 def test_a_broken_message_either_decodes_or_raises_a_codec_error(place: int, byte: int) -> None:
-    payload = bytearray(codecs.pack({"state": np.arange(3.0), "n": np.float32(2), "images": {"a": b"x"}}))
+    payload = bytearray(
+        msgpack_arrays.pack({"state": np.arange(3.0), "n": np.float32(2), "images": {"a": b"x"}})
+    )
     payload[place % len(payload)] = byte
     assert outcome(bytes(payload)) in {"decoded", "refused"}
 
@@ -271,4 +273,4 @@ def test_a_broken_message_either_decodes_or_raises_a_codec_error(place: int, byt
 )
 def test_it_says_that_broken_bytes_are_no_message(payload: bytes) -> None:
     with pytest.raises(CodecError, match="not one msgpack message"):
-        codecs.unpack(payload)
+        msgpack_arrays.unpack(payload)

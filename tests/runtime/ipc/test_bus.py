@@ -40,9 +40,9 @@ def server(context, tmp_path):
 @pytest.fixture
 def raw(context, server):
     """A client that sends whatever it likes."""
-    asking = context.socket(zmq.DEALER)
-    asking.connect(server.endpoint)
-    return asking
+    requests = context.socket(zmq.DEALER)
+    requests.connect(server.endpoint)
+    return requests
 
 
 def next_command(server):
@@ -75,12 +75,12 @@ def test_a_command_is_answered_to_who_sent_it(context, server, raw):
 
 
 def test_a_request_socket_is_served_too(context, server):
-    asking = context.socket(zmq.REQ)
-    asking.connect(server.endpoint)
-    asking.send(encode(Command("u", "run")))
+    requests = context.socket(zmq.REQ)
+    requests.connect(server.endpoint)
+    requests.send(encode(Command("u", "run")))
     address, command = next_command(server)
     server.answer(address, Ack(command.uuid, "accepted"))
-    assert answer_to(asking) == Ack("u", "accepted")
+    assert answer_to(requests) == Ack("u", "accepted")
 
 
 GARBAGE = {
@@ -113,9 +113,9 @@ def test_an_answer_to_a_client_that_is_gone_is_lost_without_harm(context, server
     raw.close(linger=0)
     for _ in range(2000):
         server.answer(address, Ack(command.uuid, "accepted"))
-    asking = context.socket(zmq.DEALER)
-    asking.connect(server.endpoint)
-    asking.send(encode(Command("v", "stop")))
+    requests = context.socket(zmq.DEALER)
+    requests.connect(server.endpoint)
+    requests.send(encode(Command("v", "stop")))
     assert next_command(server)[1].uuid == "v"
 
 

@@ -10,7 +10,7 @@ LAYOUT = SharedStateLayout(dim=3, eef_dim=8, cameras=("cam_high", "cam_wrist"), 
 
 
 @pytest.fixture
-def page():
+def shared():
     made, descriptor = SharedState.create(LAYOUT)
     yield made
     os.close(descriptor)
@@ -27,10 +27,10 @@ def observation(sequence: int = 1, **changes) -> Observation:
     return Observation(**(fields | changes))
 
 
-def test_nothing_may_be_sent_before_the_guard_has_spoken(page):
-    assert page.estop is EStop.UNKNOWN
-    page.set_estop(EStop.LATCHED)
-    assert page.estop is EStop.LATCHED
+def test_nothing_may_be_sent_before_the_guard_has_spoken(shared):
+    assert shared.estop is EStop.UNKNOWN
+    shared.set_estop(EStop.LATCHED)
+    assert shared.estop is EStop.LATCHED
 
 
 def test_a_second_mapping_sees_the_same_beats():
@@ -42,11 +42,11 @@ def test_a_second_mapping_sees_the_same_beats():
     os.close(descriptor)
 
 
-def test_an_observation_comes_back_with_its_picture(page):
+def test_an_observation_comes_back_with_its_picture(shared):
     picture = np.full((4, 6, 3), 7, np.uint8)
-    page.pictures["cam_high"].write(1, picture)
-    page.publish_observation(observation(eef=np.ones(8, np.float32)), {"cam_high": 1})
-    seen = page.read_observation(("cam_high", "cam_wrist"))
+    shared.pictures["cam_high"].write(1, picture)
+    shared.publish_observation(observation(eef=np.ones(8, np.float32)), {"cam_high": 1})
+    seen = shared.read_observation(("cam_high", "cam_wrist"))
     assert seen.sequence == 1
     assert (seen.qpos == [0, 1, 2]).all()
     assert (seen.eef == 1).all()
@@ -56,18 +56,18 @@ def test_an_observation_comes_back_with_its_picture(page):
     assert seen.captured["cam_high"] == 1.8
 
 
-def test_no_observation_is_none_and_not_zeros(page):
-    assert page.read_observation(()) is None
+def test_no_observation_is_none_and_not_zeros(shared):
+    assert shared.read_observation(()) is None
 
 
-def test_a_picture_that_was_overwritten_is_not_handed_out(page):
-    slots = page.pictures["cam_high"]
+def test_a_picture_that_was_overwritten_is_not_handed_out(shared):
+    slots = shared.pictures["cam_high"]
     slots.write(1, np.zeros((4, 6, 3), np.uint8))
     slots.write(1 + PICTURE_SLOTS, np.ones((4, 6, 3), np.uint8))
     assert slots.read(1) is None
     assert (slots.read(1 + PICTURE_SLOTS) == 1).all()
 
 
-def test_a_picture_too_large_is_an_error_that_says_so(page):
+def test_a_picture_too_large_is_an_error_that_says_so(shared):
     with pytest.raises(ValueError, match="at most 72 fit"):
-        page.pictures["cam_high"].write(1, np.zeros((5, 6, 3), np.uint8))
+        shared.pictures["cam_high"].write(1, np.zeros((5, 6, 3), np.uint8))

@@ -17,7 +17,7 @@ from runtime.kinematics.base import Kinematics
 from runtime.kinematics.forward import ChainForward
 from runtime.kinematics.loading import Loading
 from runtime.processes.coordinator.inference.worker import LockstepRunner, ThreadRunner
-from tests.runtime.lockstep_station import Station, plan
+from tests.runtime.lockstep_station import Station, spec_of
 
 ROBOT = robots.load("ur5e")
 Q = ROBOT.poses["home"]
@@ -129,7 +129,7 @@ def test_a_station_with_a_policy_of_joints_loads_no_compiler(tmp_path: Path) -> 
 def test_a_run_by_hand_begins_when_steps_can_be_answered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     loaded: list[bool] = []
     monkeypatch.setattr(station.main.runs, "_prepared", lambda: bool(loaded))
     station.command("run", mode="manual")

@@ -14,7 +14,7 @@ from websockets.sync.server import ServerConnection, serve
 
 import robots
 from robots import Robot
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.types import Observation
 
 FRANKA = robots.load("dual_franka", ["left_arm"])  # the arm of DROID: seven joints and a gripper, 1 is open
@@ -68,10 +68,10 @@ def answering(metadata: object, answer: Callable[[Any], object], asked: list[byt
             assert isinstance(request, bytes)
             if asked is not None:
                 asked.append(request)
-            connection.send(_frame(answer(codecs.unpack(request))))
+            connection.send(_frame(answer(msgpack_arrays.unpack(request))))
 
     return converse
 
 
 def _frame(value: object) -> str | bytes:
-    return value if isinstance(value, str | bytes) else codecs.pack(value)
+    return value if isinstance(value, str | bytes) else msgpack_arrays.pack(value)

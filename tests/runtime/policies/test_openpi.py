@@ -16,7 +16,7 @@ from websockets.server import ServerProtocol
 from websockets.sync.server import ServerConnection, serve
 
 import robots
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import (
     ConfigurationError,
@@ -87,11 +87,11 @@ def stub(handler: Handler) -> Iterator[str]:
 
 def replying(reply: object, metadata: object = None, seen: list[Any] | None = None) -> Handler:
     def converse(connection: ServerConnection) -> None:
-        connection.send(codecs.pack(metadata or {}))
+        connection.send(msgpack_arrays.pack(metadata or {}))
         for request in connection:
             if seen is not None:
                 seen.append(request)
-            connection.send(reply if isinstance(reply, bytes) else codecs.pack(reply))
+            connection.send(reply if isinstance(reply, bytes) else msgpack_arrays.pack(reply))
 
     return converse
 
@@ -149,7 +149,7 @@ def not_reading_server() -> Iterator[str]:
         (request,) = protocol.events_received()
         assert isinstance(request, Request)
         protocol.send_response(protocol.accept(request))
-        protocol.send_binary(codecs.pack({}))
+        protocol.send_binary(msgpack_arrays.pack({}))
         for data in protocol.data_to_send():
             peer.sendall(data)
         ended.wait()
@@ -216,7 +216,7 @@ def test_it_sends_the_key_that_the_environment_holds(monkeypatch: pytest.MonkeyP
     def converse(connection: ServerConnection) -> None:
         assert connection.request is not None
         keys.append(connection.request.headers.get("Authorization"))
-        connection.send(codecs.pack({}))
+        connection.send(msgpack_arrays.pack({}))
 
     with stub(converse) as url, policy_at(url, api_key_env="LAB_POLICY_KEY") as policy:
         policy.connect()
@@ -272,7 +272,7 @@ def test_a_chunk_says_what_its_numbers_are_and_how_fast_they_come() -> None:
 
 def request_of(shown: Observation | None = None, **settings: Any) -> dict[str, Any]:
     policy = openpi.build(Config(**settings), ROBOT, MonotonicClock(), 30.0)
-    return dict(codecs.unpack(codecs.pack(policy.request(shown or observation()))))
+    return dict(msgpack_arrays.unpack(msgpack_arrays.pack(policy.request(shown or observation()))))
 
 
 def test_the_request_has_state_pictures_and_prompt_in_the_trained_size() -> None:
@@ -512,7 +512,7 @@ def test_a_text_frame_first_is_the_servers_error() -> None:
 
 @pytest.mark.parametrize(
     ("first", "says"),
-    [(b"\xc1\xc1", "not the openpi protocol"), (codecs.pack([1]), "is a list; expected a map")],
+    [(b"\xc1\xc1", "not the openpi protocol"), (msgpack_arrays.pack([1]), "is a list; expected a map")],
 )
 def test_a_first_frame_that_is_no_map_is_the_wrong_protocol(first: bytes, says: str) -> None:
     with (
@@ -730,7 +730,7 @@ def test_the_width_of_an_answer_is_that_of_the_declared_format() -> None:
 
 def test_a_text_frame_at_any_time_is_the_servers_error() -> None:
     def converse(connection: ServerConnection) -> None:
-        connection.send(codecs.pack({}))
+        connection.send(msgpack_arrays.pack({}))
         connection.recv()
         connection.send("Traceback (most recent call last):\n  somewhere\nKeyError: 'state'\n")
 
@@ -845,7 +845,7 @@ def test_close_unblocks_an_inference_that_waits_in_another_thread() -> None:
     asked = threading.Event()
 
     def converse(connection: ServerConnection) -> None:
-        connection.send(codecs.pack({}))
+        connection.send(msgpack_arrays.pack({}))
         connection.recv()
         asked.set()
         connection.recv()
@@ -1025,13 +1025,13 @@ def test_an_answer_that_came_sooner_than_it_took_is_another_questions() -> None:
 
     def converse(connection: ServerConnection) -> None:
         conversations.append(0)
-        connection.send(codecs.pack({}))
+        connection.send(msgpack_arrays.pack({}))
         for request in connection:
             conversations[-1] += 1
-            value = codecs.unpack(request)["state"][0]
+            value = msgpack_arrays.unpack(request)["state"][0]
             late = len(conversations) == 1 and conversations[-1] == 2
             took = {"server_timing": {"infer_ms": 1e6 if late else 0.0}}
-            connection.send(codecs.pack(rows_of(0.0 if late else value, **took)))
+            connection.send(msgpack_arrays.pack(rows_of(0.0 if late else value, **took)))
 
     with stub(converse) as url, policy_at(url) as policy:
         found = [policy.infer(observation(value)).actions[0, 0] for value in (0.1, 0.2, 0.3)]
@@ -1063,10 +1063,10 @@ def test_what_waits_before_a_question_answers_none(after: str) -> None:
             there.set()
 
     def converse(connection: ServerConnection) -> None:
-        repeat(connection, codecs.pack({}), "metadata")
+        repeat(connection, msgpack_arrays.pack({}), "metadata")
         for request in connection:
-            value = codecs.unpack(request)["state"][0]
-            repeat(connection, codecs.pack(rows_of(value)), "answer")
+            value = msgpack_arrays.unpack(request)["state"][0]
+            repeat(connection, msgpack_arrays.pack(rows_of(value)), "answer")
 
     with stub(converse) as url, policy_at(url) as policy:
         policy.connect()

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 from robots import Robot
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import PolicyLostError
 from runtime.policies.openpi import OpenpiPolicy
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from tests.runtime.policies.peers import FRANKA, PIPER, seen
 
 ROOT = Path(__file__).parents[3]
@@ -45,7 +45,7 @@ def built(shown: dict[str, Any], **policy: Any) -> tuple[Any, Robot]:
         **shown,
         "policy": shown["policy"] | policy,
     }
-    made = family.plan(deployment.resolve(tree, {}, "policies.md"))
+    made = station_spec.spec_of(loader.resolve(tree, {}, "policies.md"))
     found = made.policy.build(made.deployment.policy, made.robot, MonotonicClock(), made.rate)
     return found, made.robot
 

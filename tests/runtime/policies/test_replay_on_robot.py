@@ -11,7 +11,7 @@ import pytest
 import robots
 from runtime.policies import replay
 from runtime.processes.coordinator.session.transitions import State
-from tests.runtime.lockstep_station import Station, StubPlan, plan
+from tests.runtime.lockstep_station import Station, StubPlan, spec_of
 from tests.runtime.quality import built
 
 ROWS = 90
@@ -27,7 +27,7 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Station:
         return own(self, config, robot, clock, rate)
 
     monkeypatch.setattr(StubPlan, "_policy", build)
-    return Station(plan(tmp_path))
+    return Station(spec_of(tmp_path))
 
 
 def recorded(station: Station, root: Path) -> tuple[Path, np.ndarray]:

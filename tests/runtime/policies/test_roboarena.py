@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from websockets.sync.server import ServerConnection
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import (
     ConfigurationError,
@@ -89,7 +89,7 @@ def request_of(
         policy_at(url, **settings) as policy,
     ):
         policy.infer(shown or seen(robot))
-    return codecs.unpack(asked[0])
+    return msgpack_arrays.unpack(asked[0])
 
 
 # The bytes that the field's own programs have written
@@ -135,7 +135,7 @@ def test_both_recorded_forms_of_an_answer_are_the_same_rows(form: str) -> None:
 
 def test_four_frames_per_view_are_the_recorded_request() -> None:
     """The pictures of the recorded request one by one; the last request carries them all."""
-    recorded = codecs.unpack(vector("dreamzero_infer_request_4frames"))
+    recorded = msgpack_arrays.unpack(vector("dreamzero_infer_request_4frames"))
     three = {"cam_high": "first", "cam_right_wrist": "second", "cam_left_wrist": "wrist"}
     keys = {
         "cam_high": "observation/exterior_image_0_left",
@@ -151,7 +151,7 @@ def test_four_frames_per_view_are_the_recorded_request() -> None:
         for frame in range(4):
             pictures = {camera: recorded[key][frame] for camera, key in keys.items()}
             policy.infer(seen(FRANKA, pictures=pictures))
-    first, second, *_, last = (codecs.unpack(request) for request in asked)
+    first, second, *_, last = (msgpack_arrays.unpack(request) for request in asked)
     for key in keys.values():
         np.testing.assert_array_equal(last[key], recorded[key])
         np.testing.assert_array_equal(first[key], recorded[key][0])
@@ -176,7 +176,7 @@ def test_moments_before_a_request_are_shown_from_the_second_on_although_nobody_a
                 if frame in (0, 23, 47):
                     policy.infer(shown)
             policy.reset()
-    messages = [codecs.unpack(request) for request in asked]
+    messages = [msgpack_arrays.unpack(request) for request in asked]
     sent = [message["observation/wrist_image_left"] for message in messages if message["endpoint"] == "infer"]
     assert [picture.shape for picture in sent[:3]] == [(24, 32, 3), (4, 24, 32, 3), (4, 24, 32, 3)]
     kept = [picture[..., 0, 0, 0].tolist() for picture in sent]
@@ -211,7 +211,7 @@ def test_the_metadata_of_dreamzero_are_understood() -> None:
     asked: list[bytes] = []
     with serving(answering(said, reply_to, asked)) as url, policy_at(url, cameras=three) as policy:
         policy.infer(seen(FRANKA))
-    assert codecs.unpack(asked[0])["observation/exterior_image_1_left"].shape == (180, 320, 3)
+    assert msgpack_arrays.unpack(asked[0])["observation/exterior_image_1_left"].shape == (180, 320, 3)
 
 
 @pytest.mark.parametrize(
@@ -327,7 +327,7 @@ def test_missing_fields_have_the_defaults_of_the_fields_clients() -> None:
         policy_at(url) as policy,
     ):
         policy.infer(seen(FRANKA))
-    request = codecs.unpack(asked[0])
+    request = msgpack_arrays.unpack(asked[0])
     assert request["observation/wrist_image_left"].shape == (224, 224, 3)
     assert "session_id" not in request
 
@@ -543,7 +543,7 @@ def test_an_end_that_is_not_acknowledged_is_an_error_and_owed() -> None:
         with pytest.raises(PolicyError, match="no such session"):
             policy.rest()
         policy.infer(seen(FRANKA))
-    sent = [codecs.unpack(request)["endpoint"] for request in asked]
+    sent = [msgpack_arrays.unpack(request)["endpoint"] for request in asked]
     assert sent == ["infer", "reset", "reset", "infer"]
 
 
@@ -572,17 +572,17 @@ def test_a_reset_that_is_not_acknowledged_is_an_error_and_owed(answer: object, s
         with pytest.raises(PolicyError, match=says):
             policy.reset()
         policy.infer(seen(FRANKA))
-    sent = [codecs.unpack(request) for request in asked]
+    sent = [msgpack_arrays.unpack(request) for request in asked]
     assert [message["endpoint"] for message in sent] == ["infer", "reset", "reset", "infer"]
     assert sent[0]["session_id"] == sent[1]["session_id"] == sent[2]["session_id"] != sent[3]["session_id"]
 
 
 def test_a_mute_reset_times_out_and_its_late_acknowledgement_is_never_an_answer() -> None:
     def converse(connection: ServerConnection) -> None:
-        connection.send(codecs.pack(SIX))
+        connection.send(msgpack_arrays.pack(SIX))
         for number, request in enumerate(connection):
-            if codecs.unpack(request)["endpoint"] == "infer":
-                connection.send(codecs.pack(ROWS))
+            if msgpack_arrays.unpack(request)["endpoint"] == "infer":
+                connection.send(msgpack_arrays.pack(ROWS))
             elif conversations:
                 connection.send("reset successful")
             else:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from websockets.sync.server import ServerConnection
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import ConfigurationError, ContradictionError, PolicyError, PolicyLostError
 from runtime.core.pose_format import PoseFormat
@@ -52,10 +52,10 @@ def answering(
     """Pings are answered; to what is inferred, an envelope around `data`, with what a test says otherwise."""
 
     def converse(connection: ServerConnection) -> None:
-        connection.send(codecs.pack(SAID if metadata is None else metadata))
+        connection.send(msgpack_arrays.pack(SAID if metadata is None else metadata))
         for request in connection:
             assert isinstance(request, bytes)
-            message = codecs.unpack(request)
+            message = msgpack_arrays.unpack(request)
             head = {
                 "status": "ok",
                 "ok": True,
@@ -63,12 +63,12 @@ def answering(
                 "request_id": message["request_id"],
             }
             if message["type"] == "ping":
-                connection.send(codecs.pack(head | {"type": "ping"}))
+                connection.send(msgpack_arrays.pack(head | {"type": "ping"}))
                 continue
             if asked is not None:
                 asked.append(request)
             connection.send(
-                data if isinstance(data, bytes) else codecs.pack(head | {"data": data} | envelope)
+                data if isinstance(data, bytes) else msgpack_arrays.pack(head | {"data": data} | envelope)
             )
 
     return converse
@@ -83,7 +83,7 @@ def payload_of(
         policy_at(url, **settings) as policy,
     ):
         policy.infer(shown or seen(FRANKA))
-    return codecs.unpack(asked[0])["payload"]
+    return msgpack_arrays.unpack(asked[0])["payload"]
 
 
 # The bytes that starVLA's own programs have written
@@ -96,12 +96,12 @@ def test_a_request_is_the_recorded_one_byte_for_byte() -> None:
     qpos = np.array([0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.0], np.float32)
     payload = policy.payload(seen(FRANKA, qpos=qpos, pictures=pictures, prompt="pick"))
     payload["examples"][0]["state"] = payload["examples"][0]["state"][:, :7]  # the recorded robot has seven
-    sent = codecs.pack({"type": "infer", "request_id": "r1", "payload": payload})
+    sent = msgpack_arrays.pack({"type": "infer", "request_id": "r1", "payload": payload})
     assert sent == (VECTORS / "starvla_infer_request.bin").read_bytes()
 
 
 def test_the_recorded_answer_is_understood() -> None:
-    reply = codecs.unpack((VECTORS / "starvla_infer_reply.bin").read_bytes())
+    reply = msgpack_arrays.unpack((VECTORS / "starvla_infer_reply.bin").read_bytes())
     policy = built(PIPER, cameras=["cam_high"])
     policy._width = 7
     policy._require_answered(reply, {"request_id": "r1"})
@@ -126,15 +126,15 @@ def test_the_recorded_answer_is_understood() -> None:
 )
 def test_recorded_errors_and_pongs_are_told_apart(frame: str, says: str) -> None:
     with pytest.raises(PolicyError, match=says):
-        built()._require_answered(codecs.unpack(bytes.fromhex(frame)), {"request_id": "p2"})
+        built()._require_answered(msgpack_arrays.unpack(bytes.fromhex(frame)), {"request_id": "p2"})
 
 
 def test_the_pong_answers_the_ping() -> None:
-    pong = codecs.unpack(
+    pong = msgpack_arrays.unpack(
         bytes.fromhex("84a6737461747573a26f6ba26f6bc3a474797065a470696e67aa726571756573745f6964a27031")
     )
     built()._require_answered(pong, {"request_id": "p1"})
-    assert codecs.pack({"type": "ping", "request_id": "p1"}).hex() == (
+    assert msgpack_arrays.pack({"type": "ping", "request_id": "p1"}).hex() == (
         "82a474797065a470696e67aa726571756573745f6964a27031"
     )
 
@@ -364,11 +364,13 @@ def test_pings_go_out_while_nobody_asks_until_it_is_closed() -> None:
     enough, pings = threading.Event(), []
 
     def converse(connection: ServerConnection) -> None:
-        connection.send(codecs.pack(SAID))
+        connection.send(msgpack_arrays.pack(SAID))
         for request in connection:
-            message = codecs.unpack(request)
+            message = msgpack_arrays.unpack(request)
             pings.append(message)
-            connection.send(codecs.pack({"status": "ok", "ok": True, "request_id": message["request_id"]}))
+            connection.send(
+                msgpack_arrays.pack({"status": "ok", "ok": True, "request_id": message["request_id"]})
+            )
             if len(pings) == 3:
                 enough.set()
 
@@ -391,12 +393,12 @@ def test_a_ping_that_is_not_answered_drops_the_connection_and_the_next_request_o
     def converse(connection: ServerConnection) -> None:
         conversations.append(0)
         mute = len(conversations) == 1
-        connection.send(codecs.pack(SAID))
+        connection.send(msgpack_arrays.pack(SAID))
         for number, request in enumerate(connection):
-            message = codecs.unpack(request)
+            message = msgpack_arrays.unpack(request)
             head = {"status": "ok", "ok": True, "request_id": message["request_id"]}
             if not (mute and number):
-                connection.send(codecs.pack(head | {"data": {"actions": ROWS}}))
+                connection.send(msgpack_arrays.pack(head | {"data": {"actions": ROWS}}))
 
     with serving(converse) as url, policy_at(url, ping_every=0.02, inference_deadline=0.1) as policy:
         policy.connect()

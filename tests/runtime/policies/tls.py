@@ -14,7 +14,7 @@ import pytest
 from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 
 Certificate = tuple[Path, Path]  # and its key
 
@@ -53,9 +53,9 @@ def encrypted(certificate: Certificate) -> Iterator[str]:
 
     def converse(connection: ServerConnection) -> None:
         assert connection.request is not None
-        connection.send(codecs.pack({"name": connection.request.path}))
+        connection.send(msgpack_arrays.pack({"name": connection.request.path}))
         for _ in connection:
-            connection.send(codecs.pack({"actions": [], "error": "unused"}))
+            connection.send(msgpack_arrays.pack({"actions": [], "error": "unused"}))
 
     def admit(connection: ServerConnection, request: Request) -> Response | None:
         return connection.respond(200, "OK\n") if request.path == "/healthz" else None

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from robots import Robot
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.preflight.course import Course
 from runtime.preflight.report import Report
 from runtime.sim.faults import NONE, Fault
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from runtime.station.spec import StationSpec
 from tests.runtime.policies.peers import FRANKA, PIPER
 
@@ -104,7 +104,7 @@ def planned(wire: Wire, url: str, settings: Mapping[str, Any] | None = None, **t
         "policy": {**wire.settings, **PATIENT, "url": url, **(settings or {})},
         **tables,
     }
-    return family.plan(deployment.resolve(tree, {}, "test"))
+    return station_spec.spec_of(loader.resolve(tree, {}, "test"))
 
 
 @contextlib.contextmanager

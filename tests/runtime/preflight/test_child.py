@@ -14,9 +14,9 @@ import pytest
 from websockets.exceptions import ConnectionClosed, ConnectionClosedOK
 from websockets.sync.server import ServerConnection
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.config.loader import server_of
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.command_arguments import PreflightRequest
 from runtime.policies.link import LEAVING, await_left
@@ -218,7 +218,7 @@ def test_a_server_has_one_spelling(url: str, server: str) -> None:
 
 
 def test_a_policy_without_a_server_has_none() -> None:
-    changed = deployment.changed(OWN, {"policy": {"kind": "mock"}}, "test")
+    changed = loader.changed(OWN, {"policy": {"kind": "mock"}}, "test")
     assert server_of(changed.deployment) == ""
 
 
@@ -228,7 +228,7 @@ def test_the_program_leaves_a_server_with_a_close_frame() -> None:
     ended: list[ConnectionClosed] = []
 
     def converse(connection: ServerConnection) -> None:
-        connection.send(codecs.pack({"action_dim": 99}))
+        connection.send(msgpack_arrays.pack({"action_dim": 99}))
         try:
             connection.recv()
         except ConnectionClosed as closed:

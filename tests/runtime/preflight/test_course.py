@@ -100,10 +100,10 @@ def test_the_policy_is_shown_the_robot_at_its_pose_with_grey_pictures(flown: Any
 
 
 def test_what_it_is_shown_is_the_same_every_time() -> None:
-    plan = planned(MOCK, "", policy={"kind": "mock"})
-    once, again = pictures(plan), pictures(plan)
+    spec = planned(MOCK, "", policy={"kind": "mock"})
+    once, again = pictures(spec), pictures(spec)
     assert all(np.array_equal(once[key], again[key]) for key in once)
-    subject = Subject(plan, VirtualClock(5.0))
+    subject = Subject(spec, VirtualClock(5.0))
     assert subject.commanded() is None
     assert set(subject.now("go").captured.values()) == {5.0}
 
@@ -166,9 +166,9 @@ def test_what_does_not_fit_the_robot_is_said_before_anybody_is_asked(flown: Any,
     def build(*given: object) -> Policy:
         raise ConfigurationError("policy.cameras = ['cam_9']; allowed: cam_high")
 
-    plan = planned(MOCK, "", policy={"kind": "mock"})
+    spec = planned(MOCK, "", policy={"kind": "mock"})
     monkeypatch.setattr(variants("runtime.policies")["mock"], "build", build)
-    report = Course(plan).run(30.0)
+    report = Course(spec).run(30.0)
     assert (report.verdict, report.stage, report.calls) == ("misconfigured", "resolve", ())
 
 
@@ -183,8 +183,8 @@ def test_a_policy_that_never_comes_back_is_a_timeout_at_the_deadline(flown: Any)
 
 
 def test_the_deadline_is_what_the_policys_own_come_to() -> None:
-    plan = planned(WIRES["openpi"], "ws://127.0.0.1:1")
-    assert patience(plan.deployment) == pytest.approx(20.0 + 30.0 + 2 * 20.0 + 10.0)
+    spec = planned(WIRES["openpi"], "ws://127.0.0.1:1")
+    assert patience(spec.deployment) == pytest.approx(20.0 + 30.0 + 2 * 20.0 + 10.0)
     assert patience(planned(MOCK, "", policy={"kind": "mock"}).deployment) == 10.0
 
 
@@ -233,7 +233,7 @@ def test_compiling_kinematics_is_not_the_policys_time(flown: Any, monkeypatch: p
     from runtime.station.spec import StationSpec
 
     made = StationSpec.kinematics
-    monkeypatch.setattr(StationSpec, "kinematics", lambda plan: (threading.Event().wait(3.2), made(plan))[1])
+    monkeypatch.setattr(StationSpec, "kinematics", lambda spec: (threading.Event().wait(3.2), made(spec))[1])
     poses = np.concatenate([np.append(arm.pose(FRANKA.poses["home"]), 0.5) for arm in FRANKA.arms])
 
     class Posed(Stub):

@@ -12,7 +12,7 @@ from runtime.ipc.messages import Command, Event
 from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightDesk
 from runtime.processes.coordinator.session.transitions import State
 from runtime.station.preflight_child import Flight
-from tests.runtime.lockstep_station import Station, plan
+from tests.runtime.lockstep_station import Station, spec_of
 from tests.runtime.preflight.bench import LEROBOT, WIRES, planned
 
 OWN = planned(WIRES["openpi"], "ws://127.0.0.1:8000")
@@ -142,7 +142,7 @@ def test_reports_and_servers_are_told() -> None:
 
 
 def test_a_station_takes_its_policy_back_for_a_set_up_and_for_a_run(tmp_path: Any, monkeypatch: Any) -> None:
-    station = Station(plan(tmp_path))
+    station = Station(spec_of(tmp_path))
     flights = Recorder()
     monkeypatch.setattr(station.main.preflights, "_preflights", flights)
     try:

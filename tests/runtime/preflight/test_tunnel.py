@@ -33,8 +33,8 @@ def test_a_server_behind_a_tunnel_is_asked_and_the_tunnel_is_gone_afterwards(tmp
     with contextlib.closing(contextlib.ExitStack()) as stack, served("openpi") as url:
         server = SshServer(tmp_path / "ssh", free_port()).start()
         stack.callback(server.stop)
-        plan = planned(WIRES["openpi"], url, {"tunnel": server.settings()})
-        report = Course(plan).run(60.0)
+        spec = planned(WIRES["openpi"], url, {"tunnel": server.settings()})
+        report = Course(spec).run(60.0)
         assert report.ok, report.sentence
         closed = Course(planned(WIRES["openpi"], "ws://127.0.0.1:1", {"tunnel": server.settings()})).run(60.0)
         assert (closed.verdict, closed.stage) == ("port_closed", "connect"), closed.sentence

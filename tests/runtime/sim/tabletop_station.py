@@ -17,7 +17,7 @@ import numpy as np
 
 import robots
 from robots import Robot
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.clock import Clock
 from runtime.core.types import Float64, UInt8
 from runtime.processes.coordinator.session.machine import State
@@ -33,7 +33,7 @@ from runtime.sim.render import Renderer
 from runtime.sim.script import Script
 from runtime.sim.surroundings import Surroundings
 from runtime.sim.tabletop import Reset, Tabletop
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from runtime.station.spec import StationSpec
 from runtime.transports import zmq
 from runtime.transports.base import Capabilities
@@ -136,7 +136,7 @@ def planned(
     """The station of the deployment `name` with the bench laid out by `seed`; nothing is recorded."""
     given = [f'data_dir="{data}"', "recording.enabled=false", "lockstep.delay_ticks=3", *assignments]
     given += [] if url is None else [f'policy.url="{url}"']
-    made = family.plan(deployment.load(DEPLOYMENTS / f"{name}.toml", given))
+    made = station_spec.spec_of(loader.load(DEPLOYMENTS / f"{name}.toml", given))
     bench = SlowEye(made.robot, Tabletop(made.robot, seed))
     return TabletopPlan(made.resolved, made.robot, bench, {})
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.sim.drives import Switch
 from runtime.sim.gate import Gate
 from runtime.sim.tabletop import Reset
@@ -16,7 +16,7 @@ HOME = ROBOT.poses["home"].astype(np.float32)
 
 
 def command(action: Any = HOME, **fields: Any) -> bytes:
-    return codecs.pack({"t": 0.0, "action": action, "target": "real"} | fields)
+    return msgpack_arrays.pack({"t": 0.0, "action": action, "target": "real"} | fields)
 
 
 @pytest.fixture
@@ -64,14 +64,16 @@ def test_limits_that_were_rounded_to_float32_are_not_violations(gate: Gate) -> N
         assert (accepted.target <= ROBOT.upper).all()
 
 
-@pytest.mark.parametrize("payload", [b"", b"\xc1", codecs.pack([1]), codecs.pack({"target": 3})])
+@pytest.mark.parametrize(
+    "payload", [b"", b"\xc1", msgpack_arrays.pack([1]), msgpack_arrays.pack({"target": 3})]
+)
 def test_garbage_is_refused_as_malformed(gate: Gate, payload: bytes) -> None:
     assert gate.judge(payload, 0.0) is None
     assert gate.refused == {"malformed": 1}
 
 
 def test_without_a_target_field_it_is_meant_for_the_robot(gate: Gate) -> None:
-    accepted = gate.judge(codecs.pack({"t": 0.0, "action": HOME}), 0.0)
+    accepted = gate.judge(msgpack_arrays.pack({"t": 0.0, "action": HOME}), 0.0)
     assert accepted is not None
     assert accepted.target is not None
 
@@ -195,7 +197,7 @@ def test_a_wish_to_lay_the_bench_passes_where_there_is_one() -> None:
         (2.0, WISH | {"positions": None, "master": "first", "t": 1.0, "seq": 3}, Reset("one", 7, None)),
         (4.0, WISH | {"positions": positions}, Reset("one", 7, positions)),
     ):
-        accepted = gate.judge(codecs.pack(wish), arrival)
+        accepted = gate.judge(msgpack_arrays.pack(wish), arrival)
         assert accepted is not None
         assert accepted.reset == expected
         assert accepted.target is accepted.control is None
@@ -204,7 +206,7 @@ def test_a_wish_to_lay_the_bench_passes_where_there_is_one() -> None:
 
 
 def test_a_node_without_a_bench_refuses_the_wish(gate: Gate) -> None:
-    assert gate.judge(codecs.pack(WISH), 0.0) is None
+    assert gate.judge(msgpack_arrays.pack(WISH), 0.0) is None
     assert gate.refused == {"no_bench": 1}
 
 
@@ -223,14 +225,14 @@ def test_a_node_without_a_bench_refuses_the_wish(gate: Gate) -> None:
 )
 def test_a_wish_of_the_wrong_shape_is_refused(wrong: dict[str, Any]) -> None:
     gate = Gate(ROBOT, deadline=0.3, bench=True)
-    assert gate.judge(codecs.pack(WISH | wrong), 0.0) is None
+    assert gate.judge(msgpack_arrays.pack(WISH | wrong), 0.0) is None
     assert gate.refused == {"malformed": 1}
 
 
 def test_the_bench_is_not_laid_for_a_second_client_while_the_first_commands() -> None:
     gate = Gate(ROBOT, deadline=0.3, bench=True)
     gate.judge(command(master="first"), 0.0)
-    assert gate.judge(codecs.pack(WISH | {"master": "second"}), 0.5) is None
+    assert gate.judge(msgpack_arrays.pack(WISH | {"master": "second"}), 0.5) is None
     assert gate.refused == {"other_master": 1}
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.clock import VirtualClock
 from runtime.core.errors import SetupError
 from runtime.ipc.identity import LOCAL
@@ -26,7 +26,7 @@ from runtime.sim import lockstep, serve
 from runtime.sim.lockstep import Rested, planned
 from runtime.sim.node import parser
 from runtime.sim.tabletop import Tabletop
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from tests.runtime.lockstep_station import column
 from tests.runtime.sim.tabletop_station import DEPLOYMENTS, SlowEye
 
@@ -64,7 +64,7 @@ class Operator:
         assert session.state is State.READY, session.reason
         self._given.append(self._give("run", duration_s=seconds).data["episode"])
         self._until(State.READY)
-        self._ended.append((session.reason, set(self.station.main.inference.tally.delays)))
+        self._ended.append((session.reason, set(self.station.main.inference.metrics.delays)))
         while self._dawdles and runs.last_episode.get("uuid") != self._given[-1]:
             self.station.turn()
 
@@ -74,7 +74,7 @@ class Operator:
         while runs.last_episode["uuid"] != self._given[-1]:
             self.station.turn()
         for uuid_, (reason, delays) in zip(self._given, self._ended, strict=True):
-            episode = open_episode(self.station.plan.deployment.episodes_dir / uuid_)
+            episode = open_episode(self.station.spec.deployment.episodes_dir / uuid_)
             truth = next(event["data"] for event in episode.events if event["kind"] == "truth")
             said = {key: value for key, value in truth.items() if key not in ("episode", "reset")}
             sent, steps = column(episode.rows, "action"), column(episode.rows, "step")
@@ -126,7 +126,7 @@ def courses(
         server.reply = replying
     urls = [str(server.start()["url"]) for server in servers]
     given = [f'data_dir="{data}"', f'policy.url="{urls[0]}"', "recording.export=false", "lease.ttl_s=600"]
-    made = family.plan(deployment.load(DEPLOYMENTS / "tabletop.toml", given))
+    made = station_spec.spec_of(loader.load(DEPLOYMENTS / "tabletop.toml", given))
     around = SlowEye(made.robot, Tabletop(made.robot, 1))
     options = parser().parse_args(["--robot", made.robot.name, "--bench", "tabletop", "--seed", "1"])
     over = Rested(around.truth, clock)

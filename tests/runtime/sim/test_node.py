@@ -15,7 +15,7 @@ import pytest
 import zmq
 
 import robots
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import MonotonicClock, VirtualClock
 from runtime.core.errors import CodecError, SetupError
 from runtime.core.types import Float64, Observation, RobotCommand
@@ -69,13 +69,13 @@ class Bench:
             self.node.tick(PERIOD)
             assert self.frames.poll(int(PATIENCE * 1e3))
             payload = self.frames.recv()
-        return dict(codecs.unpack(payload))
+        return dict(msgpack_arrays.unpack(payload))
 
     def send(self, action: Any = HOME, **fields: Any) -> None:
         """A command that has arrived at the node when this returns."""
         message = {"t": 0.0, "action": np.asarray(action, np.float32), "target": "real"} | fields
         self.number += 1
-        self.post(codecs.pack(message | {"seq": self.number}))
+        self.post(msgpack_arrays.pack(message | {"seq": self.number}))
 
     def post(self, payload: bytes) -> None:
         self.commands.send(payload)
@@ -99,7 +99,7 @@ class Bench:
         commands = self.node._sockets._subscriber
         while not commands.poll(20):
             assert time.monotonic() < deadline
-            self.commands.send(codecs.pack({"t": 0.0, "target": "sim", "master": "joiner"}))
+            self.commands.send(msgpack_arrays.pack({"t": 0.0, "target": "sim", "master": "joiner"}))
         while commands.poll(100):
             commands.recv()
 
@@ -170,8 +170,8 @@ def test_any_robot_goes_where_it_is_told_and_measures_what_its_chains_say(name: 
     target = np.clip(start + 0.05 * np.minimum(1.0, robot.upper - robot.lower), robot.lower, robot.upper)
     for _ in range(45):
         clock.advance(PERIOD)
-        said = codecs.unpack(
-            node.exchange([codecs.pack({"t": 0.0, "action": target.astype(np.float32)})], PERIOD)
+        said = msgpack_arrays.unpack(
+            node.exchange([msgpack_arrays.pack({"t": 0.0, "action": target.astype(np.float32)})], PERIOD)
         )
     found = np.asarray(robot.join(said["state"]), np.float64)
     np.testing.assert_allclose(found, target, atol=1e-3)
@@ -186,7 +186,7 @@ def test_any_robot_goes_where_it_is_told_and_measures_what_its_chains_say(name: 
 
 def test_a_robot_that_measures_no_poses_sends_none() -> None:
     node = Node(ROBOT, parser().parse_args(["--robot", "agilex_piper", *SMALL, "--no-eef"]), VirtualClock())
-    assert "eef" not in codecs.unpack(node.exchange([], PERIOD))
+    assert "eef" not in msgpack_arrays.unpack(node.exchange([], PERIOD))
 
 
 def test_frame_numbers_in_the_message_and_in_the_pictures_agree(bench: Bench) -> None:
@@ -233,7 +233,7 @@ def test_a_command_it_refuses_moves_nothing_and_is_reported(bench: Bench, action
 
 
 def test_a_malformed_command_does_not_end_it(bench: Bench) -> None:
-    for payload in (b"", b"\xc1", b"\x85\xa1t", codecs.pack("hello")):
+    for payload in (b"", b"\xc1", b"\x85\xa1t", msgpack_arrays.pack("hello")):
         bench.post(payload)
     assert bench.tick()["refused"] == {"malformed": 4}
     bench.send(AWAY)
@@ -353,7 +353,7 @@ def test_every_nth_message_is_cut() -> None:
             bench.node.tick(PERIOD)
             assert bench.frames.poll(int(PATIENCE * 1e3))
             try:
-                codecs.unpack(bench.frames.recv())
+                msgpack_arrays.unpack(bench.frames.recv())
             except CodecError:
                 broken.append(True)
             else:
@@ -456,7 +456,7 @@ def test_every_robot_can_be_simulated(name: str) -> None:
     with contextlib.closing(Node(robot, options, VirtualClock())) as node:
         node.open()
         node.tick(PERIOD)
-        message = codecs.unpack(codecs.pack(node._observation()))
+        message = msgpack_arrays.unpack(msgpack_arrays.pack(node._observation()))
     assert list(message["state"]) == [group.name for group in robot.groups]
     assert list(message["images"]) == [camera.key for camera in robot.cameras]
 

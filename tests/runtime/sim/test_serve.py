@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import ClientConnection, connect
 
 import robots
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import ContradictionError, PolicyError, PolicyGone
 from runtime.core.types import Observation
@@ -47,13 +47,13 @@ def conversation(url: str) -> Iterator[ClientConnection]:
 def receive(connection: ClientConnection) -> dict[str, Any]:
     answer = connection.recv(timeout=PATIENCE)
     assert isinstance(answer, bytes)
-    return dict(codecs.unpack(answer))
+    return dict(msgpack_arrays.unpack(answer))
 
 
 def request(**changes: Any) -> bytes:
     picture = np.zeros((3, 8, 8), np.uint8)
     whole = {"state": HOME.astype(np.float32), "images": {"cam_high": picture}, "prompt": "wave"}
-    return codecs.pack(whole | changes)
+    return msgpack_arrays.pack(whole | changes)
 
 
 def test_it_speaks_as_an_openpi_server_does(serve: Any) -> None:

@@ -3,7 +3,7 @@ import threading
 import pytest
 import zmq
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.sim import drives
 from runtime.sim.drives import Drives, Switch
 from runtime.transports.node_messages import DRIVE_FAULTS_LIMIT
@@ -61,7 +61,7 @@ def test_a_word_is_said_once_the_node_listens():
         thread.start()
         assert drives.main(["fault", "--fault", "hot", "--action-endpoint", endpoint]) == 0
         thread.join()
-        assert codecs.unpack(heard[0]) == {"t": 0.0, "target": "drives_fault", "fault": "hot"}
+        assert msgpack_arrays.unpack(heard[0]) == {"t": 0.0, "target": "drives_fault", "fault": "hot"}
     finally:
         node.close(linger=0)
 

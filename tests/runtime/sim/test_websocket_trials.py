@@ -24,23 +24,23 @@ LIMITS = f"{{low={list(map(float, ARM.lower))}, high={list(map(float, ARM.upper)
 
 
 def arena_server(**arena: Any) -> Any:
-    def made(plan: TabletopPlan, script: Script) -> RoboarenaServer:
-        return RoboarenaServer(plan.robot, Arena(HORIZON, plan.rate, resolution=SIZE, **arena), 0, script)
+    def made(spec: TabletopPlan, script: Script) -> RoboarenaServer:
+        return RoboarenaServer(spec.robot, Arena(HORIZON, spec.rate, resolution=SIZE, **arena), 0, script)
 
     return made
 
 
 def starvla_server(old: bool) -> Any:
-    def made(plan: TabletopPlan, script: Script) -> StarvlaServer:
-        star = Star(HORIZON, plan.rate, size=SIZE, views=("cam_wrist", "cam_high"), old=old)
-        return StarvlaServer(plan.robot, star, 0, script)
+    def made(spec: TabletopPlan, script: Script) -> StarvlaServer:
+        star = Star(HORIZON, spec.rate, size=SIZE, views=("cam_wrist", "cam_high"), old=old)
+        return StarvlaServer(spec.robot, star, 0, script)
 
     return made
 
 
 def rtc_server(dialect: Any) -> Any:
-    def made(plan: TabletopPlan, script: Script) -> OpenpiServer:
-        return OpenpiServer(plan.robot, Behaviour(HORIZON, plan.rate, rtc=dialect), 0, script)
+    def made(spec: TabletopPlan, script: Script) -> OpenpiServer:
+        return OpenpiServer(spec.robot, Behaviour(HORIZON, spec.rate, rtc=dialect), 0, script)
 
     return made
 

@@ -16,7 +16,7 @@ from runtime.motion.timeline import DimensionKinds
 from runtime.policies.base import PolicyInfo
 from runtime.safety.limits import Limits
 from runtime.spaces.binary_grippers import DWELL_S, Dwell, Switch, switches
-from tests.runtime.lockstep_station import Station, StubPlan, plan
+from tests.runtime.lockstep_station import Station, StubPlan, spec_of
 from tests.runtime.tick_bench import PERIOD, WITH_GRIPPER, Bench
 
 PERCENT = Switch(6, 100.0, 0.0, 80.0, 5.0)  # an R1 Lite's
@@ -77,7 +77,7 @@ def test_every_binary_gripper_of_a_robot_is_one() -> None:
 
 def test_the_hysteresis_is_the_deployments_where_it_says_so(tmp_path: Path) -> None:
     table = {"left_arm": {"binary": True, "threshold": 0.05, "hysteresis": 0.5}}
-    (only,) = switches(plan(tmp_path, grippers=table).robot)
+    (only,) = switches(spec_of(tmp_path, grippers=table).robot)
     assert only.snapped(np.array([0.06, 0.074, 0.076, 0.03, 0.02]), 0.0).tolist() == [0, 0, 0.1, 0.1, 0]
 
 
@@ -207,7 +207,7 @@ def test_whatever_control_is_ordered_it_sends_open_or_closed(
         elif kind == "restart":
             bench.tick = bench.new_tick()
         else:
-            bench.page.set_estop(EStop.LATCHED if kind == "estop" else EStop.CLEAR)
+            bench.shared.set_estop(EStop.LATCHED if kind == "estop" else EStop.CLEAR)
         bench.run(ticks)
         told = np.array([bench.status[name][2] for name in ("locked", "simulated")], np.float64)
         assert set(np.round(told[~np.isnan(told)], 6)) <= {0.0, 0.1}
@@ -220,9 +220,9 @@ def test_an_e_stop_that_takes_a_robot_over_moves_no_gripper_and_the_next_order_s
 ) -> None:
     bench = Bench(limits=BINARY, switches=(HALF,))
     bench.measured = np.array([0.2, 0.0, stood])
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     bench.run(5)
-    bench.page.set_estop(EStop.CLEAR)
+    bench.shared.set_estop(EStop.CLEAR)
     bench.run(5)
     assert bench.sent[:, 2] == pytest.approx(stood)
     begun = len(bench.sent)
@@ -251,7 +251,7 @@ def r1_lite(tmp_path: Path, kind: str, told: list[float], **more: Any) -> tuple[
         made[:, 13] = 37.0
         return made
 
-    return plan(tmp_path, rows, kind, robot="r1_lite", start=home, delay=2, **more), home
+    return spec_of(tmp_path, rows, kind, robot="r1_lite", start=home, delay=2, **more), home
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from runtime.ipc.shared_state import EStop, SharedState
 from runtime.processes.control.process import make_tick
 from runtime.processes.coordinator.session.transitions import State
 from tests.runtime.collision_samples import collisions, turned
-from tests.runtime.lockstep_station import Station, plan
+from tests.runtime.lockstep_station import Station, spec_of
 from tests.runtime.tick_bench import RecordingSink
 
 INWARDS = 0.01  # [rad] per step
@@ -33,7 +33,7 @@ def to_and_fro(observation: Observation, number: int) -> Float64:
 def run(tmp_path: Path, mode: str, recorded: bool = False) -> Station:
     safety = {"collision": mode, "jump": 1.0}
     recording = {"enabled": recorded}
-    made = plan(tmp_path, to_and_fro, start=turned(0.8), safety=safety, recording=recording)
+    made = spec_of(tmp_path, to_and_fro, start=turned(0.8), safety=safety, recording=recording)
     return Station(made).running(130)
 
 
@@ -66,7 +66,7 @@ def test_where_collisions_are_refused_the_robot_stops_before_it_and_the_run_hold
 
 def test_a_motion_by_hand_into_the_other_arm_is_refused_before_anything_moves(tmp_path: Path) -> None:
     station = Station(
-        plan(tmp_path, start=turned(0.5), run={"mode": "manual"}, recording={"enabled": False})
+        spec_of(tmp_path, start=turned(0.5), run={"mode": "manual"}, recording={"enabled": False})
     ).running(5)
     before = station.robot.position.copy()
     with pytest.raises(RuntimeFault, match=r"move: left_arm/\w+ and right_arm/\w+ would be .* of the way"):
@@ -88,7 +88,7 @@ def entangled() -> Float64:
 
 
 def test_homing_through_the_other_arm_fails_the_set_up_with_what_to_do(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, start=entangled(), setup={"home": True}))
+    station = Station(spec_of(tmp_path, start=entangled(), setup={"home": True}))
     station.prepare()
     assert station.state is State.IDLE
     assert "going to the pose 'home': left_arm/link" in station.reason
@@ -98,7 +98,7 @@ def test_homing_through_the_other_arm_fails_the_set_up_with_what_to_do(tmp_path:
 
 
 def test_homing_by_command_through_the_other_arm_is_refused_and_nothing_changes(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, start=entangled())).ready()
+    station = Station(spec_of(tmp_path, start=entangled())).ready()
     with pytest.raises(RuntimeFault, match="going to the pose 'home': left_arm/link"):
         station.command("home")
     assert station.state is State.READY
@@ -110,34 +110,34 @@ def control(
     tmp_path: Path, start: Float64, **safety: Any
 ) -> tuple[Any, SharedState, RecordingSink, VirtualClock]:
     """Control alone, engaged at `start`."""
-    made = plan(tmp_path, start=start, safety=safety)
-    page, _ = SharedState.create(made.layout)
-    page.set_estop(EStop.CLEAR)
+    made = spec_of(tmp_path, start=start, safety=safety)
+    shared, _ = SharedState.create(made.layout)
+    shared.set_estop(EStop.CLEAR)
     clock, sink = VirtualClock(10.0), RecordingSink()
-    return make_tick(made, page, sink, clock.now), page, sink, clock
+    return make_tick(made, shared, sink, clock.now), shared, sink, clock
 
 
 def test_control_itself_stops_a_motion_that_nobody_has_checked(tmp_path: Path) -> None:
     start = turned(0.8)
-    tick, page, sink, clock = control(tmp_path, start, collision="off")
+    tick, shared, sink, clock = control(tmp_path, start, collision="off")
     position, records = start, []
     for step in range(155):
         if step == 5:  # it has been seen for long enough to be taken over
-            page.rings["orders"].push(encode(Order(1, "motion", goal=turned(1.6))))
+            shared.rings["orders"].push(encode(Order(1, "motion", goal=turned(1.6))))
         for process in ("main", "guard"):
-            page.beat(process, clock.now())
+            shared.beat(process, clock.now())
         now = clock.now()
-        page.publish_observation(
+        shared.publish_observation(
             Observation(step + 1, now, {"joints": now}, position.astype(np.float32), {}), {}
         )
         tick(step, now)
         position = sink.sent[-1].astype(float) if sink.sent else start
-        records += [m for m in map(decode, page.rings["ticks"].drain()) if isinstance(m, TickDone)]
+        records += [m for m in map(decode, shared.rings["ticks"].drain()) if isinstance(m, TickDone)]
         clock.advance(1 / 30)
     assert any(record.refused for record in records)
     assert any("right_arm/" in note for record in records for note in record.notes)
     assert min(collisions()._clearance.distances(q.astype(float)).min() for q in sink.sent) > 0.004
-    assert bytes(page.control.read()["behaviour"]) == b"hold"
+    assert bytes(shared.control.read()["behaviour"]) == b"hold"
 
 
 def test_control_needs_no_compiler(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from runtime.ipc.messages import Command, encode
 from runtime.ipc.shared_state import EStop
 from runtime.processes.coordinator.process import CommandService
 from runtime.processes.guard.process import Desk
-from tests.runtime.lockstep_station import Station, plan
+from tests.runtime.lockstep_station import Station, spec_of
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="to be another account one has to be root")
 NOBODY = 65534
@@ -55,10 +55,10 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.context: zmq.Context[Any] = zmq.Context()
-        self.station = Station(plan(folder))
-        self.folder = self.station.plan.deployment.station_dir
+        self.station = Station(spec_of(folder))
+        self.folder = self.station.spec.deployment.station_dir
         self.main = CommandService(self.station.main, self.context)
-        self.guard = Desk(self.station.guard, self.station.main.page, self.context, self.folder)
+        self.guard = Desk(self.station.guard, self.station.main.shared, self.context, self.folder)
         Key(self.folder).secret()
         read = Endpoints(self.folder).read
         self.places = {"main": str(read("main")["commands"]), "guard": str(read("guard")["estop"])}
@@ -126,11 +126,11 @@ def test_where_the_sockets_are_left_open_it_commands_nothing_and_may_press(bench
         for answer in bench.nobody(lambda: asked(bench.places["main"], claim, local)):
             assert "refused" in answer
             assert "not signed by this lab's web" in answer
-        assert bench.station.main.page.estop is not EStop.LATCHED
+        assert bench.station.main.shared.estop is not EStop.LATCHED
         press = Command("e", "estop", {"why": "smoke"}, user="root")
         (answer,) = bench.nobody(lambda: asked(bench.places["guard"], press))
         assert "latched" in answer or "measured position" in answer
-        assert bench.station.main.page.estop is EStop.LATCHED
+        assert bench.station.main.shared.estop is EStop.LATCHED
         assert json.loads((bench.folder / "estop.json").read_text("utf-8"))["by"] == "root (unverified)"
     finally:
         for folder, mode in before:

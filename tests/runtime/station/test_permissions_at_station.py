@@ -14,7 +14,7 @@ import pytest
 from runtime.ipc.messages import Ack, Command
 from runtime.policies import openpi
 from runtime.processes.coordinator.session.transitions import State
-from tests.runtime.lockstep_station import Station, StubPlan, plan
+from tests.runtime.lockstep_station import Station, StubPlan, spec_of
 
 CANARY = "the canary sings"
 
@@ -36,7 +36,7 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Station
 
     monkeypatch.setattr(StubPlan, "_policy", build)
     monkeypatch.setenv("LAB_SECRET", CANARY)
-    made = Station(plan(tmp_path))
+    made = Station(spec_of(tmp_path))
     made.until(lambda: made.state is State.IDLE, 30.0, "a state to set up from")
     yield made
     made.close()

@@ -10,14 +10,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from runtime import __main__ as command_line
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.errors import ConfigurationError
 from runtime.recording.files import document
 from runtime.recording.reader import open_episode
 from runtime.station import rerun
 from runtime.station.rerun import find
 from runtime.station.run import Provenance
-from tests.runtime.lockstep_station import plan
+from tests.runtime.lockstep_station import spec_of
 
 ONE = "1a2b3c4d-0000-4000-8000-000000000001"
 CLEAN = {"commit": "c" * 40, "dirty": False}
@@ -26,7 +26,7 @@ OTHER = "1a2b9999-0000-4000-8000-000000000002"
 
 def kept(data: Path, run: str = ONE, mode: str = "continuous", **changes: Any) -> dict[str, Any]:
     """The manifest of an episode in `data`, as a station writes it, with `changes`."""
-    manifest = Provenance(plan(data, strategy="sync"), "boot-1").manifest(mode, None)
+    manifest = Provenance(spec_of(data, strategy="sync"), "boot-1").manifest(mode, None)
     manifest |= {"uuid": run, "git": CLEAN} | changes
     folder = data / "episodes" / run
     folder.mkdir(parents=True)
@@ -139,7 +139,7 @@ def test_settings_that_there_were_not_yet_have_their_defaults(tmp_path: Path) ->
     manifest = kept(tmp_path)
     old = {name: value for name, value in manifest["configuration"].items() if name != "faults"}
     old["run"] = {"duration_s": None}
-    changed = manifest | {"configuration": old, "configuration_hash": deployment.digest_of(old)}
+    changed = manifest | {"configuration": old, "configuration_hash": loader.digest_of(old)}
     for key in ("versions", "git"):
         del changed[key]
     (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(document(changed, "the manifest"))
@@ -153,7 +153,7 @@ def test_the_ports_of_a_bus_of_before_say_nothing_of_what_was_done(tmp_path: Pat
     manifest = kept(tmp_path)
     old = dict(manifest["configuration"])
     old["bus"] = old["bus"] | {"host": "127.0.0.1", "command_port": 5, "estop_port": 0}
-    changed = manifest | {"configuration": old, "configuration_hash": deployment.digest_of(old)}
+    changed = manifest | {"configuration": old, "configuration_hash": loader.digest_of(old)}
     (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(document(changed, "the manifest"))
     assert rerun.rerun(ONE, tmp_path).resolved.digest == manifest["configuration_hash"]
 
@@ -196,7 +196,7 @@ def test_a_manifest_that_is_torn_or_absent_is_named(tmp_path: Path) -> None:
 def test_a_setting_that_is_none_any_more_is_named_with_its_run(tmp_path: Path) -> None:
     manifest = kept(tmp_path)
     manifest["configuration"]["control"]["magic"] = 7
-    manifest["configuration_hash"] = deployment.digest_of(manifest["configuration"])
+    manifest["configuration_hash"] = loader.digest_of(manifest["configuration"])
     (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(document(manifest, "the manifest"))
     with pytest.raises(ConfigurationError, match=rf"configuration of run {ONE}.*(?s:.)*magic"):
         rerun.rerun(ONE, tmp_path)
@@ -247,7 +247,7 @@ def test_a_run_in_lockstep_is_exported_and_one_of_mode_sim_is_in_no_dataset(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = {"duration_s": 0.5, "mode": "sim"}
-    made = plan(tmp_path, run=run, publish={"dataset": "set"})
+    made = spec_of(tmp_path, run=run, publish={"dataset": "set"})
     assert command_line.run_in_lockstep(made) == 0
     (path,) = (tmp_path / "exports" / "stack-the-cups" / "sim" / "async").glob("*.parquet")
     assert f"export   {path}" in capsys.readouterr().out

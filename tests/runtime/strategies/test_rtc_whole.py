@@ -18,7 +18,7 @@ from runtime.core.types import Float32, Float64, UInt8
 from runtime.processes.coordinator.session.transitions import State
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.script import Answer, Script
-from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, column, plan
+from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, column, spec_of
 
 HORIZON, DELAY = 16, 4
 
@@ -79,14 +79,14 @@ class Log:
 def wired(
     tmp_path: Path, dialect: str, strategy: str, served: str = "", log: Log | None = None, **settings: Any
 ) -> Iterator[Station]:
-    bare = plan(tmp_path)
+    bare = spec_of(tmp_path)
     server = OpenpiServer(bare.robot, Behaviour(HORIZON, 30.0, rtc=served or dialect), 0, Wavering())
     if log is not None:
         log.listen(server)
     if dialect == "openpi_rtc":
         settings = {"rtc_envelope": {"server_shift": HORIZON // 2}, **settings}
     with contextlib.closing(server):
-        made = plan(
+        made = spec_of(
             tmp_path,
             strategy=strategy,
             delay=DELAY,

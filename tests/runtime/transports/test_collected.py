@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.clock import MonotonicClock
 from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from runtime.transports import ros1, ros2
 from runtime.transports.ros import cdr, packed
 from runtime.transports.ros.messages import JointState, Wire
@@ -96,7 +96,7 @@ def demonstration(
         "safety": {"joint_age_s": PATIENCE_S, "picture_age_s": PATIENCE_S},
         "control": {"heartbeat_timeout_s": 10.0},
     }
-    station = lockstep.Lockstep(family.plan(deployment.resolve(tree, {}, "test")))
+    station = lockstep.Lockstep(station_spec.spec_of(loader.resolve(tree, {}, "test")))
     session = station.main.session
     try:
         station.connect()

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.errors import TransportError
 from runtime.datasets.published import publish
 from runtime.datasets.reader import open_dataset
 from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from tests.runtime.datasets.foreign import Plan, column, shown, write
 from tests.runtime.datasets.small import seen
 
@@ -26,12 +26,12 @@ VERSIONS = ("v2.0", "v2.1", "v3.0")
 
 
 def foreign(root: Path, version: str, fps: float = FPS) -> Plan:
-    plan = Plan(version, lengths=LENGTHS, fps=fps, videos=CAMERAS, widths=WIDTHS, smooth=True)
-    write(root, plan)
-    return plan
+    spec = Plan(version, lengths=LENGTHS, fps=fps, videos=CAMERAS, widths=WIDTHS, smooth=True)
+    write(root, spec)
+    return spec
 
 
-def trial(tmp_path: Path, **tables: Any) -> family.StationSpec:
+def trial(tmp_path: Path, **tables: Any) -> station_spec.StationSpec:
     mapping = {"state": "joints", "action": "action"}
     place = {"path": str(tmp_path / "set"), "episode": EPISODE, "mapping": mapping}
     tree = {
@@ -47,7 +47,7 @@ def trial(tmp_path: Path, **tables: Any) -> family.StationSpec:
         "recording": {"min_free_bytes": 0},
         **tables,
     }
-    return family.plan(deployment.resolve(tree, {}, "test"))
+    return station_spec.spec_of(loader.resolve(tree, {}, "test"))
 
 
 def stacked(table: Any, name: str) -> np.ndarray:
@@ -68,20 +68,20 @@ def played(episode: Episode) -> dict[str, list[int]]:
 def test_every_frame_is_observed_once_and_every_recorded_action_is_executed(
     tmp_path: Path, version: str
 ) -> None:
-    plan = foreign(tmp_path / "set", version)
+    spec = foreign(tmp_path / "set", version)
     done = lockstep.run(trial(tmp_path))
     assert (done.state, done.reason) == (State.READY, "the recording that is the source has ended")
     episode, length = open_episode(Path(done.episode["path"])), LENGTHS[EPISODE]
     assert episode.frames == length
-    assert np.array_equal(stacked(episode.rows, "qpos"), column(EPISODE, "joints", length, plan))
-    assert np.array_equal(stacked(episode.ticks, "executed"), column(EPISODE, "action", length, plan))
+    assert np.array_equal(stacked(episode.rows, "qpos"), column(EPISODE, "joints", length, spec))
+    assert np.array_equal(stacked(episode.ticks, "executed"), column(EPISODE, "action", length, spec))
     wanted = [shown(EPISODE, k) for k in range(length)]
     assert played(episode) == dict.fromkeys(CAMERAS, wanted)
     assert episode.manifest["task"] == "stack the cups"
 
 
 def test_a_trial_of_v30_is_published_as_v30_and_played_again(tmp_path: Path) -> None:
-    plan = foreign(tmp_path / "set", "v3.0")
+    spec = foreign(tmp_path / "set", "v3.0")
     done = lockstep.run(trial(tmp_path))
     publish(Path(done.episode["path"]), tmp_path / "again", version="v3.0")
     again = {
@@ -95,8 +95,8 @@ def test_a_trial_of_v30_is_published_as_v30_and_played_again(tmp_path: Path) -> 
     twice = lockstep.run(trial(tmp_path, transport=again, policy=policy))
     assert twice.state is State.READY, twice.reason
     episode, length = open_episode(Path(twice.episode["path"])), LENGTHS[EPISODE]
-    assert np.array_equal(stacked(episode.rows, "qpos"), column(EPISODE, "joints", length, plan))
-    assert np.array_equal(stacked(episode.ticks, "executed"), column(EPISODE, "action", length, plan))
+    assert np.array_equal(stacked(episode.rows, "qpos"), column(EPISODE, "joints", length, spec))
+    assert np.array_equal(stacked(episode.ticks, "executed"), column(EPISODE, "action", length, spec))
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -11,7 +11,7 @@ import pytest
 import zmq
 
 import robots
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import MonotonicClock, VirtualClock
 from runtime.core.errors import ConfigurationError, TransportError
 from runtime.core.types import Observation, RobotCommand
@@ -44,7 +44,7 @@ class Node:
     def hear(self, patience: float = PATIENCE) -> dict[str, Any] | None:
         if not self.subscriber.poll(int(patience * 1e3)):
             return None
-        return dict(codecs.unpack(self.subscriber.recv()))
+        return dict(msgpack_arrays.unpack(self.subscriber.recv()))
 
     def close(self) -> None:
         self.publisher.close(linger=0)
@@ -98,7 +98,7 @@ def frame(t: float, mark: int = 0, /, **changes: Any) -> bytes:
         "hil_supported": False,
         "hil_active": False,
     }
-    return codecs.pack({key: value for key, value in (message | changes).items() if value is not ...})
+    return msgpack_arrays.pack({key: value for key, value in (message | changes).items() if value is not ...})
 
 
 def until_heard(node: Node, source: NodeSource, payload: Callable[[], bytes]) -> Observation:
@@ -362,7 +362,7 @@ def test_an_unusable_message_is_counted_by_name_and_the_next_one_arrives(
 
 
 @pytest.mark.parametrize(
-    "payload", [b"", b"\x85\xa1t", b"\xc1", codecs.pack([1, 2]), b"\x80", b"GET / HTTP/1.1\r\n\r\n"]
+    "payload", [b"", b"\x85\xa1t", b"\xc1", msgpack_arrays.pack([1, 2]), b"\x80", b"GET / HTTP/1.1\r\n\r\n"]
 )
 def test_garbage_is_counted_as_malformed(node: Node, payload: bytes) -> None:
     with listening(node) as source:

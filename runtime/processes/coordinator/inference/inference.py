@@ -72,17 +72,17 @@ class Inference:
 
     def __init__(
         self,
-        asking: PolicyRequests,
+        requests: PolicyRequests,
         strategy: Strategy,
-        page: SharedState,
+        shared: SharedState,
         orders: ControlQueue,
         clock: Clock,
         patience: Patience,
         commitment: RtcPrefix,
     ) -> None:
-        self.asking = asking
-        self.runner = asking.runner
-        self.tally = PolicyMetrics()
+        self.requests = requests
+        self.runner = requests.runner
+        self.metrics = PolicyMetrics()
         self.proposal: PendingChunk | None = None  # shown, and neither committed nor cancelled
         self.shown: ShownChunk | None = None
         self._planned: ShownChunk | None = None  # the newest that control has merged
@@ -90,7 +90,7 @@ class Inference:
         self.rtc_warning = ""
         self._given: Conditioning | None = None  # with the newest request
         self._strategy = strategy
-        self._page = page
+        self._page = shared
         self._orders = orders
         self._clock = clock
         self._patience = patience
@@ -107,12 +107,12 @@ class Inference:
 
     @property
     def policy(self) -> Policy:
-        return self.asking.policy
+        return self.requests.policy
 
     @property
     def notes(self) -> list[Event]:
         """For main to collect."""
-        return self.asking.notes
+        return self.requests.notes
 
     @property
     def asked(self) -> bool:
@@ -156,14 +156,14 @@ class Inference:
     def exchange(self, policy: Policy, task: str) -> None:
         """Ask `policy`, with the instruction `task`, from now on; figures are counted anew."""
         self.pause()
-        self.asking.exchange(policy, task)
-        self.tally.forget()
+        self.requests.exchange(policy, task)
+        self.metrics.forget()
         self._forget_failures()
 
     def tune(self, strategy: Strategy, task: str) -> None:
         """Go on with another strategy, other parameters, another instruction; a request in flight stays."""
         self._strategy = strategy
-        self.asking.task = task
+        self.requests.task = task
         self.rtc_warning = ""
 
     # --- a run ---------------------------------------------------------------------------------------------
@@ -172,11 +172,11 @@ class Inference:
         """Ask from now on, for this run; `fresh` lets the policy forget the episode before."""
         self._run, self._mode = run, mode
         if fresh:
-            self.asking.forget()
-            self.tally.forget()
+            self.requests.forget()
+            self.metrics.forget()
             self.shown = self._planned = None
         else:
-            self.asking.resume()
+            self.requests.resume()
         self._commitment.clear()
         self._forget_failures()
         self._stale_since = None
@@ -217,7 +217,7 @@ class Inference:
         made = self._unmerged.pop(merged.chunk_id, None)
         if merged.run != self._run:
             return
-        self.tally.merged(merged)
+        self.metrics.merged(merged)
         self._commitment.merged(merged)
         if made is not None:
             state = "dropped" if merged.dropped else "merged"
@@ -250,7 +250,7 @@ class Inference:
             return self._pump() if self._run else None
 
     def _pump(self) -> PolicyAnswer | None:
-        self.asking.glance()
+        self.requests.glance()
         if self._flight is not None:
             if not self.runner.ready(self._flight):
                 return None
@@ -266,7 +266,7 @@ class Inference:
         now = self._clock.now()
         first, self.failure = self._back_off.since is None, str(error)
         self._back_off.failed(now)
-        self.tally.lost += isinstance(error, PolicyLostError)
+        self.metrics.lost += isinstance(error, PolicyLostError)
         if self._back_off.lasts(now) > self._patience.lost:
             return False
         if first:
@@ -293,7 +293,7 @@ class Inference:
         waited = self._mode in ON_DEMAND or self._strategy.query.waits
         try:
             committed = self._committed if self.continues else None
-            flight = self.asking.ask(waited, committed, self._strategy.parameters.k_max)
+            flight = self.requests.ask(waited, committed, self._strategy.parameters.k_max)
         except StaleObservationError:
             if self._stale_since is None:
                 self._stale_since = now
@@ -307,7 +307,7 @@ class Inference:
     def _committed(self, step: int) -> Conditioning | None:
         parameters = self._strategy.parameters
         found = self._commitment.conditioning(
-            step, list(self.tally.delays)[-50:], parameters.delay_quantile, parameters.execution_horizon
+            step, list(self.metrics.delays)[-50:], parameters.delay_quantile, parameters.execution_horizon
         )
         warning = self._commitment.warning
         if warning and not self.rtc_warning:  # its numbers change with every request
@@ -317,10 +317,10 @@ class Inference:
 
     def _take(self, answered: PolicyResponse) -> PolicyAnswer:
         step, chunk = answered.observation.step, answered.chunk
-        self.asking.note(answered)
+        self.requests.note(answered)
         made = PendingChunk(self._orders.next_chunk(), answered.made.rows, answered)
         self._wanted = False
-        self.tally.answered(answered.seconds, answered.age, answered.ik)
+        self.metrics.answered(answered.seconds, answered.age, answered.ik)
         self._commitment.answered(made.number, chunk, step, answered.waited, self._generation, made.rows)
         if self._mode == "preview":
             self.proposal = made

@@ -42,8 +42,8 @@ class SightSettings:
 class PolicyObservation:
     """Reads the page; `simulated` shows the joints of the simulated robot in place of the real one's."""
 
-    def __init__(self, page: SharedState, clock: Clock, settings: SightSettings) -> None:
-        self._page = page
+    def __init__(self, shared: SharedState, clock: Clock, settings: SightSettings) -> None:
+        self._page = shared
         self._clock = clock
         self._settings = settings
         self.simulated = False

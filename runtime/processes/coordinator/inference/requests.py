@@ -52,12 +52,18 @@ class PolicyRequests:
     """
 
     def __init__(
-        self, policy: Policy, task: str, spaces: ActionSpaces, sight: Eyes, runner: Runner, clock: Clock
+        self,
+        policy: Policy,
+        task: str,
+        spaces: ActionSpaces,
+        policy_observation: Eyes,
+        runner: Runner,
+        clock: Clock,
     ) -> None:
         self.policy = policy
         self.task = task
         self.runner = runner
-        self.sight = sight
+        self.policy_observation = policy_observation
         self._spaces = spaces
         self._clock = clock
         self._fresh = True
@@ -113,7 +119,7 @@ class PolicyRequests:
 
     def observe(self) -> Observation:
         """What the policy would be shown now; PolicyError where there is nothing, or it is old."""
-        return self.sight.now(self.task, self.policy.sees_pictures)
+        return self.policy_observation.now(self.task, self.policy.sees_pictures)
 
     def ask(
         self, waited: bool = False, committed: Committed | None = None, k_max: int | None = None
@@ -155,7 +161,7 @@ class PolicyRequests:
         where it is measured.
         """
         qpos = np.asarray(shown.qpos, dtype=np.float64)
-        told = self.sight.commanded()
+        told = self.policy_observation.commanded()
         if told is None:
             return Onset(qpos, qpos)
         step, commanded = told

@@ -31,12 +31,12 @@ class Grip:
 class Grippers:
     """The locks in force, and what requests make of them."""
 
-    def __init__(self, plan: StationSpec) -> None:
-        self._groups = [group for group in plan.robot.groups if group.gripper is not None]
-        self._robot = plan.robot.name
-        self._limits = plan.limits
-        self._switches = switches(plan.robot)
-        self.locks: Float64 = np.full(plan.robot.dim, np.nan)
+    def __init__(self, spec: StationSpec) -> None:
+        self._groups = [group for group in spec.robot.groups if group.gripper is not None]
+        self._robot = spec.robot.name
+        self._limits = spec.limits
+        self._switches = switches(spec.robot)
+        self.locks: Float64 = np.full(spec.robot.dim, np.nan)
 
     def asked(self, request: GripperRequest, commanded: Float64, free: bool) -> Grip:
         """`free`: nothing else moves the arms, so that a gripper can be moved; else opening and closing lock it there.

@@ -26,15 +26,15 @@ class ManualControl:
     """Motions within limits and the workspace box, locks of grippers; raises RuntimeFault where it refuses."""
 
     def __init__(
-        self, plan: StationSpec, page: SharedState, orders: ControlQueue, runs: Runs, targets: Targets
+        self, spec: StationSpec, shared: SharedState, orders: ControlQueue, runs: Runs, targets: Targets
     ) -> None:
-        self._plan = plan
-        self._page = page
+        self._plan = spec
+        self._page = shared
         self._orders = orders
         self._runs = runs
         self._targets = targets
-        self.grippers = Grippers(plan)
-        status = page.control.read()
+        self.grippers = Grippers(spec)
+        status = shared.control.read()
         if bytes(status["behaviour"]):  # a predecessor that died may have locked some
             self.grippers.locks = np.array(status["locked"], np.float64)
 

@@ -39,11 +39,11 @@ class TargetPreview:
 class Targets:
     """Turns what a person asks for into joint targets of one robot."""
 
-    def __init__(self, plan: StationSpec, spaces: ActionSpaces, kinematics: Kinematics) -> None:
-        self._plan = plan
+    def __init__(self, spec: StationSpec, spaces: ActionSpaces, kinematics: Kinematics) -> None:
+        self._plan = spec
         self._spaces = spaces
         self._kinematics = kinematics
-        self._ways = PathCheck(plan)
+        self._ways = PathCheck(spec)
 
     def prepare(self) -> bool:
         """Begin to load what a jog needs, where nobody has; whether it is there."""
@@ -147,7 +147,7 @@ def _stepped(pose: Float64, jog: Jog) -> Float64:
     return np.concatenate([pose[:3] + way, quaternion_of_matrix(there)])
 
 
-def told(aim: TargetPreview, plan: StationSpec, distance: float, duration: float) -> dict[str, Any]:
+def told(aim: TargetPreview, spec: StationSpec, distance: float, duration: float) -> dict[str, Any]:
     """The aim as an answer to a client: joints, poses, errors in mm and degrees."""
     return {
         "joints": aim.joints.tolist(),
@@ -158,5 +158,5 @@ def told(aim: TargetPreview, plan: StationSpec, distance: float, duration: float
         "clipped": list(aim.clipped),
         "distance": distance,
         "duration_s": duration,
-        "robot": plan.robot.name,
+        "robot": spec.robot.name,
     }

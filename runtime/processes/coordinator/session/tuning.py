@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.command_arguments import TuneRequest
 from runtime.policies.base import PolicyInfo
@@ -12,25 +12,23 @@ from runtime.processes.coordinator.inference.inference import Strategy
 from runtime.station.spec import StationSpec
 
 
-def strategy_of(plan: StationSpec) -> Strategy:
+def strategy_of(spec: StationSpec) -> Strategy:
     """The asking half of a plan's strategy."""
-    settings = plan.deployment.strategy
-    return Strategy(plan.strategy.query(settings), settings)
+    settings = spec.deployment.strategy
+    return Strategy(spec.strategy.query(settings), settings)
 
 
-def tuned(plan: StationSpec, asked: TuneRequest, info: PolicyInfo | None) -> StationSpec:
+def tuned(spec: StationSpec, asked: TuneRequest, info: PolicyInfo | None) -> StationSpec:
     """`plan` with what is asked; another kind keeps the parameters. RuntimeFault names what is wrong.
 
     `info` is what the connected policy says of itself, None where none is.
     """
     if asked.strategy is None and asked.task is None:
         raise RuntimeFault("tune: nothing to change; allowed: strategy, task")
-    now = plan.deployment
+    now = spec.deployment
     strategy = {**now.strategy.model_dump(), **(asked.strategy or {})}
     task = now.task if asked.task is None else asked.task
-    made = replace(
-        plan, resolved=deployment.changed(plan.resolved, {"strategy": strategy, "task": task}, "tune")
-    )
+    made = replace(spec, resolved=loader.changed(spec.resolved, {"strategy": strategy, "task": task}, "tune"))
     if info is not None and info.supports_rtc is False and strategy_of(made).query.continues:
         raise RuntimeFault(f"tune: the policy {info.name!r} does not continue a chunk that it is given (RTC)")
     return made

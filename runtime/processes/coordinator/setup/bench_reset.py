@@ -21,9 +21,9 @@ class BenchReset:
     """One reset at a time; a node that simulates no bench has none."""
 
     def __init__(
-        self, plan: StationSpec, orders: ControlQueue, clock: Clock, reception: Callable[[], ReceptionReport]
+        self, spec: StationSpec, orders: ControlQueue, clock: Clock, reception: Callable[[], ReceptionReport]
     ) -> None:
-        self._plan = plan
+        self._plan = spec
         self._orders = orders
         self._clock = clock
         self._reception = reception  # what it last reported

@@ -22,12 +22,12 @@ _ARRIVED_RAD = 0.1
 class SetupMotion:
     """One motion at a time; `where` names its goal in sentences."""
 
-    def __init__(self, plan: StationSpec, orders: ControlQueue, page: SharedState, clock: Clock) -> None:
-        self._plan = plan
+    def __init__(self, spec: StationSpec, orders: ControlQueue, shared: SharedState, clock: Clock) -> None:
+        self._plan = spec
         self._orders = orders
-        self._page = page
+        self._page = shared
         self._clock = clock
-        self._ways = PathCheck(plan)
+        self._ways = PathCheck(spec)
 
     def start(self, goal: Float64, where: str) -> None:
         """Have control go to `goal` [D]; RuntimeFault, and nothing moves, where the way there is not free."""

@@ -51,22 +51,22 @@ class SetUp:
 
     def __init__(
         self,
-        plan: StationSpec,
+        spec: StationSpec,
         inference: Inference,
         orders: ControlQueue,
-        page: SharedState,
+        shared: SharedState,
         clock: Clock,
         reception: Callable[[], ReceptionReport],
     ) -> None:
-        self._plan = plan
+        self._plan = spec
         self._inference = inference
         self._orders = orders
-        self._page = page
+        self._page = shared
         self._clock = clock
         self._reception = reception  # what it last reported
         self._met = False  # control was asked to take the robot over where it is read
-        self._going = SetupMotion(plan, orders, page, clock)
-        self.bench = BenchReset(plan, orders, clock, reception)
+        self._going = SetupMotion(spec, orders, shared, clock)
+        self.bench = BenchReset(spec, orders, clock, reception)
         self.stage = Stage.IDLE
         self.info: PolicyInfo | None = None
         self.validated = ""
@@ -200,7 +200,7 @@ class SetUp:
         try:
             self._require_family()
             self._check_cameras()
-            self._inference.asking.observe()
+            self._inference.requests.observe()
             self._check_joints()
             self._check_drives()
         except (PolicyError, SetupError) as error:
@@ -265,7 +265,7 @@ class SetUp:
     def _answered(self) -> bool:
         """Ask once more, and look at what came; whether something did."""
         if self._asked is None:
-            self._asked = self._inference.asking.ask()
+            self._asked = self._inference.requests.ask()
             return False
         if not self._inference.runner.ready(self._asked):
             return False
@@ -282,9 +282,9 @@ class SetUp:
         return waited >= least
 
     def _validate(self, answered: PolicyResponse) -> None:
-        self._inference.asking.note(answered)
+        self._inference.requests.note(answered)
         if self._left == self._plan.deployment.setup.warmup_chunks:
-            self._inference.asking.compare(answered)
+            self._inference.requests.compare(answered)
         self.first_action = answered.made.meant
         first = first_action(self.first_action, np.asarray(answered.observation.qpos, np.float64), self._plan)
         far = ": far, approach it or start elsewhere" if first["far"] else ""
@@ -294,7 +294,7 @@ class SetUp:
         )
 
 
-def check_info(info: PolicyInfo, plan: StationSpec, continues: bool) -> None:
+def check_info(info: PolicyInfo, spec: StationSpec, continues: bool) -> None:
     """Hold what a policy says of itself against the strategy that asks it; SetupError with both sides.
 
     `continues`: the strategy's requests carry what the robot is committed to.
@@ -306,10 +306,10 @@ def check_info(info: PolicyInfo, plan: StationSpec, continues: bool) -> None:
             "another strategy, or a server and policy.rtc that do"
         )
     # More rows cannot be executed of each answer than it has.
-    wanted = plan.deployment.strategy.execution_horizon
-    if wanted is None or info.horizon is None or "execution_horizon" not in plan.strategy.USES:
+    wanted = spec.deployment.strategy.execution_horizon
+    if wanted is None or info.horizon is None or "execution_horizon" not in spec.strategy.USES:
         return
-    steps = resampling.length(info.horizon, info.rate or plan.rate, plan.rate)
+    steps = resampling.length(info.horizon, info.rate or spec.rate, spec.rate)
     if wanted > steps:
         raise SetupError(
             f"strategy.execution_horizon = {wanted} control steps, but the policy {info.name!r} says that its "
@@ -317,10 +317,10 @@ def check_info(info: PolicyInfo, plan: StationSpec, continues: bool) -> None:
         )
 
 
-def first_action(action: Float64, joints: Float64, plan: StationSpec) -> dict[str, Any]:
+def first_action(action: Float64, joints: Float64, spec: StationSpec) -> dict[str, Any]:
     """How far an action [D] is from `joints` [D]: {"distance" rad, "joint", "far"}; joints count, and nothing else."""
-    limits = plan.limits
-    away = np.where(limits.places, np.abs(difference(action, joints, plan.dims.wrapping)), 0.0)
+    limits = spec.limits
+    away = np.where(limits.places, np.abs(difference(action, joints, spec.dims.wrapping)), 0.0)
     worst = int(away.argmax())
-    far = bool(away[worst] > plan.deployment.safety.first_action_far)
+    far = bool(away[worst] > spec.deployment.safety.first_action_far)
     return {"distance": float(away[worst]), "joint": limits.names[worst], "far": far}

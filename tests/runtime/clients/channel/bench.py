@@ -16,7 +16,7 @@ from runtime.ipc.bus import CommandServer, Endpoints
 from runtime.ipc.messages import Ack
 from runtime.processes.coordinator.process import CommandService
 from tests.processes import eventually
-from tests.runtime.lockstep_station import Station, plan
+from tests.runtime.lockstep_station import Station, spec_of
 
 ANSWER_MS = 5000  # as the older channel's own script waits
 _TICK_S = 0.003  # ten times as fast as life
@@ -28,8 +28,8 @@ class Bench:
     def __init__(self, folder, silence_s=60.0, scripts="together", **settings):
         self.context = zmq.Context()
         self.lock, self._ended, self.frozen = threading.Lock(), threading.Event(), False
-        self.station = Station(plan(folder, lease={"ttl_s": 60.0}, **settings))
-        self.folder = self.station.plan.deployment.station_dir
+        self.station = Station(spec_of(folder, lease={"ttl_s": 60.0}, **settings))
+        self.folder = self.station.spec.deployment.station_dir
         self._service = CommandService(self.station.main, self.context)
         self._guard = CommandServer(self.context, self.folder, "estop")
         Endpoints(self.folder).write("guard", {"estop": self._guard.endpoint})

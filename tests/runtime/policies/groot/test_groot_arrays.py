@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.errors import CodecError
 from runtime.policies.groot import arrays
 
@@ -144,7 +144,7 @@ def test_what_could_do_harm_is_refused_and_named(value: object, says: str) -> No
 
 def test_openpis_arrays_are_named() -> None:
     with pytest.raises(CodecError, match="openpi dialect"):
-        arrays.unpack(codecs.pack({"actions": ACTIONS}), LIMIT)
+        arrays.unpack(msgpack_arrays.pack({"actions": ACTIONS}), LIMIT)
 
 
 def test_a_message_that_is_too_long_is_refused_unread() -> None:

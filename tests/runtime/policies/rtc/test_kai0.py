@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.errors import PolicyError
 from runtime.core.types import Conditioning
 from runtime.policies.rtc.kai0 import Kai0
@@ -21,12 +21,12 @@ def committed(count: int = 50, consumed: int = 10, delay: int = 3, horizon: int 
 
 def test_the_request_of_its_own_client_is_reproduced_byte_for_byte() -> None:
     recorded = (VECTORS / "rtc_c_request.bin").read_bytes()
-    message = codecs.unpack(recorded)
+    message = msgpack_arrays.unpack(recorded)
     observation = {key: message[key] for key in ("state", "images", "prompt")}
     rows = np.array(message["prev_action_chunk"], np.float32)[:, :2]
     weight = message["max_guidance_weight"]
     request = Kai0("whole", weight).request(observation, Conditioning(rows, 1, 3, 8))
-    assert codecs.pack(request) == recorded
+    assert msgpack_arrays.pack(request) == recorded
 
 
 def test_the_first_request_lacks_only_the_chunk() -> None:

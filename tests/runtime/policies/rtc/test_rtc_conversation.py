@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.core import msgpack_arrays as codecs
+from runtime.core import msgpack_arrays
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import PolicyError, PolicyLostError, PolicyTimeout
 from runtime.core.types import ActionChunk, Conditioning, Observation
@@ -145,7 +145,7 @@ def test_a_request_that_the_server_cannot_read_is_answered_with_an_error_without
     with talking("async_rtc") as policy:
         policy.connect()
         with policy._lock:
-            reply = codecs.unpack(policy._link.exchange(codecs.pack({"state": 1}), 10.0))
+            reply = msgpack_arrays.unpack(policy._link.exchange(msgpack_arrays.pack({"state": 1}), 10.0))
     assert reply["request_id"] is None
     assert "expected 'openpi-async-rtc' version 2" in reply["error"]
 

@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import ConfigurationError, PolicyError
 from runtime.policies.base import Policy
 from runtime.policies.openpi import OpenpiPolicy
 from runtime.policies.tunnel import policy as tunnelled
 from runtime.policies.tunnel.policy import TunnelledPolicy
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from tests.runtime.policies.peers import PIPER, seen
 
 CAMERAS = {camera.key: camera.key for camera in PIPER.cameras}
@@ -40,7 +40,7 @@ def ssh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def made(**policy: Any) -> Policy:
     tree = {"station": "bench", "robot": "agilex_piper", "transport": {"kind": "zmq"}, "policy": policy}
-    return family.plan(deployment.resolve(tree, {}, "a test")).new_policy(MonotonicClock())
+    return station_spec.spec_of(loader.resolve(tree, {}, "a test")).new_policy(MonotonicClock())
 
 
 def test_only_those_that_say_so_have_one() -> None:
@@ -65,10 +65,10 @@ def test_a_checkpoint_lays_its_tunnel_on_top_of_the_deployments_or_takes_it_away
         "transport": {"kind": "zmq"},
         "policy": {"kind": "openpi", "tunnel": {"host": "gpu", "user": "lab"}},
     }
-    resolved = deployment.resolve(tree, {}, "a test")
+    resolved = loader.resolve(tree, {}, "a test")
 
     def changed(tunnel: object) -> Any:
-        other = deployment.changed(resolved, {"policy": {"tunnel": tunnel}}, "setup")
+        other = loader.changed(resolved, {"policy": {"tunnel": tunnel}}, "setup")
         return other.deployment.policy.tunnel  # type: ignore[attr-defined]
 
     assert changed({"host": "gpu-2"}).where == "lab@gpu-2"

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import (
     ConfigurationError,
@@ -31,7 +31,7 @@ from runtime.sim.faults import Fault
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.starvla_server import Star, StarvlaServer
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from tests.processes import alive, eventually
 from tests.runtime.policies.peers import PIPER, seen
 from tests.runtime.policies.tls import encrypted, self_signed
@@ -56,7 +56,7 @@ def through(tunnel: dict[str, Any], robot: str = "agilex_piper", **policy: Any) 
             **policy,
         },
     }
-    made = family.plan(deployment.resolve(tree, {}, "a test")).new_policy(MonotonicClock())
+    made = station_spec.spec_of(loader.resolve(tree, {}, "a test")).new_policy(MonotonicClock())
     assert isinstance(made, TunnelledPolicy)
     return made
 
@@ -388,7 +388,7 @@ def test_a_run_holds_naming_the_tunnel_that_broke_and_goes_on_when_it_is_up_agai
         station.until(lambda: session.state is not State.SETTING_UP, 60.0, "set-up")
         assert session.state is State.READY, session.reason
         station.command("run")
-        station.until(lambda: station.main.inference.tally.answers > 2, 20.0, "answers")
+        station.until(lambda: station.main.inference.metrics.answers > 2, 20.0, "answers")
         server.stop()
         station.until(lambda: session.state is not State.RUNNING, 60.0, "the end of patience")
         assert session.state is State.HOLDING
@@ -398,8 +398,8 @@ def test_a_run_holds_naming_the_tunnel_that_broke_and_goes_on_when_it_is_up_agai
         assert isinstance(policy, TunnelledPolicy)
         assert policy._keeper is not None
         assert policy._keeper.wait(lambda now: now.up, 30).up
-        answers = station.main.inference.tally.answers
+        answers = station.main.inference.metrics.answers
         station.command("resume")
-        station.until(lambda: station.main.inference.tally.answers > answers + 2, 20.0, "answers")
+        station.until(lambda: station.main.inference.metrics.answers > answers + 2, 20.0, "answers")
         assert session.state is State.RUNNING, session.reason
     assert server.log().count("Accepted publickey") == 2

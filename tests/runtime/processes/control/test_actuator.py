@@ -26,7 +26,7 @@ def settings(limits=None, **options):
 
 
 def robot(bench, **options):
-    return RobotActuator(bench.page, bench.sink, settings(**options), bench.clock.now)
+    return RobotActuator(bench.shared, bench.sink, settings(**options), bench.clock.now)
 
 
 def seen(*joints, captured=100.0):
@@ -102,7 +102,7 @@ def test_the_e_stop_pressed_within_a_tick_repeats_the_last_command_to_the_robot(
     bench = Bench()
     actuator = robot(bench)
     actuator.engage(np.array([0.1, 0.1]))
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     sent = actuator.send(0, 100.0, Target(np.ones(2), "policy", "policy"), np.ones(2))
     assert sent.executed.tolist() == [0.1, 0.1]
     assert bench.sent.tolist() == pytest.approx([pytest.approx([0.1, 0.1])])

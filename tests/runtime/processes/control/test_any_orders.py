@@ -65,7 +65,7 @@ def happen(bench, number, what):
     elif kind == "lock":
         bench.lock(NAN, NAN, rest[0])
     elif kind == "estop":
-        bench.page.set_estop(rest[0])
+        bench.shared.set_estop(rest[0])
     else:
         setattr(bench, kind, rest[0])
 
@@ -87,7 +87,7 @@ class Witness:
         assert len(sent) <= 1
         assert len(sent) == int(status["engaged"])  # an engaged robot is told something on every tick
         self.weigh(record)
-        stopped = bench.page.estop is EStop.LATCHED
+        stopped = bench.shared.estop is EStop.LATCHED
         if stopped:
             assert status["estop_obeyed"]
             assert not status["moving"]

@@ -158,12 +158,12 @@ def test_another_run_starts_anew_where_the_robot_is(bench):
 def test_the_e_stop_ends_a_simulation(bench):
     simulating(bench, engaged=True)
     bench.run(9)
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     bench.run(3)
     assert np.isnan(simulated(bench)).all()
     assert bench.behaviour == "estop"
     assert {record.source for record in bench.records()[-3:]} == {"estop"}
-    bench.page.set_estop(EStop.CLEAR)
+    bench.shared.set_estop(EStop.CLEAR)
     bench.run(5)
     assert np.isnan(simulated(bench)).all()
 
@@ -315,7 +315,7 @@ def test_everything_is_said_with_its_step(bench):
 
 
 def test_a_full_ring_is_counted_and_never_waited_for(bench):
-    bench.page.rings["ticks"].push = lambda payload: not isinstance(decode(payload), TickDone)
+    bench.shared.rings["ticks"].push = lambda payload: not isinstance(decode(payload), TickDone)
     following(bench)
     bench.run(3)
     assert bench.status["records_lost"] == 4

@@ -12,7 +12,7 @@ from runtime.ipc.shared_state import SharedState, SharedStateLayout
 from runtime.processes.control.command_subscribers import SubscriberCheck
 from runtime.processes.coordinator.session.transitions import State
 from runtime.transports.base import Sink
-from tests.runtime.lockstep_station import Station, plan
+from tests.runtime.lockstep_station import Station, spec_of
 
 WHY = "a subscriber of /right is incompatible in its reliability"
 
@@ -45,12 +45,12 @@ class Desk:
     """Looks at a mouth, tick by tick at 10 Hz."""
 
     def __init__(self) -> None:
-        self.page, _ = SharedState.create(SharedStateLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16))
+        self.shared, _ = SharedState.create(SharedStateLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16))
         self.mouth = Mouth()
         self.said: list[tuple[str, str, Mapping[str, Any]]] = []
-        self._hearing = SubscriberCheck(self.page, self.mouth, lambda *event: self.said.append(event))
+        self._hearing = SubscriberCheck(self.shared, self.mouth, lambda *event: self.said.append(event))
         self.now = 100.0
-        self.page.beat("main", self.now)
+        self.shared.beat("main", self.now)
 
     def go(self, seconds: float) -> list[tuple[str, str, Mapping[str, Any]]]:
         """What is said meanwhile."""
@@ -90,16 +90,16 @@ def test_a_transport_that_cannot_say_says_that_once(desk: Desk) -> None:
 def test_a_main_that_is_started_anew_is_told_again_when_it_is_there(desk: Desk) -> None:
     desk.mouth.found = {"/left": ""}
     assert len(desk.go(5.0)) == 1
-    desk.page.beat("main", 0.0)
+    desk.shared.beat("main", 0.0)
     assert desk.go(5.0) == []
-    desk.page.beat("main", desk.now)
+    desk.shared.beat("main", desk.now)
     assert [text for _, text, _ in desk.go(5.0)] == ["nobody listens to /left"]
 
 
 def test_it_is_in_the_status_before_anything_is_set_up_and_leaves_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    station = Station(plan(tmp_path))
+    station = Station(spec_of(tmp_path))
     found = {"/left": ""}
     monkeypatch.setattr(station.robot, "unheard", lambda: dict(found), raising=False)
     station.go(90)

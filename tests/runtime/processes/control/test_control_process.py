@@ -32,8 +32,8 @@ class LateClock(VirtualClock):
 class Ticks:
     """In the place of the tick: keeps what it was called with."""
 
-    def __init__(self, page: SharedState) -> None:
-        self.status = np.zeros((), page.layout.control_dtype())
+    def __init__(self, shared: SharedState) -> None:
+        self.status = np.zeros((), shared.layout.control_dtype())
         self.done: list[tuple[int, float, float]] = []
 
     def __call__(self, step: int, planned: float, woke: float) -> None:
@@ -41,35 +41,35 @@ class Ticks:
 
 
 @pytest.fixture
-def page() -> SharedState:
-    page, _ = SharedState.create(SharedStateLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16))
-    return page
+def shared() -> SharedState:
+    shared, _ = SharedState.create(SharedStateLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16))
+    return shared
 
 
-def looped(page: SharedState, clock: VirtualClock, times: int, rate: float = 10.0) -> Ticks:
-    ticks: Any = Ticks(page)
-    loop = Loop(ticks, page, clock, rate, "FIFO 20")
+def looped(shared: SharedState, clock: VirtualClock, times: int, rate: float = 10.0) -> Ticks:
+    ticks: Any = Ticks(shared)
+    loop = Loop(ticks, shared, clock, rate, "FIFO 20")
     for _ in range(times):
         loop.once()
     return ticks
 
 
-def test_a_late_tick_does_not_make_the_next_one_late(page: SharedState) -> None:
-    done = looped(page, LateClock(0.0, 0.03, 0.0), 3).done
+def test_a_late_tick_does_not_make_the_next_one_late(shared: SharedState) -> None:
+    done = looped(shared, LateClock(0.0, 0.03, 0.0), 3).done
     assert [step for step, _, _ in done] == [1, 2, 3]
     assert [planned for _, planned, _ in done] == pytest.approx([100.1, 100.2, 100.3])
     assert [woke - planned for _, planned, woke in done] == pytest.approx([0.0, 0.03, 0.0])
 
 
-def test_missed_ticks_are_skipped_and_counted_and_steps_follow_the_clock(page: SharedState) -> None:
-    ticks = looped(page, LateClock(0.0, 0.25, 0.0), 3)
+def test_missed_ticks_are_skipped_and_counted_and_steps_follow_the_clock(shared: SharedState) -> None:
+    ticks = looped(shared, LateClock(0.0, 0.25, 0.0), 3)
     assert [step for step, _, _ in ticks.done] == [1, 4, 5]
     assert [planned for _, planned, _ in ticks.done] == pytest.approx([100.1, 100.4, 100.5])
     assert [woke - planned for _, planned, woke in ticks.done] == pytest.approx([0.0, 0.05, 0.0])
 
 
-def test_the_rate_is_exact_however_late_each_tick_is(page: SharedState) -> None:
-    done = looped(page, LateClock(*[0.001, 0.004] * 500), 1000, rate=200.0).done
+def test_the_rate_is_exact_however_late_each_tick_is(shared: SharedState) -> None:
+    done = looped(shared, LateClock(*[0.001, 0.004] * 500), 1000, rate=200.0).done
     assert done[-1][1] - done[0][1] == pytest.approx(999 / 200.0)
 
 
@@ -96,18 +96,18 @@ def test_its_figures_are_those_of_the_newest_ticks_and_counters_go_on() -> None:
 class Beats:
     """In the place of the tick: looks when control last said that it is alive."""
 
-    def __init__(self, page: SharedState) -> None:
-        self.status = np.zeros((), page.layout.control_dtype())
-        self._page = page
+    def __init__(self, shared: SharedState) -> None:
+        self.status = np.zeros((), shared.layout.control_dtype())
+        self._page = shared
         self.seen: list[float] = []
 
     def __call__(self, step: int, planned: float, woke: float) -> None:
         self.seen.append(self._page.last_beat("control"))
 
 
-def test_control_is_alive_in_the_page_before_its_tick_begins(page: SharedState) -> None:
-    beats: Any = Beats(page)
-    Loop(beats, page, LateClock(0.002), 10.0, "ordinary").once()
+def test_control_is_alive_in_the_page_before_its_tick_begins(shared: SharedState) -> None:
+    beats: Any = Beats(shared)
+    Loop(beats, shared, LateClock(0.002), 10.0, "ordinary").once()
     assert beats.seen == pytest.approx([100.102])
 
 
@@ -116,22 +116,22 @@ def test_the_tick_of_a_deployment_keeps_its_arms_in_their_boxes(
     tmp_path: Path, half: float, refused: bool
 ) -> None:
     box = {"lower": [-half] * 3, "upper": [half] * 3}
-    plan = station.plan(tmp_path, safety={"workspace": {"left_arm": box}})
-    page, _ = SharedState.create(plan.layout)
-    page.set_estop(EStop.CLEAR)
+    spec = station.spec(tmp_path, safety={"workspace": {"left_arm": box}})
+    shared, _ = SharedState.create(spec.layout)
+    shared.set_estop(EStop.CLEAR)
     clock, sink = VirtualClock(10.0), RecordingSink()
-    tick = make_tick(plan, page, sink, clock.now)
-    source = plan.transport.source(None, None, clock)
+    tick = make_tick(spec, shared, sink, clock.now)
+    source = spec.transport.source(None, None, clock)
     for step in range(5):  # until the joints are believed
         if step == 4:
-            page.rings["orders"].push(encode(Order(1, "follow", run=1)))
-            page.rings["orders"].push(encode(PostedChunk(1, 1, 4, np.tile(STANDS, (5, 1)))))
+            shared.rings["orders"].push(encode(Order(1, "follow", run=1)))
+            shared.rings["orders"].push(encode(PostedChunk(1, 1, 4, np.tile(STANDS, (5, 1)))))
         for process in ("main", "guard"):
-            page.beat(process, clock.now())
-        page.publish_observation(source.receive(0.0), dict.fromkeys(plan.cameras, 1))
+            shared.beat(process, clock.now())
+        shared.publish_observation(source.receive(0.0), dict.fromkeys(spec.cameras, 1))
         tick(step, clock.now())
         clock.advance(1 / 30)
-    *_, record = (m for m in map(decode, page.rings["ticks"].drain()) if isinstance(m, TickDone))
+    *_, record = (m for m in map(decode, shared.rings["ticks"].drain()) if isinstance(m, TickDone))
     assert record.refused is refused
     assert [note for note in record.notes if "box" in note] == (
         ["left_arm would leave the workspace box"] if refused else []

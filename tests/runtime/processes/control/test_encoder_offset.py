@@ -54,7 +54,7 @@ FAULTS = {
 
 def told(bench, state):
     if state == "estop":
-        bench.page.set_estop(EStop.LATCHED)
+        bench.shared.set_estop(EStop.LATCHED)
     elif state == "hold":
         bench.say("hold", run=1)
 
@@ -114,9 +114,9 @@ def test_e_stops_pressed_again_and_again_do_not_lead_a_robot_on():
     bench.break_encoder()
     bench.go(0.5)
     for _ in range(10):
-        bench.page.set_estop(EStop.LATCHED)
+        bench.shared.set_estop(EStop.LATCHED)
         bench.go(1.5)
-        bench.page.set_estop(EStop.CLEAR)
+        bench.shared.set_estop(EStop.CLEAR)
         bench.go(0.3)
     assert np.ptp(bench.moves) <= 0.25 + 0.06
 
@@ -182,14 +182,14 @@ def leapt(way):
 @pytest.mark.parametrize("way", [0.4, 0.9, -0.9])
 def test_where_a_joint_leapt_is_in_the_status_until_a_set_up_meets_it(way):
     bench = leapt(way)
-    assert bench.page.doubt.startswith(f"a reads {way:.3f} rad and is held at 0.000")
+    assert bench.shared.doubt.startswith(f"a reads {way:.3f} rad and is held at 0.000")
     bench.fault = lambda true, since: way  # the encoder is right: the joint stands there
     bench.say("meet")
     for _ in range(60):
         bench.go(PERIOD)
-        assert abs(bench.sent[-1, 0] - way) <= 0.1001 or bench.page.doubt
+        assert abs(bench.sent[-1, 0] - way) <= 0.1001 or bench.shared.doubt
     assert bench.sent[-1, 0] == pytest.approx(way, abs=1e-3)
-    assert bench.page.doubt == ""
+    assert bench.shared.doubt == ""
     most = TWO_JOINTS.velocity[0] * bench.safety.motion_velocity_scale * PERIOD
     assert np.abs(np.diff(bench.sent[:, 0])).max() <= most * 1.01
 
@@ -199,7 +199,7 @@ def test_a_joint_that_goes_away_from_the_set_up_that_meets_it_stays_in_doubt(way
     bench = leapt(way)
     bench.say("meet")
     bench.go(FOR)
-    assert "set up again" in bench.page.doubt
+    assert "set up again" in bench.shared.doubt
     assert bench.true[0] == pytest.approx(way, abs=0.05)
     assert "is its encoder off?" in bench.said("implausible")[-1].text
 
@@ -219,4 +219,4 @@ def test_a_stop_ends_at_once_what_a_set_up_leads_to_where_a_joint_is_read(end):
     assert 0.05 < begins < 0.6
     bench.go(2.0)
     assert abs(bench.true[0] - begins) <= 0.1
-    assert bench.page.doubt
+    assert bench.shared.doubt

@@ -7,7 +7,7 @@ from tests.runtime.tick_bench import WITH_GRIPPER, Bench, following
 NAN = float("nan")
 
 
-def plan(gripper, count=60, arm=0.0):
+def spec_of(gripper, count=60, arm=0.0):
     rows = np.zeros((count, 3))
     rows[:, :2], rows[:, 2] = arm, gripper
     return rows
@@ -58,7 +58,7 @@ def test_what_cannot_be_locked_is_refused_and_changes_nothing(values, said):
 
 def test_the_policy_moves_the_arm_and_not_a_locked_gripper(bench):
     bench.lock(NAN, NAN, 0.05)
-    following(bench, plan(0.1, arm=0.03))
+    following(bench, spec_of(0.1, arm=0.03))
     bench.run(20)
     assert bench.sent[-1] == pytest.approx([0.03, 0.03, 0.05])
     record = bench.records()[-1]
@@ -83,7 +83,7 @@ def test_locking_elsewhere_goes_there_within_the_limits_and_nothing_else_moves(b
 
 
 def test_unlocking_moves_nothing_by_itself(bench):
-    following(bench, plan(0.05))
+    following(bench, spec_of(0.05))
     bench.say("hold", run=1)
     bench.run(5)
     bench.lock(NAN, NAN, 0.1)
@@ -96,7 +96,7 @@ def test_unlocking_moves_nothing_by_itself(bench):
 
 def test_unlocking_under_a_policy_lets_it_have_the_gripper_within_the_limits(bench):
     bench.lock(NAN, NAN, 0.05)
-    following(bench, plan(0.1))
+    following(bench, spec_of(0.1))
     bench.run(9)
     bench.lock(NAN, NAN, NAN)
     bench.run(20)
@@ -124,16 +124,16 @@ def test_a_gripper_locked_and_unlocked_in_the_middle_of_a_motion_never_jumps(ben
 
 
 def test_the_e_stop_knows_of_no_lock(bench):
-    following(bench, plan(0.05))
+    following(bench, spec_of(0.05))
     bench.run(5)
-    bench.page.set_estop(2)
+    bench.shared.set_estop(2)
     bench.lock(NAN, NAN, 0.1)
     bench.run(10)
     assert (bench.sent[-10:, 2] == bench.sent[-11, 2]).all()
 
 
 def test_locks_that_are_none_are_said_and_control_goes_on(bench):
-    following(bench, plan(0.05))
+    following(bench, spec_of(0.05))
     bench.lock(0.5, NAN, NAN)
     bench.run(3)
     assert "a is no gripper" in bench.said("lock_refused")[0].text

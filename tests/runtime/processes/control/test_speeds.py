@@ -78,17 +78,17 @@ def test_a_refused_action_stops_the_base(bench: Bench) -> None:
 
 
 def test_the_e_stop_stops_the_base_at_once_however_fast_it_is_measured(bench: Bench) -> None:
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     bench.moved_by_hand = np.array([0.0, 0.4])
     bench.run(5)
     assert (bench.sent[-5:, 1] == 0.0).all()
-    bench.page.set_estop(EStop.CLEAR)
+    bench.shared.set_estop(EStop.CLEAR)
     bench.run(20)
     assert bench.sent[-1][1] == 0.0
 
 
 def test_an_e_stop_within_the_tick_stops_the_base(bench: Bench) -> None:
-    bench.before_send = lambda: bench.page.set_estop(EStop.LATCHED)
+    bench.before_send = lambda: bench.shared.set_estop(EStop.LATCHED)
     bench.run()
     assert bench.sent[-1][1] == 0.0
 
@@ -134,7 +134,7 @@ def test_a_base_does_not_drive_on_because_it_is_measured_driving_where_it_should
 
 
 def test_a_speed_is_no_gripper_to_be_locked(bench: Bench) -> None:
-    bench.page.rings["orders"].push(encode(LockGrippers(np.array([np.nan, 0.4]))))
+    bench.shared.rings["orders"].push(encode(LockGrippers(np.array([np.nan, 0.4]))))
     bench.run()
     assert [event.text for event in bench.said("lock_refused")] == [
         "base.vx is no gripper: only grippers are locked"
@@ -149,9 +149,9 @@ def test_a_person_cannot_have_a_base_driven_by_a_motion_and_an_approach_leaves_i
         robot.joint_names, robot.lower, robot.upper, robot.velocity, grippers, none, robot.speed_dims
     )
     settings = SimpleNamespace(safety=SafetySettings())
-    plan: Any = SimpleNamespace(robot=robot, limits=limits, deployment=settings, dims=DimensionKinds())
+    spec: Any = SimpleNamespace(robot=robot, limits=limits, deployment=settings, dims=DimensionKinds())
     unused: Any = None
-    targets = Targets(plan, unused, unused)
+    targets = Targets(spec, unused, unused)
     driving = robot.poses["home"].copy()
     driving[robot.speed_dims[0]] = 0.2
     with pytest.raises(

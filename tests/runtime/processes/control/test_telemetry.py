@@ -84,7 +84,7 @@ def test_what_comes_near_is_told_once_and_how_near_it_came_when_it_is_over():
 def test_a_record_says_what_filled_its_tick(sent, simulated, source):
     bench = Bench()
     bench.observe()
-    report = Telemetry(bench.page)
+    report = Telemetry(bench.shared)
     report.begin(3, 100.0)
     report.record(bench.tick._eyes.look(), sent, simulated)
     (record,) = bench.records()
@@ -95,7 +95,7 @@ def test_a_restarted_control_goes_on_counting():
     bench = following(Bench())
     bench.tick.status["missed"] = 5
     bench.run(2)
-    assert Telemetry(bench.page).status["missed"] == 5
+    assert Telemetry(bench.shared).status["missed"] == 5
 
 
 def test_what_leads_a_step_is_the_chunk_with_the_largest_part():

@@ -21,7 +21,7 @@ def test_a_new_control_keeps_silent(bench):
 
 def test_nothing_is_sent_before_the_guard_has_read_its_latch():
     bench = Bench()
-    bench.page.set_estop(EStop.UNKNOWN)
+    bench.shared.set_estop(EStop.UNKNOWN)
     following(bench)
     bench.run(3)
     assert bench.sink.sent == []
@@ -65,12 +65,12 @@ def test_a_motion_is_interrupted_within_one_tick(bench):
 def test_the_e_stop_sends_the_measured_position_and_refuses_everything_else(bench):
     following(bench)
     bench.run(5)
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     bench.measured = bench.moved_by_hand = np.array([0.07, 0.03])
     bench.say("motion", goal=np.array([1.0, 1.0]))
     bench.run(6)
     assert np.allclose(bench.sink.sent[-1], [0.07, 0.03], atol=1e-4)
-    assert bench.page.control.read()["estop_obeyed"]
+    assert bench.shared.control.read()["estop_obeyed"]
     assert bench.said("estopped")
 
 
@@ -80,7 +80,7 @@ def test_the_e_stop_repeats_the_last_position_where_the_measurement_is_old(bench
     bench.feed = False
     bench.run(15)
     last = bench.sink.sent[-1]
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     bench.measured = np.array([1.0, 1.0])
     bench.run(1)
     assert (bench.sink.sent[-1] == last).all()
@@ -90,7 +90,7 @@ def test_an_arm_that_comes_back_elsewhere_under_e_stop_is_not_pulled_to_where_it
     """It was switched off and on again after the e-stop, as one does."""
     bench.say("motion", goal=np.zeros(2))
     bench.run(3)
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     bench.run(30)
     bench.feed = False
     bench.run(40)
@@ -104,7 +104,7 @@ def test_an_arm_that_comes_back_elsewhere_under_e_stop_is_not_pulled_to_where_it
     bench.run(5)
     way = np.array([0.1, 0.2, 0.3, 0.3, 0.3])  # no faster than it moves
     assert bench.sent[told:] == pytest.approx(np.outer(way, [1.0, 0.0]), abs=1e-6)
-    bench.page.set_estop(EStop.CLEAR)
+    bench.shared.set_estop(EStop.CLEAR)
     bench.run(5)
     assert bench.sent[-1] == pytest.approx([0.3, 0.0], abs=1e-6)
 
@@ -148,11 +148,11 @@ def test_a_gripper_that_was_on_its_way_to_its_lock_does_not_go_on_after_an_e_sto
     bench.run(3)
     bench.lock(float("nan"), float("nan"), 0.1)
     bench.run(2)
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     bench.run(10)
     stood = bench.sent[-1]
     assert 0.0 < stood[2] < 0.09
-    bench.page.set_estop(EStop.CLEAR)
+    bench.shared.set_estop(EStop.CLEAR)
     bench.run(30)
     assert bench.sent[-1] == pytest.approx(stood, abs=1e-6)
     assert np.isnan(bench.status["locked"]).all()
@@ -160,9 +160,9 @@ def test_a_gripper_that_was_on_its_way_to_its_lock_does_not_go_on_after_an_e_sto
 
 def test_releasing_the_e_stop_holds_and_does_not_go_on(bench):
     following(bench)
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     bench.run(2)
-    bench.page.set_estop(EStop.CLEAR)
+    bench.shared.set_estop(EStop.CLEAR)
     bench.run(10)
     assert bench.behaviour == "hold"
     assert (np.array(bench.sink.sent[-5:]) == bench.sink.sent[-1]).all()
@@ -252,7 +252,7 @@ def test_chunks_of_a_run_that_is_over_are_ignored(bench):
     bench.say("hold", run=0)
     bench.chunk(9, wave(30, start=1.0))
     bench.run(3)
-    merged = [decode(m) for m in bench.page.rings["control_events"].drain()]
+    merged = [decode(m) for m in bench.shared.rings["control_events"].drain()]
     assert [m.dropped for m in merged if isinstance(m, ChunkMerged)] == [
         "",
         "control is not following that run any more",
@@ -295,25 +295,25 @@ def test_each_tick_is_written_down_with_its_source_and_its_makers(bench):
 
 def test_an_e_stop_from_before_this_start_sends_nothing_until_the_robot_has_been_measured():
     bench = Bench(seen=False)
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     bench.feed = False
     bench.run(5)
     assert bench.sink.sent == []  # nobody knows where the robot is: zero would be a command to go there
-    assert bench.page.control.read()["estop_obeyed"]
+    assert bench.shared.control.read()["estop_obeyed"]
     bench.measured, bench.feed = np.array([0.4, -0.3]), True
     bench.run(6)
     assert np.allclose(bench.sink.sent, [[0.4, -0.3]] * 3)  # and not before several samples agree
-    bench.page.set_estop(EStop.CLEAR)
+    bench.shared.set_estop(EStop.CLEAR)
     bench.run(3)
     assert np.allclose(bench.sink.sent[-1], [0.4, -0.3])
 
 
 def test_releasing_an_e_stop_over_a_robot_that_was_never_measured_keeps_silent():
     bench = Bench(seen=False)
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     bench.feed = False
     bench.run(3)
-    bench.page.set_estop(EStop.CLEAR)
+    bench.shared.set_estop(EStop.CLEAR)
     bench.run(3)
     assert bench.behaviour == "silent"
     assert bench.sink.sent == []
@@ -355,9 +355,10 @@ def test_a_chunk_that_comes_too_late_does_not_end_a_starvation(bench):
 
 def test_the_record_of_a_tick_is_on_its_way_before_main_can_see_the_tick(bench):
     seen = []
-    push = bench.page.rings["ticks"].push
-    bench.page.rings["ticks"].push = lambda payload: (
-        seen.append((type(decode(payload)).__name__, int(bench.page.control.read()["step"]))) or push(payload)
+    push = bench.shared.rings["ticks"].push
+    bench.shared.rings["ticks"].push = lambda payload: (
+        seen.append((type(decode(payload)).__name__, int(bench.shared.control.read()["step"])))
+        or push(payload)
     )
     following(bench)
     bench.run()
@@ -368,7 +369,7 @@ def test_an_e_stop_pressed_within_a_tick_repeats_the_last_command(bench):
     following(bench, wave(60, speed=1.5))
     bench.run(5)
     last = bench.sink.sent[-1]
-    bench.before_send = lambda: bench.page.set_estop(EStop.LATCHED)
+    bench.before_send = lambda: bench.shared.set_estop(EStop.LATCHED)
     bench.run()
     assert np.allclose(bench.sink.sent[-1], last)
     assert bench.records()[-1].notes == ["e-stop pressed within the tick"]
@@ -490,7 +491,7 @@ def test_until_joints_that_come_back_are_believed_what_was_commanded_last_is(bef
     elif before == "hold":
         bench.say("hold")
     elif before == "estop":
-        bench.page.set_estop(EStop.LATCHED)
+        bench.shared.set_estop(EStop.LATCHED)
     bench.run(8, stretch)
     brought_back(bench, np.array([-0.3, 0.3, 0.0]), stretch)
     held = bench.sent[-1]
@@ -504,7 +505,7 @@ def test_until_joints_that_come_back_are_believed_what_was_commanded_last_is(bef
     elif ordered == "hold":
         bench.say("hold")
     elif ordered != "nothing":
-        bench.page.set_estop(EStop.LATCHED if ordered == "estop" else EStop.CLEAR)
+        bench.shared.set_estop(EStop.LATCHED if ordered == "estop" else EStop.CLEAR)
     bench.run(1, stretch)
     while not bench.status["believed"]:
         assert bench.sent[-1] == pytest.approx(held, abs=1e-9)
@@ -543,7 +544,7 @@ def test_an_arm_that_sags_a_little_is_held_at_its_target(bench):
 def test_a_spike_that_a_joint_could_have_moved_does_not_move_an_arm_under_e_stop(bench, ticks):
     following(bench, wave(60, speed=0.0))
     bench.run(5)
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     bench.run(ticks)
     bench.measured = np.array([0.3, 0.0])
     bench.run(30)
@@ -554,7 +555,7 @@ def test_a_spike_that_a_joint_could_have_moved_does_not_move_an_arm_under_e_stop
 def test_an_arm_that_reads_below_its_command_is_not_led_away_by_the_e_stop(bench, sags):
     bench.say("motion", goal=np.zeros(2))
     bench.run(10)
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     for _ in range(40):
         bench.moved_by_hand = bench.sent[-1] - sags
         bench.run()
@@ -590,7 +591,7 @@ def test_a_node_that_comes_back_at_0_and_is_pulled_at_first_is_left_alone(bench)
 def test_an_arm_under_e_stop_does_not_sink_under_its_own_measurement(bench):
     following(bench)
     bench.run(5)
-    bench.page.set_estop(EStop.LATCHED)
+    bench.shared.set_estop(EStop.LATCHED)
     bench.run(1)
     for _ in range(90):  # a joint that always ends up a little below where it is told to be
         bench.moved_by_hand = bench.sink.sent[-1].astype(float) - 0.02
@@ -686,7 +687,7 @@ def test_a_motion_refused_again_after_it_stopped_never_jumps_back(bench):
 
 
 def ask_node(bench, word="scene_reset", **data):
-    bench.page.rings["orders"].push(encode(NodeRequest(word, data)))
+    bench.shared.rings["orders"].push(encode(NodeRequest(word, data)))
 
 
 def test_a_word_for_the_node_goes_to_the_sink_and_moves_nothing(bench):
@@ -709,7 +710,7 @@ def test_a_sink_that_takes_no_words_is_an_event_and_not_the_end_of_control(bench
 
 @pytest.mark.parametrize("state", [EStop.LATCHED, EStop.UNKNOWN])
 def test_no_word_reaches_the_node_while_the_e_stop_is_not_clear(bench, state):
-    bench.page.set_estop(state)
+    bench.shared.set_estop(state)
     ask_node(bench)
     bench.run()
     assert bench.sink.told == []
@@ -717,7 +718,7 @@ def test_no_word_reaches_the_node_while_the_e_stop_is_not_clear(bench, state):
 
 
 def smoothed(bench):
-    return bench.page.control.read()["smoothed"].tolist()
+    return bench.shared.control.read()["smoothed"].tolist()
 
 
 def test_the_status_says_what_was_wanted_before_safety_and_nan_where_nothing_was(bench):
@@ -742,7 +743,7 @@ def test_the_status_says_what_was_wanted_before_safety_and_nan_where_nothing_was
 @pytest.mark.parametrize("payload", [b"", b"\xc1", encode(Order(1, "hold"))[:-3]])
 def test_a_message_that_is_none_is_said_and_control_goes_on(bench, payload):
     following(bench)
-    bench.page.rings["orders"].push(payload)
+    bench.shared.rings["orders"].push(payload)
     bench.say("hold", run=1)
     bench.run(3)
     assert len(bench.said("unreadable")) == 1

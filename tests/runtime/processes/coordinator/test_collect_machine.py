@@ -9,12 +9,12 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import initialize, rule
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.processes.coordinator.session.transitions import State
 from runtime.recording.labels import newest
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from tests.runtime.collect_station import CollectPlan, CollectStation
-from tests.runtime.lockstep_station import STANDS, plan
+from tests.runtime.lockstep_station import STANDS, spec_of
 from tests.runtime.processes.coordinator.session import test_session_machine
 from tests.runtime.processes.coordinator.session.test_session_machine import ticks
 
@@ -27,17 +27,17 @@ class Collects(test_session_machine.Machine):
 
     @initialize(mode=st.sampled_from(["absolute", "relative"]), home=st.booleans())
     def begin(self, mode: str, home: bool) -> None:
-        made = plan(
+        made = spec_of(
             Path(self.folder.name), self.rows, setup={"home": home}, recording={"min_free_bytes": 0}
         ).resolved
         leads = {
             "source": "relay",
             "mode": mode,
             "leader": {"kind": "zmq"},
-            "cameras": [camera.key for camera in family.plan(made).robot.cameras[:1]],
+            "cameras": [camera.key for camera in station_spec.spec_of(made).robot.cameras[:1]],
         }
-        resolved = deployment.changed(made, {"collection": leads}, "test")
-        robot = family.plan(resolved).robot
+        resolved = loader.changed(made, {"collection": leads}, "test")
+        robot = station_spec.spec_of(resolved).robot
         collects = CollectPlan(resolved, robot, {}, STANDS, self.rows, "joint", "", True, False)
         self.opened: dict[str, bool] = {}  # the episodes, and whether each was discarded
         self.watch(CollectStation(collects))

@@ -12,62 +12,62 @@ LAYOUT = SharedStateLayout(dim=2, eef_dim=8, cameras=())
 
 
 @pytest.fixture
-def page():
+def shared():
     return SharedState(LAYOUT, mmap.mmap(-1, SharedState.size(LAYOUT)))
 
 
-def obey(page, number):
-    status = page.control.read().copy()
+def obey(shared, number):
+    status = shared.control.read().copy()
     status["order"] = number
-    page.control.write(status)
+    shared.control.write(status)
 
 
-def read(page):
-    return [decode(payload) for payload in page.rings["orders"].drain()]
+def read(shared):
+    return [decode(payload) for payload in shared.rings["orders"].drain()]
 
 
-def test_orders_are_numbered_and_arrive_in_order(page):
-    orders = ControlQueue(page)
+def test_orders_are_numbered_and_arrive_in_order(shared):
+    orders = ControlQueue(shared)
     assert orders.give("hold", run=3, reason="halted") == 1
     assert orders.give("motion", goal=np.array([0.5, 1.0])) == 2
-    first, second = read(page)
+    first, second = read(shared)
     assert first == Order(1, "hold", 3, None, "halted")
     assert (second.number, second.kind, second.goal.tolist()) == (2, "motion", [0.5, 1.0])
 
 
-def test_an_order_is_obeyed_once_control_says_so(page):
-    orders = ControlQueue(page)
+def test_an_order_is_obeyed_once_control_says_so(shared):
+    orders = ControlQueue(shared)
     number = orders.give("hold")
     assert not orders.obeyed(number)
-    obey(page, number)
+    obey(shared, number)
     assert orders.obeyed(number)
 
 
-def test_a_restarted_main_counts_on_from_what_control_has_obeyed(page):
-    obey(page, 41)
-    orders = ControlQueue(page)
+def test_a_restarted_main_counts_on_from_what_control_has_obeyed(shared):
+    obey(shared, 41)
+    orders = ControlQueue(shared)
     assert not orders.obeyed(orders.give("follow", run=1))
-    assert read(page)[0].number == 42
+    assert read(shared)[0].number == 42
 
 
-def test_chunks_keep_their_numbers_and_their_place_among_the_orders(page):
-    orders = ControlQueue(page)
+def test_chunks_keep_their_numbers_and_their_place_among_the_orders(shared):
+    orders = ControlQueue(shared)
     orders.give("follow", run=1)
     orders.post(PostedChunk(orders.next_chunk(), 1, 10, np.zeros((3, 2))))
     orders.give("hold", run=1)
-    assert [type(message) for message in read(page)] == [Order, PostedChunk, Order]
+    assert [type(message) for message in read(shared)] == [Order, PostedChunk, Order]
     assert orders.next_chunk() == 2
 
 
-def test_a_word_for_the_node_goes_the_way_of_the_orders(page):
-    orders = ControlQueue(page)
+def test_a_word_for_the_node_goes_the_way_of_the_orders(shared):
+    orders = ControlQueue(shared)
     orders.give("hold")
     orders.ask_node("scene_reset", {"id": "r", "seed": 3})
-    assert read(page)[1] == NodeRequest("scene_reset", {"id": "r", "seed": 3})
+    assert read(shared)[1] == NodeRequest("scene_reset", {"id": "r", "seed": 3})
 
 
-def test_a_control_that_does_not_read_is_a_fault_and_not_silence(page):
-    orders = ControlQueue(page)
+def test_a_control_that_does_not_read_is_a_fault_and_not_silence(shared):
+    orders = ControlQueue(shared)
     large = PostedChunk(1, 1, 10, np.zeros((40_000, 2)))
     orders.post(large)
     with pytest.raises(RuntimeFault, match="control does not read its orders: the ring is full"):

@@ -9,20 +9,20 @@ from runtime.core.errors import SetupError
 from runtime.ipc.messages import UNHEARD, Command, EpisodeOpened, Event, encode
 from runtime.processes.coordinator.coordinator import Coordinator
 from runtime.processes.coordinator.session.transitions import State
-from tests.runtime.lockstep_station import STANDS, Station, plan, ramp
+from tests.runtime.lockstep_station import STANDS, Station, ramp, spec_of
 
 
 def without(station: Station, process: str, seconds: float) -> None:
     """Let everything go on but the heartbeat of `process`."""
-    beat = station.page.beat
-    station.page.beat = lambda name, now: None if name == process else beat(name, now)
-    station.go(int(seconds * station.plan.rate))
-    station.page.beat = beat
+    beat = station.shared.beat
+    station.shared.beat = lambda name, now: None if name == process else beat(name, now)
+    station.go(int(seconds * station.spec.rate))
+    station.shared.beat = beat
 
 
 @pytest.mark.parametrize("process", ["control", "reception", "media"])
 def test_a_process_that_hangs_in_a_run_holds_it_and_is_named(tmp_path: Path, process: str) -> None:
-    station = Station(plan(tmp_path)).running(10)
+    station = Station(spec_of(tmp_path)).running(10)
     without(station, process, 1.5)
     assert station.state is State.HOLDING
     assert f"no sign of life from the process {process}" in station.reason
@@ -39,7 +39,7 @@ def test_a_process_that_hangs_in_a_run_holds_it_and_is_named(tmp_path: Path, pro
 def test_a_run_whose_chunks_all_come_too_late_is_ended_by_the_rule_of_starvation(
     tmp_path: Path, answer: str, state: State
 ) -> None:
-    late = plan(tmp_path, lambda seen, number: ramp(seen.step, 2), delay=4, faults={"starvation": answer})
+    late = spec_of(tmp_path, lambda seen, number: ramp(seen.step, 2), delay=4, faults={"starvation": answer})
     station = Station(late).ready()
     station.command("run")
     station.reach(state, 5.0)
@@ -54,8 +54,8 @@ def test_a_run_whose_chunks_all_come_too_late_is_ended_by_the_rule_of_starvation
 def test_a_run_of_which_no_answer_can_be_used_is_ended_by_the_rule_of_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, state: State
 ) -> None:
-    station = Station(plan(tmp_path, faults={"policy_error": answer, "starvation": "slow"})).ready()
-    monkeypatch.setattr(station.main.inference.asking, "note", lambda answered: [][0])
+    station = Station(spec_of(tmp_path, faults={"policy_error": answer, "starvation": "slow"})).ready()
+    monkeypatch.setattr(station.main.inference.requests, "note", lambda answered: [][0])
     station.command("run")
     station.reach(state, 10.0)
     assert "the policy's answer cannot be used: IndexError" in station.reason
@@ -65,7 +65,7 @@ def test_a_run_of_which_no_answer_can_be_used_is_ended_by_the_rule_of_errors(
 def test_an_arm_that_was_moved_while_ready_makes_the_station_idle_and_stays_where_it_is(
     tmp_path: Path,
 ) -> None:
-    station = Station(plan(tmp_path)).running(10)
+    station = Station(spec_of(tmp_path)).running(10)
     station.stop()
     station.robot.blocked = True
     moved = STANDS.copy()
@@ -77,13 +77,13 @@ def test_an_arm_that_was_moved_while_ready_makes_the_station_idle_and_stays_wher
     assert station.state is State.IDLE
     assert "0.5" in station.reason  # by which it is known that it was moved; where it ends is followed
     assert "from where it was told to hold" in station.reason
-    arms = [dim for dim in range(len(STANDS)) if dim not in station.plan.robot.gripper_dims]
+    arms = [dim for dim in range(len(STANDS)) if dim not in station.spec.robot.gripper_dims]
     assert np.allclose(station.robot.sent[-1][arms], moved[arms], atol=0.05)
     station.close()
 
 
 def test_cameras_that_send_nothing_are_named(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path))
+    station = Station(spec_of(tmp_path))
     station.robot.cameras.remove("cam_left_wrist")
     station.go(10)
     assert station.state is State.DISCONNECTED
@@ -95,7 +95,7 @@ def test_cameras_that_send_nothing_are_named(tmp_path: Path) -> None:
 
 
 def test_a_recording_without_a_run_that_fails_is_over_and_a_run_may_begin(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     station.command("record_start")
     station.go(5)
     station.robot.picture = lambda number: np.zeros((2, 2, 3), np.uint8)  # a camera that changes its size
@@ -112,14 +112,14 @@ def test_a_recording_without_a_run_that_fails_is_over_and_a_run_may_begin(tmp_pa
 
 def restarted(station: Station, process: str) -> None:
     """As the supervisor says it."""
-    station.page.set_generation(process, station.page.generation(process) + 1)
+    station.shared.set_generation(process, station.shared.generation(process) + 1)
     station.go(3)
 
 
 def test_the_death_of_control_closes_a_recording_without_a_run_and_a_run_records_its_own(
     tmp_path: Path,
 ) -> None:
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     alone = station.command("record_start").data["episode"]
     station.go(5)
     restarted(station, "control")
@@ -138,7 +138,7 @@ def test_the_death_of_control_closes_a_recording_without_a_run_and_a_run_records
 def test_the_death_of_the_guard_leaves_a_recording_without_a_run_open_until_it_is_stopped(
     tmp_path: Path,
 ) -> None:
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     alone = station.command("record_start").data["episode"]
     station.go(5)
     restarted(station, "guard")
@@ -159,18 +159,18 @@ def test_the_death_of_the_guard_leaves_a_recording_without_a_run_open_until_it_i
 def test_a_process_that_was_restarted_and_says_nothing_yet_is_not_told_to_be_silent_since_the_machine_started(
     tmp_path: Path,
 ) -> None:
-    station = Station(plan(tmp_path)).running(60)
-    station.page.beat("media", 0.0)  # as the supervisor does before it starts one anew
-    beat = station.page.beat
-    station.page.beat = lambda name, now: None if name == "media" else beat(name, now)
+    station = Station(spec_of(tmp_path)).running(60)
+    station.shared.beat("media", 0.0)  # as the supervisor does before it starts one anew
+    beat = station.shared.beat
+    station.shared.beat = lambda name, now: None if name == "media" else beat(name, now)
     station.go(3)
     assert station.reason == "no sign of life from the process media since it was restarted"
-    station.page.beat = beat
+    station.shared.beat = beat
     station.close()
 
 
 def test_the_snapshot_says_how_the_last_run_ended(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, run={"duration_s": 0.5}))
+    station = Station(spec_of(tmp_path, run={"duration_s": 0.5}))
     station.running(30)
     shown = station.main.snapshot()
     assert shown["state"] == "ready"
@@ -182,8 +182,8 @@ def test_the_snapshot_says_how_the_last_run_ended(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("how", ["stop", "estop"])
 def test_a_media_that_does_not_read_keeps_nobody_from_stopping(tmp_path: Path, how: str) -> None:
-    station = Station(plan(tmp_path)).running(10)
-    station.page.rings["minutes"].push = lambda payload: False
+    station = Station(spec_of(tmp_path)).running(10)
+    station.shared.rings["minutes"].push = lambda payload: False
     if how == "stop":
         station.command("stop")
     else:
@@ -195,7 +195,7 @@ def test_a_media_that_does_not_read_keeps_nobody_from_stopping(tmp_path: Path, h
 
 
 def test_a_query_with_nonsense_is_refused_and_nothing_ends(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path))
+    station = Station(spec_of(tmp_path))
     ack = station.main.handle(Command("1", "events_since", {"number": "seven"}))
     assert ack.status == "refused"
     assert "'seven': must be a whole number" in ack.reason
@@ -203,8 +203,8 @@ def test_a_query_with_nonsense_is_refused_and_nothing_ends(tmp_path: Path) -> No
 
 
 def test_a_media_that_does_not_read_costs_the_record_and_not_the_station(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).running(10)
-    station.page.rings["minutes"].push = lambda payload: False
+    station = Station(spec_of(tmp_path)).running(10)
+    station.shared.rings["minutes"].push = lambda payload: False
     station.media.digest = lambda: None
     station.go(20)
     assert station.state in (State.RUNNING, State.HOLDING)
@@ -215,13 +215,13 @@ def test_a_media_that_does_not_read_costs_the_record_and_not_the_station(tmp_pat
 def test_events_from_before_main_was_there_are_kept_and_nothing_that_was_told_is_acted_on(
     tmp_path: Path,
 ) -> None:
-    station = Station(plan(tmp_path)).ready()
-    rings, told = station.page.rings, {"unheard": {"left_arm": "nobody listens"}}
+    station = Station(spec_of(tmp_path)).ready()
+    rings, told = station.shared.rings, {"unheard": {"left_arm": "nobody listens"}}
     rings["media_events"].push(encode(Event("source_frozen_cam_high", "the same picture", 0.1)))
     rings["media_events"].push(encode(EpisodeOpened(1, "one", "", "no room")))
     rings["control_events"].push(encode(Event(UNHEARD, "nobody listens", 0.1, data=told)))
     rings["control_events"].push(encode(Event("displaced", "the arm was moved", 0.1)))
-    station.main = Coordinator(station.plan, station.page, station.clock, station._runner)
+    station.main = Coordinator(station.spec, station.shared, station.clock, station._runner)
     assert [event["kind"] for event in station.main.events.since(0)] == [
         UNHEARD,
         "displaced",

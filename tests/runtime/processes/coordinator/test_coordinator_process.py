@@ -13,7 +13,7 @@ import zmq
 from runtime.ipc.bus import Endpoints, Subscriber
 from runtime.ipc.messages import Ack, Command, decode, encode
 from runtime.processes.coordinator.process import CommandService
-from tests.runtime.lockstep_station import DIM, Station, plan
+from tests.runtime.lockstep_station import DIM, Station, spec_of
 
 PATIENCE = 500  # times 10 ms
 
@@ -23,16 +23,16 @@ class Watched:
 
     def __init__(self, folder: Path) -> None:
         self._context: zmq.Context[Any] = zmq.Context()
-        self.station = Station(plan(folder))
+        self.station = Station(spec_of(folder))
         self._service = CommandService(self.station.main, self._context)
-        endpoint = Endpoints(self.station.plan.deployment.station_dir).read("main")["state"]
+        endpoint = Endpoints(self.station.spec.deployment.station_dir).read("main")["state"]
         self._reader = Subscriber(self._context, endpoint, "joints")
         self.serve = self._service.serve
-        self.context, self.endpoints = self._context, Endpoints(self.station.plan.deployment.station_dir)
+        self.context, self.endpoints = self._context, Endpoints(self.station.spec.deployment.station_dir)
 
     def joints(self) -> dict[str, Any]:
         """The newest joints, of the step that the station is at."""
-        step = int(self.station.page.control.read()["step"])
+        step = int(self.station.shared.control.read()["step"])
         for _ in range(PATIENCE):
             self._service._due.clear()  # time stands still here
             self._service.serve(0.0)
@@ -121,7 +121,7 @@ def test_an_aim_that_needs_what_is_being_loaded_is_answered_when_it_is_there(
 ) -> None:
     watched.station.ready()
     loaded: list[bool] = []
-    monkeypatch.setattr(watched.station.main.by_hand._targets, "prepare", lambda: bool(loaded))
+    monkeypatch.setattr(watched.station.main.manual._targets, "prepare", lambda: bool(loaded))
     asker = Asker(watched)
     asker.ask("step", jog=JOG)
     asker.ask("pose", pose="home")
@@ -137,7 +137,7 @@ def test_an_aim_that_needs_what_is_being_loaded_is_answered_when_it_is_there(
 def test_of_many_that_wait_for_what_is_being_loaded_some_are_refused(
     watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(watched.station.main.by_hand._targets, "prepare", lambda: False)
+    monkeypatch.setattr(watched.station.main.manual._targets, "prepare", lambda: False)
     monkeypatch.setattr("runtime.processes.coordinator.process._MOST_WAITING", 10)
     asker = Asker(watched)
     for number in range(13):

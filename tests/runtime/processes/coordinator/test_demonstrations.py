@@ -9,15 +9,15 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.errors import RecordingError, SetupError
 from runtime.datasets.published import publish
 from runtime.processes.coordinator.session.transitions import State
 from runtime.recording.labels import labels
 from runtime.recording.reader import Episode
-from runtime.station import spec as family
+from runtime.station import spec as station_spec
 from tests.runtime.collect_station import CollectStation, SelfDriven, collecting
-from tests.runtime.lockstep_station import MOVED, STANDS, column, plan
+from tests.runtime.lockstep_station import MOVED, STANDS, column, spec_of
 
 LEFT = MOVED[0]
 SESSION = {"uuid": "00000000-0000-4000-8000-000000000007", "dataset": "cups"}
@@ -71,7 +71,7 @@ def test_a_leader_says_no_chunks(tmp_path: Path) -> None:
     station.turn, seen = 0.002, set()
     for _ in range(30):
         station.go(1)
-        status = station.page.control.read()
+        status = station.shared.control.read()
         seen.add((int(status["chunk"]), int(status["chunks"])))
     assert seen <= {(-1, 0), (0, 0)}, "nothing is drawn where nothing is planned in chunks"
     station.command("stop")
@@ -168,7 +168,7 @@ def test_what_a_leader_wants_is_limited_by_safety_like_anything_else(tmp_path: P
     station.turn = 0.2  # 6 rad/s
     station.go(6)
     speed = np.abs(np.diff(station.robot.sent[:, LEFT])).max() * 30
-    assert speed <= station.plan.robot.velocity[LEFT] + 1e-6
+    assert speed <= station.spec.robot.velocity[LEFT] + 1e-6
     station.close()
 
 
@@ -259,7 +259,7 @@ def test_whatever_stops_us_stops_the_node_too(tmp_path: Path, cause: str) -> Non
         for _ in range(45):  # control sees that nobody is there after a second
             station._tick(station.step, station.clock.now())
             station.step += 1
-            station.clock.sleep_until(station.step / station.plan.rate)
+            station.clock.sleep_until(station.step / station.spec.rate)
     assert not station.robot.collects  # type: ignore[attr-defined]
     assert [word for word, _ in station.robot.told].count("collect_stop") == 5
     if cause != "main":
@@ -330,7 +330,7 @@ def test_a_station_set_up_to_collect_runs_no_policy_and_one_with_a_policy_collec
     with pytest.raises(SetupError, match="strategy while the station is set up to collect"):
         station.command("tune", strategy={"kind": "async"})
     station.ready()
-    assert station.main.plan.deployment.strategy.kind == "async"
+    assert station.main.spec.deployment.strategy.kind == "async"
     with pytest.raises(SetupError, match="set up with collect = true first"):
         station.command("run", mode="collect")
     with pytest.raises(SetupError, match="set up with collect first"):
@@ -363,7 +363,7 @@ def test_a_node_that_cannot_be_told_to_leave_off_is_refused(
         "recording": {"min_free_bytes": 0},
     }
     with pytest.raises(SetupError, match=r"to leave off.*nor says what it applied") as refused:
-        family.plan(deployment.resolve(tree, {}, "test"))
+        station_spec.spec_of(loader.resolve(tree, {}, "test"))
     assert f"collection.leader.kind = '{leader}'" in str(refused.value)
 
 
@@ -378,7 +378,7 @@ def test_a_set_up_to_collect_takes_no_policy(tmp_path: Path, given: dict[str, An
 def test_a_deployment_without_a_collection_says_so(tmp_path: Path) -> None:
     from tests.runtime.lockstep_station import Station
 
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     assert station.main.snapshot()["collect"] is None
     with pytest.raises(SetupError, match=r"no \[collection\]"):
         station.command("setup", collect=True)
@@ -390,7 +390,7 @@ def test_a_deployment_without_a_collection_says_so(tmp_path: Path) -> None:
 def test_a_snapshot_says_what_the_next_episode_will_be_like_in_the_words_of_its_manifest(
     tmp_path: Path,
 ) -> None:
-    cameras = list(plan(tmp_path).cameras)[:2]
+    cameras = list(spec_of(tmp_path).cameras)[:2]
     station = collecting(tmp_path, cameras=cameras, columns=["eef"])
     assert station.collect["setup"] is None
     station.armed()
@@ -413,7 +413,7 @@ def test_a_snapshot_says_what_the_next_episode_will_be_like_in_the_words_of_its_
 
 
 def test_only_the_cameras_and_columns_of_the_schema_are_recorded(tmp_path: Path) -> None:
-    cameras = [camera.key for camera in collecting(tmp_path / "other").plan.robot.cameras][:1]
+    cameras = [camera.key for camera in collecting(tmp_path / "other").spec.robot.cameras][:1]
     station = collecting(tmp_path, cameras=cameras, columns=["eef"], primary_camera=cameras[0]).armed()
     manifest = demonstrated(station, 10).manifest
     assert list(manifest["cameras"]) == cameras

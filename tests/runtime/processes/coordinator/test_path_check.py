@@ -22,8 +22,8 @@ def ways(**safety: Any) -> PathCheck:
     grippers = np.isin(np.arange(own.dim), own.gripper_dims)
     limits = Limits(own.joint_names, own.lower, own.upper, own.velocity, grippers, np.zeros(own.dim, bool))
     settings = SimpleNamespace(safety=SafetySettings(**safety))
-    plan: Any = SimpleNamespace(robot=own, limits=limits, deployment=settings, dims=DimensionKinds())
-    return PathCheck(plan)
+    spec: Any = SimpleNamespace(robot=own, limits=limits, deployment=settings, dims=DimensionKinds())
+    return PathCheck(spec)
 
 
 def test_a_way_into_the_other_arm_is_refused_with_the_pair_where_and_what_to_do() -> None:

@@ -18,7 +18,7 @@ from runtime.ipc.shared_state import EStop
 from runtime.processes.coordinator.process import CommandService
 from runtime.processes.coordinator.session.transitions import State
 from tests import presses
-from tests.runtime.lockstep_station import Station, plan
+from tests.runtime.lockstep_station import Station, spec_of
 
 PATIENCE = 500  # turns
 PAGE = "web:ann:p1"
@@ -29,10 +29,10 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.context: zmq.Context[Any] = zmq.Context()
-        self.station = Station(plan(folder))
+        self.station = Station(spec_of(folder))
         self.main = self.station.main
         self.service = CommandService(self.main, self.context)
-        self.folder = self.station.plan.deployment.station_dir
+        self.folder = self.station.spec.deployment.station_dir
         self.key = Key(self.folder)
 
     def client(self) -> zmq.Socket[bytes]:
@@ -203,7 +203,7 @@ def test_a_flood_of_questions_is_told_once_and_a_stop_is_answered_in_a_few_turns
 def test_a_press_at_the_wrong_socket_stops_the_robot_and_is_latched_by_the_guard(bench: Bench) -> None:
     bench.station.running(5)
     assert bench.ask(bench.client(), Command("p", "estop", {"why": "smoke"})).status == "accepted"
-    assert bench.main.page.estop is EStop.LATCHED
+    assert bench.main.shared.estop is EStop.LATCHED
     bench.station.go(40)
     assert bench.main.session.state is State.FAULTED
     assert json.loads((bench.folder / "estop.json").read_text("utf-8"))["why"] == "smoke"
@@ -212,13 +212,13 @@ def test_a_press_at_the_wrong_socket_stops_the_robot_and_is_latched_by_the_guard
 
 
 def test_whatever_is_wrong_with_a_press_at_the_wrong_socket_it_is_pressed(bench: Bench) -> None:
-    page, client = bench.main.page, bench.client()
+    shared, client = bench.main.shared, bench.client()
     for name, payload in presses.PACKED.items():
-        page.set_estop(EStop.CLEAR)
+        shared.set_estop(EStop.CLEAR)
         client.send(payload)
         assert bench.service._server.socket.poll(5000)
         bench.service.serve(0.0)
-        assert (name, page.estop) == (name, EStop.LATCHED)
+        assert (name, shared.estop) == (name, EStop.LATCHED)
         answer = decode(client.recv())
         assert isinstance(answer, Ack)
         assert answer.status == "accepted"
@@ -229,4 +229,4 @@ def test_a_press_whose_uuid_was_anothers_is_pressed(bench: Bench) -> None:
     assert bench.ask(bench.client(), stop, signed=True).status == "accepted"
     press = Command(stop.uuid, "estop", user="ann", holder=PAGE)
     assert bench.ask(bench.client(), press).status == "accepted"
-    assert bench.main.page.estop is EStop.LATCHED
+    assert bench.main.shared.estop is EStop.LATCHED

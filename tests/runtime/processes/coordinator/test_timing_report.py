@@ -10,33 +10,33 @@ from runtime.processes.coordinator.timing_report import TimingReport
 
 
 @pytest.fixture
-def page() -> SharedState:
-    page, _ = SharedState.create(SharedStateLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16))
-    return page
+def shared() -> SharedState:
+    shared, _ = SharedState.create(SharedStateLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16))
+    return shared
 
 
-def tell(page: SharedState, scheduling: str, p99_ms: float = 0.1, ticks: int = 1000) -> None:
-    status = np.zeros((), page.layout.control_dtype())
+def tell(shared: SharedState, scheduling: str, p99_ms: float = 0.1, ticks: int = 1000) -> None:
+    status = np.zeros((), shared.layout.control_dtype())
     status["scheduling"], status["ticks"], status["lateness_p99"] = scheduling.encode(), ticks, p99_ms / 1000
-    page.control.write(status)
+    shared.control.write(status)
 
 
-def watching(page: SharedState, asked: bool = True) -> TimingReport:
-    return TimingReport(page, 100.0, 20, asked)
+def watching(shared: SharedState, asked: bool = True) -> TimingReport:
+    return TimingReport(shared, 100.0, 20, asked)
 
 
 def kinds(punctuality: TimingReport, now: float) -> list[str]:
     return [event.kind for event in punctuality.look(now)]
 
 
-def test_who_has_the_real_time_class_and_is_on_time_is_told_nothing(page: SharedState) -> None:
-    tell(page, "FIFO 20")
-    assert watching(page).look(10.0) == []
+def test_who_has_the_real_time_class_and_is_on_time_is_told_nothing(shared: SharedState) -> None:
+    tell(shared, "FIFO 20")
+    assert watching(shared).look(10.0) == []
 
 
-def test_another_class_is_told_once_with_what_to_do_about_it(page: SharedState) -> None:
-    tell(page, "slice 0.1 ms unlocked")
-    told = watching(page)
+def test_another_class_is_told_once_with_what_to_do_about_it(shared: SharedState) -> None:
+    tell(shared, "slice 0.1 ms unlocked")
+    told = watching(shared)
     (event,) = told.look(10.0)
     assert event.kind == "scheduling"
     assert "'slice 0.1 ms unlocked'" in event.text
@@ -45,35 +45,35 @@ def test_another_class_is_told_once_with_what_to_do_about_it(page: SharedState) 
     assert told.look(12.0) == []
 
 
-def test_who_did_not_ask_for_the_class_gets_no_advice(page: SharedState) -> None:
-    tell(page, "ordinary")
-    assert watching(page, asked=False).look(10.0) == []
+def test_who_did_not_ask_for_the_class_gets_no_advice(shared: SharedState) -> None:
+    tell(shared, "ordinary")
+    assert watching(shared, asked=False).look(10.0) == []
 
 
-def test_late_ticks_are_told_once_and_once_again_when_they_are_over(page: SharedState) -> None:
-    told = watching(page)
+def test_late_ticks_are_told_once_and_once_again_when_they_are_over(shared: SharedState) -> None:
+    told = watching(shared)
     heard = []
     for now, p99_ms in enumerate((0.2, 1.4, 3.0, 0.8, 0.4, 0.4), start=10):
-        tell(page, "FIFO 20", p99_ms)
+        tell(shared, "FIFO 20", p99_ms)
         heard.append(kinds(told, float(now)))
     assert heard == [[], ["late_ticks"], [], [], ["punctual"], []]
 
 
 def test_nothing_is_judged_before_two_seconds_of_ticks_nor_without_a_clock_of_its_own(
-    page: SharedState,
+    shared: SharedState,
 ) -> None:
-    told = watching(page)
-    tell(page, "ordinary", 5.0, ticks=199)
+    told = watching(shared)
+    tell(shared, "ordinary", 5.0, ticks=199)
     assert told.look(10.0) == []
-    tell(page, "", 5.0)  # lockstep
+    tell(shared, "", 5.0)  # lockstep
     assert told.look(12.0) == []
-    tell(page, "ordinary", 5.0, ticks=200)
+    tell(shared, "ordinary", 5.0, ticks=200)
     assert kinds(told, 14.0) == ["scheduling", "late_ticks"]
 
 
-def test_it_looks_once_a_second(page: SharedState) -> None:
-    told = watching(page)
+def test_it_looks_once_a_second(shared: SharedState) -> None:
+    told = watching(shared)
     assert told.look(10.0) == []
-    tell(page, "ordinary", 5.0)
+    tell(shared, "ordinary", 5.0)
     assert told.look(10.9) == []
     assert kinds(told, 11.0) == ["scheduling", "late_ticks"]

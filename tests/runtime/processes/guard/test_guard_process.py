@@ -22,8 +22,8 @@ PERIOD = 1 / 30
 class Control:
     """A clock on whose every wait control ticks, and obeys the flag where it is alive."""
 
-    def __init__(self, page):
-        self.page, self.alive, self.slept = page, True, 0.0
+    def __init__(self, shared):
+        self.shared, self.alive, self.slept = shared, True, 0.0
         self.clock = VirtualClock(100.0)
         self.now = self.clock.now
 
@@ -33,9 +33,9 @@ class Control:
             self.tick()
 
     def tick(self):
-        status = self.page.control.read().copy()
-        status["estop_obeyed"] = self.page.estop is EStop.LATCHED
-        self.page.control.write(status)
+        status = self.shared.control.read().copy()
+        status["estop_obeyed"] = self.shared.estop is EStop.LATCHED
+        self.shared.control.write(status)
 
 
 class FailingLatch(Latch):
@@ -55,7 +55,7 @@ class FailingLatch(Latch):
 
 
 @pytest.fixture
-def page():
+def shared():
     return SharedState(LAYOUT, mmap.mmap(-1, SharedState.size(LAYOUT)))
 
 
@@ -66,40 +66,40 @@ def latch(tmp_path):
 
 
 @pytest.fixture
-def control(page):
-    return Control(page)
+def control(shared):
+    return Control(shared)
 
 
 @pytest.fixture
-def guard(page, latch, control):
-    return Guard(page, latch, control, PERIOD, "bench-1")
+def guard(shared, latch, control):
+    return Guard(shared, latch, control, PERIOD, "bench-1")
 
 
 def press(guard, **changes):
     return guard.answer(Command("u", "estop", {"why": "arm too low"}, **({"user": "anna"} | changes)))
 
 
-def test_a_guard_that_finds_no_latch_lets_commands_pass(guard, page):
-    assert page.estop is EStop.CLEAR
+def test_a_guard_that_finds_no_latch_lets_commands_pass(guard, shared):
+    assert shared.estop is EStop.CLEAR
 
 
-def test_a_station_latched_before_its_start_starts_latched(page, latch, control):
+def test_a_station_latched_before_its_start_starts_latched(shared, latch, control):
     latch.set("anna", "yesterday")
-    Guard(page, latch, control, PERIOD)
-    assert page.estop is EStop.LATCHED
+    Guard(shared, latch, control, PERIOD)
+    assert shared.estop is EStop.LATCHED
 
 
-def test_a_latch_that_cannot_be_read_starts_latched(page, latch, control, tmp_path):
+def test_a_latch_that_cannot_be_read_starts_latched(shared, latch, control, tmp_path):
     (tmp_path / "bench-1" / "estop.json").write_text("{", "utf-8")
-    Guard(page, latch, control, PERIOD)
-    assert page.estop is EStop.LATCHED
+    Guard(shared, latch, control, PERIOD)
+    assert shared.estop is EStop.LATCHED
 
 
-def test_a_press_raises_the_flag_and_is_on_disk(guard, page, latch):
+def test_a_press_raises_the_flag_and_is_on_disk(guard, shared, latch):
     ack = press(guard)
     assert (ack.uuid, ack.status) == ("u", "done")
     assert ack.reason == "every tick now sends the measured position"
-    assert page.estop is EStop.LATCHED
+    assert shared.estop is EStop.LATCHED
     assert (latch.read().by, latch.read().why) == ("anna", "arm too low")
 
 
@@ -112,15 +112,15 @@ def test_anybody_may_press_and_is_named_as_far_as_known(guard, latch, changes, b
     assert latch.read().by == by
 
 
-def test_the_flag_is_raised_before_the_disk_is_touched(page, control, latch, monkeypatch):
+def test_the_flag_is_raised_before_the_disk_is_touched(shared, control, latch, monkeypatch):
     seen = []
-    guard = Guard(page, latch, control, PERIOD)
-    monkeypatch.setattr(latch, "set", lambda *_: seen.append(page.estop))
+    guard = Guard(shared, latch, control, PERIOD)
+    monkeypatch.setattr(latch, "set", lambda *_: seen.append(shared.estop))
     press(guard)
     assert seen == [EStop.LATCHED]
 
 
-def test_nothing_is_logged_before_the_flag_the_disk_and_the_answer(guard, page, latch, caplog):
+def test_nothing_is_logged_before_the_flag_the_disk_and_the_answer(guard, shared, latch, caplog):
     ack = press(guard)
     assert (ack.status, caplog.text) == ("done", "")
     guard.watch()
@@ -130,30 +130,30 @@ def test_nothing_is_logged_before_the_flag_the_disk_and_the_answer(guard, page, 
     assert caplog.text == ""
 
 
-def test_a_disk_that_fails_does_not_keep_the_flag_down(page, control, tmp_path):
-    guard = Guard(page, FailingLatch(tmp_path), control, PERIOD)
+def test_a_disk_that_fails_does_not_keep_the_flag_down(shared, control, tmp_path):
+    guard = Guard(shared, FailingLatch(tmp_path), control, PERIOD)
     ack = press(guard)
-    assert page.estop is EStop.LATCHED
+    assert shared.estop is EStop.LATCHED
     assert ack.status == "done"
     assert ack.reason.endswith(
         "not on disk (No space left on device): a restart of the station may forget it"
     )
 
 
-def test_a_control_that_does_not_answer_means_the_hardware_stop(guard, page, control, latch):
+def test_a_control_that_does_not_answer_means_the_hardware_stop(guard, shared, control, latch):
     control.alive = False
     begun = control.now()
     ack = press(guard)
     assert ack.status == "failed"
     assert ack.reason == "latched, but control has not obeyed within 67 ms: USE THE HARDWARE STOP"
     assert control.now() - begun == pytest.approx(2 * PERIOD, abs=0.003)
-    assert page.estop is EStop.LATCHED
+    assert shared.estop is EStop.LATCHED
     assert latch.read() is not None
 
 
-def test_both_troubles_are_told_at_once(page, control, tmp_path):
+def test_both_troubles_are_told_at_once(shared, control, tmp_path):
     control.alive = False
-    guard = Guard(page, FailingLatch(tmp_path), control, 0.001)
+    guard = Guard(shared, FailingLatch(tmp_path), control, 0.001)
     reason = press(guard).reason
     assert "within 50 ms: USE THE HARDWARE STOP" in reason
     assert "not on disk" in reason
@@ -169,92 +169,92 @@ def test_what_a_control_said_before_it_died_does_not_count_for_a_new_press(guard
     assert press(guard).status == "failed"
 
 
-def test_a_release_clears_the_flag_and_the_disk(guard, page, latch):
+def test_a_release_clears_the_flag_and_the_disk(guard, shared, latch):
     press(guard)
-    page.ask_release()
+    shared.ask_release()
     guard.watch()
-    assert page.estop is EStop.CLEAR
+    assert shared.estop is EStop.CLEAR
     assert latch.read() is None
 
 
-def test_nothing_is_released_that_was_not_asked_for(guard, page):
+def test_nothing_is_released_that_was_not_asked_for(guard, shared):
     press(guard)
     guard.watch()
-    assert page.estop is EStop.LATCHED
+    assert shared.estop is EStop.LATCHED
 
 
-def test_one_release_releases_one_press(guard, page):
+def test_one_release_releases_one_press(guard, shared):
     press(guard)
-    page.ask_release()
+    shared.ask_release()
     guard.watch()
     press(guard)
     guard.watch()
-    assert page.estop is EStop.LATCHED
+    assert shared.estop is EStop.LATCHED
 
 
-def test_a_release_asked_for_before_a_press_does_not_undo_that_press(guard, page, latch):
+def test_a_release_asked_for_before_a_press_does_not_undo_that_press(guard, shared, latch):
     press(guard)
-    page.ask_release()
+    shared.ask_release()
     press(guard)  # comes in before the guard has looked for releases
     guard.watch()
-    assert page.estop is EStop.LATCHED
+    assert shared.estop is EStop.LATCHED
     assert latch.read() is not None
 
 
-def test_a_latch_that_cannot_be_removed_stays_latched_and_the_guard_lives(page, control, tmp_path):
+def test_a_latch_that_cannot_be_removed_stays_latched_and_the_guard_lives(shared, control, tmp_path):
     latch = FailingLatch(tmp_path)
-    guard = Guard(page, latch, control, PERIOD)
+    guard = Guard(shared, latch, control, PERIOD)
     press(guard)
-    page.ask_release()
+    shared.ask_release()
     guard.watch()
-    assert page.estop is EStop.LATCHED
+    assert shared.estop is EStop.LATCHED
     latch.fails = False
-    page.ask_release()
+    shared.ask_release()
     guard.watch()
-    assert page.estop is EStop.CLEAR
+    assert shared.estop is EStop.CLEAR
 
 
-def test_a_restarted_guard_trusts_the_flag_where_the_disk_has_nothing(page, latch, control, tmp_path):
-    press(Guard(page, FailingLatch(tmp_path), control, PERIOD))
+def test_a_restarted_guard_trusts_the_flag_where_the_disk_has_nothing(shared, latch, control, tmp_path):
+    press(Guard(shared, FailingLatch(tmp_path), control, PERIOD))
     assert latch.read() is None
-    Guard(page, latch, control, PERIOD)
-    assert page.estop is EStop.LATCHED
+    Guard(shared, latch, control, PERIOD)
+    assert shared.estop is EStop.LATCHED
 
 
-def test_a_restarted_guard_does_not_carry_out_releases_of_before(page, latch, control):
-    press(Guard(page, latch, control, PERIOD))
-    page.ask_release()
-    restarted = Guard(page, latch, control, PERIOD)
+def test_a_restarted_guard_does_not_carry_out_releases_of_before(shared, latch, control):
+    press(Guard(shared, latch, control, PERIOD))
+    shared.ask_release()
+    restarted = Guard(shared, latch, control, PERIOD)
     restarted.watch()
-    assert page.estop is EStop.LATCHED
+    assert shared.estop is EStop.LATCHED
 
 
-def to_main(page, uuid="u"):
+def to_main(shared, uuid="u"):
     """What main does with a press that comes to its socket."""
-    page.rings["presses"].push(encode(Command(uuid, "estop", {"why": "at the wrong door"}, "ben")))
-    page.set_estop(EStop.LATCHED)
+    shared.rings["presses"].push(encode(Command(uuid, "estop", {"why": "at the wrong door"}, "ben")))
+    shared.set_estop(EStop.LATCHED)
 
 
-def test_a_press_that_came_to_main_is_latched_on_disk_with_who_and_why(guard, page, latch):
-    to_main(page)
+def test_a_press_that_came_to_main_is_latched_on_disk_with_who_and_why(guard, shared, latch):
+    to_main(shared)
     guard.watch()
     assert (latch.read().by, latch.read().why) == ("ben", "at the wrong door")
-    assert page.estop is EStop.LATCHED
+    assert shared.estop is EStop.LATCHED
 
 
-def test_a_press_that_came_to_main_while_there_was_no_guard_is_latched_by_the_next(page, latch, control):
-    to_main(page)
-    restarted = Guard(page, latch, control, PERIOD)
+def test_a_press_that_came_to_main_while_there_was_no_guard_is_latched_by_the_next(shared, latch, control):
+    to_main(shared)
+    restarted = Guard(shared, latch, control, PERIOD)
     restarted.watch()
-    assert (page.estop, latch.read().by) == (EStop.LATCHED, "ben")
+    assert (shared.estop, latch.read().by) == (EStop.LATCHED, "ben")
 
 
-def test_a_release_under_way_does_not_undo_a_press_that_comes_to_main(guard, page, latch):
+def test_a_release_under_way_does_not_undo_a_press_that_comes_to_main(guard, shared, latch):
     press(guard)
-    page.ask_release()
-    to_main(page)
+    shared.ask_release()
+    to_main(shared)
     guard.watch()
-    assert (page.estop, latch.read().by) == (EStop.LATCHED, "ben")
+    assert (shared.estop, latch.read().by) == (EStop.LATCHED, "ben")
 
 
 def test_the_status_says_who_pressed(guard):
@@ -264,10 +264,10 @@ def test_the_status_says_who_pressed(guard):
 
 
 @pytest.mark.parametrize("kind", ["release", "stop", ""])
-def test_the_guard_knows_nothing_else(guard, page, kind):
+def test_the_guard_knows_nothing_else(guard, shared, kind):
     ack = guard.answer(Command("u", kind))
     assert (ack.status, ack.reason) == ("refused", f"the guard knows estop and status, not {kind!r}")
-    assert page.estop is EStop.CLEAR
+    assert shared.estop is EStop.CLEAR
 
 
 # --- the socket ----------------------------------------------------------------------------------------------
@@ -288,11 +288,11 @@ class Counting(Latch):
 class Door:
     """The guard behind its real socket; `client` sends whatever it likes."""
 
-    def __init__(self, page, control, folder):
-        self.folder, self.page, self.latch = folder, page, Counting(folder)
+    def __init__(self, shared, control, folder):
+        self.folder, self.shared, self.latch = folder, shared, Counting(folder)
         self.context = zmq.Context()
-        self.guard = Guard(page, self.latch, control, PERIOD, "bench-1")
-        self.desk = Desk(self.guard, page, self.context, folder)
+        self.guard = Guard(shared, self.latch, control, PERIOD, "bench-1")
+        self.desk = Desk(self.guard, shared, self.context, folder)
         self._endpoint = Endpoints(folder).read("guard")["estop"]
 
     def client(self):
@@ -321,8 +321,8 @@ class Door:
 
 
 @pytest.fixture
-def door(page, control, tmp_path):
-    made = Door(page, control, tmp_path / "bench-1")
+def door(shared, control, tmp_path):
+    made = Door(shared, control, tmp_path / "bench-1")
     yield made
     made.close()
 
@@ -356,7 +356,7 @@ def test_a_press_of_a_program_is_recorded_by_account(door):
 
 
 @pytest.mark.parametrize("trouble", ["forged", "no key", "a key for everybody", "a folder for a key"])
-def test_a_press_that_cannot_be_verified_is_obeyed_and_recorded_so(door, page, trouble):
+def test_a_press_that_cannot_be_verified_is_obeyed_and_recorded_so(door, shared, trouble):
     payload = pressed()
     signature = b"made up" if trouble == "forged" else Key(door.folder).sign(payload)
     if trouble == "no key":
@@ -370,17 +370,17 @@ def test_a_press_that_cannot_be_verified_is_obeyed_and_recorded_so(door, page, t
     client.send_multipart([payload, signature])
     door.serve()
     assert answers(client)[0].status == "done"
-    assert page.estop is EStop.LATCHED
+    assert shared.estop is EStop.LATCHED
     assert door.latch.read().by == "anna (unverified)"
 
 
 @pytest.mark.parametrize("name", presses.PACKED)
-def test_whatever_is_wrong_with_a_press_it_is_pressed_recorded_and_answered(door, page, name):
+def test_whatever_is_wrong_with_a_press_it_is_pressed_recorded_and_answered(door, shared, name):
     client = door.client()
     client.send(presses.PACKED[name])
     door.serve()
     (ack,) = answers(client)
-    assert (ack.status, page.estop) == ("done", EStop.LATCHED)
+    assert (ack.status, shared.estop) == ("done", EStop.LATCHED)
     assert door.latch.read().by == f"account:{account(os.geteuid())}"
     assert 0 < len(door.latch.read().why) < 1000
 
@@ -398,51 +398,51 @@ _WHOLE = pressed()
         [_WHOLE[number : number + 7] for number in range(0, len(_WHOLE), 7)],
     ],
 )
-def test_a_press_in_a_later_frame_or_in_several_is_heard(door, page, frames):
+def test_a_press_in_a_later_frame_or_in_several_is_heard(door, shared, frames):
     client = door.client()
     client.send_multipart(frames)
     door.serve()
     assert client.poll(2000)
     assert decode(client.recv_multipart()[-1]).status == "done"
-    assert page.estop is EStop.LATCHED
+    assert shared.estop is EStop.LATCHED
 
 
 @pytest.mark.parametrize("name", presses.OTHERS)
-def test_what_follows_a_message_of_another_kind_makes_it_no_press(door, page, name):
+def test_what_follows_a_message_of_another_kind_makes_it_no_press(door, shared, name):
     client = door.client()
     client.send_multipart([presses.OTHERS[name], b"a signature with kind: estop"])
     door.serve()
-    assert page.estop is EStop.CLEAR
+    assert shared.estop is EStop.CLEAR
 
 
 @pytest.mark.parametrize("name", presses.OTHERS)
-def test_what_only_speaks_of_the_e_stop_does_not_press_it(door, page, name):
+def test_what_only_speaks_of_the_e_stop_does_not_press_it(door, shared, name):
     client = door.client()
     client.send(presses.OTHERS[name])
     door.serve()
     assert len(answers(client)) == 1
-    assert page.estop is EStop.CLEAR
+    assert shared.estop is EStop.CLEAR
 
 
-def test_presses_behind_a_flood_of_long_garbage_are_answered_before_it_is_read(door, page):
+def test_presses_behind_a_flood_of_long_garbage_are_answered_before_it_is_read(door, shared):
     noisy, client = door.client(), door.client()
     for _ in range(200):
         noisy.send(b"\xc1" * (200 << 10))
     client.send(pressed("mine", "ben"))
     assert door.heard(client).uuid == "mine"
-    assert page.estop is EStop.LATCHED
+    assert shared.estop is EStop.LATCHED
 
 
-def test_the_flag_is_up_before_anybody_is_asked_who_he_is(door, page, monkeypatch):
+def test_the_flag_is_up_before_anybody_is_asked_who_he_is(door, shared, monkeypatch):
     seen = []
-    monkeypatch.setattr(guard_module, "identified", lambda command, *_: seen.append(page.estop) or command)
+    monkeypatch.setattr(guard_module, "identified", lambda command, *_: seen.append(shared.estop) or command)
     client = door.client()
     client.send(pressed())
     door.serve()
     assert seen == [EStop.LATCHED]
 
 
-def test_the_answer_says_whether_the_press_latched_and_when_it_was_carried_out(door, page):
+def test_the_answer_says_whether_the_press_latched_and_when_it_was_carried_out(door, shared):
     client = door.client()
 
     def asked(uuid):
@@ -453,7 +453,7 @@ def test_the_answer_says_whether_the_press_latched_and_when_it_was_carried_out(d
     first, again, other = asked("u"), asked("u"), asked("v")
     assert [latched for latched, _ in (first, again, other)] == ["anew", "before", "already"]
     assert again[1] == first[1] < other[1]
-    page.ask_release()
+    shared.ask_release()
     door.guard.watch()
     late = asked("u")
     assert late[0] == "anew"
@@ -507,17 +507,17 @@ def test_different_reasons_in_a_flood_are_one_latch_in_a_turn(door):
     assert (len(found), door.latch.written <= turns) == (500, True)
 
 
-def test_a_repeat_after_a_release_presses_again(door, page):
+def test_a_repeat_after_a_release_presses_again(door, shared):
     client = door.client()
     client.send(pressed())
     door.serve()
-    page.ask_release()
+    shared.ask_release()
     door.guard.watch()
-    assert (page.estop, door.latch.read()) == (EStop.CLEAR, None)
+    assert (shared.estop, door.latch.read()) == (EStop.CLEAR, None)
     client.send(pressed())
     door.serve()
     assert [ack.status for ack in answers(client)] == ["done", "done"]
-    assert page.estop is EStop.LATCHED
+    assert shared.estop is EStop.LATCHED
     assert door.latch.read() is not None
 
 

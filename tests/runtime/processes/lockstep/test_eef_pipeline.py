@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.pose_format import PoseFormat
 from runtime.core.types import ActionChunk, ActionMode, Conditioning, Float64, Observation
 from runtime.kinematics.base import IkFlag
@@ -19,7 +19,7 @@ from runtime.spaces.conversion import ActionSpaces
 from runtime.spaces.pose_rows import PoseRows
 from runtime.spaces.relative_poses import absolute
 from runtime.transports.base import Capabilities
-from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, column, on_time, plan, ramp
+from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, column, on_time, ramp, spec_of
 
 SIX = PoseFormat(orientation="6d", gripper=False)
 EULER = PoseFormat(orientation="euler", euler_order="ZYX", degrees=True, frame="world")
@@ -47,7 +47,7 @@ def _inverse(vectors: Float64) -> Float64:
 
 def speaking(station: Station, rows: Rows, pose: PoseFormat, mode: ActionMode = "absolute") -> Station:
     """The station's policy, answering with joint rows as poses of that format, relative to what it is shown."""
-    robot, spaces = station.plan.robot, station.main.spaces
+    robot, spaces = station.spec.robot, station.main.spaces
     layout = PoseRows(pose, robot)
     numbers = PoseRows(pose.model_copy(update={"frame": ""}), robot)
 
@@ -72,7 +72,7 @@ def speaking(station: Station, rows: Rows, pose: PoseFormat, mode: ActionMode = 
 def test_poses_of_any_format_and_mode_move_the_joints_as_they_are_meant(
     tmp_path: Path, pose: PoseFormat, mode: ActionMode, delay: int
 ) -> None:
-    station = speaking(Station(plan(tmp_path, delay=delay)), on_time, pose, mode).running(60)
+    station = speaking(Station(spec_of(tmp_path, delay=delay)), on_time, pose, mode).running(60)
     episode = station.stop()
     chosen = column(episode.ticks, "control_source") == "policy"
     steps = column(episode.ticks, "step")[chosen] - episode.ticks["step"][0].as_py()
@@ -81,7 +81,7 @@ def test_poses_of_any_format_and_mode_move_the_joints_as_they_are_meant(
     assert not any(column(episode.ticks, "refused"))
     assert station.events("ik_unreached") == []
     raw = episode.raw.to_pylist()
-    assert {len(row["action"]) for row in raw} == {PoseRows(pose, station.plan.robot).width}
+    assert {len(row["action"]) for row in raw} == {PoseRows(pose, station.spec.robot).width}
     assert {row["space"] for row in raw} == {"eef"}
     flags = np.array([row["ik_flags"] for row in raw])
     assert flags.shape == (len(raw), 2)
@@ -91,7 +91,7 @@ def test_poses_of_any_format_and_mode_move_the_joints_as_they_are_meant(
 
 
 def test_poses_out_of_reach_are_executed_as_near_as_can_be_and_recorded_as_missed(tmp_path: Path) -> None:
-    station = speaking(Station(plan(tmp_path)), on_time, PoseFormat())
+    station = speaking(Station(spec_of(tmp_path)), on_time, PoseFormat())
     infer = station.policy.infer
 
     def stretched(observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
@@ -113,7 +113,7 @@ def test_poses_out_of_reach_are_executed_as_near_as_can_be_and_recorded_as_misse
     missed = [[flag & IkFlag.OVER_TOLERANCE for flag in row["ik_flags"]] for row in raw]
     assert missed == [[0, int(row["index"] >= 10)] for row in raw]
     assert max(row["ik_position_error"][1] for row in raw) > 0.3
-    sent, robot = station.robot.sent, station.plan.robot
+    sent, robot = station.robot.sent, station.spec.robot
     assert (sent >= robot.lower - 1e-6).all()
     assert (sent <= robot.upper + 1e-6).all()
     assert np.all(np.abs(np.diff(sent, axis=0)) <= robot.velocity / 30 + 1e-6)
@@ -131,7 +131,7 @@ def test_a_policy_that_means_to_begin_far_away_is_found_out_although_the_first_s
         rows[:, MOVED] += 0.9
         return rows
 
-    station = speaking(Station(plan(tmp_path, strategy=strategy)), far, SIX).ready()
+    station = speaking(Station(spec_of(tmp_path, strategy=strategy)), far, SIX).ready()
     first = station.main.snapshot()["first_action"]
     assert first["far"]
     assert first["distance"] == pytest.approx(0.9, abs=0.01)
@@ -142,7 +142,7 @@ def test_a_policy_that_means_to_begin_far_away_is_found_out_although_the_first_s
 
 
 def test_joint_chunks_say_nothing_of_poses(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).running(20)
+    station = Station(spec_of(tmp_path)).running(20)
     assert station.main.snapshot()["policy"]["ik"] == {}
     raw = station.stop().raw.to_pylist()
     assert {row["ik_flags"] for row in raw} == {row["eef_source"] for row in raw} == {None}
@@ -153,7 +153,7 @@ def test_joint_chunks_say_nothing_of_poses(tmp_path: Path) -> None:
 def test_the_recording_says_which_poses_there_were_and_which_the_policy_was_shown(
     tmp_path: Path, wanted: Any
 ) -> None:
-    station = speaking(Station(plan(tmp_path)), on_time, SIX, "relative")
+    station = speaking(Station(spec_of(tmp_path)), on_time, SIX, "relative")
     station.policy.sees_poses, station.policy.observation_eef = True, wanted
     receive = station.robot.receive
 
@@ -185,18 +185,18 @@ class PosePlan(StubPlan):
 
 
 def publishing(tmp_path: Path, pose: PoseFormat) -> Station:
-    made = plan(tmp_path)
+    made = spec_of(tmp_path)
     wanted = {"publication": {"space": "eef", "pose": pose.model_dump()}}
     fields = {name: getattr(made, name) for name in StubPlan.__dataclass_fields__}
-    fields["resolved"] = deployment.changed(made.resolved, wanted, "test")
+    fields["resolved"] = loader.changed(made.resolved, wanted, "test")
     return Station(PosePlan(**fields))
 
 
 @pytest.mark.parametrize("pose", [SIX, EULER], ids=str)
 def test_published_poses_are_those_of_the_safe_joint_command(tmp_path: Path, pose: PoseFormat) -> None:
     station = publishing(tmp_path, pose).running(60)
-    robot = station.plan.robot
-    spaces, layout = ActionSpaces(robot, station.plan.kinematics(), 30.0), PoseRows(pose, robot)
+    robot = station.spec.robot
+    spaces, layout = ActionSpaces(robot, station.spec.kinematics(), 30.0), PoseRows(pose, robot)
     sent = station.robot.commands
     assert len(sent) > 50
     previous = None
@@ -210,6 +210,6 @@ def test_published_poses_are_those_of_the_safe_joint_command(tmp_path: Path, pos
 
 
 def test_where_joints_are_published_there_are_no_poses(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, start=STANDS)).running(10)
+    station = Station(spec_of(tmp_path, start=STANDS)).running(10)
     assert {command.eef for command in station.robot.commands} == {None}
     station.close()

@@ -5,7 +5,7 @@ import pytest
 
 from runtime.core.errors import SetupError
 from runtime.processes.coordinator.session.transitions import State
-from tests.runtime.lockstep_station import MOVED, Station, plan
+from tests.runtime.lockstep_station import MOVED, Station, spec_of
 
 JOINT = "left_arm.joint0"
 LEAP = 0.9  # [rad] beyond the following error
@@ -23,7 +23,7 @@ def stay(observation, number):
 
 
 def ready(folder, home=True):
-    made = plan(folder, rows=stay, setup={"home": home, "pose": "ready"}, recording={"enabled": False})
+    made = spec_of(folder, rows=stay, setup={"home": home, "pose": "ready"}, recording={"enabled": False})
     station = Station(made).ready()
     station.go(45)
     return station
@@ -109,7 +109,7 @@ def test_the_first_set_up_after_a_leap_takes_the_robot_over_where_it_is_read(tmp
     assert station.state is State.READY, station.reason
     assert not station.events("refusals")
     moved = np.abs(np.diff(station.robot.sent[count - 1 :], axis=0))
-    assert (moved <= station.plan.limits.velocity / station.plan.rate * 1.05).all()
+    assert (moved <= station.spec.limits.velocity / station.spec.rate * 1.05).all()
     station.command("run")
     station.go(30)
     assert station.state is State.RUNNING

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from runtime import __main__ as command_line
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.errors import PolicyError, SetupError
 from runtime.core.types import Float64, Observation
 from runtime.datasets.published import publish
@@ -18,8 +18,8 @@ from runtime.ipc.shared_state import EStop
 from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.station import spec as family
-from tests.runtime.lockstep_station import DIM, MOVED, STANDS, Station, column, on_time, plan, ramp
+from runtime.station import spec as station_spec
+from tests.runtime.lockstep_station import DIM, MOVED, STANDS, Station, column, on_time, ramp, spec_of
 from tests.runtime.recording.samples import decoded, numbers
 
 DELAYS = [0, 3, 7]
@@ -39,7 +39,7 @@ def executed(episode: Episode, source: str = "policy") -> tuple[np.ndarray, Floa
 
 
 def finite_and_within_limits(station: Station) -> bool:
-    robot, sent = station.plan.robot, station.robot.sent
+    robot, sent = station.spec.robot, station.robot.sent
     return bool(
         np.isfinite(sent).all() and (sent >= robot.lower - 1e-6).all() and (sent <= robot.upper + 1e-6).all()
     )
@@ -52,7 +52,7 @@ def finite_and_within_limits(station: Station) -> bool:
 def test_async_executes_for_every_step_exactly_what_the_policy_meant_for_it(
     tmp_path: Path, delay: int
 ) -> None:
-    station = Station(plan(tmp_path, delay=delay)).running(90)
+    station = Station(spec_of(tmp_path, delay=delay)).running(90)
     episode = station.stop()
     steps, actions = executed(episode)
     assert steps.tolist() == list(
@@ -78,7 +78,7 @@ def test_async_executes_for_every_step_exactly_what_the_policy_meant_for_it(
 def test_sync_executes_every_action_once_and_in_order_and_stands_while_it_waits(
     tmp_path: Path, delay: int
 ) -> None:
-    station = Station(plan(tmp_path, in_order, strategy="sync", delay=delay)).running(100)
+    station = Station(spec_of(tmp_path, in_order, strategy="sync", delay=delay)).running(100)
     episode = station.stop()
     steps, actions = executed(episode)
     assert (actions == ramp(0, len(actions)).astype(np.float32)).all()
@@ -97,7 +97,7 @@ def test_sync_executes_every_action_once_and_in_order_and_stands_while_it_waits(
 def test_two_runs_are_recorded_equal_to_the_last_bit(tmp_path: Path, strategy: str, delay: int) -> None:
     episodes = []
     for name in ("one", "two"):
-        made = plan(tmp_path / name, strategy=strategy, delay=delay, run={"duration_s": 2.0})
+        made = spec_of(tmp_path / name, strategy=strategy, delay=delay, run={"duration_s": 2.0})
         done = lockstep.run(made)
         assert done.state is State.READY, done.reason
         episodes.append(open_episode(Path(done.episode["path"])))
@@ -114,7 +114,7 @@ def test_two_runs_are_recorded_equal_to_the_last_bit(tmp_path: Path, strategy: s
 
 def test_a_policy_of_another_rate_still_means_the_same_times(tmp_path: Path) -> None:
     """A policy at 15 Hz under control at 30 Hz: every other step is a row of it, those between are midway."""
-    made = plan(tmp_path, lambda o, n: ramp(o.step, 20)[::2], delay=3)
+    made = spec_of(tmp_path, lambda o, n: ramp(o.step, 20)[::2], delay=3)
     station = Station(made).ready()
     infer = station.policy.infer
 
@@ -131,7 +131,7 @@ def test_a_policy_of_another_rate_still_means_the_same_times(tmp_path: Path) -> 
 
 
 def test_control_at_100_hz_is_recorded_on_a_grid_of_30(tmp_path: Path) -> None:
-    made = plan(tmp_path, control={"rate": 100.0}, recording={"fps": 30.0})
+    made = spec_of(tmp_path, control={"rate": 100.0}, recording={"fps": 30.0})
     station = Station(made).running(200)
     episode = station.stop()
     first = episode.ticks["step"][0].as_py()
@@ -146,7 +146,7 @@ def test_control_at_100_hz_is_recorded_on_a_grid_of_30(tmp_path: Path) -> None:
 
 
 def test_each_row_has_its_own_picture(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).running(40)
+    station = Station(spec_of(tmp_path)).running(40)
     episode = station.stop()
     for video in episode.videos.values():
         assert numbers(video) == column(episode.rows, "sequence").tolist()
@@ -167,7 +167,7 @@ def test_a_policy_that_answers_nan_leads_to_holding_with_a_named_reason(
             answer[4, 2] = np.nan
         return answer
 
-    station = Station(plan(tmp_path, rows, strategy=strategy)).running(0)
+    station = Station(spec_of(tmp_path, rows, strategy=strategy)).running(0)
     station.reach(State.HOLDING)
     assert "nan for left_arm.joint2 in row 4" in station.reason
     station.go(30)
@@ -178,7 +178,7 @@ def test_a_policy_that_answers_nan_leads_to_holding_with_a_named_reason(
 
 
 def test_a_policy_with_the_wrong_dimension_fails_the_set_up_with_a_sentence(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, lambda o, n: np.zeros((10, 13))))
+    station = Station(spec_of(tmp_path, lambda o, n: np.zeros((10, 13))))
     station.prepare()
     assert station.state is State.IDLE
     assert "joint actions of shape (10, 13); agilex_piper takes [H, 14]" in station.reason
@@ -199,7 +199,7 @@ def test_a_policy_that_raises_in_the_middle_of_a_run_is_held_and_not_asked_again
             raise error
         return ramp(observation.step, 20)
 
-    station = Station(plan(tmp_path, rows, delay=delay)).running(0)
+    station = Station(spec_of(tmp_path, rows, delay=delay)).running(0)
     station.reach(State.HOLDING)
     assert str(error) in station.reason
     assert type(error).__name__ in station.reason
@@ -219,7 +219,7 @@ def test_a_policy_that_jumps_is_refused_and_held(tmp_path: Path) -> None:
             answer[:, 0] += 1.5
         return answer
 
-    station = Station(plan(tmp_path, rows, strategy="sync")).running(0)
+    station = Station(spec_of(tmp_path, rows, strategy="sync")).running(0)
     station.reach(State.HOLDING)
     assert "10 actions refused in a row" in station.reason
     assert "left_arm.joint0 would be 1.5" in station.reason
@@ -229,7 +229,7 @@ def test_a_policy_that_jumps_is_refused_and_held(tmp_path: Path) -> None:
 
 
 def test_a_policy_that_is_always_too_late_is_held_and_not_running_for_ever(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, lambda o, n: ramp(o.step, 5), delay=7)).running(0)
+    station = Station(spec_of(tmp_path, lambda o, n: ramp(o.step, 5), delay=7)).running(0)
     station.reach(State.HOLDING, 10.0)
     assert "no usable chunk" in station.reason
     assert len(station.events("chunk_dropped")) >= 2
@@ -238,7 +238,7 @@ def test_a_policy_that_is_always_too_late_is_held_and_not_running_for_ever(tmp_p
 
 
 def test_of_a_policy_that_does_not_answer_it_is_said_since_when(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, delay=300)).running(0)
+    station = Station(spec_of(tmp_path, delay=300)).running(0)
     station.reach(State.HOLDING, 20.0)
     reason = r"no usable chunk for [\d.]+ s: the policy was asked [1-9][\d.]* s ago and has not answered yet"
     assert re.fullmatch(reason, station.reason), station.reason
@@ -248,33 +248,34 @@ def test_of_a_policy_that_does_not_answer_it_is_said_since_when(tmp_path: Path) 
 def test_a_run_that_held_is_no_success_and_is_not_published(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made = plan(tmp_path, lambda o, n: ramp(o.step, 5), delay=7, publish={"dataset": "set"})
+    made = spec_of(tmp_path, lambda o, n: ramp(o.step, 5), delay=7, publish={"dataset": "set"})
     assert command_line.run_in_lockstep(made) == 1
     assert "holding: no usable chunk" in capsys.readouterr().out
     assert not (tmp_path / "set").exists()
     assert (
-        command_line.run_in_lockstep(plan(tmp_path, run={"duration_s": 0.5}, publish={"dataset": "set"})) == 0
+        command_line.run_in_lockstep(spec_of(tmp_path, run={"duration_s": 0.5}, publish={"dataset": "set"}))
+        == 0
     )
     assert (tmp_path / "set/meta/info.json").exists()
 
 
 def test_a_policy_that_is_absent_fails_the_set_up_with_its_sentence(tmp_path: Path) -> None:
     with pytest.raises(SetupError, match="set-up failed: no server listens there"):
-        lockstep.run(plan(tmp_path, absent="no server listens there"))
+        lockstep.run(spec_of(tmp_path, absent="no server listens there"))
 
 
 # --- commands ----------------------------------------------------------------------------------------------
 
 
 def test_the_e_stop_in_the_middle_of_a_run_faults_and_sends_the_measured_position(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).running(30)
+    station = Station(spec_of(tmp_path)).running(30)
     assert station.guard.press("ada", "smoke") == ""
     station.robot.blocked = True
     station.robot.position = STANDS + 0.01
     station.go(20)
     assert station.state is State.FAULTED
     assert "ada: smoke" in station.reason
-    arms = [dim for dim in range(len(STANDS)) if dim not in station.plan.robot.gripper_dims]
+    arms = [dim for dim in range(len(STANDS)) if dim not in station.spec.robot.gripper_dims]
     assert (station.robot.sent[-12:, arms] == (STANDS + 0.01).astype(np.float32)[arms]).all()
     for kind in ("setup", "run", "resume", "home"):
         with pytest.raises(SetupError, match="not allowed while faulted"):
@@ -290,12 +291,12 @@ def test_the_e_stop_in_the_middle_of_a_run_faults_and_sends_the_measured_positio
 def test_an_e_stop_is_told_with_who_pressed_where_the_disk_has_it_soon(
     tmp_path: Path, on_disk: bool, reason: str
 ) -> None:
-    station = Station(plan(tmp_path)).running(30)
-    station.page.set_estop(EStop.LATCHED)
+    station = Station(spec_of(tmp_path)).running(30)
+    station.shared.set_estop(EStop.LATCHED)
     station.go(3)
     assert station.state is State.RUNNING  # control obeys already; nobody knows yet who it was
     if on_disk:
-        Latch(station.plan.deployment.station_dir).set("ada", "smoke")
+        Latch(station.spec.deployment.station_dir).set("ada", "smoke")
         station.go(2)
     else:
         station.go(6)
@@ -307,7 +308,7 @@ def test_an_e_stop_is_told_with_who_pressed_where_the_disk_has_it_soon(
 def test_the_e_stop_is_latched_on_disk_and_read_before_the_first_command_of_a_second_start(
     tmp_path: Path,
 ) -> None:
-    made = plan(tmp_path)
+    made = spec_of(tmp_path)
     station = Station(made).running(30)
     station.guard.press("ada", "smoke")
     station.go(3)
@@ -336,7 +337,7 @@ def test_the_e_stop_is_latched_on_disk_and_read_before_the_first_command_of_a_se
 
 
 def test_the_duration_ends_the_run_and_time_on_hold_does_not_count(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, run={"duration_s": 2.0})).running(30)
+    station = Station(spec_of(tmp_path, run={"duration_s": 2.0})).running(30)
     station.command("halt")
     station.go(45)
     station.command("resume")
@@ -353,7 +354,7 @@ def test_the_duration_ends_the_run_and_time_on_hold_does_not_count(tmp_path: Pat
 
 
 def test_halt_and_resume_keep_one_episode_with_its_held_rows_marked(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, delay=3)).running(30)
+    station = Station(spec_of(tmp_path, delay=3)).running(30)
     station.command("halt")
     assert station.state is State.HOLDING
     asked = station.policy.calls.count("infer")
@@ -375,7 +376,7 @@ def test_halt_and_resume_keep_one_episode_with_its_held_rows_marked(tmp_path: Pa
 
 
 def test_a_run_that_is_halted_before_it_began_begins_when_it_is_resumed(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, run={"duration_s": 1.0})).ready()
+    station = Station(spec_of(tmp_path, run={"duration_s": 1.0})).ready()
     station.command("run")
     station.command("halt")  # media has not even heard of the run
     station.go(30)
@@ -391,7 +392,7 @@ def test_a_run_that_is_halted_before_it_began_begins_when_it_is_resumed(tmp_path
 
 
 def test_stop_writes_the_outcome_and_holds(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).running(45)
+    station = Station(spec_of(tmp_path)).running(45)
     episode = station.stop()
     assert episode.outcome is not None
     assert episode.outcome["status"] == "finished"
@@ -408,7 +409,7 @@ def test_stop_writes_the_outcome_and_holds(tmp_path: Path) -> None:
 def test_the_policy_is_told_once_of_each_end_of_what_it_drove(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     policy = station.main.inference.policy
     monkeypatch.setattr(policy, "rest", lambda: policy.calls.append("rest"))
     station.command("run", mode="manual")
@@ -431,7 +432,7 @@ def test_a_policy_that_cannot_end_its_rollout_keeps_no_run_from_ending(
     def rest() -> None:
         raise PolicyError("the server is mute")
 
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     monkeypatch.setattr(station.main.inference.policy, "rest", rest)
     station.command("run")
     station.go(20)
@@ -446,7 +447,7 @@ def test_a_policy_that_cannot_end_its_rollout_keeps_no_run_from_ending(
 
 
 def test_a_second_run_is_an_episode_of_its_own(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).running(20)
+    station = Station(spec_of(tmp_path)).running(20)
     first = station.stop()
     station.command("run")
     station.go(20)
@@ -458,7 +459,7 @@ def test_a_second_run_is_an_episode_of_its_own(tmp_path: Path) -> None:
 
 
 def test_a_lease_that_is_not_renewed_holds_the_robot(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, lease={"ttl_s": 1.0})).running(20)
+    station = Station(spec_of(tmp_path, lease={"ttl_s": 1.0})).running(20)
     for _ in range(40):
         station.tick()
     assert station.state is State.HOLDING
@@ -470,7 +471,7 @@ def test_a_lease_that_is_not_renewed_holds_the_robot(tmp_path: Path) -> None:
 
 
 def test_a_node_that_falls_silent_holds_the_robot(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).running(30)
+    station = Station(spec_of(tmp_path)).running(30)
     station.robot.silent = True
     station.reach(State.HOLDING, 3.0)
     assert "old, allowed" in station.reason
@@ -478,7 +479,7 @@ def test_a_node_that_falls_silent_holds_the_robot(tmp_path: Path) -> None:
 
 
 def test_homing_comes_to_the_pose_within_the_limits_of_motions(tmp_path: Path) -> None:
-    made = plan(tmp_path, setup={"home": True})
+    made = spec_of(tmp_path, setup={"home": True})
     station = Station(made).ready()
     home = made.robot.poses["home"]
     assert np.allclose(station.robot.position, home, atol=1e-6)
@@ -488,7 +489,7 @@ def test_homing_comes_to_the_pose_within_the_limits_of_motions(tmp_path: Path) -
 
 
 def test_a_halt_while_it_homes_stops_it(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, setup={"home": True}))
+    station = Station(spec_of(tmp_path, setup={"home": True}))
     station.reach(State.IDLE)
     station.command("setup")
     station.go(15)
@@ -497,7 +498,7 @@ def test_a_halt_while_it_homes_stops_it(tmp_path: Path) -> None:
     station.go(20)
     assert station.state is State.IDLE
     assert (station.robot.sent[-5:] == station.robot.sent[-1]).all()
-    assert np.abs(station.robot.position - station.plan.robot.poses["home"]).max() > 0.1
+    assert np.abs(station.robot.position - station.spec.robot.poses["home"]).max() > 0.1
     station.close()
 
 
@@ -505,7 +506,7 @@ def test_a_halt_while_it_homes_stops_it(tmp_path: Path) -> None:
 def test_without_room_on_the_disk_nothing_is_begun_and_the_refusal_says_how_much_is_wanted(
     tmp_path: Path, kind: str
 ) -> None:
-    station = Station(plan(tmp_path, recording={"min_free_bytes": 10**15})).ready()
+    station = Station(spec_of(tmp_path, recording={"min_free_bytes": 10**15})).ready()
     wanted = rf"room to record in {tmp_path}/episodes: \d+ bytes free, at least {10**15} wanted"
     with pytest.raises(SetupError, match=wanted):
         station.command(kind)
@@ -520,7 +521,7 @@ def test_without_room_on_the_disk_nothing_is_begun_and_the_refusal_says_how_much
 def test_a_recording_that_cannot_be_opened_ends_a_trial_before_it_began_and_says_so(
     tmp_path: Path, on_failure: str
 ) -> None:
-    station = Station(plan(tmp_path, recording={"on_failure": on_failure})).ready()
+    station = Station(spec_of(tmp_path, recording={"on_failure": on_failure})).ready()
     (tmp_path / "episodes").write_text("in its place")
     ack = station.command("run", trial={"id": 1})
     station.go(5)
@@ -541,7 +542,7 @@ def test_a_recording_that_cannot_be_opened_ends_a_trial_before_it_began_and_says
 
 
 def test_a_run_that_is_stopped_before_it_began_is_told_as_such(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     run = station.command("run").uuid
     station.command("stop")  # before media has heard of either
     station.go(5)
@@ -558,7 +559,7 @@ def test_a_run_that_is_stopped_before_it_began_is_told_as_such(tmp_path: Path) -
 
 
 def test_a_trial_is_refused_where_nothing_is_recorded(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, recording={"enabled": False})).ready()
+    station = Station(spec_of(tmp_path, recording={"enabled": False})).ready()
     with pytest.raises(SetupError, match=r"a trial counts by its recording, and recording\.enabled = false"):
         station.command("run", trial={"id": 1})
     station.command("run")
@@ -566,7 +567,7 @@ def test_a_trial_is_refused_where_nothing_is_recorded(tmp_path: Path) -> None:
 
 
 def test_where_evidence_is_not_wanted_a_run_goes_on_without_its_recording(tmp_path: Path) -> None:
-    made = plan(tmp_path, recording={"min_free_bytes": 10**15, "on_failure": "continue"})
+    made = spec_of(tmp_path, recording={"min_free_bytes": 10**15, "on_failure": "continue"})
     station = Station(made).running(30)
     assert station.state is State.RUNNING
     assert len(station.events("recording_failed")) == 1
@@ -575,7 +576,7 @@ def test_where_evidence_is_not_wanted_a_run_goes_on_without_its_recording(tmp_pa
 
 
 def test_a_run_whose_recording_was_lost_is_not_resumed(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).running(20)
+    station = Station(spec_of(tmp_path)).running(20)
     station.robot.picture = lambda number: np.zeros((24, 32, 3), np.uint8)  # another size from now on
     station.reach(State.HOLDING, 5.0)
     assert "must be uint8" in station.reason
@@ -593,7 +594,7 @@ def test_a_run_whose_recording_was_lost_is_not_resumed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("delay", [0, 3])
 def test_a_policy_that_speaks_poses_reaches_them(tmp_path: Path, delay: int) -> None:
-    made = plan(tmp_path, delay=delay, space="eef")
+    made = spec_of(tmp_path, delay=delay, space="eef")
     eef_of = made.spaces().eef_of
 
     def poses(observation: Observation, number: int) -> Any:
@@ -623,7 +624,7 @@ def test_a_policy_that_speaks_poses_reaches_them(tmp_path: Path, delay: int) -> 
 
 @pytest.mark.parametrize("strategy", ["sync", "async"])
 def test_what_was_published_plays_through_the_whole_pipeline_unchanged(tmp_path: Path, strategy: str) -> None:
-    first = lockstep.run(plan(tmp_path, run={"duration_s": 2.0}))
+    first = lockstep.run(spec_of(tmp_path, run={"duration_s": 2.0}))
     publish(Path(first.episode["path"]), tmp_path / "set")
     mapping = {"eef": "eef_state", "action_eef": "eef_action"}
     tree = {
@@ -636,7 +637,7 @@ def test_what_was_published_plays_through_the_whole_pipeline_unchanged(tmp_path:
         "safety": {"report_only": True},
         "recording": {"min_free_bytes": 0},
     }
-    done = lockstep.run(family.plan(deployment.resolve(tree, {}, "test")))
+    done = lockstep.run(station_spec.spec_of(loader.resolve(tree, {}, "test")))
     assert (done.state, done.reason) == (State.READY, "the recording that is the source has ended")
     source, copy = open_episode(Path(first.episode["path"])), open_episode(Path(done.episode["path"]))
     assert copy.frames == source.frames == 60
@@ -648,7 +649,7 @@ def test_what_was_published_plays_through_the_whole_pipeline_unchanged(tmp_path:
 
 
 def test_no_command_ever_leaves_before_set_up(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path))
+    station = Station(spec_of(tmp_path))
     station.go(30)
     assert station.state is State.IDLE
     assert station.robot.commands == []

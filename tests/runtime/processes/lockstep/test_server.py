@@ -27,7 +27,7 @@ from runtime.processes.lockstep.server import ServedLockstep
 from runtime.processes.media.episode_closing import Close, in_background
 from runtime.processes.media.recorder import ClosedEpisode
 from runtime.recording.reader import Episode, open_episode
-from tests.runtime.lockstep_station import STANDS, StubPlan, StubPolicy, StubRobot, column, plan
+from tests.runtime.lockstep_station import STANDS, StubPlan, StubPolicy, StubRobot, column, spec_of
 
 TURNS = 5000
 
@@ -145,7 +145,7 @@ class Client:
 
 @pytest.fixture
 def made(tmp_path: Path) -> StubPlan:
-    return plan(tmp_path, recording={"min_free_bytes": 0, "export": False})
+    return spec_of(tmp_path, recording={"min_free_bytes": 0, "export": False})
 
 
 @pytest.fixture
@@ -163,7 +163,7 @@ def test_time_stands_still_before_and_after_a_set_up_and_its_station_is_seen_all
 ) -> None:
     assert client.turn(50, 0.1) == 0
     client.ready()
-    endpoints = Endpoints(client.station.plan.deployment.station_dir)
+    endpoints = Endpoints(client.station.spec.deployment.station_dir)
     context: zmq.Context[Any] = zmq.Context()
     states = Subscriber(context, endpoints.read("main")["state"], "state")
     pictures = Subscriber(context, endpoints.read("media")["cameras"], "camera/")
@@ -206,7 +206,7 @@ def test_what_a_person_moves_in_between_takes_its_time_and_then_it_stands_still(
 def test_a_policy_that_takes_long_changes_nothing_of_what_is_recorded(tmp_path: Path) -> None:
     said = []
     for name, waits in (("quick", 0.0), ("slow", 0.02)):
-        made = plan(tmp_path / name, recording={"min_free_bytes": 0, "export": False})
+        made = spec_of(tmp_path / name, recording={"min_free_bytes": 0, "export": False})
         client = Client(made)
         infer = client.policy.infer
 
@@ -226,7 +226,7 @@ def test_a_policy_that_takes_long_changes_nothing_of_what_is_recorded(tmp_path: 
         episode = client.episode()
         asked = [row["observation_step"] for row in episode.raw.to_pylist()]
         said.append((client.robot.sent[:60], asked[:12], column(episode.rows, "time")[:55]))
-        delays = list(client.station.main.inference.tally.delays)
+        delays = list(client.station.main.inference.metrics.delays)
         assert delays[2:]
         assert set(delays[2:]) == {3}  # 100 ms, whatever they really took
         client.close()
@@ -353,11 +353,11 @@ def test_the_e_stop_is_obeyed_at_once(client: Client, during: str) -> None:
     client.turn(20, 1 / 30)
     assert client.state is State.FAULTED
     assert f"account:{account(os.getuid())}: smoke" in client.reason
-    assert Latch(client.station.plan.deployment.station_dir).read() is not None
+    assert Latch(client.station.spec.deployment.station_dir).read() is not None
     client.accepted("release")
     client.turn(20, 1 / 30)
     assert client.state is State.IDLE
-    assert Latch(client.station.plan.deployment.station_dir).read() is None
+    assert Latch(client.station.spec.deployment.station_dir).read() is None
 
 
 def test_a_policy_that_hangs_keeps_nobody_from_stopping(client: Client) -> None:
@@ -377,7 +377,7 @@ def test_a_station_is_of_one_process(made: StubPlan, client: Client) -> None:
 
 
 def test_there_is_no_control_channel(tmp_path: Path) -> None:
-    made = plan(tmp_path, control_channel={"enabled": True})
+    made = spec_of(tmp_path, control_channel={"enabled": True})
     with pytest.raises(SetupError, match=r"control_channel\.enabled = true in lockstep, which has none"):
         ServedLockstep(made, VirtualClock())
 

@@ -81,7 +81,7 @@ class FakeSource(Source):
 class Desk:
     def __init__(self, closer: Any = at_once) -> None:
         layout = SharedStateLayout(2, 8, CAMERAS, 300)
-        self.page = SharedState(layout, mmap.mmap(-1, SharedState.size(layout)))
+        self.shared = SharedState(layout, mmap.mmap(-1, SharedState.size(layout)))
         self.clock, self.source, self.journal = VirtualClock(100.0), FakeSource(), FakeJournal()
         robot = {"name": "toy", "joint_names": ["a", "b"], "eef_names": [], "dim": 2, "eef_dim": 0}
         grid = DatasetGrid(robot, CAMERAS, RATE, RATE, lambda q: q)
@@ -89,8 +89,8 @@ class Desk:
         self.previewed: list[int] = []
         self.on_disk: list[Path] = []
         preview = lambda o: self.previewed.append(o.sequence)  # noqa: E731
-        self.media = Media(self.page, recorder, self.clock, preview, closer, self.on_disk.append)
-        self.reception = Reception(self.page, self.source, self.clock)
+        self.media = Media(self.shared, recorder, self.clock, preview, closer, self.on_disk.append)
+        self.reception = Reception(self.shared, self.source, self.clock)
 
     def observation(self, sequence: int, **changes: Any) -> Observation:
         now = self.clock.now()
@@ -118,7 +118,7 @@ class Desk:
             self.clock.advance(1 / RATE)
 
     def post(self, message: Message, ring: str = "minutes") -> None:
-        self.page.rings[ring].push(encode(message))
+        self.shared.rings[ring].push(encode(message))
 
     def begin(self, run: int = 1, **manifest: Any) -> None:
         self.post(BeginEpisode(run, {"uuid": "one"} | manifest))
@@ -133,7 +133,7 @@ class Desk:
 
     def heard(self) -> list[Message]:
         """All that main has not heard yet, that of reception first."""
-        rings = (self.page.rings[name] for name in ("reception_events", "media_events"))
+        rings = (self.shared.rings[name] for name in ("reception_events", "media_events"))
         return [decode(payload) for ring in rings for payload in ring.drain()]
 
 
@@ -144,7 +144,7 @@ def desk() -> Desk:
 
 def test_an_observation_reaches_the_page_with_its_pictures_and_the_preview(desk: Desk) -> None:
     desk.receive(1)
-    seen = desk.page.read_observation(CAMERAS)
+    seen = desk.shared.read_observation(CAMERAS)
     assert seen is not None
     assert (seen.sequence, seen.captured["left"]) == (1, 100.0)
     assert all((seen.pictures[camera] == 1).all() for camera in CAMERAS)
@@ -155,18 +155,18 @@ def test_a_picture_that_is_not_new_is_not_written_again(desk: Desk) -> None:
     desk.receive(1)
     desk.source.waiting.append(desk.observation(2, captured={"joints": 100.2, "left": 100.0, "right": 100.2}))
     desk.pump()
-    record = desk.page.observation.read()
+    record = desk.shared.observation.read()
     assert record["picture_number"].tolist() == [1, 2]
     assert record["picture_captured"].tolist() == [100.0, 100.2]
 
 
 def test_a_restarted_reception_goes_on_counting_pictures(desk: Desk) -> None:
     desk.receive(1, 2)
-    desk.reception = Reception(desk.page, desk.source, desk.clock)
+    desk.reception = Reception(desk.shared, desk.source, desk.clock)
     desk.source.waiting.append(desk.observation(3))
     desk.pump()
-    assert desk.page.observation.read()["picture_number"].tolist() == [3, 3]
-    seen = desk.page.read_observation(CAMERAS)
+    assert desk.shared.observation.read()["picture_number"].tolist() == [3, 3]
+    seen = desk.shared.read_observation(CAMERAS)
     assert seen is not None
     assert (seen.pictures["left"] == 3).all()
 
@@ -204,7 +204,7 @@ def test_a_source_that_fails_is_told_once_and_received_from_again(desk: Desk) ->
     assert [e.text for e in desk.told(Event)] == ["frame 7 cannot be decoded"]
     assert desk.clock.now() == pytest.approx(100.03)  # it waits and does not spin
     desk.receive(1)
-    assert desk.page.observation.read()["sequence"] == 1
+    assert desk.shared.observation.read()["sequence"] == 1
     desk.source.waiting.append(TransportError("frame 7 cannot be decoded"))
     desk.pump()
     assert len(desk.told(Event)) == 1
@@ -216,8 +216,8 @@ def test_a_picture_too_large_for_the_page_is_named_and_the_rest_goes_on(desk: De
     desk.source.waiting.append(desk.observation(1, pictures=pictures))
     desk.pump()
     assert [e.kind for e in desk.told(Event)] == ["source_picture_too_large_left"]
-    assert desk.page.observation.read()["picture_number"].tolist() == [0, 1]
-    assert desk.page.observation.read()["sequence"] == 1
+    assert desk.shared.observation.read()["picture_number"].tolist() == [0, 1]
+    assert desk.shared.observation.read()["sequence"] == 1
 
 
 def test_a_run_begins_with_the_first_frame_of_the_source(desk: Desk) -> None:
@@ -225,7 +225,7 @@ def test_a_run_begins_with_the_first_frame_of_the_source(desk: Desk) -> None:
     desk.source.first = desk.observation(2)
     desk.begin()
     assert desk.source.begun == 1
-    assert desk.page.observation.read()["sequence"] == 2  # before main hears that it may begin
+    assert desk.shared.observation.read()["sequence"] == 2  # before main hears that it may begin
     (opened,) = desk.told(EpisodeOpened)
     assert (opened.run, opened.uuid, opened.path, opened.error) == (1, "one", "/episodes/one", "")
     assert desk.media.recording
@@ -303,7 +303,7 @@ def test_a_recording_that_fails_is_an_event_and_closes_the_episode(desk: Desk) -
     assert (closed.status, closed.reason) == ("failed", "disk full while append")
     assert not desk.media.recording
     desk.receive(2)  # and life goes on
-    assert desk.page.observation.read()["sequence"] == 2
+    assert desk.shared.observation.read()["sequence"] == 2
 
 
 def test_an_event_that_cannot_be_written_fails_the_recording_too(desk: Desk) -> None:
@@ -323,7 +323,7 @@ def test_a_recording_whose_end_was_never_told_is_closed_where_another_one_begins
     desk.pump()
     desk.post(BeginEpisode(2, {"uuid": "two"}))
     desk.pump()
-    messages = [decode(payload) for payload in desk.page.rings["media_events"].drain()]
+    messages = [decode(payload) for payload in desk.shared.rings["media_events"].drain()]
     (closed,) = [m for m in messages if isinstance(m, EpisodeClosed)]
     assert (closed.uuid, closed.status, closed.rows) == ("one", "interrupted", 1)
     assert closed.reason == "its end was never told, and another recording begins"
@@ -336,7 +336,7 @@ def test_what_was_addressed_to_a_predecessor_is_not_obeyed(desk: Desk) -> None:
     desk.receive(1)
     desk.post(BeginEpisode(1, {"uuid": "old"}))
     desk.tick(0, 1)
-    Media(desk.page, desk.media._recorder, desk.clock).digest()
+    Media(desk.shared, desk.media._recorder, desk.clock).digest()
     assert not desk.media.recording
     assert desk.source.begun == 0
 
@@ -358,16 +358,16 @@ def test_the_report_counts_rows_and_repeated_pictures(desk: Desk) -> None:
 def test_a_tick_that_comes_before_the_observation_it_saw_was_read_is_a_row_of_that_one(desk: Desk) -> None:
     desk.receive(1)
     desk.begin()
-    drain = desk.page.rings["observations"].drain
+    drain = desk.shared.rings["observations"].drain
 
     def late() -> Any:
-        desk.page.rings["observations"].drain = drain  # type: ignore[method-assign]
+        desk.shared.rings["observations"].drain = drain  # type: ignore[method-assign]
         yield from drain()
         desk.source.waiting.append(desk.observation(2))
         desk.reception.pump(0.0)
         desk.tick(0, 2)
 
-    desk.page.rings["observations"].drain = late  # type: ignore[method-assign]
+    desk.shared.rings["observations"].drain = late  # type: ignore[method-assign]
     desk.media.digest()
     (row,) = desk.journal.rows
     assert row.lost == frozenset()
@@ -404,17 +404,17 @@ def test_what_media_had_no_room_for_is_lost_in_its_rows_and_said(
     desk.begin()
     desk.tick(0, 1)
     desk.media.digest()
-    push = desk.page.rings["observations"].push
-    desk.page.rings["observations"].push = lambda payload: False  # type: ignore[method-assign]
+    push = desk.shared.rings["observations"].push
+    desk.shared.rings["observations"].push = lambda payload: False  # type: ignore[method-assign]
     desk.receive(2, 3)
-    desk.page.rings["observations"].push = push  # type: ignore[method-assign]
+    desk.shared.rings["observations"].push = push  # type: ignore[method-assign]
     desk.tick(1, 3)
     desk.receive(4)
     desk.tick(2, 4)
     desk.media.digest()
     assert [row.lost for row in desk.journal.rows] == [frozenset(), set(CAMERAS), frozenset()]
     assert caplog.text.count("media does not read") == 1
-    assert desk.page.observation.read()["sequence"] == 4  # and control saw all of them
+    assert desk.shared.observation.read()["sequence"] == 4  # and control saw all of them
 
 
 def test_a_recording_goes_on_over_another_reception(desk: Desk) -> None:
@@ -422,9 +422,9 @@ def test_a_recording_goes_on_over_another_reception(desk: Desk) -> None:
     desk.begin(run=0)
     desk.tick(0, 2, run=0)
     desk.media.digest()
-    desk.reception, desk.source.waiting = Reception(desk.page, desk.source, desk.clock), deque()
+    desk.reception, desk.source.waiting = Reception(desk.shared, desk.source, desk.clock), deque()
     desk.receive(1)
-    assert desk.page.observation.read()["sequence"] == 3
+    assert desk.shared.observation.read()["sequence"] == 3
     desk.tick(1, 3, run=0)
     desk.media.digest()
     assert [row.sequence for row in desk.journal.rows] == [2, 3]
@@ -445,7 +445,7 @@ def test_a_restarted_media_lets_the_run_of_its_predecessor_end(desk: Desk) -> No
     desk.receive(1)
     desk.begin()
     ended = desk.source.ended
-    desk.media = Media(desk.page, desk.media._recorder, desk.clock)
+    desk.media = Media(desk.shared, desk.media._recorder, desk.clock)
     desk.reception.pump(0.0)
     assert desk.source.ended == ended + 1
 
@@ -492,7 +492,7 @@ def test_while_an_episode_is_being_closed_media_receives_and_still_counts_it_as_
 ) -> None:
     slow.receive(*range(2, 12))
     messages = slow.heard()
-    assert slow.page.observation.read()["sequence"] == 11
+    assert slow.shared.observation.read()["sequence"] == 11
     assert [m.recording for m in messages if isinstance(m, MediaReport)][-1] == "one"
     assert [m for m in messages if isinstance(m, EpisodeClosed)] == []
     disk.finish()

@@ -12,14 +12,14 @@ import simplejpeg
 
 from runtime.core.types import Observation
 from runtime.processes.media.previews import Previews
-from tests.runtime.lockstep_station import plan
+from tests.runtime.lockstep_station import spec_of
 
 
 class Looking:
     """What is shown of a station's pictures."""
 
     def __init__(self, folder: Path) -> None:
-        made = plan(folder, bus={"preview_rate": 15.0})
+        made = spec_of(folder, bus={"preview_rate": 15.0})
         self.previews, self._dim = Previews(made), made.robot.dim
         self._socket, self.previews._publisher = self.previews._publisher, self  # type: ignore[assignment]
         self._shown: list[tuple[str, bytes]] = []

@@ -13,7 +13,7 @@ from runtime.ipc.messages import Ack
 from runtime.processes.coordinator.session.transitions import State
 from runtime.recording.reader import open_episode
 from runtime.station.run import Run
-from tests.runtime.lockstep_station import Station, plan
+from tests.runtime.lockstep_station import Station, spec_of
 
 SETTLED = 4  # ticks after which an order has gone to media and its answer to main
 ticks = st.integers(0, 6)
@@ -32,7 +32,7 @@ class Recorded(RuleBasedStateMachine):
     @initialize(on_failure=st.sampled_from(["hold", "continue"]))
     def begin(self, on_failure: str) -> None:
         self.episodes = Path(self.folder.name) / "episodes"
-        self.station = Station(plan(Path(self.folder.name), recording={"on_failure": on_failure}))
+        self.station = Station(spec_of(Path(self.folder.name), recording={"on_failure": on_failure}))
         runs = self.station.main.runs
         follow = runs._follow
 
@@ -70,8 +70,8 @@ class Recorded(RuleBasedStateMachine):
 
     @rule(process=st.sampled_from(["control", "guard"]), wait=ticks)
     def dies(self, process: str, wait: int) -> None:
-        page = self.station.page
-        page.set_generation(process, page.generation(process) + 1)
+        shared = self.station.shared
+        shared.set_generation(process, shared.generation(process) + 1)
         self.go(wait)
 
     @rule(wait=ticks)

@@ -23,20 +23,20 @@ class Gate:
 
     def __init__(self) -> None:
         layout = SharedStateLayout(2, 8, ("cam",), 75)
-        self.page = SharedState(layout, mmap.mmap(-1, SharedState.size(layout)))
+        self.shared = SharedState(layout, mmap.mmap(-1, SharedState.size(layout)))
         self.clock, self.source = VirtualClock(100.0), FakeSource()
         self.said: list[Event] = []
         self.order: list[tuple[int, dict[str, int], bool]] = []
         self.intake = self.begun()
 
     def begun(self) -> ObservationReceiver:
-        return ObservationReceiver(self.page, self.source, self.clock, self.said.append, self.hand_on)
+        return ObservationReceiver(self.shared, self.source, self.clock, self.said.append, self.hand_on)
 
     def hand_on(self, seen: Observation, numbers: Any) -> None:
         self.order.append((seen.sequence, dict(numbers), self.published() == seen.sequence))
 
     def published(self) -> int:
-        seen = self.page.read_observation(())
+        seen = self.shared.read_observation(())
         return -1 if seen is None else int(seen.sequence)
 
     def observation(self, sequence: int, **changes: Any) -> Observation:
@@ -65,7 +65,7 @@ def gate() -> Gate:
 def test_an_observation_is_handed_on_with_its_pictures_in_place_before_the_page_has_it(gate: Gate) -> None:
     gate.receive(1)
     assert gate.order == [(1, {"cam": 1}, False)]
-    assert gate.page.pictures["cam"].read(1) is not None
+    assert gate.shared.pictures["cam"].read(1) is not None
     assert gate.published() == 1
 
 
@@ -73,7 +73,7 @@ def test_a_successor_goes_on_counting_also_where_the_page_was_not_told_of_the_la
     gate: Gate,
 ) -> None:
     gate.receive(2)
-    gate.page.pictures["cam"].write(3, np.ones((5, 5, 3), np.uint8))  # and then it died
+    gate.shared.pictures["cam"].write(3, np.ones((5, 5, 3), np.uint8))  # and then it died
     gate.intake = gate.begun()
     gate.receive(1)
     assert gate.order[-1] == (3, {"cam": 4}, False)
@@ -161,7 +161,7 @@ def test_a_fault_is_said_with_its_sentence_where_the_source_has_one(
 def test_a_picture_that_has_no_room_is_counted_and_not_written(gate: Gate) -> None:
     gate.receive(2, pictures={"cam": np.zeros((6, 6, 3), np.uint8)})
     assert gate.intake.faults() == {"picture_too_large_cam": 2}
-    assert gate.page.observation.read()["picture_number"].tolist() == [0]
+    assert gate.shared.observation.read()["picture_number"].tolist() == [0]
 
 
 def test_a_source_that_fails_is_said_once_and_again_after_it_came_back(gate: Gate) -> None:

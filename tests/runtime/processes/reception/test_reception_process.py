@@ -14,12 +14,12 @@ def desk() -> Desk:
 
 
 def handed_on(desk: Desk) -> list[object]:
-    return [decode(payload) for payload in desk.page.rings["observations"].drain()]
+    return [decode(payload) for payload in desk.shared.rings["observations"].drain()]
 
 
 def test_the_first_frame_of_a_run_is_handed_on_before_it_is_said_to_have_begun(desk: Desk) -> None:
     desk.source.first = desk.observation(1)
-    desk.page.rings["source"].push(encode(BeginRun(7)))
+    desk.shared.rings["source"].push(encode(BeginRun(7)))
     assert desk.reception.hear()
     observed, begun = handed_on(desk)
     assert isinstance(observed, Observed)
@@ -29,24 +29,24 @@ def test_the_first_frame_of_a_run_is_handed_on_before_it_is_said_to_have_begun(d
 
 
 def test_that_a_run_has_begun_is_said_as_soon_as_there_is_room(desk: Desk) -> None:
-    push = desk.page.rings["observations"].push
-    desk.page.rings["observations"].push = lambda payload: False  # type: ignore[method-assign]
-    desk.page.rings["source"].push(encode(BeginRun(7)))
+    push = desk.shared.rings["observations"].push
+    desk.shared.rings["observations"].push = lambda payload: False  # type: ignore[method-assign]
+    desk.shared.rings["source"].push(encode(BeginRun(7)))
     assert not desk.reception.hear()
-    desk.page.rings["observations"].push = push  # type: ignore[method-assign]
+    desk.shared.rings["observations"].push = push  # type: ignore[method-assign]
     assert desk.reception.hear()
     assert handed_on(desk) == [RunBegun(7)]
     assert desk.source.begun == 1
 
 
 def test_what_was_asked_of_a_predecessor_is_not_done(desk: Desk) -> None:
-    desk.page.rings["source"].push(encode(BeginRun(7)))
-    Reception(desk.page, desk.source, desk.clock).pump(0.0)
+    desk.shared.rings["source"].push(encode(BeginRun(7)))
+    Reception(desk.shared, desk.source, desk.clock).pump(0.0)
     assert desk.source.begun == 0
 
 
 def test_it_reports_how_old_joints_come_in_and_as_what_it_runs(desk: Desk) -> None:
-    desk.reception = Reception(desk.page, desk.source, desk.clock, "FIFO 19")
+    desk.reception = Reception(desk.shared, desk.source, desk.clock, "FIFO 19")
     desk.source.waiting.append(desk.observation(1, captured={"joints": desk.clock.now() - 0.02}))
     desk.reception.pump(0.0)
     (report,) = desk.told(ReceptionReport)
@@ -56,7 +56,7 @@ def test_it_reports_how_old_joints_come_in_and_as_what_it_runs(desk: Desk) -> No
 
 def test_it_reports_and_obeys_also_while_its_source_is_not_there(desk: Desk) -> None:
     desk.source.counts = {"malformed": 1}
-    desk.page.rings["source"].push(encode(BeginRun(7)))
+    desk.shared.rings["source"].push(encode(BeginRun(7)))
     desk.reception.tend()
     (report,) = desk.told(ReceptionReport)
     assert report.faults == {"malformed": 1}
@@ -72,7 +72,7 @@ def test_more_than_a_core_for_seconds_is_too_much_and_a_moment_of_it_is_not() ->
 def test_it_gives_its_class_up_with_a_sentence(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     left: list[str] = []
     monkeypatch.setattr(realtime, "leave_all", lambda: left.append("all"))
-    desk.reception = Reception(desk.page, desk.source, desk.clock, "FIFO 19")
+    desk.reception = Reception(desk.shared, desk.source, desk.clock, "FIFO 19")
     desk.reception.give_way()
     desk.reception.report()
     said, report = desk.heard()

@@ -92,18 +92,20 @@ class Desk:
 
     def __init__(self, runner: Runner | None = None, strategy: Strategy | None = None) -> None:
         layout = SharedStateLayout(2, 8, ("cam",), 300)
-        self.page = SharedState(layout, mmap.mmap(-1, SharedState.size(layout)))
+        self.shared = SharedState(layout, mmap.mmap(-1, SharedState.size(layout)))
         self.clock = VirtualClock(100.0)
         self.policy = FakePolicy()
         self.runner = runner or LockstepRunner(0)
-        sight = PolicyObservation(self.page, self.clock, SightSettings(RATE, 0.2, 0.5))
+        policy_observation = PolicyObservation(self.shared, self.clock, SightSettings(RATE, 0.2, 0.5))
         self.spaces = FakeSpaces()
-        self.asking = PolicyRequests(self.policy, "pick", self.spaces, sight, self.runner, self.clock)
+        self.requests = PolicyRequests(
+            self.policy, "pick", self.spaces, policy_observation, self.runner, self.clock
+        )
         self.inference = Inference(
-            self.asking,
+            self.requests,
             strategy or ASYNC,
-            self.page,
-            ControlQueue(self.page),
+            self.shared,
+            ControlQueue(self.shared),
             self.clock,
             Patience(stale=1.0, lost=3.0),
             RtcPrefix(RATE),
@@ -113,7 +115,7 @@ class Desk:
     def observe(self, **changes: Any) -> None:
         self.sequence += 1
         now = self.clock.now()
-        self.page.pictures["cam"].write(self.sequence, PICTURE)
+        self.shared.pictures["cam"].write(self.sequence, PICTURE)
         fields: dict[str, Any] = {
             "sequence": self.sequence,
             "arrived": now,
@@ -121,19 +123,19 @@ class Desk:
             "qpos": np.zeros(2, np.float32),
             "pictures": {},
         }
-        self.page.publish_observation(Observation(**(fields | changes)), {"cam": self.sequence})
+        self.shared.publish_observation(Observation(**(fields | changes)), {"cam": self.sequence})
 
     def ticked(self, step: int, remaining: int = 0, **said: Any) -> None:
         """Control has done `step` with the newest observation."""
-        status = self.page.control.read().copy()
+        status = self.shared.control.read().copy()
         for name, value in said.items():
             status[name] = value
         status["step"], status["planned"], status["sequence"] = step, self.clock.now(), self.sequence
         status["remaining"] = remaining
-        self.page.control.write(status)
+        self.shared.control.write(status)
 
     def posted(self) -> list[PostedChunk]:
-        found = [decode(payload) for payload in self.page.rings["orders"].drain()]
+        found = [decode(payload) for payload in self.shared.rings["orders"].drain()]
         return [message for message in found if isinstance(message, PostedChunk)]
 
     def merged(self, chunk: int, run: int = 1, delay: int = 3, dropped: str = "") -> None:
@@ -167,7 +169,7 @@ class GlancingPolicy(FakePolicy):
 def test_who_wants_it_is_shown_what_is_seen_between_requests_and_only_in_a_run() -> None:
     desk = Desk(strategy=SYNC)
     policy = GlancingPolicy()
-    desk.asking.policy = policy
+    desk.requests.policy = policy
     desk.going()
     for _ in range(31):
         desk.ticked(desk.sequence + 7, remaining=5)  # enough is planned: nothing is asked
@@ -186,7 +188,7 @@ def test_who_wants_it_is_shown_what_is_seen_between_requests_and_only_in_a_run()
 def test_what_is_too_old_is_glanced_at_by_nobody_and_a_gap_is_followed_by_no_burst() -> None:
     desk = Desk(strategy=SYNC)
     policy = GlancingPolicy()
-    desk.asking.policy = policy
+    desk.requests.policy = policy
     desk.going()
     desk.ticked(7, remaining=5)
     desk.inference.pump()
@@ -203,26 +205,26 @@ def test_what_is_too_old_is_glanced_at_by_nobody_and_a_gap_is_followed_by_no_bur
 
 
 def test_an_observation_that_control_has_seen_is_of_the_step_that_saw_it(desk: Desk) -> None:
-    assert desk.asking.observe().step == 7
+    assert desk.requests.observe().step == 7
 
 
 def test_a_newer_observation_is_of_the_next_step(desk: Desk) -> None:
     desk.clock.advance(0.02)
     desk.observe()
-    assert desk.asking.observe().step == 8
+    assert desk.requests.observe().step == 8
 
 
 def test_while_control_stalls_an_observation_is_of_the_step_that_will_see_it(desk: Desk) -> None:
     desk.clock.advance(14.5 / RATE)
     desk.observe()
-    assert desk.asking.observe().step == 22
+    assert desk.requests.observe().step == 22
 
 
 def test_an_observation_that_arrived_just_before_a_tick_that_missed_it_is_of_the_next_step(
     desk: Desk,
 ) -> None:
     desk.observe(arrived=desk.clock.now() - 0.001)
-    assert desk.asking.observe().step == 8
+    assert desk.requests.observe().step == 8
 
 
 def test_the_policy_is_shown_the_task_the_pictures_and_poses(desk: Desk) -> None:
@@ -248,24 +250,24 @@ def test_what_is_too_old_is_named_and_not_shown_to_the_policy(
     desk = Desk()
     desk.observe(captured={name: 100.0 + offset for name, offset in captured.items()})
     with pytest.raises(PolicyError, match=sentence):
-        desk.asking.ask()
+        desk.requests.ask()
     assert desk.policy.calls == []
 
 
 def test_pictures_may_be_older_than_joints(desk: Desk) -> None:
     desk.observe(captured={"joints": 100.0, "cam": 99.6})
-    assert desk.asking.observe().captured["cam"] == 99.6
+    assert desk.requests.observe().captured["cam"] == 99.6
 
 
 def test_without_an_observation_or_a_picture_it_says_what_is_missing() -> None:
     desk = Desk()
     with pytest.raises(PolicyError, match="no observation has arrived yet"):
-        desk.asking.observe()
+        desk.requests.observe()
     now = desk.clock.now()
     bare = Observation(1, now, {"joints": now}, np.zeros(2, np.float32), {})
-    desk.page.publish_observation(bare, {})
+    desk.shared.publish_observation(bare, {})
     with pytest.raises(PolicyError, match="no picture has arrived from cam"):
-        desk.asking.observe()
+        desk.requests.observe()
 
 
 def test_an_answer_is_posted_unmerged_with_the_step_of_its_observation(desk: Desk) -> None:
@@ -286,7 +288,7 @@ def test_nothing_is_asked_while_an_answer_is_not_merged_yet(desk: Desk) -> None:
     desk.merged(1)
     desk.inference.pump()
     assert desk.policy.calls.count("infer") == 2
-    assert list(desk.inference.tally.delays) == [3]
+    assert list(desk.inference.metrics.delays) == [3]
 
 
 def test_a_dropped_chunk_is_followed_by_a_new_query(desk: Desk) -> None:
@@ -341,7 +343,7 @@ def test_a_pause_drops_the_answer_that_is_still_in_flight() -> None:
 
 def test_what_control_says_of_another_run_is_not_counted(desk: Desk) -> None:
     desk.merged(1, run=9)
-    assert list(desk.inference.tally.delays) == []
+    assert list(desk.inference.metrics.delays) == []
 
 
 def test_the_policy_is_reset_once_per_run_and_before_its_first_inference(desk: Desk) -> None:
@@ -412,7 +414,7 @@ def test_an_error_about_one_answer_is_told_as_the_policys_and_the_next_is_taken(
 
     desk.going()
     with monkeypatch.context() as patch:
-        patch.setattr(desk.asking, "note", note)
+        patch.setattr(desk.requests, "note", note)
         with pytest.raises(PolicyError, match="cannot be used: IndexError: index 3 is out of bounds"):
             desk.inference.pump()
     assert "Traceback" in caplog.text
@@ -425,7 +427,7 @@ def test_a_policy_whose_answers_cannot_be_used_is_not_back(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     desk.going()
-    monkeypatch.setattr(desk.asking, "note", lambda answered: [][0])
+    monkeypatch.setattr(desk.requests, "note", lambda answered: [][0])
     for _ in range(100):
         desk.observe()
         with pytest.raises(PolicyError) as told:
@@ -499,7 +501,7 @@ def test_a_call_whose_turn_comes_after_the_exchange_is_still_the_former_policys(
 
     desk.runner.submit = submit  # type: ignore[method-assign]
     former, other = desk.policy, FakePolicy()
-    desk.asking.ask()
+    desk.requests.ask()
     desk.inference.exchange(other, "place")
     calls[0]()
     assert former.calls == ["close", "reset", "infer"]
@@ -508,11 +510,11 @@ def test_a_call_whose_turn_comes_after_the_exchange_is_still_the_former_policys(
 
 def test_the_same_policy_is_neither_closed_nor_told_to_forget_by_a_new_task(desk: Desk) -> None:
     desk.inference.pump()
-    assert desk.inference.tally.latencies
+    assert desk.inference.metrics.latencies
     desk.inference.exchange(desk.policy, "place")
     assert desk.policy.calls == ["reset", "infer"]
-    assert (len(desk.inference.tally.latencies), len(desk.inference.tally.delays)) == (0, 0)
-    desk.asking.ask()
+    assert (len(desk.inference.metrics.latencies), len(desk.inference.metrics.delays)) == (0, 0)
+    desk.requests.ask()
     assert desk.policy.calls == ["reset", "infer", "infer"]
     assert desk.policy.seen[-1].prompt == "place"
 
@@ -676,17 +678,17 @@ def test_a_pause_forgets_what_the_robot_was_committed_to() -> None:
 
 
 def test_in_simulation_the_policy_is_shown_the_joints_of_the_simulated_robot(desk: Desk) -> None:
-    desk.asking.sight.simulated = True
-    status = desk.page.control.read().copy()
+    desk.requests.policy_observation.simulated = True
+    status = desk.shared.control.read().copy()
     status["simulated"] = np.nan
-    desk.page.control.write(status)
-    assert desk.asking.observe().qpos.tolist() == [
+    desk.shared.control.write(status)
+    assert desk.requests.observe().qpos.tolist() == [
         0.0,
         0.0,
     ]  # it has not begun: it stands where the real one does
     status["simulated"] = [0.5, -0.5]
-    desk.page.control.write(status)
-    shown = desk.asking.observe()
+    desk.shared.control.write(status)
+    shown = desk.requests.observe()
     assert shown.qpos.tolist() == [0.5, -0.5]
     assert shown.eef is None
     assert shown.step == 7
@@ -697,12 +699,12 @@ def test_figures_are_those_of_the_run(desk: Desk) -> None:
     desk.merged(1, delay=3)
     desk.inference.pump()
     desk.merged(2, delay=5, dropped="too late")
-    figures = desk.inference.tally.figures()
+    figures = desk.inference.metrics.figures()
     assert (figures["answers"], figures["dropped"]) == (2, 1)
     assert figures["delay_steps"]["max"] == 5.0
-    assert desk.inference.tally.newest()["delays"] == [3, 5]
+    assert desk.inference.metrics.newest()["delays"] == [3, 5]
     desk.inference.begin(2, fresh=True)
-    assert desk.inference.tally.figures()["delay_steps"] is None
+    assert desk.inference.metrics.figures()["delay_steps"] is None
 
 
 # Where a chunk takes over
@@ -822,7 +824,7 @@ def test_how_poses_were_met_is_recorded_told_and_counted(desk: Desk, monkeypatch
         "worst_deg": 0.0,
     }
     assert note.data == pytest.approx(figures)
-    assert desk.inference.tally.newest()["ik"] == note.data
+    assert desk.inference.metrics.newest()["ik"] == note.data
     (posted,) = desk.posted()
     assert posted.meant is not None
     np.testing.assert_array_equal(posted.meant, [0.1, 0.2])
@@ -830,7 +832,7 @@ def test_how_poses_were_met_is_recorded_told_and_counted(desk: Desk, monkeypatch
     assert desk.inference.shown is not None
     assert desk.inference.shown.ik == note.data
     desk.inference.pump()
-    assert desk.inference.tally.figures()["ik"]["over"] == 4
+    assert desk.inference.metrics.figures()["ik"]["over"] == 4
 
 
 def test_poses_that_are_all_reached_are_no_event(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -838,4 +840,4 @@ def test_poses_that_are_all_reached_are_no_event(desk: Desk, monkeypatch: pytest
     monkeypatch.setattr(desk.spaces, "to_command", lambda chunk, observation, onset: rows)
     desk.inference.pump()
     assert desk.inference.notes == []
-    assert desk.inference.tally.newest()["ik"]["velocity"] == 4
+    assert desk.inference.metrics.newest()["ik"]["velocity"] == 4

@@ -18,13 +18,13 @@ def merged(delay: int, mistimed: int = 0, dropped: str = "") -> ChunkMerged:
 
 
 def test_answers_delays_and_what_went_wrong_are_counted() -> None:
-    tally = PolicyMetrics()
+    metrics = PolicyMetrics()
     for milliseconds in range(1, 101):
-        tally.answered(milliseconds / 1000)
-    tally.merged(merged(3))
-    tally.merged(merged(5, mistimed=2))
-    tally.merged(merged(60, dropped="all in the past"))
-    figures = tally.figures()
+        metrics.answered(milliseconds / 1000)
+    metrics.merged(merged(3))
+    metrics.merged(merged(5, mistimed=2))
+    metrics.merged(merged(60, dropped="all in the past"))
+    figures = metrics.figures()
     assert (figures["answers"], figures["mistimed"], figures["dropped"]) == (100, 1, 1)
     assert figures["latency_ms"]["p50"] == 50.5
     assert figures["latency_ms"]["max"] == 100.0
@@ -32,33 +32,33 @@ def test_answers_delays_and_what_went_wrong_are_counted() -> None:
 
 
 def test_without_a_measurement_there_is_no_figure() -> None:
-    tally = PolicyMetrics()
-    assert tally.figures()["latency_ms"] is None
-    assert tally.figures()["delay_steps"] is None
-    newest = tally.newest()
+    metrics = PolicyMetrics()
+    assert metrics.figures()["latency_ms"] is None
+    assert metrics.figures()["delay_steps"] is None
+    newest = metrics.newest()
     assert (newest["latencies_ms"], newest["delays"]) == ([], [])
     assert all(math.isnan(newest[name]) for name in ("latency_p50_ms", "delay_p50", "delay_max"))
     assert math.isnan(quantile([], 50))
 
 
 def test_a_page_is_told_the_newest_sixty_and_the_counts_go_on() -> None:
-    tally = PolicyMetrics()
+    metrics = PolicyMetrics()
     for number in range(100):
-        tally.answered(number / 1000)
-        tally.merged(merged(number))
-    told = tally.newest()
+        metrics.answered(number / 1000)
+        metrics.merged(merged(number))
+    told = metrics.newest()
     assert told["delays"] == list(range(40, 100))
     assert len(told["latencies_ms"]) == 60
-    assert tally.answers == 100
+    assert metrics.answers == 100
 
 
 def test_how_old_an_observation_was_when_the_policy_was_asked_is_a_figure() -> None:
-    tally = PolicyMetrics()
-    tally.answered(0.1)
-    assert tally.figures()["observation_age_ms"] is None
+    metrics = PolicyMetrics()
+    metrics.answered(0.1)
+    assert metrics.figures()["observation_age_ms"] is None
     for age in (0.010, 0.020, 0.030):
-        tally.answered(0.1, age)
-    assert tally.figures()["observation_age_ms"] == {
+        metrics.answered(0.1, age)
+    assert metrics.figures()["observation_age_ms"] == {
         "p50": 20.0,
         "p90": pytest.approx(28.0),
         "p99": pytest.approx(29.8),
@@ -67,15 +67,15 @@ def test_how_old_an_observation_was_when_the_policy_was_asked_is_a_figure() -> N
 
 
 def test_a_page_is_told_the_spread_of_the_newest_three_hundred() -> None:
-    tally = PolicyMetrics()
+    metrics = PolicyMetrics()
     for number in range(1000):
-        tally.answered(number / 1000)
-        tally.merged(merged(1000 - number))
-    told = tally.newest()
+        metrics.answered(number / 1000)
+        metrics.merged(merged(1000 - number))
+    told = metrics.newest()
     assert told["latency_p50_ms"] == pytest.approx(849.5)
     assert told["latency_p90_ms"] == pytest.approx(969.1)
     assert (told["delay_p50"], told["delay_max"]) == (150.5, 300)
-    assert tally.figures()["latency_ms"]["p50"] == pytest.approx(499.5)
+    assert metrics.figures()["latency_ms"]["p50"] == pytest.approx(499.5)
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=50), st.floats(0, 100))
@@ -84,9 +84,9 @@ def test_a_quantile_is_that_of_numpy(values: list[float], percent: float) -> Non
 
 
 def test_a_new_run_begins_anew() -> None:
-    tally = PolicyMetrics()
-    tally.answered(0.1, 0.02)
-    tally.merged(merged(3, mistimed=1, dropped="x"))
-    tally.starved = tally.lost = 2
-    tally.forget()
-    assert tally.figures() == PolicyMetrics().figures()
+    metrics = PolicyMetrics()
+    metrics.answered(0.1, 0.02)
+    metrics.merged(merged(3, mistimed=1, dropped="x"))
+    metrics.starved = metrics.lost = 2
+    metrics.forget()
+    assert metrics.figures() == PolicyMetrics().figures()

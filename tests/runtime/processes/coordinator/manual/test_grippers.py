@@ -23,8 +23,8 @@ def robot() -> Any:
 def grippers() -> Grippers:
     made = robot()
     limits = SimpleNamespace(lower=made.lower, upper=made.upper)
-    plan: Any = SimpleNamespace(robot=made, limits=limits)
-    return Grippers(plan)
+    spec: Any = SimpleNamespace(robot=made, limits=limits)
+    return Grippers(spec)
 
 
 def at(value: float = 0.05) -> np.ndarray:

@@ -35,8 +35,8 @@ def targets(workspace: dict[str, WorkspaceBox] | None = None) -> Targets:
         robot.joint_names, robot.lower, robot.upper, robot.velocity, grippers, np.zeros(robot.dim, bool)
     )
     chosen = SimpleNamespace(safety=SafetySettings(workspace=workspace or {}))
-    plan: Any = SimpleNamespace(robot=robot, limits=limits, deployment=chosen, dims=DimensionKinds())
-    return Targets(plan, spaces, kinematics)
+    spec: Any = SimpleNamespace(robot=robot, limits=limits, deployment=chosen, dims=DimensionKinds())
+    return Targets(spec, spaces, kinematics)
 
 
 def ready() -> np.ndarray:

@@ -20,7 +20,7 @@ from runtime.ipc.shared_state import EStop
 from runtime.processes.control.process import make_tick
 from runtime.processes.coordinator.coordinator import Coordinator
 from runtime.processes.coordinator.session.transitions import COMMANDS, State
-from tests.runtime.lockstep_station import DIM, STANDS, Station, plan
+from tests.runtime.lockstep_station import DIM, STANDS, Station, spec_of
 
 PERIOD = 1 / 30
 BRAKES = 10.0  # [rad/s2] at least, half of what a stop is set to: the last step of one is shorter
@@ -91,7 +91,7 @@ class Machine(RuleBasedStateMachine):
     def begin(self, delay: int, home: bool, strategy: str) -> None:
         self.watch(
             Station(
-                plan(
+                spec_of(
                     Path(self.folder.name),
                     self.rows,
                     strategy=strategy,
@@ -106,9 +106,9 @@ class Machine(RuleBasedStateMachine):
     def watch(self, station: Station) -> None:
         """Be the witness of that station."""
         self.station = station
-        self.limits = station.plan.limits
+        self.limits = station.spec.limits
         self.records: list[Any] = []
-        ring = station.page.rings["ticks"]
+        ring = station.shared.rings["ticks"]
         push = ring.push
         ring.push = lambda payload: self.records.append(decode(payload)) or push(payload)  # type: ignore[method-assign]
         self.speed: Float64 = np.zeros(DIM)
@@ -225,21 +225,21 @@ class Machine(RuleBasedStateMachine):
 
     def restart_control(self) -> None:
         station = self.station
-        for _ in station.page.rings["orders"].drain():
+        for _ in station.shared.rings["orders"].drain():
             pass
-        station._tick = make_tick(station.plan, station.page, station._sink, station.clock.now)
-        station.page.set_generation("control", station.page.generation("control") + 1)
+        station._tick = make_tick(station.spec, station.shared, station._sink, station.clock.now)
+        station.shared.set_generation("control", station.shared.generation("control") + 1)
         self.going, self.speed = False, np.zeros(DIM)
 
     def restart_main(self) -> None:
         station = self.station
-        station.page.beat("main", 0.0)
+        station.shared.beat("main", 0.0)
         told = len(station.robot.commands)
         station._tick(station.step, station.clock.now())  # control sees that nobody is there
-        self.look(station.page.observation.read()["qpos"].astype(np.float64), told)
+        self.look(station.shared.observation.read()["qpos"].astype(np.float64), told)
         station.step += 1
-        station.clock.sleep_until(station.step / station.plan.rate)
-        station.main = Coordinator(station.plan, station.page, station.clock, station._runner)
+        station.clock.sleep_until(station.step / station.spec.rate)
+        station.main = Coordinator(station.spec, station.shared, station.clock, station._runner)
         self.going = False
         self.merged.clear()
 
@@ -253,11 +253,11 @@ class Machine(RuleBasedStateMachine):
                 station._handle("lease_renew" if held else "lease_claim")
             told = len(station.robot.commands)
             station.tick()
-            self.look(station.page.observation.read()["qpos"].astype(np.float64), told)
+            self.look(station.shared.observation.read()["qpos"].astype(np.float64), told)
 
     def look(self, measured: Float64, told: int) -> None:
         station = self.station
-        status = station.page.control.read()
+        status = station.shared.control.read()
         new = station.robot.commands[told:]
         assert len(new) == int(status["engaged"])
         stepped = any("stepped" in note for r in self.records if isinstance(r, TickDone) for note in r.notes)
@@ -291,7 +291,7 @@ class Machine(RuleBasedStateMachine):
                 station.state,
                 station.reason,
             )  # a locked gripper goes on to its place
-        fresh = station.clock.now() - float(station.page.observation.read()["joints_captured"]) < 0.1
+        fresh = station.clock.now() - float(station.shared.observation.read()["joints_captured"]) < 0.1
         if (
             min(self.still, self.moved - AGREED) > 12
             and fresh
@@ -306,7 +306,7 @@ class Machine(RuleBasedStateMachine):
         assert (sent <= np.maximum(limits.upper, before) + 1e-5).all()
         speed = (sent - before) / PERIOD
         assert (np.abs(speed) <= limits.velocity * 1.001 + 1e-4).all()
-        if self.station.page.estop is EStop.CLEAR:
+        if self.station.shared.estop is EStop.CLEAR:
             rate = 60.0 * limits.reach * PERIOD
             assert (np.abs(speed - self.speed) <= rate * 1.06 + 1e-3).all()
         self.speed = speed

@@ -8,24 +8,24 @@ from typing import Any
 
 import pytest
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.errors import ConfigurationError, SetupError
 from runtime.processes.coordinator.session.transitions import State
-from tests.runtime.lockstep_station import Station, on_time, plan
+from tests.runtime.lockstep_station import Station, on_time, spec_of
 
 OTHER = {"amplitude": 0.1}  # of the mock policy, whose default is 0.2
 BENCH = {"id": "reset-1", "seed": 7, "positions": {"block": [0.1, 0.3, 45.0]}}
 
 
 def simulated(folder: Path, **settings: Any) -> Station:
-    return Station(plan(folder, simulated=True, **settings))
+    return Station(spec_of(folder, simulated=True, **settings))
 
 
 # --- the policy --------------------------------------------------------------------------------------------
 
 
 def test_another_policy_takes_the_place_of_the_former_which_is_closed_first(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     station.ready(policy=OTHER)
     former, other = station.policies
     assert former.calls == ["connect", "reset", "infer", "infer", "close"]
@@ -42,7 +42,7 @@ def test_a_policy_whose_module_cannot_be_loaded_is_refused_by_name_and_the_stati
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "runtime.policies.starvla", None)
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     with pytest.raises(SetupError, match=r"'starvla' cannot be loaded: .*starvla.py: ModuleNotFoundError"):
         station.command("setup", policy={"kind": "starvla", "url": "ws://127.0.0.1:1"})
     station.command("run")
@@ -52,7 +52,7 @@ def test_a_policy_whose_module_cannot_be_loaded_is_refused_by_name_and_the_stati
 
 
 def test_the_same_policy_is_kept_and_connected_anew(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).ready(policy={"amplitude": 0.2})
+    station = Station(spec_of(tmp_path)).ready(policy={"amplitude": 0.2})
     station.ready(policy={"kind": "mock"})
     assert station.policies == [station.policy]
     assert station.policy.calls.count("connect") == 2
@@ -61,13 +61,13 @@ def test_the_same_policy_is_kept_and_connected_anew(tmp_path: Path) -> None:
 
 
 def test_a_set_up_that_names_none_takes_the_deployments_own_again(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, policy={"period_s": 5.0}))
+    station = Station(spec_of(tmp_path, policy={"period_s": 5.0}))
     station.ready(policy=OTHER)
-    assert station.main.plan.deployment.policy.period_s == 5.0  # merged over the deployment's own
+    assert station.main.spec.deployment.policy.period_s == 5.0  # merged over the deployment's own
     station.ready(policy={"horizon": 20})
-    assert station.main.plan.deployment.policy.amplitude == 0.2  # not over what was set up before
+    assert station.main.spec.deployment.policy.amplitude == 0.2  # not over what was set up before
     station.ready()
-    assert station.main.plan.resolved == station.plan.resolved
+    assert station.main.spec.resolved == station.spec.resolved
     assert len(station.policies) == 4
     station.close()
 
@@ -101,12 +101,12 @@ REFUSED = {
 def test_a_refused_set_up_leaves_everything_as_it_was(
     tmp_path: Path, arguments: dict[str, Any], sentence: str
 ) -> None:
-    station = Station(plan(tmp_path)).ready(task="first", checkpoint={"id": 1, "name": "A"})
-    before, calls = station.main.plan, list(station.policy.calls)
+    station = Station(spec_of(tmp_path)).ready(task="first", checkpoint={"id": 1, "name": "A"})
+    before, calls = station.main.spec, list(station.policy.calls)
     with pytest.raises(SetupError, match=sentence):
         station.command("setup", **arguments)
     assert station.state is State.READY
-    assert station.main.plan is before
+    assert station.main.spec is before
     assert station.main.inference.policy is station.policy
     assert station.policy.calls == calls
     assert station.policies == [station.policy]
@@ -118,8 +118,8 @@ def test_a_refused_set_up_leaves_everything_as_it_was(
 
 
 def test_a_policy_that_does_not_fit_the_robot_is_refused_before_the_former_is_closed(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).ready()
-    station.plan.built["unfit"] = ConfigurationError("policy.cameras names nose")
+    station = Station(spec_of(tmp_path)).ready()
+    station.spec.built["unfit"] = ConfigurationError("policy.cameras names nose")
     with pytest.raises(SetupError, match=r"policy\.cameras names nose"):
         station.command("setup", policy=OTHER)
     assert station.main.inference.policy is station.policy
@@ -128,8 +128,8 @@ def test_a_policy_that_does_not_fit_the_robot_is_refused_before_the_former_is_cl
 
 
 def test_a_policy_whose_own_code_fails_is_refused_and_ends_nothing(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).ready()
-    station.plan.built["unfit"] = ZeroDivisionError("0 / 0")
+    station = Station(spec_of(tmp_path)).ready()
+    station.spec.built["unfit"] = ZeroDivisionError("0 / 0")
     with pytest.raises(SetupError, match="policy 'mock' cannot be made: ZeroDivisionError: 0 / 0"):
         station.command("setup", policy=OTHER)
     assert (station.state, station.main.inference.policy) == (State.READY, station.policy)
@@ -137,20 +137,20 @@ def test_a_policy_whose_own_code_fails_is_refused_and_ends_nothing(tmp_path: Pat
 
 
 def test_the_manifest_says_what_was_really_used(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).ready(policy=OTHER, task="fold", checkpoint={"id": 7, "name": "B"})
+    station = Station(spec_of(tmp_path)).ready(policy=OTHER, task="fold", checkpoint={"id": 7, "name": "B"})
     station.command("run")
     station.go(20)
     manifest = station.stop().manifest
-    expected = deployment.changed(station.plan.resolved, {"policy": OTHER, "task": "fold"}, "test")
+    expected = loader.changed(station.spec.resolved, {"policy": OTHER, "task": "fold"}, "test")
     assert manifest["configuration"] == expected.tree
-    assert manifest["configuration_hash"] == expected.digest != station.plan.resolved.digest
+    assert manifest["configuration_hash"] == expected.digest != station.spec.resolved.digest
     assert manifest["task"] == "fold"
     assert manifest["checkpoint"] == {"id": 7, "name": "B"}
     station.ready()
     station.command("run")
     station.go(20)
     manifest = station.stop().manifest
-    assert manifest["configuration_hash"] == station.plan.resolved.digest
+    assert manifest["configuration_hash"] == station.spec.resolved.digest
     assert (manifest["task"], manifest["checkpoint"]) == ("stack the cups", {})
     station.close()
 
@@ -162,14 +162,14 @@ def test_the_policy_is_given_the_task_of_the_set_up(tmp_path: Path) -> None:
         prompts.append(observation.prompt)
         return on_time(observation, number)
 
-    station = Station(plan(tmp_path, rows)).ready(task="fold the towel")
+    station = Station(spec_of(tmp_path, rows)).ready(task="fold the towel")
     station.ready()
     assert prompts == ["fold the towel"] * 2 + ["stack the cups"] * 2
     station.close()
 
 
 def test_figures_of_the_former_policy_are_not_the_new_ones(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).running(20)
+    station = Station(spec_of(tmp_path)).running(20)
     assert station.main.snapshot()["policy"]["answers"] > 0
     station.stop()
     station.ready(policy=OTHER)
@@ -178,10 +178,10 @@ def test_figures_of_the_former_policy_are_not_the_new_ones(tmp_path: Path) -> No
 
 
 def test_a_failed_set_up_can_be_made_good_by_another_policy(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, absent="no server there: start it"))
+    station = Station(spec_of(tmp_path, absent="no server there: start it"))
     station.prepare(policy=OTHER)
     assert (station.state, station.reason) == (State.IDLE, "no server there: start it")
-    object.__setattr__(station.plan, "absent", "")  # somebody starts it
+    object.__setattr__(station.spec, "absent", "")  # somebody starts it
     object.__setattr__(station.main.operations._own, "absent", "")
     station.ready(policy={"amplitude": 0.3})
     assert [policy.calls[0] for policy in station.policies[1:]] == ["connect", "connect"]
@@ -190,7 +190,7 @@ def test_a_failed_set_up_can_be_made_good_by_another_policy(tmp_path: Path) -> N
 
 
 def test_an_open_recording_keeps_the_policy_that_its_manifest_names(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     station.command("record_start")
     station.go(2)
     with pytest.raises(SetupError, match=r"a recording is open, .* record stop first"):
@@ -206,7 +206,7 @@ def test_an_open_recording_keeps_the_policy_that_its_manifest_names(tmp_path: Pa
 
 
 def test_a_run_is_told_its_trial_and_its_operator_and_answers_with_its_episode(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     ack = station.command(
         "run", trial={"id": 12, "scene": {"name": "cups"}}, operator="anna", duration_s=30.0
     )
@@ -219,7 +219,7 @@ def test_a_run_is_told_its_trial_and_its_operator_and_answers_with_its_episode(t
 
 
 def test_a_run_without_arguments_has_the_deployments_operator_and_limit(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, operator="ben", run={"duration_s": 20.0})).ready()
+    station = Station(spec_of(tmp_path, operator="ben", run={"duration_s": 20.0})).ready()
     station.command("run")
     station.go(10)
     assert station.main.snapshot()["run"]["duration_s"] == 20.0
@@ -229,7 +229,7 @@ def test_a_run_without_arguments_has_the_deployments_operator_and_limit(tmp_path
 
 
 def test_the_limit_of_a_run_is_its_own(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, run={"duration_s": 20.0})).ready()
+    station = Station(spec_of(tmp_path, run={"duration_s": 20.0})).ready()
     station.command("run", duration_s=0.5)
     station.reach(State.READY, 1.0)
     assert station.reason == "the run's 0.5 s are over"
@@ -238,13 +238,13 @@ def test_the_limit_of_a_run_is_its_own(tmp_path: Path) -> None:
 
 
 def test_a_run_that_is_not_recorded_has_no_episode(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, recording={"enabled": False})).ready()
+    station = Station(spec_of(tmp_path, recording={"enabled": False})).ready()
     assert station.command("run").data["episode"] == ""
     station.close()
 
 
 def test_a_recording_alone_answers_with_its_episode_too(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     episode = station.command("record_start").data["episode"]
     station.go(5)
     station.command("record_stop")
@@ -417,13 +417,13 @@ def test_the_snapshot_says_what_is_set_up(tmp_path: Path) -> None:
     assert (shown["simulated"], shown["truth"]["seed"]) == (True, 7)
     assert "url" not in str(shown["policy"])
     facts = shown["facts"]
-    assert facts["joint_names"] == list(station.plan.robot.joint_names)
-    assert facts["home"] == station.plan.robot.poses["home"].tolist()
-    assert (facts["rate"], facts["cameras"]) == (30.0, list(station.plan.cameras))
+    assert facts["joint_names"] == list(station.spec.robot.joint_names)
+    assert facts["home"] == station.spec.robot.poses["home"].tolist()
+    assert (facts["rate"], facts["cameras"]) == (30.0, list(station.spec.cameras))
     station.close()
 
 
 def test_a_real_bench_is_shown_as_such(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     assert station.main.snapshot()["simulated"] is False
     station.close()

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.config import loader as deployment
+from runtime.config import loader
 from runtime.core.errors import PolicyError, SetupError
 from runtime.core.types import Observation
 from runtime.policies.base import PolicyInfo
 from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.coordinator.setup.sequence import Stage
 from runtime.spaces.conversion import CommandRows
-from tests.runtime.lockstep_station import MOVED, STANDS, Station, on_time, plan, ramp
+from tests.runtime.lockstep_station import MOVED, STANDS, Station, on_time, ramp, spec_of
 
 
 def failed(station: Station) -> str:
@@ -31,7 +31,7 @@ def without_control(station: Station, seconds: float, beating: bool = True) -> N
     while station.clock.now() < until:
         now = station.clock.now()
         for process in ("control", *others) if beating else others:
-            station.page.beat(process, now)
+            station.shared.beat(process, now)
         station._handle("lease_renew")
         station.reception.pump(0.0)
         station.media.digest()
@@ -40,7 +40,7 @@ def without_control(station: Station, seconds: float, beating: bool = True) -> N
 
 
 def test_it_goes_from_stage_to_stage_and_says_so(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, setup={"home": True})).ready()
+    station = Station(spec_of(tmp_path, setup={"home": True})).ready()
     assert station.events("setup") == [
         "waiting for a complete observation",
         "going to the pose",
@@ -55,14 +55,14 @@ def test_it_goes_from_stage_to_stage_and_says_so(tmp_path: Path) -> None:
 
 
 def test_the_policy_is_reset_once_and_warmed_up_as_often_as_asked(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, setup={"warmup_chunks": 4})).ready()
+    station = Station(spec_of(tmp_path, setup={"warmup_chunks": 4})).ready()
     assert station.policy.calls == ["connect", "reset", "infer", "infer", "infer", "infer"]
     assert station.robot.commands == []  # nothing moved: no homing was asked for
     station.close()
 
 
 def test_the_first_row_is_compared_with_where_the_arm_is(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, lambda o, n: ramp(100, 5))).ready()
+    station = Station(spec_of(tmp_path, lambda o, n: ramp(100, 5))).ready()
     assert (
         station.main.setup.validated == "5 rows in 0 ms, the first at most 0.200 rad away (left_arm.joint0)"
     )
@@ -70,7 +70,7 @@ def test_the_first_row_is_compared_with_where_the_arm_is(tmp_path: Path) -> None
 
 
 def test_a_policy_that_cannot_be_reached_ends_it_with_its_sentence(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, absent="no server at ws://there: start it"))
+    station = Station(spec_of(tmp_path, absent="no server at ws://there: start it"))
     assert failed(station) == "no server at ws://there: start it"
     assert station.policy.calls == ["connect", "close"]
     station.close()
@@ -83,7 +83,7 @@ def test_a_policy_that_fails_while_it_is_warmed_up_ends_it(tmp_path: Path, error
             raise error
         return on_time(observation, number)
 
-    station = Station(plan(tmp_path, rows, delay=2))
+    station = Station(spec_of(tmp_path, rows, delay=2))
     assert str(error) in failed(station)
     assert station.policy.calls == ["connect", "reset", "infer", "infer", "close"]
     station.close()
@@ -96,14 +96,14 @@ def test_a_policy_that_answers_what_is_no_number_ends_it(tmp_path: Path, value: 
         answer[3, 9] = value
         return answer
 
-    station = Station(plan(tmp_path, rows))
+    station = Station(spec_of(tmp_path, rows))
     assert f"{value} for right_arm.joint2 in row 3" in failed(station)
     assert station.robot.commands == []
     station.close()
 
 
 def test_a_camera_that_falls_away_ends_it_with_its_name(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, setup={"observation_timeout_s": 1.0}))
+    station = Station(spec_of(tmp_path, setup={"observation_timeout_s": 1.0}))
     station.reach(State.IDLE)
     station.robot.cameras.remove("cam_left_wrist")
     station.go(30)  # the last picture of it grows old
@@ -114,7 +114,7 @@ def test_a_camera_that_falls_away_ends_it_with_its_name(tmp_path: Path) -> None:
 
 
 def test_an_arm_that_does_not_arrive_ends_it_with_its_name_and_how_far_it_is(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, setup={"home": True}))
+    station = Station(spec_of(tmp_path, setup={"home": True}))
     station.robot.bias[8] = 0.2
     reason = failed(station)
     assert "the arm did not arrive: right_arm.joint1 is 0.20 rad from the pose 'home'" in reason
@@ -125,7 +125,7 @@ def test_an_arm_that_does_not_arrive_ends_it_with_its_name_and_how_far_it_is(tmp
 
 
 def test_a_blocked_arm_is_not_pulled_at_further_than_the_following_error(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, setup={"home": True}))
+    station = Station(spec_of(tmp_path, setup={"home": True}))
     station.robot.blocked = True
     reason = failed(station)
     assert "10 actions refused in a row" in reason
@@ -139,7 +139,7 @@ def test_a_blocked_arm_is_not_pulled_at_further_than_the_following_error(tmp_pat
 
 
 def test_a_node_that_falls_silent_while_it_homes_stops_the_motion(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, setup={"home": True}))
+    station = Station(spec_of(tmp_path, setup={"home": True}))
     station.reach(State.IDLE)
     station.command("setup")
     station.go(15)
@@ -154,21 +154,21 @@ def test_a_node_that_falls_silent_while_it_homes_stops_the_motion(tmp_path: Path
 def test_joints_that_read_exactly_0_are_named_before_anything_moves(tmp_path: Path) -> None:
     standing = STANDS.copy()
     standing[[3, 12]] = 0.0
-    station = Station(plan(tmp_path, start=standing)).ready()
+    station = Station(spec_of(tmp_path, start=standing)).ready()
     (named,) = station.events("zero_joints")
-    zero = np.flatnonzero(station.plan.limits.places & (standing == 0.0))
-    assert named.startswith(", ".join(station.plan.limits.names[i] for i in zero) + " read exactly 0 rad")
+    zero = np.flatnonzero(station.spec.limits.places & (standing == 0.0))
+    assert named.startswith(", ".join(station.spec.limits.names[i] for i in zero) + " read exactly 0 rad")
     station.close()
 
 
 def test_a_set_up_waits_until_the_joints_are_believed(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, setup={"observation_timeout_s": 1.0}))
+    station = Station(spec_of(tmp_path, setup={"observation_timeout_s": 1.0}))
     station.reach(State.IDLE)
     noise = np.random.default_rng(1)
     station.robot.blocked = True
     station.command("setup")
     for _ in range(60):
-        station.robot.position = STANDS + noise.normal(0.0, 0.6, len(STANDS)) * station.plan.limits.places
+        station.robot.position = STANDS + noise.normal(0.0, 0.6, len(STANDS)) * station.spec.limits.places
         station.go(1)
     assert station.state is State.IDLE
     assert "no complete observation within 1 s: " in station.reason
@@ -177,7 +177,7 @@ def test_a_set_up_waits_until_the_joints_are_believed(tmp_path: Path) -> None:
 
 
 def test_a_motion_that_control_never_finishes_ends_it(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, setup={"home": True}))
+    station = Station(spec_of(tmp_path, setup={"home": True}))
     station.reach(State.IDLE)
     station.go(10)  # control has seen the joints
     station.command("setup")
@@ -188,7 +188,7 @@ def test_a_motion_that_control_never_finishes_ends_it(tmp_path: Path) -> None:
 
 
 def test_without_control_no_motion_is_ordered(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, setup={"home": True, "observation_timeout_s": 3.0}))
+    station = Station(spec_of(tmp_path, setup={"home": True, "observation_timeout_s": 3.0}))
     station.reach(State.IDLE)
     station.command("setup")
     without_control(station, 4.5, beating=False)
@@ -200,7 +200,7 @@ def test_without_control_no_motion_is_ordered(tmp_path: Path) -> None:
 @pytest.mark.parametrize("ticks", [1, 3, 8])  # while connecting, before and within warming up
 @pytest.mark.parametrize("command", ["stop", "halt"])
 def test_it_can_be_cancelled_at_any_time_and_begun_again(tmp_path: Path, ticks: int, command: str) -> None:
-    station = Station(plan(tmp_path, delay=4))
+    station = Station(spec_of(tmp_path, delay=4))
     station.reach(State.IDLE)
     station.command("setup")
     station.go(ticks)
@@ -215,19 +215,19 @@ def test_it_can_be_cancelled_at_any_time_and_begun_again(tmp_path: Path, ticks: 
 
 
 def test_homing_alone_asks_no_policy(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     asked = len(station.policy.calls)
     station.command("home")
     assert station.state is State.SETTING_UP
     station.reach(State.READY)
     assert station.reason == "at the pose 'home'"
     assert len(station.policy.calls) == asked
-    assert np.allclose(station.robot.position, station.plan.robot.poses["home"], atol=1e-6)
+    assert np.allclose(station.robot.position, station.spec.robot.poses["home"], atol=1e-6)
     station.close()
 
 
 def test_a_transport_that_moves_nothing_is_not_homed(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, moves_robot=False, setup={"home": True})).ready()
+    station = Station(spec_of(tmp_path, moves_robot=False, setup={"home": True})).ready()
     assert station.robot.commands == []
     with pytest.raises(SetupError, match="transport 'dataset' moves no robot"):
         station.command("home")
@@ -236,7 +236,7 @@ def test_a_transport_that_moves_nothing_is_not_homed(tmp_path: Path) -> None:
 
 
 def test_a_second_set_up_connects_and_validates_anew(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path)).ready()
+    station = Station(spec_of(tmp_path)).ready()
     station.command("setup")
     assert station.main.setup.validated == ""
     station.reach(State.READY)
@@ -246,7 +246,7 @@ def test_a_second_set_up_connects_and_validates_anew(tmp_path: Path) -> None:
 
 
 def test_the_e_stop_ends_it(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path, setup={"home": True}))
+    station = Station(spec_of(tmp_path, setup={"home": True}))
     station.reach(State.IDLE)
     station.command("setup")
     station.go(15)
@@ -265,9 +265,9 @@ def test_the_e_stop_ends_it(tmp_path: Path) -> None:
 
 def with_horizon(tmp_path: Path, steps: int, **said: Any) -> Station:
     """A station that is to execute so many steps of each answer; its policy says of itself what is `said`."""
-    made = plan(tmp_path, strategy="sync")
+    made = spec_of(tmp_path, strategy="sync")
     strategy = {"strategy": {"execution_horizon": steps}}
-    station = Station(replace(made, resolved=deployment.changed(made.resolved, strategy, "test")))
+    station = Station(replace(made, resolved=loader.changed(made.resolved, strategy, "test")))
     station.policy.connect = lambda: PolicyInfo("stub", **said)  # type: ignore[method-assign]
     return station
 
@@ -289,14 +289,14 @@ def test_no_more_steps_can_be_executed_of_an_answer_than_it_has(tmp_path: Path, 
 def test_a_short_fast_chunk_is_set_up_and_moves_the_robot(
     tmp_path: Path, strategy: str, rate: float, count: int
 ) -> None:
-    station = Station(plan(tmp_path, lambda seen, number: ramp(seen.step, count), strategy))
+    station = Station(spec_of(tmp_path, lambda seen, number: ramp(seen.step, count), strategy))
     infer = station.policy.infer
     station.policy.infer = lambda *asked: replace(infer(*asked), rate=rate)  # type: ignore[method-assign]
     station.ready().command("run")
     station.go(60)
     assert station.state is State.RUNNING, station.reason
     assert station.robot.sent[-1, MOVED[0]] == pytest.approx(
-        0.002 * station.main.page.control.read()["step"], abs=0.1
+        0.002 * station.main.shared.control.read()["step"], abs=0.1
     )
     assert len(np.unique(station.robot.sent[:, MOVED[0]])) > 10
     station.close()
@@ -305,7 +305,7 @@ def test_a_short_fast_chunk_is_set_up_and_moves_the_robot(
 def test_what_goes_wrong_with_an_answer_ends_the_set_up_and_not_main(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    station = Station(plan(tmp_path))
+    station = Station(spec_of(tmp_path))
     monkeypatch.setattr(CommandRows, "meant", property(lambda made: made.rows[len(made.rows)]))
     assert "the policy's answer cannot be used: IndexError: index 20 is out of bounds" in failed(station)
     assert "Traceback" in caplog.text
@@ -325,7 +325,7 @@ def test_as_many_steps_as_it_has_can_be(tmp_path: Path, said: dict[str, Any]) ->
 
 def measuring(tmp_path: Path, off: float) -> Station:
     """A station whose robot measures the pose of its right arm `off` metres too high."""
-    station = Station(plan(tmp_path))
+    station = Station(spec_of(tmp_path))
     receive = station.robot.receive
 
     def with_poses(timeout: float) -> Observation | None:
@@ -379,7 +379,7 @@ def set_up_in(station: Station, **args: Any) -> float:
 
 
 def test_whose_policy_is_quick_takes_as_long_as_it_is_told_to(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path))
+    station = Station(spec_of(tmp_path))
     station.until(lambda: station.state is State.IDLE, 5.0, "observations")
     quick = set_up_in(station)
     assert quick < 1.0
@@ -395,7 +395,7 @@ def test_whose_policy_is_quick_takes_as_long_as_it_is_told_to(tmp_path: Path) ->
 
 
 def test_a_rest_can_be_cancelled_and_times_that_cannot_be_are_refused(tmp_path: Path) -> None:
-    station = Station(plan(tmp_path))
+    station = Station(spec_of(tmp_path))
     station.until(lambda: station.state is State.IDLE, 5.0, "observations")
     station.command("setup", least={"warm_up_s": 100.0})
     station.go(90)
