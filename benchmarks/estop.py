@@ -172,7 +172,7 @@ def _under(found: Bench, attack: str, share: float) -> Iterator[dict[str, int]]:
 
 
 def _presses(station: Station, press: Callable[[str], Press], seconds: float) -> dict[str, Any]:
-    """Press and release by turns for so long; once main does not release, each press comes on top of the last."""
+    """Press and release by turns for so long; where it is not released, each comes on top of the last."""
     made: list[Press] = []
     lost, releases = 0, True
     until = time.monotonic() + seconds

@@ -1,4 +1,4 @@
-"""The station whose e-stop is pressed: its run, its releases, whether main speaks, and how memory grows."""
+"""The station whose e-stop is pressed: its run, its releases, whether the coordinator speaks, and how memory grows."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STATE_S = 0.1  # between two snapshots
 _READY_S, _RELEASE_S = 120.0, 2.0
 _TRIES = 3
 _HOLDER = "benchmark"
-_FAMILY = ("main", "guard")
+_FAMILY = ("coordinator", "guard")
 
 
 class Station:
@@ -90,7 +90,7 @@ class Station:
         )
 
     def release(self) -> bool:
-        """Release the e-stop; False where main does not."""
+        """Release the e-stop; False where the coordinator does not."""
         try:
             self.client.wait(lambda status: status["state"] == "faulted", _RELEASE_S)
             self.client.command("release")
@@ -100,7 +100,7 @@ class Station:
         return True
 
     def interruption(self) -> str:
-        """What ended the run before somebody pressed, "" where nothing did; raises RuntimeFault where main is mute."""
+        """What ended the run before somebody pressed, "" where nothing did; raises RuntimeFault where all is mute."""
         self.appeared()
         events = self.client.events_since(self._newest_event)
         left = [event["text"] for event in events if event["kind"] in ("state", "family_died")]
@@ -119,7 +119,7 @@ class Beside(NamedTuple):
 
 
 class Watching:
-    """Listens to main, keeps the lease and looks at memory until it is ended."""
+    """Listens to the coordinator, keeps the lease and looks at memory until it is ended."""
 
     def __init__(self, station: Station, web: int) -> None:
         self._heard = [time.monotonic()]

@@ -1,6 +1,6 @@
 """How long things take from end to end while everything runs: control at 30 Hz, cameras, recording, five pages.
 
-`command_ms`: a page presses Halt over its websocket, until it has the acknowledgement, which main gives when the
+`command_ms`: a page presses Halt over its websocket, until it has the acknowledgement, given when the
 order is on its way to control and the answer is in its journal. `node_ms`: from the same press until control hands
 the first changed command to the socket towards the node; at 30 Hz a tick comes every 33 ms, so about half of that is
 waiting for the next one. `renew_ms`: the same way there and back, 20 times a second, without a change of state.

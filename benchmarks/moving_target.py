@@ -1,7 +1,7 @@
 """A target that moves: the block rides on the simulated conveyor, and each strategy is to stay beside it.
 
 Everything is the product's own, in lockstep and deterministic: the node with its gate, plant and messages
-(runtime/sim), the whole station (media, main, control, safety), the strategies. Only time is virtual and the
+(runtime/sim), the whole station (media, the coordinator, control, safety), the strategies. Only time is virtual and the
 sockets are left out. What was chosen, and why:
 
 * The policy (runtime/sim/chase.py) sees a picture for each request, takes the block to go on as it does, and answers
@@ -123,7 +123,7 @@ def chase(strategy: Mapping[str, Any], delay: int, seed: int) -> Chased:
         made = spec_of(Path(folder), strategy, delay, seed)
         with closing(Lockstep(made)) as station:
             commanded = _follow(station, made.conveyor)
-            state, rate = str(station.main.session.state), made.rate
+            state, rate = str(station.coordinator.session.state), made.rate
     course, escort = made.conveyor, made.conveyor.escort
     return Chased(
         strategy=str(strategy["kind"]),
@@ -140,7 +140,7 @@ def chase(strategy: Mapping[str, Any], delay: int, seed: int) -> Chased:
 
 def _follow(station: Lockstep, conveyor: Conveyor) -> Float64:
     """Set up, run until the course is over; returns the arms' commands [ticks, D] of the course."""
-    session, commanded = station.main.session, []
+    session, commanded = station.coordinator.session, []
     station.connect()
     station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
     station.command("setup")

@@ -1,6 +1,6 @@
 """kill -9 at random moments while a station records and a worker publishes: what is lost, and whether all still opens.
 
-Media, main, control and reception are killed in turn, each during a run that records; the worker while it does the
+Media, the coordinator, control and reception are killed in turn, each in a recorded run; the worker while it does the
 jobs of what was recorded. Nothing is timed by the victim: the moment of the kill is ours, on the clock of the rows.
 """
 
@@ -37,7 +37,7 @@ from tests.crash.lab import Lab
 from tests.processes import eventually
 
 EPISODES = 6  # for the worker
-PROCESSES = ("media", "main", "control", "reception")
+PROCESSES = ("media", "coordinator", "control", "reception")
 _SPREAD_S = (1.0, 3.5)  # of a recording, within which its kill falls
 _WORKING_S = (0.0, 1.5)  # of a worker, from when it has its first job
 _CLOSED_S = 120.0

@@ -30,7 +30,7 @@ from tests.crash.lab import ROOT, Lab
 PROGRAMS = {
     "supervisor": "runtime.__main__",
     "control": "runtime.processes.control.process",
-    "main": "runtime.processes.coordinator.process",
+    "coordinator": "runtime.processes.coordinator.process",
     "reception": "runtime.processes.reception.process",
     "media": "runtime.processes.media.process",
     "guard": "runtime.processes.guard.process",

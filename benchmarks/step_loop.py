@@ -1,6 +1,6 @@
 """The two halves of a strategy in integer steps: a query, a delay, a merge, one action per step.
 
-What main and control do with them, in the same order, and nothing else: no process, no wire, no safety, a robot
+What the coordinator and control do with them, in the same order, and no more: no process, no wire, no safety, a robot
 that is at once where it is told to be. A tick is: collect the answer or ask, merge what was posted, execute.
 """
 
@@ -125,7 +125,7 @@ class StepLoop:
         return _Request(self._number, self.step, due, self._query.waits, rows)
 
     def _conditioning(self) -> Conditioning | None:
-        """What the robot is committed to, as main would tell a policy that continues its chunks."""
+        """What the robot is committed to, as the coordinator would tell a policy that continues its chunks."""
         quantile, horizon = self._config.delay_quantile, self._config.execution_horizon
         return self._commitment.conditioning(self.step, self._delays, quantile, horizon)
 
@@ -162,7 +162,7 @@ class StepLoop:
 
 
 def _as_told(merged: Merged) -> ChunkMerged:
-    """What control would tell main of it."""
+    """What control would tell the coordinator of it."""
     return ChunkMerged(
         merged.chunk_id,
         1,

@@ -153,7 +153,7 @@ def _run(spec: KnownPlan) -> tuple[int, Mapping[int, Float32]]:
     """The step of the run's first observation, and by control step what was planned, before safety."""
     planned: dict[int, Float32] = {}
     with closing(Lockstep(spec)) as station:
-        session = station.main.session
+        session = station.coordinator.session
         station.connect()
         station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
         station.command("setup")

@@ -83,7 +83,7 @@ def protocols(robot: Robot) -> list[Protocol]:
 
 def measure(seconds: float) -> list[Row]:
     """A row per protocol, each asked for `seconds`, openpi for twice as long as it shares them with its peer."""
-    heap.keep()  # as main does
+    heap.keep()  # as the coordinator does
     robot = robots.load(ROBOT)
     return [_case(protocol, robot, seconds) for protocol in protocols(robot)]
 

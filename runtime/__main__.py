@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         made = spec_of(_resolved(given))
         made.new_policy(
             MonotonicClock()
-        ).close()  # what does not fit it is said here, not by a main that dies
+        ).close()  # what does not fit it is said here, not by a coordinator that dies
         _require_encoder(made)
         if given.headless:
             from runtime.clients import headless

@@ -13,11 +13,11 @@ from benchmarks.estop_lab import PRESSED
 from runtime.ipc.bus import CommandClient, Endpoints
 from runtime.ipc.messages import Command
 
-_SOCKETS = (("main", "commands"), ("guard", "estop"))
+_SOCKETS = (("coordinator", "commands"), ("guard", "estop"))
 
 
 def status_flood(target: Target) -> Counter[str]:
-    """Ask main and guard for their status as fast as their sockets take it."""
+    """Ask the coordinator and guard for their status as fast as their sockets take it."""
     sent: Counter[str] = Counter()
     for process, key in _SOCKETS:
         threading.Thread(target=_flood, args=(target, process, key, sent), daemon=True).start()

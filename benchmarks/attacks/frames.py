@@ -41,9 +41,9 @@ class _Page(LivePage):
 
 
 def dead_station(target: Target) -> Counter[str]:
-    """Press the e-stop of a station whose guard and main are there and answer nothing."""
+    """Press the e-stop of a station whose guard and the coordinator are there and answer nothing."""
     message = {"type": "estop", "why": "somebody leans on it"}
-    with _stopped(target, "guard", "main"):
+    with _stopped(target, "guard", "coordinator"):
         return _waves(target, OTHER, message, target.part(_PRESSES))
 
 

@@ -154,7 +154,7 @@ class Scenario(Bench):
     def go(self) -> None:
         """One tick: the robot is seen, told, and moves."""
         self._begun = True
-        for process in ("main", "guard"):
+        for process in ("coordinator", "guard"):
             self.shared.beat(process, self.clock.now())
         self.happen()
         self.observe(qpos=self.read().astype(np.float32))

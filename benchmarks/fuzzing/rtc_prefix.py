@@ -309,7 +309,7 @@ def _run(spec: SeldomPlan, made: Scenario, random: np.random.Generator) -> Plann
     planned = Planned({}, set(), {}, set(), {}, 0)
     around = Around(runner=Late(*made.delay, random))
     with closing(Lockstep(spec, around=around)) as station:
-        session = station.main.session
+        session = station.coordinator.session
         station.connect()
         station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
         station.command("setup")
@@ -324,9 +324,9 @@ def _run(spec: SeldomPlan, made: Scenario, random: np.random.Generator) -> Plann
                 planned.rows[step] = row
             if session.state is not State.RUNNING:
                 planned.held |= {step, step + 1}  # in the former an answer may be laid that is told no more
-            if not station.main.inference.continues:
+            if not station.coordinator.inference.continues:
                 planned.other.add(step + 1)
-            shown = station.main.inference.shown
+            shown = station.coordinator.inference.shown
             if shown is not None and shown.state == "merged":
                 used = shown.targets[shown.targets >= 0]
                 worst = shown.ik.get("worst_mm", 0.0) / 1e3, math.radians(shown.ik.get("worst_deg", 0.0))
@@ -343,7 +343,7 @@ def _run(spec: SeldomPlan, made: Scenario, random: np.random.Generator) -> Plann
 
 def _interfere(station: Lockstep, made: Scenario, random: np.random.Generator) -> None:
     """What a person might do now."""
-    state = station.main.session.state
+    state = station.coordinator.session.state
     if state is State.READY:
         station.command("run")
     elif state is State.HOLDING:

@@ -125,10 +125,10 @@ class _Reader(ABC):
 
 
 class _Numbers(_Reader):
-    """State, joints, chunks and events, from main."""
+    """State, joints, chunks and events, from the coordinator."""
 
     def __init__(self, feed: Feed, wire: StationWire) -> None:
-        super().__init__(wire, "main", "state", ("state", "joints", "chunk", "event"))
+        super().__init__(wire, "coordinator", "state", ("state", "joints", "chunk", "event"))
         self._feed = feed
 
     def heard(self, found: Mapping[str, Any]) -> None:

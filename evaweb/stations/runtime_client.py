@@ -51,7 +51,7 @@ class StationWire:
         self._ahead_known = -float("inf")
 
     def request(self, command: Command, *, timeout: float | None = None, expires: bool = False) -> Ack:
-        """The answer of main; one request at a time over a connection that is kept.
+        """The answer of the coordinator; one request at a time over a connection that is kept.
 
         With `expires` the command is void once we have given up waiting for its answer: it can never be
         carried out behind the back of somebody who was told that it was lost. Raises StationGone where it was
@@ -72,7 +72,7 @@ class StationWire:
     def urgent(self, command: Command, process: str, key: str, timeout: float) -> Ack:
         """The answer over a connection of its own: nothing that hangs stands before it.
 
-        `process` and `key` name the socket: main's "commands", the guard's "estop".
+        `process` and `key` name the socket: the coordinator's "commands", the guard's "estop".
         """
         try:
             context = zmq.Context.instance()
@@ -107,7 +107,7 @@ class StationWire:
         return StationGone(f"{self.name} is not running: its runtime has to be started")
 
     def _connected(self) -> CommandClient:
-        endpoint = self.address("main", "commands")
+        endpoint = self.address("coordinator", "commands")
         if self._client is None or endpoint != self._endpoint:
             if self._client is not None:
                 self._client.close()

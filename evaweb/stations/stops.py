@@ -107,7 +107,7 @@ def stopped(command: messages.Command, station: str) -> Answer:
     """What the station says to a stop or halt; nothing that hangs stands before it."""
     try:
         timeout = settings.EVA_COMMAND_TIMEOUT_S
-        return answer_of(wire_to(station).urgent(command, "main", "commands", timeout))
+        return answer_of(wire_to(station).urgent(command, "coordinator", "commands", timeout))
     except NoAnswer as fault:
         return Answer(CommandStatus.UNKNOWN, f"{fault}; the e-stop goes another way")
     except StationGone as fault:

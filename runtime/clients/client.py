@@ -102,7 +102,7 @@ class StationClient:
         return self._command(kind, timeout, self._epoch, identity, arguments)
 
     def estop(self, why: str) -> Ack:
-        """Press the software e-stop at the guard, which needs neither lease nor main."""
+        """Press the software e-stop at the guard, which needs neither lease nor the coordinator."""
         try:
             command = self._question("estop", {"why": kept(why)})
             return urgent(self._context, self._endpoints, ("guard", "estop"), command, 2.0)
@@ -111,7 +111,7 @@ class StationClient:
 
     def subscribe(self, *streams: str) -> Subscriber:
         """The station's live streams: state, joints, event."""
-        return Subscriber(self._context, self._endpoints.read("main")["state"], *streams)
+        return Subscriber(self._context, self._endpoints.read("coordinator")["state"], *streams)
 
     def wait(self, reached: Callable[[dict[str, Any]], bool], timeout: float) -> dict[str, Any]:
         """The first status that satisfies `reached`, keeping a lease that is held; raises TransportError."""
@@ -151,7 +151,7 @@ class StationClient:
         return _accepted(ack)
 
     def _send(self, command: Command, timeout: float) -> Ack:
-        endpoint = self._endpoints.read("main")["commands"]
+        endpoint = self._endpoints.read("coordinator")["commands"]
         if self._commands is None or endpoint != self._endpoint:
             self.close()
             owner = self._endpoints.owner

@@ -113,7 +113,7 @@ class Attended:
         """The status, once its events were told."""
         self._client.renew()
         status = self._client.status()
-        if status["boot"] != self._boot:  # another main counts its events anew
+        if status["boot"] != self._boot:  # another coordinator counts its events anew
             self._boot, self._heard = status["boot"], 0
         if status["newest_event"] > self._heard:
             for event in self._client.events_since(self._heard):

@@ -73,7 +73,7 @@ class ControlSettings(Settings):
     realtime_priority: int = Field(default=20, ge=1, le=99)
     """Priority within SCHED_FIFO."""
     heartbeat_timeout_s: float = Field(default=1.0, gt=0)
-    """Silence of main or guard after which control holds [s]."""
+    """Silence of the coordinator or guard after which control holds [s]."""
     orphan_hold_s: float = Field(default=5.0, ge=0, le=8)
     """How long control goes on holding after its supervisor has died [s]."""
     starvation_hold_s: float = Field(default=1.0, gt=0)

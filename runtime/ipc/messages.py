@@ -18,10 +18,10 @@ from runtime.core.errors import CodecError
 from runtime.core.msgpack_arrays import pack, unpack
 from runtime.core.types import Float32, Float64, UInt8
 
-# Kinds of events that control gives and main reads: whether anybody listens to commands.
+# Kinds of events that control gives and the coordinator reads: whether anybody listens to commands.
 UNHEARD, HEARD = "commands_unheard", "commands_heard"
 
-# --- main -> control ---------------------------------------------------------------------------------------
+# --- the coordinator -> control ---------------------------------------------------------------------------------------
 
 OrderKind = Literal[
     "silent", "hold", "meet", "follow", "motion", "yield"
@@ -84,7 +84,7 @@ class NodeRequest:
     data: Mapping[str, Any] = field(default_factory=dict)
 
 
-# --- control -> main and media -----------------------------------------------------------------------------
+# --- control -> the coordinator and media -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +134,7 @@ class Event:
     data: Mapping[str, Any] = field(default_factory=dict)
 
 
-# --- main -> media -----------------------------------------------------------------------------------------
+# --- the coordinator -> media -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +176,7 @@ class EndEpisode:
     details: Mapping[str, Any] = field(default_factory=dict)
 
 
-# --- media -> main -----------------------------------------------------------------------------------------
+# --- media -> the coordinator -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +218,7 @@ class MediaReport:
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """An observation as in runtime.core.types.Observation, its pictures by their numbers in the slots of the page."""
+    """An observation as in runtime.core.types.Observation, its pictures by the numbers of their slots."""
 
     sequence: int
     arrived: float
@@ -253,7 +253,7 @@ class EndRun:
     """The source's run is over."""
 
 
-# --- reception -> main -------------------------------------------------------------------------------------
+# --- reception -> the coordinator -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,7 +272,7 @@ class ReceptionReport:
     )  # of the deployment's own, as by Source.camera_health
     age_ms: Mapping[str, float] = field(
         default_factory=dict
-    )  # of joints when they came into the page: p50, p99, max of the newest
+    )  # of joints when they came into shared state: p50, p99, max of the newest
     scheduling: str = ""  # the class of the process, as by runtime.core.realtime
 
 

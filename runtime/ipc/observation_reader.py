@@ -32,7 +32,7 @@ class LatestObservation:
 
 
 class ObservationReader:
-    """Reads the page; an observation that is still the newest is not read again."""
+    """Reads the shared state; an observation that is still the newest is not read again."""
 
     def __init__(self, shared: SharedState) -> None:
         self._page = shared

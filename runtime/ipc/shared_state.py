@@ -20,18 +20,18 @@ from runtime.ipc.shared_memory import Record, Ring, aligned
 _LINE = 64
 PICTURE_SLOTS = 12  # 0.4 s of a camera at 30 Hz: for so long may media be late
 RING_BYTES = {
-    "orders": 1 << 20,  # main -> control: orders and chunks
-    "minutes": 4 << 20,  # main -> media: begin, raw chunks, events, end
+    "orders": 1 << 20,  # the coordinator -> control: orders and chunks
+    "minutes": 4 << 20,  # the coordinator -> media: begin, raw chunks, events, end
     "ticks": 4 << 20,  # control -> media: one record per tick
     "observations": 2 << 20,  # reception -> media: observations and events in their order
     "source": 1 << 12,  # media -> reception: a run of the source begins, or is over
-    "control_events": 1 << 19,  # control -> main
-    "reception_events": 1 << 19,  # reception -> main
-    "media_events": 1 << 19,  # media -> main
-    "presses": 1 << 14,  # main -> guard: presses of the e-stop that came to main
+    "control_events": 1 << 19,  # control -> the coordinator
+    "reception_events": 1 << 19,  # reception -> the coordinator
+    "media_events": 1 << 19,  # media -> the coordinator
+    "presses": 1 << 14,  # the coordinator -> guard: presses of the e-stop that came to the coordinator
 }
 DOUBT_BYTES = 200
-PROCESSES = ("control", "main", "reception", "media", "guard")
+PROCESSES = ("control", "coordinator", "reception", "media", "guard")
 
 
 class EStop(IntEnum):
@@ -44,7 +44,7 @@ class EStop(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class SharedStateLayout:
-    """The sizes everything in the page follows from; equal in all of the family."""
+    """The sizes everything in the shared state follows from; equal in all of the family."""
 
     dim: int
     eef_dim: int
@@ -194,7 +194,7 @@ class SharedState:
 
     @property
     def releases(self) -> int:
-        """How often main has asked the guard to release the latch."""
+        """How often the coordinator has asked the guard to release the latch."""
         return int(self._release[0])
 
     def ask_release(self) -> None:
@@ -207,7 +207,7 @@ class SharedState:
         return EStop(self._shared[self._estop])
 
     def set_estop(self, state: EStop) -> None:
-        """Lowered by the guard alone; main raises it for a press that came to main's socket."""
+        """Lowered by the guard alone; the coordinator raises it for a press that came to the coordinator's socket."""
         self._shared[self._estop] = int(state)
 
     @property

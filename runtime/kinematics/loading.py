@@ -58,5 +58,5 @@ class Loading(Kinematics):
             return self._make()
         except RuntimeFault:
             raise
-        except Exception as error:  # of a compiler or a library: it must not end main
+        except Exception as error:  # of a compiler or a library: it must not end the coordinator
             raise SetupError(f"kinematics cannot be made: {type(error).__name__}: {error}") from error

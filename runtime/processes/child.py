@@ -1,4 +1,4 @@
-"""What every process of a station starts from: its plan, the page, a lifeline, a log."""
+"""What every process of a station starts from: its plan, the shared state, a lifeline, a log."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ class StationSpec:
             return through_tunnel(made, settings)
         except RuntimeFault:
             raise
-        except Exception as error:  # of a policy's own code: it must not end main
+        except Exception as error:  # of a policy's own code: it must not end coordinator
             logging.getLogger(__name__).exception("the policy's own code failed")
             raise ConfigurationError(
                 f"policy {settings.kind!r} cannot be made: {type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""A strategy has two halves: when to ask the policy (main), and how an answer joins the timeline (control)."""
+"""A strategy has two halves: when to ask the policy (coordinator), how an answer joins the timeline (control)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from runtime.motion.timeline import (
 
 BlendShape = Literal["linear", "cosine", "exponential"]
 JOIN_WINDOW = 8  # steps over which a chunk takes over from what it does not continue
-_MOST_SHARES = 4096  # that are told of a chunk: they pass the ring to main
+_MOST_SHARES = 4096  # that are told of a chunk: they pass the ring to the coordinator
 
 
 class StrategyParameters(Settings):

@@ -64,8 +64,8 @@ def test_every_attack_that_is_measured_has_a_program() -> None:
             "no sign",
         ),
         (
-            [("family_died", "the process main died"), ("state", "running -> faulted: e-stop by x")],
-            "main died",
+            [("family_died", "the process coordinator died"), ("state", "running -> faulted: e-stop by x")],
+            "coordinator died",
         ),
     ],
 )

@@ -121,7 +121,7 @@ class Lab:
 
     def pids(self):
         found = Endpoints(self.data / "stations" / "demo").read("supervisor")
-        return {name: int(found[name]) for name in ("control", "main", "reception", "media", "guard")}
+        return {name: int(found[name]) for name in ("control", "coordinator", "reception", "media", "guard")}
 
     def kill(self, process):
         """kill -9 of one of the family, or of the supervisor."""

@@ -28,9 +28,9 @@ def bench(lab):
 
 
 def connections(lab):
-    """The policy servers that main is connected to, by port."""
+    """The policy servers that the coordinator is connected to, by port."""
     ports = {int(url.rpartition(":")[2].strip("/")) for url in (lab.own, lab.other)}
-    found = psutil.Process(lab.pids()["main"]).net_connections("tcp")
+    found = psutil.Process(lab.pids()["coordinator"]).net_connections("tcp")
     return [one.raddr.port for one in found if one.raddr and one.raddr.port in ports]
 
 
@@ -46,7 +46,7 @@ def set_up(lab, **arguments):
 
 
 def descriptors(lab):
-    return psutil.Process(lab.pids()["main"]).num_fds()
+    return psutil.Process(lab.pids()["coordinator"]).num_fds()
 
 
 def test_policies_are_exchanged_over_real_sockets_and_never_two_are_connected(bench):

@@ -136,8 +136,8 @@ def test_a_stale_command_is_refused_and_a_repeated_one_gets_its_first_answer(lab
     again = client._command("run", 2.0, epoch=client._epoch, identity="11111111-1111-4111-8111-111111111111")
     assert (again.status, again.sequence) == (first.status, first.sequence)
     assert client.status()["run"]["number"] == runs
-    lab.kill("main")
-    eventually(lab.answers, 10, "a new main")
+    lab.kill("coordinator")
+    eventually(lab.answers, 10, "a new coordinator")
     lab.reach("idle")
     replayed = client._command("run", 2.0, identity="11111111-1111-4111-8111-111111111111")
     assert replayed.status == "accepted"  # its first answer, from the journal
@@ -160,7 +160,7 @@ def test_an_expiring_lease_makes_the_robot_hold_and_its_holder_may_resume(lab):
 
 def test_the_e_stop_works_while_main_is_stuck_and_outlives_a_restart_of_the_station(lab):
     lab.up().running(0.5)
-    main = lab.pids()["main"]
+    main = lab.pids()["coordinator"]
     os.kill(main, signal.SIGSTOP)
     try:
         ack = lab.client.estop("main is stuck")

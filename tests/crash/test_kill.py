@@ -12,7 +12,7 @@ from tests.crash.lab import ROOT, Lab
 from tests.processes import alive, eventually
 
 pytestmark = pytest.mark.slow
-FAMILY = ("control", "main", "reception", "media", "guard")
+FAMILY = ("control", "coordinator", "reception", "media", "guard")
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def recording(lab, episode):
     ("process", "status", "reason"),
     [
         ("control", "interrupted", "the process control died and was restarted"),
-        ("main", "interrupted", "main has given no sign of life since it was restarted"),
+        ("coordinator", "interrupted", "the coordinator has given no sign of life since it was restarted"),
         ("media", "interrupted", "the recorder ended without closing the episode"),
         ("guard", "finished", "stopped by the operator"),
     ],

@@ -33,7 +33,7 @@ def small_disk(lab):
     subprocess.run(["umount", str(lab.data)], check=True)
 
 
-@pytest.mark.parametrize("process", ["media", "main", "guard"])
+@pytest.mark.parametrize("process", ["media", "coordinator", "guard"])
 def test_a_process_is_restarted_although_the_disk_is_full_and_found_when_there_is_room(small_disk, process):
     lab = small_disk.up("recording.enabled=false")
     before = lab.pids()
@@ -137,7 +137,7 @@ def test_a_terminal_that_takes_no_more_stops_neither_commands_nor_the_e_stop(lab
                 os.write(writing, bytes(4096))
         os.set_blocking(writing, True)
         for _ in range(20):
-            lab.client.command("halt")  # each is a line in main's log
+            lab.client.command("halt")  # each is a line in the coordinator's log
         assert lab.client.status()["state"] == "holding"
         for _ in range(2):
             assert lab.client.estop("the terminal is stuck").status == "done"
@@ -188,7 +188,7 @@ def of_this_lab(lab):
 
 def test_a_headless_driver_ends_with_a_family_that_gives_up(lab):
     lab.node().server()
-    (lab.data / "stations" / "demo" / "commands.jsonl").mkdir(parents=True)  # over which main dies
+    (lab.data / "stations" / "demo" / "commands.jsonl").mkdir(parents=True)  # over which the coordinator dies
     done = headless(lab)
     assert done.returncode == 1
     assert "giving up" in done.stderr

@@ -37,7 +37,7 @@ def up_through_a_tunnel(lab, ssh_server):
         "control.orphan_hold_s=0.5",
     )
     lab.ready()
-    [ssh] = children(lab.pids()["main"], "ssh")
+    [ssh] = children(lab.pids()["coordinator"], "ssh")
     return ssh
 
 
@@ -71,7 +71,12 @@ def bystander(ssh_server):
 
 
 @pytest.mark.parametrize(
-    "victims", [["supervisor"], ["main"], ["supervisor", "main", "control", "reception", "media", "guard"]]
+    "victims",
+    [
+        ["supervisor"],
+        ["coordinator"],
+        ["supervisor", "coordinator", "control", "reception", "media", "guard"],
+    ],
 )
 def test_no_tunnel_outlives_what_was_killed(lab, ssh_server, bystander, victims):
     ssh = up_through_a_tunnel(lab, ssh_server)
@@ -79,9 +84,9 @@ def test_no_tunnel_outlives_what_was_killed(lab, ssh_server, bystander, victims)
     for process in victims:
         lab.kill(process)
     eventually(lambda: not alive(ssh), 10, "the end of ssh")
-    if victims == ["main"]:  # another main makes its own at the next set-up
+    if victims == ["coordinator"]:  # another one makes its own at the next set-up
         eventually(lab.answers, 10, "the station answers again")
         lab.ready()
-        [again] = children(lab.pids()["main"], "ssh")
+        [again] = children(lab.pids()["coordinator"], "ssh")
         assert again != ssh
     assert bystander.poll() is None

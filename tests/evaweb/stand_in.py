@@ -75,7 +75,7 @@ class StandIn:
         self._streams = Publisher(context, self._folder, "state", 64)
         self._cameras = Publisher(context, self._folder, "cameras", 16)
         endpoints = Endpoints(self._folder)
-        endpoints.write("main", {"commands": self._main.endpoint, "state": self._streams.endpoint})
+        endpoints.write("coordinator", {"commands": self._main.endpoint, "state": self._streams.endpoint})
         endpoints.write("media", {"cameras": self._cameras.endpoint})
         endpoints.write("guard", {"estop": self._guard.endpoint})
         self._thread = threading.Thread(target=self._run, args=(self._ended,), daemon=True)

@@ -109,7 +109,7 @@ class CollectStation(Station):
 
     @property
     def collect(self) -> Any:
-        return self.main.snapshot()["collect"]
+        return self.coordinator.snapshot()["collect"]
 
     def armed(self, **arguments: Any) -> CollectStation:
         self.ready(collect=True, **arguments)

@@ -211,11 +211,11 @@ class Station(Lockstep):
 
     @property
     def state(self) -> State:
-        return self.main.session.state
+        return self.coordinator.session.state
 
     @property
     def reason(self) -> str:
-        return self.main.session.reason
+        return self.coordinator.session.reason
 
     def go(self, ticks: int) -> None:
         """Tick under a lease that is kept."""
@@ -237,13 +237,13 @@ class Station(Lockstep):
         return self
 
     def stop(self) -> Episode:
-        """Stop, let the end go from main to media and back, and read what was recorded."""
+        """Stop, let the end go from the coordinator to media and back, and read what was recorded."""
         self.command("stop")
         self.go(3)
         return self.episode()
 
     def episode(self) -> Episode:
-        return open_episode(Path(self.main.runs.last_episode["path"]))
+        return open_episode(Path(self.coordinator.runs.last_episode["path"]))
 
     def prepare(self, **arguments: Any) -> None:
         """Set up, to whatever end."""
@@ -252,7 +252,7 @@ class Station(Lockstep):
         self.until(lambda: self.state is not State.SETTING_UP, 60.0, "set-up")
 
     def events(self, kind: str) -> list[str]:
-        return [event["text"] for event in self.main.events.since(0) if event["kind"] == kind]
+        return [event["text"] for event in self.coordinator.events.since(0) if event["kind"] == kind]
 
 
 def column(table: Any, name: str) -> np.ndarray:

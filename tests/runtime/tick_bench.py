@@ -68,7 +68,7 @@ class RecordingSink(Sink):
 
 
 class Bench:
-    """The robot goes at once where it is told, unless `moved_by_hand`; `feed` and `alive` let its joints and main be.
+    """The robot goes at once where it is told, unless `moved_by_hand`; `feed` and `alive`: joints, coordinator.
 
     `chosen` is the strategy's section; further keywords are settings of safety. Before the first tick the robot has
     stood where it is for long enough to be believed, unless nobody has `seen` it.
@@ -156,7 +156,7 @@ class Bench:
         }
         self.shared.publish_observation(Observation(**(fields | changes)), {"cam": self.sequence})
 
-    # --- what main posts -----------------------------------------------------------------------------------
+    # --- what the coordinator posts -----------------------------------------------------------------------------------
 
     def post(self, message: Message) -> None:
         assert self.shared.rings["orders"].push(encode(message))
@@ -183,7 +183,7 @@ class Bench:
         self._begun = True
         for _ in range(ticks):
             if self.alive:
-                self.shared.beat("main", self.clock.now())
+                self.shared.beat("coordinator", self.clock.now())
                 self.shared.beat("guard", self.clock.now())
             if self.feed:
                 self.observe()
@@ -198,7 +198,7 @@ class Bench:
     # --- what control tells --------------------------------------------------------------------------------
 
     def told(self) -> list[Event | ChunkMerged]:
-        """Everything that main was told since the last call."""
+        """Everything that the coordinator was told since the last call."""
         messages = [decode(payload) for payload in self.shared.rings["control_events"].drain()]
         return [message for message in messages if isinstance(message, Event | ChunkMerged)]
 

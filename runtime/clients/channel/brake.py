@@ -1,4 +1,4 @@
-"""Stops, which wait for nothing: `stop` and `halt` by main, the e-stop by the guard."""
+"""Stops, which wait for nothing: `stop` and `halt` by the coordinator, the e-stop by the guard."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def is_estop(message: Message) -> bool:
 
 
 class Brake:
-    """Stops at main: also what another script of this channel has begun, whose lease it then uses."""
+    """Stops at the coordinator: also what another script of this channel has begun, whose lease it then uses."""
 
     def __init__(self, open_client: Callable[[str], StationClient], lives: Lives, outcomes: Outcomes) -> None:
         self._open, self._lives, self._outcomes = open_client, lives, outcomes

@@ -32,7 +32,7 @@ _LOOK_S = 0.1
 
 
 class Desk:
-    """The channel's one way to main, but for stops; used by one thread."""
+    """The channel's one way to the coordinator, but for stops; used by one thread."""
 
     def __init__(
         self,

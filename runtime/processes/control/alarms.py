@@ -17,7 +17,7 @@ _THERE = 1e-6  # [rad]
 
 def silent_sibling(shared: SharedState, now: float, allowed: float) -> str:
     """The process whose heartbeat is older than `allowed` seconds, in a sentence; "" where none is."""
-    for process in ("main", "guard"):
+    for process in ("coordinator", "guard"):
         if not shared.alive(process, now, allowed):
             return f"no sign of life from {process} {shared.silence(process, now)}"
     return ""

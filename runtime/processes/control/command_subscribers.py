@@ -22,8 +22,8 @@ class SubscriberCheck:
         self._told: dict[str, str] = {}
 
     def look(self, now: float) -> None:
-        """One tick; a main that was started anew is told again."""
-        if self._page.last_beat("main") == 0.0:
+        """One tick; a coordinator that was started anew is told again."""
+        if self._page.last_beat("coordinator") == 0.0:
             self._told, self._next = {}, now
             return
         if now < self._next:

@@ -74,7 +74,7 @@ class Lateness:
         self._missed += missed
 
     def write(self) -> None:
-        """Renew the figures in control's status; the next tick writes them to the page."""
+        """Renew the figures in control's status; the next tick writes them to the shared state."""
         status, late = self._status, self._late[: min(self._count, _LATENESS_KEPT)]
         status["ticks"], status["missed"] = self._ticks, self._missed
         if len(late):

@@ -1,4 +1,4 @@
-"""What control tells of its ticks: its status in the page, events to main, a record of each tick to media."""
+"""What control tells of its ticks: its status to all, events to the coordinator, a record of each tick to media."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ class Telemetry:
         self._tell_makers(makers, sent)
 
     def publish(self, seen: LatestObservation, standing: TickState) -> None:
-        """Control's status, and only then the events: main decides by it, so that none may overtake it.
+        """Control's status, and only then the events: the coordinator decides by it, so that none may overtake it.
 
         The tick's record comes before either, so that whoever ends an episode by them loses no row.
         """

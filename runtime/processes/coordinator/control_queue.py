@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 class ControlQueue:
-    """Writes orders and chunks; only the thread that owns main's loop may call it."""
+    """Writes orders and chunks; only the thread that owns the coordinator's loop may call it."""
 
     def __init__(self, shared: SharedState) -> None:
         self._page = shared
@@ -47,7 +47,9 @@ class ControlQueue:
         try:
             self._push(Order(self._number, kind, run, goal, reason, mode, speed))
         except RuntimeFault as error:
-            log.error("order %s is lost: %s", kind, error)  # main goes on: it notices that control hangs
+            log.error(
+                "order %s is lost: %s", kind, error
+            )  # the coordinator goes on: it notices that control hangs
         return self._number
 
     def obeyed(self, number: int) -> bool:

@@ -131,7 +131,7 @@ class Coordinator:
         self._take_over()
 
     def _take_over(self) -> None:
-        """Keep the events from before there was a main, or since one died; act on nothing that was told to that one."""
+        """Keep the events from before there was a coordinator, or since one died; act on nothing told to that one."""
         for ring in _TO_MAIN:
             for payload in self.shared.rings[ring].drain():
                 if isinstance(message := decode(payload), Event):
@@ -152,7 +152,7 @@ class Coordinator:
 
     def pump(self) -> None:
         """Hear the family, notice what happened, advance set-up and inference."""
-        self.shared.beat("main", self.clock.now())
+        self.shared.beat("coordinator", self.clock.now())
         for ring in _TO_MAIN:
             for payload in self.shared.rings[ring].drain():
                 self._hear(decode(payload))
@@ -259,7 +259,7 @@ class Coordinator:
             self._observe(SessionEvent.RUN_FAILED, failure)
 
     def say(self, event: Event) -> None:
-        """An event of main's own: to the log, to clients, into the episode."""
+        """An event of the coordinator's own: to the log, to clients, into the episode."""
         self._log(event)
         self.runs.note(event)
 

@@ -1,4 +1,4 @@
-"""What main notices by itself: siblings, e-stop, lease, link, the end of a run."""
+"""What the coordinator notices by itself: siblings, e-stop, lease, link, the end of a run."""
 
 from __future__ import annotations
 

@@ -35,16 +35,16 @@ Answered = tuple[Command, Ack, Call]
 class CommandService:
     """What clients of the station talk to."""
 
-    def __init__(self, main: Coordinator, context: zmq.Context[Any]) -> None:
-        self._main = main
-        settings = main.spec.deployment
+    def __init__(self, coordinator: Coordinator, context: zmq.Context[Any]) -> None:
+        self._coordinator = coordinator
+        settings = coordinator.spec.deployment
         folder = settings.station_dir
         self._server = CommandServer(context, folder, "commands")
         self._turns = Turns(self._server, STOPPING, _SHARE)
         self._key = Key(folder)
         self._streams = Publisher(context, folder, "state", STREAM_HIGH_WATER)
         self._journal = CommandJournal(folder)
-        main.session.remember(self._journal.answers)
+        coordinator.session.remember(self._journal.answers)
         self._endpoints = Endpoints(folder)
         self._tell_where()
         self._due: dict[str, float] = {}
@@ -54,8 +54,12 @@ class CommandService:
         self._waiting: list[Asked] = []  # for what is still being loaded
 
     def _tell_where(self) -> None:
-        where = {"commands": self._server.endpoint, "state": self._streams.endpoint, "boot": self._main.boot}
-        self._endpoints.write("main", where)
+        where = {
+            "commands": self._server.endpoint,
+            "state": self._streams.endpoint,
+            "boot": self._coordinator.boot,
+        }
+        self._endpoints.write("coordinator", where)
 
     def serve(self, timeout: float) -> None:
         """Wait up to `timeout` seconds for a command; answer all stops and some of the rest; publish what is due."""
@@ -77,7 +81,7 @@ class CommandService:
         self._tell_of_flood()
         self._publish()
         if any(
-            [self._server.moved(), self._streams.moved(), self._endpoints.lost("main")]
+            [self._server.moved(), self._streams.moved(), self._endpoints.lost("coordinator")]
         ):  # all are looked after
             self._tell_where()
 
@@ -90,10 +94,10 @@ class CommandService:
         fresh: list[Answered] = []
         for call, command in stops:
             same = (command.kind, command.user, command.holder, command.epoch)
-            known = None if command.kind == "estop" else self._main.session.answered(command)
+            known = None if command.kind == "estop" else self._coordinator.session.answered(command)
             ack = known or first.get(same)
             if ack is None:
-                ack = first[same] = self._main.handle(command)
+                ack = first[same] = self._coordinator.handle(command)
                 fresh.append((command, ack, call))
             self._server.answer(call, replace(ack, uuid=command.uuid))
         return fresh
@@ -102,14 +106,14 @@ class CommandService:
         """Answers that are new, to be given when they are on disk."""
         fresh: list[Answered] = []
         for call, command in asked:
-            if (first := self._main.session.answered(command)) is not None:
+            if (first := self._coordinator.session.answered(command)) is not None:
                 self._server.answer(call, first)
             elif refusal := forged(command) or lacking(command):
                 self._refuse(call, command, refusal)
-            elif self._main.waits(command):
+            elif self._coordinator.waits(command):
                 self._keep(call, command)
             else:
-                fresh.append((command, self._main.handle(command), call))
+                fresh.append((command, self._coordinator.handle(command), call))
         return fresh
 
     def _refuse(self, call: Call, command: Command, reason: str) -> None:
@@ -131,26 +135,26 @@ class CommandService:
 
     def _say_seldom(self, kind: str, text: str) -> None:
         """An event, unless there was one of its kind just now: a flood is not to fill the record."""
-        if (now := self._main.people.now()) >= self._due.get(kind, 0.0):
+        if (now := self._coordinator.people.now()) >= self._due.get(kind, 0.0):
             self._due[kind] = now + _FLOOD_S
-            self._main.say(Event(kind, text, self._main.clock.now()))
+            self._coordinator.say(Event(kind, text, self._coordinator.clock.now()))
 
     def _tell_once(self, failure: str) -> None:
         """A disk that is full stays so for a while: one event when it begins."""
         if failure and not self._unjournalled:
             text = f"answers to commands are not on disk: {failure}"
-            self._main.say(Event("not_journalled", text, self._main.clock.now()))
+            self._coordinator.say(Event("not_journalled", text, self._coordinator.clock.now()))
         self._unjournalled = failure
 
     def _publish(self) -> None:
-        main, now = self._main, self._main.people.now()
-        self._every("state", 0.1, now, main.snapshot)
+        coordinator, now = self._coordinator, self._coordinator.people.now()
+        self._every("state", 0.1, now, coordinator.snapshot)
         self._every("joints", 1 / 30, now, self._joints)
         self._every("poses", 1 / 30, now, self._poses)
         self._publish_chunk(now)
-        for event in main.events.since(self._told):
+        for event in coordinator.events.since(self._told):
             self._streams.publish("event", event)
-        self._told = main.events.newest
+        self._told = coordinator.events.newest
 
     def _every(self, stream: str, period: float, now: float, content: Callable[[], object]) -> None:
         if now >= self._due.get(stream, 0.0):
@@ -218,10 +222,10 @@ class CommandService:
 
 
 def main() -> None:
-    """The process main: decide and serve until the supervisor is gone."""
+    """The process coordinator: decide and serve until the supervisor is gone."""
     heap.keep()
     descriptors.allow_all()
-    member = join("main")
+    member = join("coordinator")
     deciding = Coordinator(member.spec, member.shared, MonotonicClock(), ThreadRunner())
     service = CommandService(deciding, zmq.Context.instance())
     while not member.lifeline.cut:

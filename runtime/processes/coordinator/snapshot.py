@@ -27,7 +27,7 @@ from runtime.station.spec import StationSpec
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The parts of main that a snapshot shows, at the moment `now` of the runtime's clock."""
+    """The parts of the coordinator that a snapshot shows, at the moment `now` of the runtime's clock."""
 
     spec: StationSpec
     shared: SharedState

@@ -74,9 +74,9 @@ class Guard:
         return ""
 
     def watch(self) -> None:
-        """Release where main has asked for it, latch what came to main meanwhile, then log what there is to say.
+        """Release where the coordinator has asked for it, latch what came to it meanwhile, then log what there is.
 
-        Main has raised the flag for such a press itself: a release in between has lowered it again.
+        The coordinator has raised the flag for such a press itself: a release in between has lowered it again.
         """
         if self._page.releases != self._releases:
             self._release()
@@ -88,7 +88,7 @@ class Guard:
         self._unsaid.clear()
 
     def _release(self) -> None:
-        """Main has checked the lease; where the disk refuses, the e-stop stays."""
+        """The coordinator has checked the lease; where the disk refuses, the e-stop stays."""
         self._releases = self._page.releases
         try:
             self._latch.clear()

@@ -59,7 +59,7 @@ class Around:
 
 
 class Lockstep:
-    """One station without processes; each `tick` is reception, media, main, control in that order.
+    """One station without processes; each `tick` is reception, media, the coordinator, control in that order.
 
     `clock` and `around` are given where somebody else has a part in it.
     """
@@ -79,7 +79,7 @@ class Lockstep:
         self.media = Media(self.shared, recorder, clock, around.preview, around.closer, around.on_disk)
         self.reception = Reception(self.shared, self._source, clock, LOCKSTEP)
         self._runner = around.runner or LockstepRunner(settings.lockstep.delay_ticks)
-        self.main = Coordinator(spec, self.shared, clock, self._runner, around.people)
+        self.coordinator = Coordinator(spec, self.shared, clock, self._runner, around.people)
         self._tick = make_tick(spec, self.shared, self._sink, self.clock.now)
         self.step = 0
 
@@ -98,7 +98,7 @@ class Lockstep:
         self.media.digest()
         if self.reception.hear():  # a run begins with its source, in this tick
             self.media.digest()
-        self.main.pump()
+        self.coordinator.pump()
         self._tick(self.step, now)
         self._runner.tick()
         self.step += 1
@@ -117,16 +117,16 @@ class Lockstep:
         return ack
 
     def _handle(self, kind: str, arguments: Mapping[str, Any] | None = None) -> Ack:
-        session = self.main.session
-        return self.main.handle(
+        session = self.coordinator.session
+        return self.coordinator.handle(
             Command(
                 str(uuid.uuid4()),
                 kind,
                 arguments or {},
                 user=_HOLDER,
                 holder=_HOLDER,
-                epoch=0 if kind == "lease_claim" else self.main.lease.epoch,
-                boot=self.main.boot,
+                epoch=0 if kind == "lease_claim" else self.coordinator.lease.epoch,
+                boot=self.coordinator.boot,
                 sequence=session.sequence,
                 role=LOCAL,
             )
@@ -137,17 +137,17 @@ class Lockstep:
         end = self.clock.now() + seconds
         while not reached():
             if self.clock.now() > end:
-                session = self.main.session
+                session = self.coordinator.session
                 raise SetupError(f"{what}: not within {seconds:g} s; {session.state}: {session.reason}")
-            self._handle("lease_renew" if self.main.lease.current(self.clock.now()) else "lease_claim")
+            self._handle("lease_renew" if self.coordinator.lease.current(self.clock.now()) else "lease_claim")
             self.tick()
-        return self.main.session.state
+        return self.coordinator.session.state
 
     def close(self) -> None:
         """Close the episode, the policy, source and sink."""
         self.media.digest()
         self.media.end("interrupted", "lockstep ended")
-        self.main.close()
+        self.coordinator.close()
         self._source.close()
         self._sink.close()
 
@@ -174,7 +174,7 @@ def run(spec: StationSpec, longest: float = 3600.0) -> LockstepRun:
     `longest` bounds the virtual time of the run [s].
     """
     station = Lockstep(spec)
-    session = station.main.session
+    session = station.coordinator.session
     try:
         station.connect()
         station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
@@ -187,10 +187,10 @@ def run(spec: StationSpec, longest: float = 3600.0) -> LockstepRun:
         why = session.reason
         if how is State.HOLDING:
             station.command("stop")
-        for _ in range(3):  # the end goes from main to media and back
+        for _ in range(3):  # the end goes from the coordinator to media and back
             station.tick()
         return LockstepRun(
-            station.main.runs.last_episode, how, why, station.step, station.main.events.since(0)
+            station.coordinator.runs.last_episode, how, why, station.step, station.coordinator.events.since(0)
         )
     finally:
         station.close()

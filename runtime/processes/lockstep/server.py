@@ -115,8 +115,8 @@ class ServedLockstep(Lockstep):
         self._figures = Lateness(self._tick.status, LOCKSTEP)
         context: zmq.Context[Any] = zmq.Context.instance()
         self._estops = Desk(self.guard, self.shared, context, settings.station_dir)
-        self._service = CommandService(self.main, context)
-        self._told_at = -1  # the step that main was last told of how it goes, time standing still
+        self._service = CommandService(self.coordinator, context)
+        self._told_at = -1  # the step that the coordinator was last told of how it goes, time standing still
         self._again_at = self._next_at = 0.0  # on the people's clock
 
     def serve(self, ended: Callable[[], bool]) -> None:
@@ -144,8 +144,8 @@ class ServedLockstep(Lockstep):
     def tick(self) -> None:
         """One control period; a run that is over ends within it."""
         super()._pass()
-        if why := self._over(self.main.session.state is State.RUNNING):
-            self.main.finish(why)
+        if why := self._over(self.coordinator.session.state is State.RUNNING):
+            self.coordinator.finish(why)
         super().tick()
         self._figures.add(0.0, 0)
         if self.step % _FIGURES_EVERY == 0:
@@ -158,14 +158,14 @@ class ServedLockstep(Lockstep):
         """Whether time stands still: nothing goes on that needs it, or somebody is waited for."""
         if self._asking.begin() or self.media.closing:
             return True
-        if self.main.session.state not in (State.IDLE, State.READY):
+        if self.coordinator.session.state not in (State.IDLE, State.READY):
             return False
         moving = bytes(self.shared.control.read()["behaviour"]) == b"motion"
-        return not (moving or self.main.runs.alone or self.shared.rings["orders"].waiting)
+        return not (moving or self.coordinator.runs.alone or self.shared.rings["orders"].waiting)
 
     def _fast(self) -> bool:
         """Whether nobody is waited for, who would want to see it as it happens."""
-        state, run = self.main.session.state, self.main.run
+        state, run = self.coordinator.session.state, self.coordinator.run
         if state is State.RUNNING:
             return run is None or run.mode not in _ON_DEMAND
         return state is State.SETTING_UP
@@ -173,7 +173,7 @@ class ServedLockstep(Lockstep):
     def _stand(self) -> None:
         """Hear and tell, while it is still now; what begins, begins with a tick."""
         self.guard.watch()
-        closing, rests = self.media.closing, self.main.session.state in (State.IDLE, State.READY)
+        closing, rests = self.media.closing, self.coordinator.session.state in (State.IDLE, State.READY)
         if closing:
             self.media.collect()
         elif rests:
@@ -183,7 +183,7 @@ class ServedLockstep(Lockstep):
             self._told_at = self.step
             self.media.report()
             self.reception.report()
-        self.main.pump()
+        self.coordinator.pump()
         if (now := self._people.now()) >= self._again_at:
             self._again_at = now + _AGAIN_S
             self._previews.again()

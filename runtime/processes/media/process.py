@@ -85,7 +85,7 @@ class Media:
         self._closing_uuid = ""
         self._waiting: BeginEpisode | None = None  # for the episode before it to be closed
         self._waiting_since = 0.0
-        self._opened: EpisodeOpened | None = None  # main is told when the source has begun the run
+        self._opened: EpisodeOpened | None = None  # the coordinator is told when the source has begun the run
         self._newest = 0  # number of the newest observation
         self._truth: Mapping[str, Any] = {}  # of a simulated bench, as its node last said it
         self._next_report = 0.0
@@ -104,7 +104,7 @@ class Media:
         return self._closing is not None
 
     def digest(self) -> None:
-        """Write down what reception, control and main have posted."""
+        """Write down what reception, control and the coordinator have posted."""
         self.collect()
         self._drain("observations")
         self._drain("minutes")
@@ -163,7 +163,7 @@ class Media:
         elif isinstance(message, RunBegun):
             self._run_begun(message)
         elif isinstance(message, EndEpisode):
-            self._drain("ticks")  # those that control did before main decided to end
+            self._drain("ticks")  # those that control did before the coordinator decided to end
             self._say_truth(message.details.get("reached") or {})
             self.end(message.status, message.reason, message.details)
             self._opened = None
@@ -209,7 +209,7 @@ class Media:
             log.warning("reception does not read: %s lost", type(message).__name__)
 
     def end(self, status: str, reason: str, details: Mapping[str, Any] | None = None) -> None:
-        """Close the open episode, if there is one; main is told when that is done."""
+        """Close the open episode, if there is one; the coordinator is told when that is done."""
         if self._recorder.recording:
             self._closing_uuid = self._recorder.recording
             self._closing = self._closer(self._recorder.end(status, reason, details or {}))  # type: ignore[arg-type]
@@ -228,7 +228,7 @@ class Media:
             log.error("episode %s has no outcome, the next start completes it: %s", uuid, why)
 
     def collect(self) -> None:
-        """Tell main of episodes that have been closed, at last or at once."""
+        """Tell the coordinator of episodes that have been closed, at last or at once."""
         if (late := self._unclosed.look()) is not None:
             self._closed(late)
         if self._closing is None or not self._closing.done():
@@ -252,7 +252,7 @@ class Media:
         self.end("failed", str(error))
 
     def report(self) -> None:
-        """Tell main how it goes; done by itself five times a second."""
+        """Tell the coordinator how it goes; done by itself five times a second."""
         recorder, now = self._recorder, self._clock.now()
         self._next_report = now + _REPORT_PERIOD
         recording = recorder.recording or self._closing_uuid  # until it is on disk
@@ -268,13 +268,13 @@ class Media:
             self._say(Event("truth", f"the simulated bench says: {how}", self._clock.now(), data=data))
 
     def _say(self, event: Event) -> None:
-        """An event of media's own: to main, and into the episode."""
+        """An event of media's own: to the coordinator, and into the episode."""
         self._tell(event)
         self._hear(event)
 
     def _tell(self, message: Message) -> None:
         if not self._page.rings["media_events"].push(encode(message)):
-            log.warning("main does not read: %s lost", type(message).__name__)
+            log.warning("the coordinator does not read: %s lost", type(message).__name__)
 
 
 def make_recorder(spec: StationSpec, now: Callable[[], float], patient: bool = False) -> Recorder:
@@ -313,8 +313,13 @@ def main() -> None:
             now = clock.now()
             shared.beat("media", now)
             media.digest()
-            if media.recording and not shared.alive("main", now, spec.deployment.control.heartbeat_timeout_s):
-                media.end("interrupted", f"main has given no sign of life {shared.silence('main', now)}")
+            if media.recording and not shared.alive(
+                "coordinator", now, spec.deployment.control.heartbeat_timeout_s
+            ):
+                media.end(
+                    "interrupted",
+                    f"the coordinator has given no sign of life {shared.silence('coordinator', now)}",
+                )
             clock.sleep_until(now + _PERIOD_S)
     finally:
         media.end("interrupted", "the station's supervisor ended")

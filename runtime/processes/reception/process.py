@@ -1,4 +1,4 @@
-"""The process that receives every observation and puts it where control, main and media find it."""
+"""The process that receives every observation and puts it where control, the coordinator and media find it."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Reception:
         self._report_in_time()
 
     def give_way(self) -> None:
-        """No real-time class any more: what comes in would take the processors from the guard and from main."""
+        """No real-time class any more: what comes in would take the processors from guard and coordinator."""
         realtime.leave_all()
         self._scheduling = "ordinary"
         text = (
@@ -98,7 +98,7 @@ class Reception:
         return True
 
     def report(self) -> None:
-        """Tell main how it goes; done by itself five times a second."""
+        """Tell the coordinator how it goes; done by itself five times a second."""
         intake, now = self._intake, self._clock.now()
         self._next_report = now + _REPORT_PERIOD
         faults, rates = intake.faults(), intake.rates()
@@ -115,7 +115,7 @@ class Reception:
             log.warning("media does not read: rows miss what is observed now")
 
     def _say(self, event: Event) -> None:
-        """An event of reception's own: to main, and into the episode."""
+        """An event of reception's own: to the coordinator, and into the episode."""
         self._tell(event)
         if not self._record(event):
             log.warning("media does not read: %s is missing from the record", event.kind)
@@ -125,7 +125,7 @@ class Reception:
 
     def _tell(self, message: Message) -> None:
         if not self._page.rings["reception_events"].push(encode(message)):
-            log.warning("main does not read: %s lost", type(message).__name__)
+            log.warning("the coordinator does not read: %s lost", type(message).__name__)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""What reception receives: observations into the page, with their rates, faults, ages, drives and truth."""
+"""What reception receives: observations into shared state, with their rates, faults, ages, drives and truth."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _STANDING = "_unusable"  # ends the names of faults that are in every message of
 
 
 class ObservationReceiver:
-    """The way of an observation: pictures into their slots, `hand_on` with their numbers, numbers into the page.
+    """The way of an observation: pictures into their slots, `hand_on` with their numbers, numbers into shared state.
 
     Numbers of observations and of pictures go on where a predecessor in the same page ended. `truth` is what a
     simulated bench last said of itself. Events are given to `say`.
@@ -110,7 +110,7 @@ class ObservationReceiver:
         return {stream: _rate(times, now) for stream, times in self._arrivals.items()}
 
     def age_ms(self) -> dict[str, float]:
-        """How old joints were when they came into the page: p50, p99 and max of the newest 2000 [ms]."""
+        """How old joints were when they came into shared state: p50, p99 and max of the newest 2000 [ms]."""
         if not self._ages:
             return {}
         p50, p99, worst = (1000.0 * np.percentile(self._ages, (50, 99, 100))).tolist()

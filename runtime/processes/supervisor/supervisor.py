@@ -1,4 +1,4 @@
-"""The family's parent: starts control, main, reception, media and guard, restarts what dies, ends what must end."""
+"""The family's parent: starts the five processes, restarts what dies, ends what must end."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _MODULES = {
     "reception": "runtime.processes.reception.process",
     "media": "runtime.processes.media.process",
     "control": "runtime.processes.control.process",
-    "main": "runtime.processes.coordinator.process",
+    "coordinator": "runtime.processes.coordinator.process",
     "headless": "runtime.clients.headless",
 }
-_START_ORDER = ("guard", "reception", "media", "control", "main")
+_START_ORDER = ("guard", "reception", "media", "control", "coordinator")
 MOST_RESTARTS, RESTART_WINDOW_S = 5, 60.0
 _PATIENCE_S = 9.0  # after the lifeline is cut; then what is left is killed
 _DRIVER_PATIENCE_S = 2.0  # for what drives a headless run, after it was told to end
@@ -120,7 +120,7 @@ class Supervisor:
         )
 
     def _spawn_channel(self) -> subprocess.Popen[bytes]:
-        """The control channel: a client like any other, without a part in the page."""
+        """The control channel: a client like any other, without a part in the shared state."""
         station, data = self._plan.deployment.station, str(self._plan.deployment.data)
         return subprocess.Popen(
             [sys.executable, "-m", "runtime.clients.channel", station, "--data-dir", data, "--lifeline"],

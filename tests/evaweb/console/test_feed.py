@@ -97,7 +97,7 @@ def test_an_address_that_cannot_be_used_is_a_link_that_says_so_until_there_is_a_
     ear, runtime, content
 ):
     ear.wait(lambda stream, content: (stream, content) == ("link", Link(True)))
-    path = settings.DATA_DIR / "stations" / runtime.name / "endpoints" / "main.json"
+    path = settings.DATA_DIR / "stations" / runtime.name / "endpoints" / "coordinator.json"
     good = path.read_text()
     path.write_text(content)
     ear.wait(lambda stream, content: stream == "link" and not content.ok and "yet" not in content.reason)

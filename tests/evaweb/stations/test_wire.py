@@ -75,7 +75,7 @@ def test_what_is_urgent_does_not_wait_behind_what_hangs(runtime):
     wire = wire_to(runtime.name)
     wire._lock.acquire()  # somebody is waiting for an answer
     try:
-        assert wire.urgent(Command(str(uuid4()), "status"), "main", "commands", 2.0).status == "done"
+        assert wire.urgent(Command(str(uuid4()), "status"), "coordinator", "commands", 2.0).status == "done"
         with pytest.raises(StationGone, match="does not answer: status was not sent"):
             wire.status(timeout=0.05)
     finally:
@@ -114,6 +114,6 @@ def test_threads_share_a_wire_and_each_gets_its_own_answer(runtime):
 
 def test_an_endpoint_file_that_names_no_socket_means_not_running(runtime):
     folder = settings.DATA_DIR / "stations" / runtime.name / "endpoints"
-    (folder / "main.json").write_text("{}")
+    (folder / "coordinator.json").write_text("{}")
     with pytest.raises(StationGone, match="is not running"):
         wire_to(runtime.name).status()

@@ -53,9 +53,9 @@ def bench(lab, disk):
     object.__setattr__(recording, "min_free_bytes", GIB)  # frozen
 
     def listen():
-        rows = tuple(lab.station.main.events.since(0))
+        rows = tuple(lab.station.coordinator.events.since(0))
         station = Station.objects.get(pk=lab.bench.station.pk)
-        events_written(station=station, history=History(lab.station.main.boot, rows))
+        events_written(station=station, history=History(lab.station.coordinator.boot, rows))
 
     lab.listen = listen
     return lab
@@ -68,7 +68,7 @@ def ready(bench, trial):
 
 
 def press_run(bench, trial):
-    order = {"page": "p", "epoch": 1, "boot": bench.station.main.boot, "sequence": 0}
+    order = {"page": "p", "epoch": 1, "boot": bench.station.coordinator.boot, "sequence": 0}
     return trial_command(user=bench.bench.operator, trial=trial, kind="run", **order)
 
 
@@ -147,7 +147,7 @@ def test_an_answer_that_is_heard_after_all_events_begins_nothing(bench, disk, mo
     monkeypatch.setattr("evaweb.stations.commands.wire_to", lambda name: Late(bench.station))
     row = fails_to_open(bench, disk, trial)
     is_as_it_was(trial)
-    order = {"page": "p", "epoch": 1, "boot": bench.station.main.boot, "sequence": 0}
+    order = {"page": "p", "epoch": 1, "boot": bench.station.coordinator.boot, "sequence": 0}
     again = trial_command(user=bench.bench.operator, trial=trial, kind="run", uuid=row.pk, **order)
     assert again.status == "accepted"  # its first answer
     is_as_it_was(goes_on(bench, trial))
@@ -157,11 +157,13 @@ def test_events_that_come_again_after_the_trial_was_given_back_or_runs_anew_chan
     trial = bench.bench.prepare()
     ready(bench, trial)
     fails_to_open(bench, disk, trial)
-    old = bench.station.main.events.since(0)
+    old = bench.station.coordinator.events.since(0)
 
     def again():
         for event in old:
-            services.run_changed(station=bench.bench.station, event=event, boot=bench.station.main.boot)
+            services.run_changed(
+                station=bench.bench.station, event=event, boot=bench.station.coordinator.boot
+            )
         trial.refresh_from_db()
 
     again()

@@ -57,11 +57,11 @@ class Direct:
         return self.request(command)
 
     def status(self):
-        return self._station.main.snapshot()
+        return self._station.coordinator.snapshot()
 
     def request(self, command, **how):
         self._station._handle("lease_claim")
-        main = self._station.main
+        main = self._station.coordinator
         held = {"holder": "lockstep", "epoch": main.lease.epoch, "boot": main.boot}
         return main.handle(replace(command, **held, sequence=main.session.sequence))
 
@@ -90,7 +90,7 @@ class Lab:
             "user": self.bench.operator,
             "page": "p",
             "epoch": 1,
-            "boot": self.station.main.boot,
+            "boot": self.station.coordinator.boot,
             "sequence": 0,
         }
         row = trial_command(trial=trial, kind=kind, **order)
@@ -120,12 +120,12 @@ class Lab:
 
     def listen(self):
         """Hand the station's events on, as the chronicle does."""
-        for event in self.station.main.events.since(self._heard):
+        for event in self.station.coordinator.events.since(self._heard):
             self._heard = event["number"]
             if event["kind"] == "episode_closed":
                 export(Path(event["data"]["path"]), self.station.plan.deployment.data)  # as media does
                 episode_closed(station=self.bench.station, data=event["data"])
-            services.run_changed(station=self.bench.station, event=event, boot=self.station.main.boot)
+            services.run_changed(station=self.bench.station, event=event, boot=self.station.coordinator.boot)
 
     def score(self, trial, *reached, **words):
         ticks = self.bench.ticks(*reached)

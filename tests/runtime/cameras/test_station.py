@@ -24,7 +24,7 @@ RECORDED = ["recording.enabled=true", "recording.min_free_bytes=0"]
 
 
 def ready(station: Lockstep) -> None:
-    session = station.main.session
+    session = station.coordinator.session
     station.connect()
     station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
     station.command("setup")
@@ -40,7 +40,7 @@ def go(station: Lockstep, seconds: float) -> None:
 def stop(station: Lockstep) -> Episode:
     station.command("stop")
     go(station, 0.2)
-    return open_episode(Path(station.main.runs.last_episode["path"]))
+    return open_episode(Path(station.coordinator.runs.last_episode["path"]))
 
 
 def shown(episode: Episode) -> list[int]:
@@ -59,7 +59,7 @@ def test_a_video_is_recorded_at_its_own_pace_beside_the_nodes_joints(tmp_path: P
         ready(station)
         station.command("run")
         go(station, 2.0)
-        status = station.main.snapshot()["link"]["cameras"][CAMERA]
+        status = station.coordinator.snapshot()["link"]["cameras"][CAMERA]
         assert (status["kind"], status["condition"], status["losses"]) == ("file", "live", 0)
         episode = stop(station)
         assert made.cameras == tuple(episode.videos), "all others come from the node"
@@ -85,18 +85,20 @@ def test_a_camera_that_ends_in_a_run_is_named_refuses_the_policy_and_recording_g
         ready(station)
         station.command("run")
         go(station, 6.0)
-        assert station.main.session.state is State.HOLDING
-        held = station.main.session.reason
-        rows = station.main.snapshot()["recording"]["rows"]
+        assert station.coordinator.session.state is State.HOLDING
+        held = station.coordinator.session.reason
+        rows = station.coordinator.snapshot()["recording"]["rows"]
         go(station, 1.0)
-        assert station.main.snapshot()["recording"]["rows"] > rows, "recording goes on"
+        assert station.coordinator.snapshot()["recording"]["rows"] > rows, "recording goes on"
         episode = stop(station)
-        events = station.main.events.since(0)
+        events = station.coordinator.events.since(0)
         assert [event["text"] for event in events if event["kind"] == "camera_ended"] == [
             f"camera {CAMERA} ({film}) is ended: the file is over"
         ]
         go(station, 0.5)
-        assert station.main.snapshot()["link"]["cameras"][CAMERA]["condition"] == "live", "it stands again"
+        assert station.coordinator.snapshot()["link"]["cameras"][CAMERA]["condition"] == "live", (
+            "it stands again"
+        )
     assert CAMERA in held
     captured = column(episode.rows, f"capture_time.{CAMERA}")
     repeated = column(episode.rows, f"repeated.{CAMERA}").astype(bool)
@@ -108,13 +110,15 @@ def test_a_camera_that_ends_in_a_run_is_named_refuses_the_policy_and_recording_g
 def test_a_camera_that_cannot_be_opened_is_named_while_the_station_waits_for_it(tmp_path: Path) -> None:
     film = tmp_path / "film.mp4"
     with served("tabletop", 1, tmp_path, file_camera(film)) as (_, station):
-        session = station.main.session
+        session = station.coordinator.session
         station.connect()
         go(station, 1.0)
         assert session.state is State.DISCONNECTED
         why = f"camera {CAMERA} ({film}) is opening: there is no such file"
         assert session.reason == f"no picture has arrived from {CAMERA}; {why}"
-        said = [event["text"] for event in station.main.events.since(0) if event["kind"] == "camera_absent"]
+        said = [
+            event["text"] for event in station.coordinator.events.since(0) if event["kind"] == "camera_absent"
+        ]
         assert said == [f"camera {CAMERA} ({film}): there is no such file"]
 
 
@@ -131,7 +135,7 @@ def test_the_set_up_fails_by_name_where_a_camera_is_gone(tmp_path: Path) -> None
         station.command("stop")
         go(station, 0.5)
         station.command("setup")
-        session = station.main.session
+        session = station.coordinator.session
         station.until(lambda: session.state is not State.SETTING_UP, 10.0, "set-up")
         assert session.state is not State.READY
         assert f"camera {CAMERA} ({film}) is lost: not a video" in session.reason

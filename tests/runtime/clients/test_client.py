@@ -31,7 +31,7 @@ class Station:
         self.boot, self.effects, self.lease = boot, Recorded(), Lease(5.0)
         self.session = SessionMachine(self.effects, self.lease, boot, lambda: self.time)
         self.session.state = state
-        Endpoints(self.folder).write("main", {"commands": self._server.endpoint})
+        Endpoints(self.folder).write("coordinator", {"commands": self._server.endpoint})
 
     def _serve(self):
         while not self._ended.is_set():
@@ -199,7 +199,7 @@ def test_a_station_that_moved_to_other_sockets_is_found_again(client, station):
     client.status()
     moved = CommandServer(station.context, station.folder, "commands")
     old, station._server = station._server, moved
-    Endpoints(station.folder).write("main", {"commands": moved.endpoint})
+    Endpoints(station.folder).write("coordinator", {"commands": moved.endpoint})
     assert client.status()["boot"] == "boot-1"
     old.close()
 
@@ -221,7 +221,7 @@ def test_events_are_asked_for_by_number(client):
 
 def test_the_live_streams_are_found_in_the_folder(client, station):
     publisher = Publisher(station.context, station.folder, "state", 16)
-    Endpoints(station.folder).write("main", {"commands": "", "state": publisher.endpoint})
+    Endpoints(station.folder).write("coordinator", {"commands": "", "state": publisher.endpoint})
     subscriber = client.subscribe("state")
     for _ in range(200):
         publisher.publish("state", {"sequence": 1})

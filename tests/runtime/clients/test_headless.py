@@ -158,11 +158,11 @@ def test_the_events_of_another_main_are_read_from_its_first(plan, capsys):
         status("idle", newest_event=40),
         status("idle", newest_event=40),
         status("setting_up", newest_event=40),
-        status("idle", boot="boot-2", newest_event=1, reason="the process main died"),
+        status("idle", boot="boot-2", newest_event=1, reason="the process coordinator died"),
         events=[event(40, "state", "of the first"), event(1, "state", "of the second")],
     )
     station.events_since = lambda number: [e for e in station.events if e["number"] == number + 1]
-    with pytest.raises(RuntimeFault, match="set-up failed: the process main died"):
+    with pytest.raises(RuntimeFault, match="set-up failed: the process coordinator died"):
         drive(plan, station)
     assert "of the second" in capsys.readouterr().out
 

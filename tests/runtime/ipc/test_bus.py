@@ -295,34 +295,34 @@ def test_a_publisher_never_waits_for_a_reader_that_has_stopped(context, publishe
 
 
 def test_endpoints_are_found_in_the_stations_folder(tmp_path):
-    Endpoints(tmp_path / "bench-1").write("main", {"commands": "tcp://127.0.0.1:1"})
-    Endpoints(tmp_path / "bench-1").write("main", {"commands": "tcp://127.0.0.1:2"})
-    found = Endpoints(tmp_path / "bench-1").read("main")
+    Endpoints(tmp_path / "bench-1").write("coordinator", {"commands": "tcp://127.0.0.1:1"})
+    Endpoints(tmp_path / "bench-1").write("coordinator", {"commands": "tcp://127.0.0.1:2"})
+    found = Endpoints(tmp_path / "bench-1").read("coordinator")
     assert found["commands"] == "tcp://127.0.0.1:2"
     assert isinstance(found["pid"], int)
 
 
 def test_a_station_that_does_not_run_is_named_with_those_that_do(tmp_path):
-    Endpoints(tmp_path / "bench-1").write("main", {})
+    Endpoints(tmp_path / "bench-1").write("coordinator", {})
     with pytest.raises(TransportError, match=r"station 'bench-2' is not running here.*once run: bench-1\)"):
-        Endpoints(tmp_path / "bench-2").read("main")
+        Endpoints(tmp_path / "bench-2").read("coordinator")
 
 
 def test_a_damaged_file_is_a_station_that_does_not_run(tmp_path):
     endpoints = Endpoints(tmp_path / "bench-1")
-    endpoints.write("main", {})
-    (tmp_path / "bench-1" / "endpoints" / "main.json").write_text("{", "utf-8")
+    endpoints.write("coordinator", {})
+    (tmp_path / "bench-1" / "endpoints" / "coordinator.json").write_text("{", "utf-8")
     with pytest.raises(TransportError, match="bench-1' is not running here"):
-        endpoints.read("main")
+        endpoints.read("coordinator")
 
 
 def test_what_a_former_family_left_can_be_cleared(tmp_path):
     endpoints = Endpoints(tmp_path / "bench-1")
     endpoints.clear()
-    endpoints.write("main", {})
+    endpoints.write("coordinator", {})
     endpoints.clear()
     with pytest.raises(TransportError):
-        endpoints.read("main")
+        endpoints.read("coordinator")
 
 
 @pytest.fixture
@@ -362,8 +362,8 @@ def test_endpoints_that_are_cleared_do_not_come_later(tmp_path, refusing):
     endpoints.write("media", {})
     endpoints.clear()
     refusing["full"] = False
-    assert endpoints.write("main", {}) is True
-    assert [path.name for path in tmp_path.glob("bench-1/endpoints/*.json")] == ["main.json"]
+    assert endpoints.write("coordinator", {}) is True
+    assert [path.name for path in tmp_path.glob("bench-1/endpoints/*.json")] == ["coordinator.json"]
 
 
 # --- events ------------------------------------------------------------------------------------------------

@@ -131,30 +131,30 @@ def test_a_run_by_hand_begins_when_steps_can_be_answered(
 ) -> None:
     station = Station(spec_of(tmp_path)).ready()
     loaded: list[bool] = []
-    monkeypatch.setattr(station.main.runs, "_prepared", lambda: bool(loaded))
+    monkeypatch.setattr(station.coordinator.runs, "_prepared", lambda: bool(loaded))
     station.command("run", mode="manual")
     station.go(30)
-    assert station.main.run is not None
-    assert station.main.run.begun is None
+    assert station.coordinator.run is not None
+    assert station.coordinator.run.begun is None
     assert station._handle("move", {"pose": "ready"}).status == "refused"
     station.command("halt")
     loaded.append(True)
     station.go(10)
-    assert station.main.run.begun is None, "who has halted it has not resumed it"
+    assert station.coordinator.run.begun is None, "who has halted it has not resumed it"
     station.command("resume")
     station.go(3)
-    assert station.main.run.begun is not None
+    assert station.coordinator.run.begun is not None
     station.stop()
     loaded.clear()
     station.command("run", mode="manual")
     station.go(30)
     loaded.append(True)
     station.go(3)
-    assert station.main.run.begun is not None
+    assert station.coordinator.run.begun is not None
     station.command("stop")
     station.go(3)
     loaded.clear()
     station.command("run")
     station.go(10)
-    assert station.main.run.begun is not None, "a policy's run needs none of it"
+    assert station.coordinator.run.begun is not None, "a policy's run needs none of it"
     station.close()

@@ -42,7 +42,7 @@ def recorded(station: Station, root: Path) -> tuple[Path, np.ndarray]:
     def swing(index: int, fields: dict[str, Any]) -> None:
         fields["action"] = action(index)
 
-    name = station.main.snapshot()["facts"]["robot"]
+    name = station.coordinator.snapshot()["facts"]["robot"]
     assert name in robots.names()
     folder = built.record_of(root / "told", name, swing, frames=ROWS)
     return folder, np.stack([action(index) for index in range(ROWS)])
@@ -57,7 +57,7 @@ def set_up(folder: Path) -> dict[str, Any]:
 def test_it_is_approached_then_run_and_goes_on_after_a_hold(station: Station, tmp_path: Path) -> None:
     folder, actions = recorded(station, tmp_path)
     station.ready(**set_up(folder))
-    assert station.main.snapshot()["first_action"]["far"]
+    assert station.coordinator.snapshot()["first_action"]["far"]
     station.command("approach")
     station.reach(State.READY)
     # The way is to the newest answer of the warm-up, which is a few rows on.

@@ -144,7 +144,7 @@ def test_reports_and_servers_are_told() -> None:
 def test_a_station_takes_its_policy_back_for_a_set_up_and_for_a_run(tmp_path: Any, monkeypatch: Any) -> None:
     station = Station(spec_of(tmp_path))
     flights = Recorder()
-    monkeypatch.setattr(station.main.preflights, "_preflights", flights)
+    monkeypatch.setattr(station.coordinator.preflights, "_preflights", flights)
     try:
         station.until(lambda: station.state is State.IDLE, 5.0, "first observation")
         assert station._handle("preflight", {"id": "one"}).status == "done"

@@ -29,7 +29,7 @@ PARTS = {
     "control": (READING | {"runtime.spaces"}, {"pydantic"}),
     "reception": (READING, {"pydantic", "cv2"}),
     "media": (READING | {"runtime.spaces"}, {"pydantic", "av", "cv2", "pyarrow", "simplejpeg"}),
-    "main": (
+    "coordinator": (
         READING | {"runtime.cameras", "runtime.policies", "runtime.spaces", "runtime.teleoperators"},
         {"pydantic", "PIL", "cv2", "numba", "scipy", "websockets"},
     ),

@@ -176,7 +176,7 @@ def pick_and_place(
 ) -> Trial:
     """Set up, run until the block lies on the plate or for so long."""
     with served(name, seed, data, assignments, serve) as (made, station):
-        session, table = station.main.session, made.bench.table
+        session, table = station.coordinator.session, made.bench.table
         station.connect()
         station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
         station.command("setup")
@@ -196,6 +196,6 @@ def pick_and_place(
             dict(truth["milestones"]),
             session.state,
             session.reason,
-            station.main.events.since(0),
+            station.coordinator.events.since(0),
             station.clock.now() - began,
         )

@@ -60,17 +60,17 @@ class Operator:
         bench = {"id": str(uuid.uuid4()), "seed": seed}
         self._give("setup", policy={"url": policy}, bench=bench)
         self._until(State.READY, State.IDLE)
-        session, runs = self.station.main.session, self.station.main.runs
+        session, runs = self.station.coordinator.session, self.station.coordinator.runs
         assert session.state is State.READY, session.reason
         self._given.append(self._give("run", duration_s=seconds).data["episode"])
         self._until(State.READY)
-        self._ended.append((session.reason, set(self.station.main.inference.metrics.delays)))
+        self._ended.append((session.reason, set(self.station.coordinator.inference.metrics.delays)))
         while self._dawdles and runs.last_episode.get("uuid") != self._given[-1]:
             self.station.turn()
 
     def courses(self) -> list[Course]:
         """Of all trials, once all recordings are closed."""
-        runs, found = self.station.main.runs, []
+        runs, found = self.station.coordinator.runs, []
         while runs.last_episode["uuid"] != self._given[-1]:
             self.station.turn()
         for uuid_, (reason, delays) in zip(self._given, self._ended, strict=True):
@@ -84,7 +84,7 @@ class Operator:
     def _give(self, kind: str, **arguments: Any) -> Ack:
         for _ in range(1 + self._dawdles):  # nobody decides by what is not published yet
             self.station.turn()
-        main = self.station.main
+        main = self.station.coordinator
         epoch = 0 if kind == "lease_claim" else main.lease.epoch
         ack = main.handle(
             Command(
@@ -103,7 +103,7 @@ class Operator:
 
     def _until(self, *states: State) -> None:
         for _ in range(TURNS):
-            if self.station.main.session.state in states:
+            if self.station.coordinator.session.state in states:
                 return
             self.station.turn()
         raise AssertionError(f"never {states}")

@@ -83,7 +83,7 @@ def test_a_reset_that_the_server_does_not_acknowledge_holds_the_robot_with_what_
     """The warm-up of set-up was a session; a run that went on in it would be of no worth."""
     refusing = arena_server(fault=Fault("reset_text"))
     with served("tabletop_ur5e", 0, tmp_path, ARENA, refusing) as (_, station):
-        session = station.main.session
+        session = station.coordinator.session
         station.connect()
         station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
         station.command("setup")

@@ -190,7 +190,7 @@ order = st.tuples(
 def test_whatever_control_is_ordered_it_sends_open_or_closed(
     stood: float, course: list[tuple[str, float, int]]
 ) -> None:
-    """Rows, goals and locks as nobody in main would write them, of a robot that is taken over half open."""
+    """Rows, goals and locks as nobody in the coordinator would write them, of a robot that is taken over half open."""
     bench = Bench(limits=BINARY, dims=DimensionKinds(switched=(2,)), switches=(HALF,))
     bench.measured = np.array([0.0, 0.0, stood])
     bench.say("follow", run=1)

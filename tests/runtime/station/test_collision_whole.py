@@ -124,7 +124,7 @@ def test_control_itself_stops_a_motion_that_nobody_has_checked(tmp_path: Path) -
     for step in range(155):
         if step == 5:  # it has been seen for long enough to be taken over
             shared.rings["orders"].push(encode(Order(1, "motion", goal=turned(1.6))))
-        for process in ("main", "guard"):
+        for process in ("coordinator", "guard"):
             shared.beat(process, clock.now())
         now = clock.now()
         shared.publish_observation(

@@ -57,11 +57,14 @@ class Bench:
         self.context: zmq.Context[Any] = zmq.Context()
         self.station = Station(spec_of(folder))
         self.folder = self.station.spec.deployment.station_dir
-        self.main = CommandService(self.station.main, self.context)
-        self.guard = Desk(self.station.guard, self.station.main.shared, self.context, self.folder)
+        self.coordinator = CommandService(self.station.coordinator, self.context)
+        self.guard = Desk(self.station.guard, self.station.coordinator.shared, self.context, self.folder)
         Key(self.folder).secret()
         read = Endpoints(self.folder).read
-        self.places = {"main": str(read("main")["commands"]), "guard": str(read("guard")["estop"])}
+        self.places = {
+            "coordinator": str(read("coordinator")["commands"]),
+            "guard": str(read("guard")["estop"]),
+        }
 
     def nobody(self, work: Callable[[], Any]) -> Any:
         """What the work comes to in a process of another account, as JSON has it."""
@@ -79,14 +82,14 @@ class Bench:
                 os._exit(0)
         os.close(writing)
         while os.waitpid(child, os.WNOHANG)[0] == 0:
-            self.main.serve(0.01)
+            self.coordinator.serve(0.01)
             self.guard.serve(0.01)
         with open(reading, "rb") as pipe:
             return json.loads(pipe.read())
 
     def close(self) -> None:
         self.guard.close()
-        self.main.close()
+        self.coordinator.close()
         self.station.close()
         self.context.destroy(linger=0)
 
@@ -113,7 +116,7 @@ def test_another_account_reads_no_key_says_nothing_and_connects_nowhere(bench: B
 
 
 def test_where_the_sockets_are_left_open_it_commands_nothing_and_may_press(bench: Bench) -> None:
-    path = Path(bench.places["main"].removeprefix("ipc://"))
+    path = Path(bench.places["coordinator"].removeprefix("ipc://"))
     opened = [path.parent, path.parents[1], path.parents[2]]
     before = [(folder, folder.stat().st_mode & 0o777) for folder in opened]
     try:
@@ -123,14 +126,14 @@ def test_where_the_sockets_are_left_open_it_commands_nothing_and_may_press(bench
             Path(one.removeprefix("ipc://")).chmod(0o777)
         claim = Command("c", "lease_claim", user="root", holder="web:root:p1", epoch=1, role="admin")
         local = Command("d", "setup", user="root", holder="terminal:root@here", role="local")
-        for answer in bench.nobody(lambda: asked(bench.places["main"], claim, local)):
+        for answer in bench.nobody(lambda: asked(bench.places["coordinator"], claim, local)):
             assert "refused" in answer
             assert "not signed by this lab's web" in answer
-        assert bench.station.main.shared.estop is not EStop.LATCHED
+        assert bench.station.coordinator.shared.estop is not EStop.LATCHED
         press = Command("e", "estop", {"why": "smoke"}, user="root")
         (answer,) = bench.nobody(lambda: asked(bench.places["guard"], press))
         assert "latched" in answer or "measured position" in answer
-        assert bench.station.main.shared.estop is EStop.LATCHED
+        assert bench.station.coordinator.shared.estop is EStop.LATCHED
         assert json.loads((bench.folder / "estop.json").read_text("utf-8"))["by"] == "root (unverified)"
     finally:
         for folder, mode in before:

@@ -43,7 +43,7 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Station
 
 
 def command(station: Station, policy: dict[str, Any], role: str, vouched: tuple[str, ...] = ()) -> Command:
-    main = station.main
+    main = station.coordinator
     held = main.lease.current(main.people.now())
     assert held is not None
     given = {"holder": held.holder, "epoch": held.epoch, "boot": main.boot, "sequence": main.session.sequence}
@@ -54,7 +54,7 @@ def asked(
     station: Station, server: socket.socket, role: str, vouched: tuple[str, ...] = (), **table: Any
 ) -> Ack:
     policy = {"kind": "openpi", "url": f"ws://127.0.0.1:{server.getsockname()[1]}", "connect_deadline": 0.2}
-    return station.main.handle(command(station, policy | table, role, vouched))
+    return station.coordinator.handle(command(station, policy | table, role, vouched))
 
 
 def heard(server: socket.socket) -> bytes:
@@ -105,6 +105,6 @@ def test_a_command_that_was_answered_is_answered_alike_however_it_comes_again(
     station: Station,
 ) -> None:
     first = command(station, {"kind": "mock"}, "operator", ("policy",))
-    assert station.main.handle(first).status == "accepted"
-    assert station.main.handle(replace(first, vouched=[])).status == "accepted"
-    assert station.main.handle(replace(first, uuid=str(uuid4()), vouched=[])).status == "refused"
+    assert station.coordinator.handle(first).status == "accepted"
+    assert station.coordinator.handle(replace(first, vouched=[])).status == "accepted"
+    assert station.coordinator.handle(replace(first, uuid=str(uuid4()), vouched=[])).status == "refused"

@@ -81,7 +81,7 @@ def test_a_transport_that_says_nothing_of_cameras_has_all_of_them():
 
 def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path, monkeypatch):
     shared, descriptor = SharedState.create(spec_of(resolved).layout)
-    shared.beat("main", 12.5)
+    shared.beat("coordinator", 12.5)
     handed = tmp_path / "resolved.json"
     handed.write_text(json.dumps(dict(resolved.tree)), "utf-8")
     arguments = [
@@ -97,7 +97,7 @@ def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path,
     monkeypatch.setattr(child.log, "start", lambda process: None)
     member = child.join("control", pictures=False)
     assert member.spec.resolved.digest == resolved.digest
-    assert member.shared.last_beat("main") == 12.5
+    assert member.shared.last_beat("coordinator") == 12.5
     assert member.boot == "b"
     os.close(descriptor)
 

@@ -132,7 +132,7 @@ def test_a_chunk_continues_what_the_robot_is_committed_to_whatever_the_policy_wo
     with wired(tmp_path, dialect, "rtc") as station:
         station.running(90)
         assert station.state is State.RUNNING, station.reason
-        told = station.main.snapshot()["policy"]["rtc"]
+        told = station.coordinator.snapshot()["policy"]["rtc"]
         assert (told["conditioned"], told["predicted_delay"]) == (True, DELAY)
         assert seams(station).max() < 0.015  # of the 0.08 that it wavers
 

@@ -97,7 +97,7 @@ def demonstration(
         "control": {"heartbeat_timeout_s": 10.0},
     }
     station = lockstep.Lockstep(station_spec.spec_of(loader.resolve(tree, {}, "test")))
-    session = station.main.session
+    session = station.coordinator.session
     try:
         station.connect()
         station.until(lambda: session.state is State.IDLE, 30.0, "first observation")
@@ -111,8 +111,8 @@ def demonstration(
         assert session.state is State.RUNNING, session.reason
         station.command("label", result="success")
         station.command("stop")
-        station.until(lambda: station.main.snapshot()["collect"]["last"] is not None, 10.0, "the file")
-        last = station.main.snapshot()["collect"]["last"]
+        station.until(lambda: station.coordinator.snapshot()["collect"]["last"] is not None, 10.0, "the file")
+        last = station.coordinator.snapshot()["collect"]["last"]
         assert last["result"] == "success"
         return open_episode(data / "episodes" / last["uuid"])
     finally:

@@ -111,7 +111,7 @@ class Inference:
 
     @property
     def notes(self) -> list[Event]:
-        """For main to collect."""
+        """For the coordinator to collect."""
         return self.requests.notes
 
     @property

@@ -40,7 +40,7 @@ class SightSettings:
 
 
 class PolicyObservation:
-    """Reads the page; `simulated` shows the joints of the simulated robot in place of the real one's."""
+    """Reads the shared state; `simulated` shows the joints of the simulated robot in place of the real one's."""
 
     def __init__(self, shared: SharedState, clock: Clock, settings: SightSettings) -> None:
         self._page = shared

@@ -48,7 +48,7 @@ class PolicyResponse:
 class PolicyRequests:
     """Asks one policy; calls are made one after the other, and nobody waits for them here.
 
-    Kinematics belong to the call: for a chunk of poses they take as long as a small model, and main must not.
+    Kinematics belong to the call: for a chunk of poses they take as long as a small model; the coordinator must not.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class PolicyRequests:
         self._fresh = True
         self._held = False  # since it was last asked
         self._glance_at = float("-inf")
-        self.notes: list[Event] = []  # for main to collect
+        self.notes: list[Event] = []  # for the coordinator to collect
 
     def exchange(self, policy: Policy, task: str) -> None:
         """Ask `policy`, with the instruction `task`, from now on.

@@ -1,4 +1,4 @@
-"""Where blocking calls to a policy are made: a thread beside main, or counted out in lockstep."""
+"""Where blocking calls to a policy are made: a thread beside the coordinator, or counted out in lockstep."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Runner(ABC):
 
 @contextmanager
 def telling(what: str) -> Iterator[None]:
-    """Tell every error within as a PolicyError, its traceback in the log: what is wrong with an answer ends no main."""
+    """Tell every error within as a PolicyError, its traceback in the log: no answer ends the coordinator."""
     try:
         yield
     except RuntimeFault:
@@ -73,7 +73,7 @@ def _settle(future: Future[Result], call: Callable[[], Result]) -> None:
 
 
 class ThreadRunner(Runner):
-    """One thread of its own, so that a slow policy never stops main."""
+    """One thread of its own, so that a slow policy never stops the coordinator."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
@@ -134,7 +134,7 @@ class DeclaredRunner(Runner):
         return self._thread.busy
 
     def ready(self, future: Future[Result]) -> bool:
-        # Never within the tick of the question: how often main looks in that time is chance.
+        # Never within the tick of the question: how often the coordinator looks in that time is chance.
         return future.done() and self._now >= self._asked[future] + max(1, self._late.get(future, 1))
 
     @property

@@ -41,7 +41,7 @@ class GuardFacts:
 
 
 class Effects(ABC):
-    """What the session makes happen; implemented by main, recorded by tests.
+    """What the session makes happen; implemented by the coordinator, recorded by tests.
 
     Each raises RuntimeFault to refuse, and has changed nothing then. What is returned goes into the answer. `by` is who
     gave the command that is being carried out, `command` its uuid.

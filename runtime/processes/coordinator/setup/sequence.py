@@ -1,4 +1,4 @@
-"""What `setup` does, stage by stage, never blocking main: connect, observe, home, reset, warm up, validate."""
+"""What `setup` does, stage by stage, never blocking: connect, observe, home, reset, warm up, validate."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ class Bench:
         self.lock, self._ended, self.frozen = threading.Lock(), threading.Event(), False
         self.station = Station(spec_of(folder, lease={"ttl_s": 60.0}, **settings))
         self.folder = self.station.spec.deployment.station_dir
-        self._service = CommandService(self.station.main, self.context)
+        self._service = CommandService(self.station.coordinator, self.context)
         self._guard = CommandServer(self.context, self.folder, "estop")
         Endpoints(self.folder).write("guard", {"estop": self._guard.endpoint})
         self._open: list[Any] = []

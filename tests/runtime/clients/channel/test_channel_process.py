@@ -102,9 +102,9 @@ def newer(endpoints, first):
 
 
 def asked(endpoint):
-    """The station's snapshot over the channel, as soon as main answers."""
+    """The station's snapshot over the channel, as soon as the coordinator answers."""
     script = Script(endpoint, {})
     try:
-        return eventually(lambda: script.send(query="station").get("data"), 20, "main")
+        return eventually(lambda: script.send(query="station").get("data"), 20, "coordinator")
     finally:
         script.close()

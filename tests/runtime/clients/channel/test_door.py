@@ -97,7 +97,7 @@ def test_queries_have_the_older_form(start):
     config = script.query("config")
     assert (config["robot_type"], config["transport_type"]) == ("agilex_piper", "dataset")
     assert len(config["joint_names"]) == 14
-    assert script.query("station")["boot"] == bench.station.main.boot
+    assert script.query("station")["boot"] == bench.station.coordinator.boot
     first, *_ = script.query("events", since=0)
     assert first["number"] == 1
     assert "web:setup" in script.query("commands")["cmd"]
@@ -114,7 +114,7 @@ def test_the_script_of_the_document_sets_up_and_runs(start):
     finally:
         names["socket"].close()
     assert bench.station.reason == "the run's 2 s are over"
-    assert bench.station.main.lease.current(bench.station.clock.now()) is None
+    assert bench.station.coordinator.lease.current(bench.station.clock.now()) is None
 
 
 # --- results -------------------------------------------------------------------------------------------------
@@ -359,7 +359,7 @@ def test_the_estop_needs_no_lease_and_no_main(start):
     bench = start(State.READY)
     runner = bench.script()
     accepted(runner.cmd("start"))
-    bench.frozen = True  # main answers nothing any more
+    bench.frozen = True  # the coordinator answers nothing any more
     waiting, presser = bench.script(), bench.script()
     waiting.socket.send(b'{"cmd": "web:reset"}')
     answer = done(presser.command("estop", why="smoke"))

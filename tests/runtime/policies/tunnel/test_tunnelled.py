@@ -381,25 +381,25 @@ def test_a_run_holds_naming_the_tunnel_that_broke_and_goes_on_when_it_is_up_agai
 ) -> None:
     server = ssh_server()
     with served("tabletop_ur5e", 0, tmp_path / "data", assignments(server.settings())) as (_, station):
-        session = station.main.session
+        session = station.coordinator.session
         station.connect()
         station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
         station.command("setup")
         station.until(lambda: session.state is not State.SETTING_UP, 60.0, "set-up")
         assert session.state is State.READY, session.reason
         station.command("run")
-        station.until(lambda: station.main.inference.metrics.answers > 2, 20.0, "answers")
+        station.until(lambda: station.coordinator.inference.metrics.answers > 2, 20.0, "answers")
         server.stop()
         station.until(lambda: session.state is not State.RUNNING, 60.0, "the end of patience")
         assert session.state is State.HOLDING
         assert f"127.0.0.1:{server.port} is down since" in session.reason
         server.start()
-        policy = station.main.inference.policy
+        policy = station.coordinator.inference.policy
         assert isinstance(policy, TunnelledPolicy)
         assert policy._keeper is not None
         assert policy._keeper.wait(lambda now: now.up, 30).up
-        answers = station.main.inference.metrics.answers
+        answers = station.coordinator.inference.metrics.answers
         station.command("resume")
-        station.until(lambda: station.main.inference.metrics.answers > answers + 2, 20.0, "answers")
+        station.until(lambda: station.coordinator.inference.metrics.answers > answers + 2, 20.0, "answers")
         assert session.state is State.RUNNING, session.reason
     assert server.log().count("Accepted publickey") == 2

@@ -10,15 +10,18 @@ from tests.runtime.tick_bench import PERIOD, Bench
 
 def test_a_sibling_that_is_silent_is_named_with_how_long():
     shared = Bench().shared
-    shared.beat("main", 100.0)
+    shared.beat("coordinator", 100.0)
     shared.beat("guard", 100.0)
     assert silent_sibling(shared, 100.9, 1.0) == ""
-    shared.beat("main", 101.0)
+    shared.beat("coordinator", 101.0)
     assert silent_sibling(shared, 101.5, 1.0) == "no sign of life from guard for 1.5 s"
 
 
 def test_a_sibling_that_never_gave_a_sign_is_named_so():
-    assert silent_sibling(Bench().shared, 100.0, 1.0) == "no sign of life from main since it was restarted"
+    assert (
+        silent_sibling(Bench().shared, 100.0, 1.0)
+        == "no sign of life from the coordinator since it was restarted"
+    )
 
 
 class Held:

@@ -1,4 +1,4 @@
-"""Whatever main posts, in whatever order: what control sends stays within limits, and is accounted for."""
+"""Whatever the coordinator posts, in whatever order: what control sends stays within limits, and is accounted for."""
 
 import numpy as np
 import pytest

@@ -172,7 +172,7 @@ def test_a_dead_main_ends_a_simulation(bench):
     simulating(bench, wave(90))
     bench.alive = False
     bench.run(40)
-    assert "main" in bench.said("family")[0].text
+    assert "coordinator" in bench.said("family")[0].text
     stood = simulated(bench)
     bench.run(5)
     assert (simulated(bench) == stood).all()

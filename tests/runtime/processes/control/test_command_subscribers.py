@@ -50,7 +50,7 @@ class Desk:
         self.said: list[tuple[str, str, Mapping[str, Any]]] = []
         self._hearing = SubscriberCheck(self.shared, self.mouth, lambda *event: self.said.append(event))
         self.now = 100.0
-        self.shared.beat("main", self.now)
+        self.shared.beat("coordinator", self.now)
 
     def go(self, seconds: float) -> list[tuple[str, str, Mapping[str, Any]]]:
         """What is said meanwhile."""
@@ -90,9 +90,9 @@ def test_a_transport_that_cannot_say_says_that_once(desk: Desk) -> None:
 def test_a_main_that_is_started_anew_is_told_again_when_it_is_there(desk: Desk) -> None:
     desk.mouth.found = {"/left": ""}
     assert len(desk.go(5.0)) == 1
-    desk.shared.beat("main", 0.0)
+    desk.shared.beat("coordinator", 0.0)
     assert desk.go(5.0) == []
-    desk.shared.beat("main", desk.now)
+    desk.shared.beat("coordinator", desk.now)
     assert [text for _, text, _ in desk.go(5.0)] == ["nobody listens to /left"]
 
 
@@ -104,10 +104,10 @@ def test_it_is_in_the_status_before_anything_is_set_up_and_leaves_it(
     monkeypatch.setattr(station.robot, "unheard", lambda: dict(found), raising=False)
     station.go(90)
     assert station.state is State.IDLE
-    assert station.main.snapshot()["link"]["unheard"] == {"/left": ""}
+    assert station.coordinator.snapshot()["link"]["unheard"] == {"/left": ""}
     found.clear()
     station.go(90)
-    assert station.main.snapshot()["link"]["unheard"] == {}
-    kinds = [event["kind"] for event in station.main.events.since(0)]
+    assert station.coordinator.snapshot()["link"]["unheard"] == {}
+    kinds = [event["kind"] for event in station.coordinator.events.since(0)]
     assert [kind for kind in kinds if kind.startswith("commands_")] == ["commands_unheard", "commands_heard"]
     station.close()

@@ -126,7 +126,7 @@ def test_the_tick_of_a_deployment_keeps_its_arms_in_their_boxes(
         if step == 4:
             shared.rings["orders"].push(encode(Order(1, "follow", run=1)))
             shared.rings["orders"].push(encode(PostedChunk(1, 1, 4, np.tile(STANDS, (5, 1)))))
-        for process in ("main", "guard"):
+        for process in ("coordinator", "guard"):
             shared.beat(process, clock.now())
         shared.publish_observation(source.receive(0.0), dict.fromkeys(spec.cameras, 1))
         tick(step, clock.now())

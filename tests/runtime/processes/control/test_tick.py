@@ -200,7 +200,7 @@ def test_a_dead_main_makes_control_hold_and_keep_sending(bench):
     bench.alive = False
     bench.run(40)
     assert bench.behaviour == "hold"
-    assert "main" in bench.said("family")[0].text
+    assert "coordinator" in bench.said("family")[0].text
     assert len(bench.sink.sent) == 41
 
 

@@ -45,7 +45,7 @@ class Collects(test_session_machine.Machine):
     @rule(pressed=buttons, wait=ticks)
     def press(self, pressed: str, wait: int) -> None:
         station = self.station
-        armed, collects = station.collect["armed"], station.main.collecting.set_up
+        armed, collects = station.collect["armed"], station.coordinator.collecting.set_up
         before = station.collect["episode"] or (list(self.opened)[-1] if self.opened else None)
         self.command((pressed, {}), 0)
         if pressed == "run" and collects and not armed:
@@ -66,7 +66,7 @@ class Collects(test_session_machine.Machine):
             self.release(3)
         for kind, arguments in (("stop", {}), ("setup", {"collect": True}), ("arm", {}), ("run", {})):
             self.tick(3)
-            if kind in self.station.main.session.allowed():
+            if kind in self.station.coordinator.session.allowed():
                 self.command((kind, arguments), 1)
             for _ in range(200):
                 if self.station.state is State.SETTING_UP:
@@ -93,14 +93,14 @@ class Collects(test_session_machine.Machine):
 
     def look(self, measured: Any, told: int) -> None:
         super().look(measured, told)
-        main = self.station.main
+        main = self.station.coordinator
         run = main.run
         if run is not None and run.mode == "collect" and run.uuid:
             self.opened.setdefault(run.uuid, False)
             assert main.session.state is not State.RUNNING or main.collecting.armed, "nobody leads unarmed"
 
     def asked(self) -> bool:
-        main = self.station.main
+        main = self.station.coordinator
         leads = main.run is not None and main.run.mode == "collect"
         return super().asked() or (leads and main.session.state is State.RUNNING)
 
@@ -111,7 +111,7 @@ class Collects(test_session_machine.Machine):
     def teardown(self) -> None:
         if hasattr(self, "station"):
             self.keeps_lease = True
-            if "stop" in self.station.main.session.allowed():
+            if "stop" in self.station.coordinator.session.allowed():
                 self.command(("stop", {}), 1)
             for episode, discarded in self.opened.items():
                 folder = Path(self.folder.name) / "episodes" / episode

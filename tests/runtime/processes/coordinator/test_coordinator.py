@@ -1,4 +1,4 @@
-"""What main notices and tells, in whole stations in lockstep."""
+"""What the coordinator notices and tells, in whole stations in lockstep."""
 
 from pathlib import Path
 
@@ -55,7 +55,7 @@ def test_a_run_of_which_no_answer_can_be_used_is_ended_by_the_rule_of_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, state: State
 ) -> None:
     station = Station(spec_of(tmp_path, faults={"policy_error": answer, "starvation": "slow"})).ready()
-    monkeypatch.setattr(station.main.inference.requests, "note", lambda answered: [][0])
+    monkeypatch.setattr(station.coordinator.inference.requests, "note", lambda answered: [][0])
     station.command("run")
     station.reach(state, 10.0)
     assert "the policy's answer cannot be used: IndexError" in station.reason
@@ -88,9 +88,9 @@ def test_cameras_that_send_nothing_are_named(tmp_path: Path) -> None:
     station.go(10)
     assert station.state is State.DISCONNECTED
     assert station.reason == "no picture has arrived from cam_left_wrist"
-    sequence = station.main.session.sequence
+    sequence = station.coordinator.session.sequence
     station.go(30)
-    assert station.main.session.sequence == sequence  # told once: nothing grows stale by it
+    assert station.coordinator.session.sequence == sequence  # told once: nothing grows stale by it
     station.close()
 
 
@@ -101,7 +101,7 @@ def test_a_recording_without_a_run_that_fails_is_over_and_a_run_may_begin(tmp_pa
     station.robot.picture = lambda number: np.zeros((2, 2, 3), np.uint8)  # a camera that changes its size
     station.go(5)
     assert station.events("recording_failed")
-    assert station.main.runs.last_episode["status"] == "failed"
+    assert station.coordinator.runs.last_episode["status"] == "failed"
     with pytest.raises(SetupError, match="no recording is open"):
         station.command("record_stop")
     station.command("run")
@@ -124,7 +124,7 @@ def test_the_death_of_control_closes_a_recording_without_a_run_and_a_run_records
     station.go(5)
     restarted(station, "control")
     assert (station.state, station.media.recording) == (State.IDLE, False)
-    ended = station.main.runs.last_episode
+    ended = station.coordinator.runs.last_episode
     assert (ended["uuid"], ended["status"]) == (alone, "interrupted")
     assert ended["reason"] == "the process control died and was restarted: set up again"
     station.ready()
@@ -148,7 +148,7 @@ def test_the_death_of_the_guard_leaves_a_recording_without_a_run_open_until_it_i
         station.command("run")
     station.command("record_stop")
     station.go(3)
-    ended = station.main.runs.last_episode
+    ended = station.coordinator.runs.last_episode
     assert (ended["uuid"], ended["status"]) == (alone, "finished")
     station.command("run")
     station.go(5)
@@ -172,7 +172,7 @@ def test_a_process_that_was_restarted_and_says_nothing_yet_is_not_told_to_be_sil
 def test_the_snapshot_says_how_the_last_run_ended(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, run={"duration_s": 0.5}))
     station.running(30)
-    shown = station.main.snapshot()
+    shown = station.coordinator.snapshot()
     assert shown["state"] == "ready"
     assert shown["last_run"]["status"] == "finished"
     assert shown["last_run"]["reason"] == "the run's 0.5 s are over"
@@ -190,13 +190,13 @@ def test_a_media_that_does_not_read_keeps_nobody_from_stopping(tmp_path: Path, h
         station.guard.press("anna", "a test")
     station.go(10)
     assert station.state is (State.READY if how == "stop" else State.FAULTED)
-    assert station.main.run is None
+    assert station.coordinator.run is None
     station.close()
 
 
 def test_a_query_with_nonsense_is_refused_and_nothing_ends(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path))
-    ack = station.main.handle(Command("1", "events_since", {"number": "seven"}))
+    ack = station.coordinator.handle(Command("1", "events_since", {"number": "seven"}))
     assert ack.status == "refused"
     assert "'seven': must be a whole number" in ack.reason
     station.close()
@@ -221,13 +221,13 @@ def test_events_from_before_main_was_there_are_kept_and_nothing_that_was_told_is
     rings["media_events"].push(encode(EpisodeOpened(1, "one", "", "no room")))
     rings["control_events"].push(encode(Event(UNHEARD, "nobody listens", 0.1, data=told)))
     rings["control_events"].push(encode(Event("displaced", "the arm was moved", 0.1)))
-    station.main = Coordinator(station.spec, station.shared, station.clock, station._runner)
-    assert [event["kind"] for event in station.main.events.since(0)] == [
+    station.coordinator = Coordinator(station.spec, station.shared, station.clock, station._runner)
+    assert [event["kind"] for event in station.coordinator.events.since(0)] == [
         UNHEARD,
         "displaced",
         "source_frozen_cam_high",
     ]
-    assert station.main.unheard == told["unheard"]
+    assert station.coordinator.unheard == told["unheard"]
     assert station.state is State.DISCONNECTED  # as it begins, until it has looked itself
     assert station.reason == "waiting for the first observation"
     station.close()

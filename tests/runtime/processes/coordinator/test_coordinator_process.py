@@ -1,4 +1,4 @@
-"""What main publishes, over real sockets, of a station in lockstep."""
+"""What the coordinator publishes, over real sockets, of a station in lockstep."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Watched:
     def __init__(self, folder: Path) -> None:
         self._context: zmq.Context[Any] = zmq.Context()
         self.station = Station(spec_of(folder))
-        self._service = CommandService(self.station.main, self._context)
-        endpoint = Endpoints(self.station.spec.deployment.station_dir).read("main")["state"]
+        self._service = CommandService(self.station.coordinator, self._context)
+        endpoint = Endpoints(self.station.spec.deployment.station_dir).read("coordinator")["state"]
         self._reader = Subscriber(self._context, endpoint, "joints")
         self.serve = self._service.serve
         self.context, self.endpoints = self._context, Endpoints(self.station.spec.deployment.station_dir)
@@ -69,7 +69,7 @@ def test_in_a_run_the_curves_are_those_of_one_step(watched: Watched) -> None:
     seen = watched.joints()
     assert all(seen[name].shape == (DIM,) for name in ("measured", "raw", "planned", "commanded"))
     assert all(seen[name].dtype == np.float32 for name in ("measured", "raw", "planned", "commanded"))
-    raw = station.main.inference.raw(seen["step"])
+    raw = station.coordinator.inference.raw(seen["step"])
     assert raw is not None
     assert np.allclose(seen["raw"], raw)
     assert np.allclose(seen["planned"], raw, atol=1e-4)  # every chunk of this policy wants the same
@@ -94,7 +94,7 @@ class Asker:
     def __init__(self, watched: Watched) -> None:
         self._watched = watched
         self._socket = watched.context.socket(zmq.DEALER)
-        self._socket.connect(watched.endpoints.read("main")["commands"])
+        self._socket.connect(watched.endpoints.read("coordinator")["commands"])
 
     def ask(self, uuid: str, **arguments: Any) -> None:
         self._socket.send(encode(Command(uuid, "aim", arguments)))
@@ -121,7 +121,7 @@ def test_an_aim_that_needs_what_is_being_loaded_is_answered_when_it_is_there(
 ) -> None:
     watched.station.ready()
     loaded: list[bool] = []
-    monkeypatch.setattr(watched.station.main.manual._targets, "prepare", lambda: bool(loaded))
+    monkeypatch.setattr(watched.station.coordinator.manual._targets, "prepare", lambda: bool(loaded))
     asker = Asker(watched)
     asker.ask("step", jog=JOG)
     asker.ask("pose", pose="home")
@@ -137,7 +137,7 @@ def test_an_aim_that_needs_what_is_being_loaded_is_answered_when_it_is_there(
 def test_of_many_that_wait_for_what_is_being_loaded_some_are_refused(
     watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(watched.station.main.manual._targets, "prepare", lambda: False)
+    monkeypatch.setattr(watched.station.coordinator.manual._targets, "prepare", lambda: False)
     monkeypatch.setattr("runtime.processes.coordinator.process._MOST_WAITING", 10)
     asker = Asker(watched)
     for number in range(13):

@@ -121,7 +121,7 @@ def test_a_leader_that_is_far_away_is_approached_before_it_is_followed(tmp_path:
     station.ready(collect=True)
     station.leader.joints[LEFT] += 1.2
     station.go(2)
-    assert station.main.snapshot()["first_action"]["far"]
+    assert station.coordinator.snapshot()["first_action"]["far"]
     station.command("arm")
     station.command("run")
     station.go(10)
@@ -192,7 +192,7 @@ def test_a_node_that_drives_is_told_so_five_times_and_what_it_reports_is_the_act
     station.command("run")
     station.go(60)
     assert len(robot.commands) == sent  # nothing of ours
-    assert station.main.snapshot()["control"]["behaviour"] == "yield"
+    assert station.coordinator.snapshot()["control"]["behaviour"] == "yield"
     assert station.collect["leader"]["state"] == "alive"
     station.command("stop")
     station.go(10)
@@ -219,8 +219,8 @@ def test_a_node_that_reports_no_action_fails_the_run_within_two_seconds(tmp_path
     assert not station.collect["armed"]
     station.go(5)
     assert station.robot.told[-1][0] == "collect_stop"
-    assert station.main.runs.last_episode["status"] == "failed"
-    assert station.main.runs.last_episode["rows"] == 0
+    assert station.coordinator.runs.last_episode["status"] == "failed"
+    assert station.coordinator.runs.last_episode["rows"] == 0
     station.close()
 
 
@@ -242,7 +242,7 @@ def test_a_node_that_stops_reporting_is_told_to_end_and_the_episode_is_kept_open
     station.close()
 
 
-@pytest.mark.parametrize("cause", ["e-stop", "lease", "main"])
+@pytest.mark.parametrize("cause", ["e-stop", "lease", "coordinator"])
 def test_whatever_stops_us_stops_the_node_too(tmp_path: Path, cause: str) -> None:
     station = collecting(tmp_path, "node").armed()
     station.command("run")
@@ -252,7 +252,7 @@ def test_whatever_stops_us_stops_the_node_too(tmp_path: Path, cause: str) -> Non
         station.guard.press("anna", "a test")
         station.go(10)
     elif cause == "lease":
-        station.main.lease.give_up("lockstep", station.main.lease.epoch, station.clock.now())
+        station.coordinator.lease.give_up("lockstep", station.coordinator.lease.epoch, station.clock.now())
         for _ in range(10):
             station.tick()
     else:
@@ -262,7 +262,7 @@ def test_whatever_stops_us_stops_the_node_too(tmp_path: Path, cause: str) -> Non
             station.clock.sleep_until(station.step / station.spec.rate)
     assert not station.robot.collects  # type: ignore[attr-defined]
     assert [word for word, _ in station.robot.told].count("collect_stop") == 5
-    if cause != "main":
+    if cause != "coordinator":
         assert not station.collect["armed"]
     station.close()
 
@@ -292,7 +292,7 @@ def test_the_arm_falls_with_its_sentence(tmp_path: Path, cause: str) -> None:
     station = collecting(tmp_path).armed()
     station.go(2)
     if cause == "lease":
-        station.main.lease.give_up("lockstep", station.main.lease.epoch, station.clock.now())
+        station.coordinator.lease.give_up("lockstep", station.coordinator.lease.epoch, station.clock.now())
         station.tick()
     elif cause == "e-stop":
         station.guard.press("anna", "a test")
@@ -312,7 +312,7 @@ def test_the_arm_falls_with_its_sentence(tmp_path: Path, cause: str) -> None:
         station.robot.position[LEFT] += 1.0
         station.go(30)
     else:
-        station.main.collecting._touched -= 300.0
+        station.coordinator.collecting._touched -= 300.0
         station.go(2)
     assert not station.collect["armed"]
     assert station.collect["why_not"]
@@ -330,7 +330,7 @@ def test_a_station_set_up_to_collect_runs_no_policy_and_one_with_a_policy_collec
     with pytest.raises(SetupError, match="strategy while the station is set up to collect"):
         station.command("tune", strategy={"kind": "async"})
     station.ready()
-    assert station.main.spec.deployment.strategy.kind == "async"
+    assert station.coordinator.spec.deployment.strategy.kind == "async"
     with pytest.raises(SetupError, match="set up with collect = true first"):
         station.command("run", mode="collect")
     with pytest.raises(SetupError, match="set up with collect first"):
@@ -379,7 +379,7 @@ def test_a_deployment_without_a_collection_says_so(tmp_path: Path) -> None:
     from tests.runtime.lockstep_station import Station
 
     station = Station(spec_of(tmp_path)).ready()
-    assert station.main.snapshot()["collect"] is None
+    assert station.coordinator.snapshot()["collect"] is None
     with pytest.raises(SetupError, match=r"no \[collection\]"):
         station.command("setup", collect=True)
     with pytest.raises(SetupError, match=r"no \[collection\]"):

@@ -25,7 +25,7 @@ def begun(tmp_path: Path, mode: str, rows: Any = on_time, **settings: Any) -> St
 
 
 def phase(station: Station) -> str:
-    return str(station.main.snapshot()["phase"])
+    return str(station.coordinator.snapshot()["phase"])
 
 
 def recorded(station: Station, stream: str, name: str) -> np.ndarray:
@@ -72,7 +72,7 @@ def test_a_proposal_moves_nothing_until_it_is_committed_however_long_one_looks(t
     station = begun(tmp_path, "preview", lambda o, n: ramp(0, 6))
     station.command("step")
     station.go(90)
-    told = station.main.snapshot()
+    told = station.coordinator.snapshot()
     assert (told["phase"], told["proposal"]["rows"]) == ("proposed", 6)
     assert told["proposal"]["age_s"] > 2.0
     assert not station.robot.commands or np.allclose(station.robot.sent, STANDS)
@@ -88,9 +88,9 @@ def test_a_cancelled_proposal_is_recorded_as_one_that_was_never_executed(tmp_pat
     station = begun(tmp_path, "preview")
     station.command("step")
     station.go(2)
-    assert station.main.snapshot()["phase"] == "proposed"
+    assert station.coordinator.snapshot()["phase"] == "proposed"
     station.command("cancel")
-    assert station.main.snapshot()["proposal"] == {}
+    assert station.coordinator.snapshot()["proposal"] == {}
     station.go(5)
     assert not station.robot.commands or np.allclose(station.robot.sent, STANDS)
     episode = station.stop()
@@ -105,7 +105,7 @@ def test_approach_goes_to_where_the_shown_chunk_begins_and_commit_executes_it_fr
     station = begun(tmp_path, "preview", lambda o, n: ramp(400, 5))
     station.command("step")
     station.go(2)
-    assert station.main.snapshot()["proposal"]["far"]
+    assert station.coordinator.snapshot()["proposal"]["far"]
     station.command("approach")
     station.go(1)
     assert phase(station) == "approaching"
@@ -120,13 +120,13 @@ def test_approach_goes_to_where_the_shown_chunk_begins_and_commit_executes_it_fr
 
 def test_a_far_first_action_is_said_at_set_up_and_can_be_approached_before_the_run(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, lambda o, n: ramp(400, 20))).ready()
-    first = station.main.snapshot()["first_action"]
+    first = station.coordinator.snapshot()["first_action"]
     assert first["far"]
     assert "far" in station.reason
     station.command("approach")
     assert station.state is State.SETTING_UP
     station.reach(State.READY)
-    assert not station.main.snapshot()["first_action"]["far"]
+    assert not station.coordinator.snapshot()["first_action"]["far"]
     assert station.reason == "at the policy's first action"
     station.close()
 
@@ -143,7 +143,7 @@ def test_simulation_moves_the_simulated_robot_and_never_the_real_one(tmp_path: P
     station.command("run", mode="sim", sim_state=sim_state)
     station.go(40)
     assert station.robot.commands == [] or np.allclose(station.robot.sent, STANDS)
-    told = station.main.snapshot()
+    told = station.coordinator.snapshot()
     assert (told["mode"], told["sim_state"]) == ("sim", sim_state)
     simulated = station.shared.control.read()["simulated"]
     assert np.abs(simulated - STANDS).max() > 0.05
@@ -166,8 +166,8 @@ def test_a_run_after_a_simulation_shows_the_policy_the_real_robot_again(tmp_path
     station.go(3)
     station.command("run", mode="continuous")
     station.go(10)
-    assert not station.main.inference.requests.policy_observation.simulated
-    assert station.main.snapshot()["mode"] == "continuous"
+    assert not station.coordinator.inference.requests.policy_observation.simulated
+    assert station.coordinator.snapshot()["mode"] == "continuous"
     assert len(station.robot.commands) > 0
     station.close()
 
@@ -255,7 +255,7 @@ def test_a_locked_gripper_stays_whatever_the_policy_wants_and_the_record_says_so
     station.command("gripper", arm="left_arm", action="lock")
     station.go(20)
     assert station.robot.sent[-10:, LEFT_GRIPPER] == pytest.approx(at, abs=1e-3)
-    assert station.main.snapshot()["grippers"]["left_arm"]["locked"]
+    assert station.coordinator.snapshot()["grippers"]["left_arm"]["locked"]
     station.command("gripper", arm="left_arm", action="unlock")
     station.go(30)
     assert station.robot.sent[-1, LEFT_GRIPPER] == pytest.approx(0.02, abs=1e-3)
@@ -272,7 +272,7 @@ def test_a_trial_is_run_as_it_was_set_up_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(SetupError, match="tuned since the set-up: set up again"):
         station.command("run", trial={"id": 1})
     station.ready()
-    assert station.main.spec.deployment.strategy.blend_window == 8  # type: ignore[attr-defined]
+    assert station.coordinator.spec.deployment.strategy.blend_window == 8  # type: ignore[attr-defined]
     station.command("gripper", arm="left_arm", action="lock")
     with pytest.raises(SetupError, match="a gripper is locked"):
         station.command("run", trial={"id": 1})
@@ -294,7 +294,7 @@ def test_another_strategy_takes_over_within_a_run_without_a_gap_or_a_jump(
     station.command("tune", strategy={"kind": after})
     station.go(60)
     assert station.state is State.RUNNING, station.reason
-    assert station.main.snapshot()["strategy"] == after
+    assert station.coordinator.snapshot()["strategy"] == after
     assert station.events("starved") == []
     sent = station.robot.sent
     # The ramp's own steps are 0.002; what is caught up after a wait is blended in.
@@ -317,7 +317,7 @@ def test_another_instruction_reaches_the_policy_within_the_run(tmp_path: Path) -
     station.go(30)
     assert prompts[0] == "stack the cups"
     assert prompts[-1] == "put it back"
-    assert station.main.snapshot()["task"] == "put it back"
+    assert station.coordinator.snapshot()["task"] == "put it back"
     station.close()
 
 
@@ -333,10 +333,10 @@ def test_a_strategy_that_there_is_not_is_refused_and_nothing_changes(
     tmp_path: Path, strategy: dict[str, Any], sentence: str
 ) -> None:
     station = Station(spec_of(tmp_path)).running(10)
-    before = station.main.snapshot()["tuning"]
+    before = station.coordinator.snapshot()["tuning"]
     with pytest.raises(SetupError, match=sentence):
         station.command("tune", strategy=strategy)
-    assert station.main.snapshot()["tuning"] == before
+    assert station.coordinator.snapshot()["tuning"] == before
     station.go(20)
     assert station.state is State.RUNNING
     station.close()
@@ -377,7 +377,7 @@ def test_a_policy_that_fails_is_answered_as_the_deployment_says(
     assert str(error) in station.reason
     station.go(3)
     if status:
-        assert station.main.runs.last["status"] == status
+        assert station.coordinator.runs.last["status"] == status
     station.close()
 
 
@@ -460,7 +460,7 @@ def test_the_end_of_the_lease_stops_a_gripper_that_is_on_its_way(
         station.command("gripper", arm="left_arm", action="lock")
     station.command("gripper", arm="left_arm", action="open")
     station.go(3)
-    station.main.lease.give_up("lockstep", station.main.lease.epoch, station.clock.now())
+    station.coordinator.lease.give_up("lockstep", station.coordinator.lease.epoch, station.clock.now())
     station.tick()
     at = left_gripper(station)
     for _ in range(40):
@@ -481,7 +481,7 @@ def test_a_stop_stops_a_gripper_that_is_on_its_way_to_its_lock(tmp_path: Path, c
     station.go(40)
     assert 0.0 < at < 0.05
     assert abs(left_gripper(station) - at) < 0.01
-    told = station.main.snapshot()["grippers"]["left_arm"]
+    told = station.coordinator.snapshot()["grippers"]["left_arm"]
     assert told["locked"]
     assert told["at"] == pytest.approx(left_gripper(station), abs=1e-6)
     station.close()
@@ -499,7 +499,7 @@ def test_an_e_stop_forgets_locks_on_both_sides(tmp_path: Path) -> None:
     station.go(30)
     assert station.state is State.IDLE
     assert left_gripper(station) == at
-    assert not station.main.snapshot()["grippers"]["left_arm"]["locked"]
+    assert not station.coordinator.snapshot()["grippers"]["left_arm"]["locked"]
     station.close()
 
 
@@ -548,7 +548,7 @@ def test_an_arm_that_was_moved_while_a_person_looks_holds_the_run(tmp_path: Path
     station.go(30)
     assert station.state is State.HOLDING
     assert "from where it was told to hold" in station.reason
-    assert station.main.inference.proposal is None
+    assert station.coordinator.inference.proposal is None
     if station.robot.commands:
         assert np.allclose(station.robot.sent[-1], station.robot.position, atol=0.05)
     station.close()
@@ -557,9 +557,9 @@ def test_an_arm_that_was_moved_while_a_person_looks_holds_the_run(tmp_path: Path
 def test_another_instruction_makes_the_first_action_of_the_set_up_unknown(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, lambda o, n: ramp(400, 20))).ready()
     station.command("tune", strategy={"blend_window": 4})
-    assert "approach" in station.main.snapshot()["allowed"]
+    assert "approach" in station.coordinator.snapshot()["allowed"]
     station.command("tune", task="something else")
-    assert station.main.snapshot()["first_action"] == {}
+    assert station.coordinator.snapshot()["first_action"] == {}
     with pytest.raises(SetupError, match=r"first action is not known: set up again"):
         station.command("approach")
     station.close()
@@ -595,9 +595,9 @@ def test_a_failure_that_was_cancelled_is_not_held_against_the_next_question(tmp_
     station.policy._plan = spec_of(tmp_path / "other", rows)
     station.command("step")
     station.go(15)
-    assert station.main.snapshot()["policy"]["lost"]
+    assert station.coordinator.snapshot()["policy"]["lost"]
     station.command("cancel")
-    assert not station.main.snapshot()["policy"]["lost"]
+    assert not station.coordinator.snapshot()["policy"]["lost"]
     station.go(200)
     station.command("step")
     station.go(15)
@@ -611,9 +611,9 @@ def test_the_end_of_a_motion_before_is_not_taken_for_the_end_of_homing(tmp_path:
     station.until(
         lambda: station.shared.control.read()["behaviour"] == b"hold", 5.0, "the gripper to be open"
     )
-    station.command("home")  # control has said that it is done, main has not heard it yet
+    station.command("home")  # control has said that it is done, the coordinator has not heard it yet
     station.go(3)
-    assert station.main.setup.stage == "going to the pose"
+    assert station.coordinator.setup.stage == "going to the pose"
     station.reach(State.READY)
     assert np.abs(station.robot.position[~station.spec.limits.grippers]).max() < 1e-3
     station.close()

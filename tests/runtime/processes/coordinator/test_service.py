@@ -1,4 +1,4 @@
-"""What main's socket believes, refuses and does first, over real sockets, of a station in lockstep."""
+"""What the coordinator's socket believes, refuses and does first, over real sockets, of a station in lockstep."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Bench:
     def __init__(self, folder: Path) -> None:
         self.context: zmq.Context[Any] = zmq.Context()
         self.station = Station(spec_of(folder))
-        self.main = self.station.main
-        self.service = CommandService(self.main, self.context)
+        self.coordinator = self.station.coordinator
+        self.service = CommandService(self.coordinator, self.context)
         self.folder = self.station.spec.deployment.station_dir
         self.key = Key(self.folder)
 
@@ -39,7 +39,7 @@ class Bench:
         made: zmq.Socket[bytes] = self.context.socket(zmq.DEALER)
         made.set_hwm(100_000)
         made.linger = 0
-        made.connect(Endpoints(self.folder).read("main")["commands"])
+        made.connect(Endpoints(self.folder).read("coordinator")["commands"])
         return made
 
     def ask(self, client: zmq.Socket[bytes], command: Command, signed: bool = False) -> Ack:
@@ -58,13 +58,13 @@ class Bench:
     def led(self) -> Command:
         """The station has a run that a page leads; returns a stop of that page."""
         self.station.running(5)
-        epoch = self.main.lease.epoch + 1
+        epoch = self.coordinator.lease.epoch + 1
         claim = Command(str(uuid4()), "lease_claim", user="ann", holder=PAGE, epoch=epoch, role="operator")
         assert self.ask(self.client(), claim, signed=True).status == "accepted"
         return Command(str(uuid4()), "stop", user="ann", holder=PAGE, epoch=epoch)
 
     def told(self, kind: str) -> list[dict[str, Any]]:
-        return [event for event in self.main.events.since(0) if event["kind"] == kind]
+        return [event for event in self.coordinator.events.since(0) if event["kind"] == kind]
 
     def journalled(self) -> list[dict[str, Any]]:
         lines = (self.folder / "commands.jsonl").read_text("utf-8").splitlines()
@@ -85,7 +85,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 def test_who_the_web_signs_for_is_in_the_events_the_journal_and_the_lease(bench: Bench) -> None:
     stop = bench.led()
-    assert bench.main.snapshot()["lease"]["by"] == "ann (operator)"
+    assert bench.coordinator.snapshot()["lease"]["by"] == "ann (operator)"
     assert bench.ask(bench.client(), stop, signed=True).status == "accepted"
     event = bench.told("command")[-1]
     assert (event["data"]["user"], event["data"]["role"], event["data"]["holder"]) == ("ann", "", PAGE)
@@ -105,9 +105,9 @@ def test_a_stop_that_cannot_be_verified_is_obeyed_and_recorded_so(
     client.send_multipart([encode(stop), signature] if signature else [encode(stop)])
     for _ in range(PATIENCE):
         bench.service.serve(0.01)
-        if bench.main.session.state is not State.RUNNING:
+        if bench.coordinator.session.state is not State.RUNNING:
             break
-    assert bench.main.session.state is (State.READY if kind == "stop" else State.HOLDING)
+    assert bench.coordinator.session.state is (State.READY if kind == "stop" else State.HOLDING)
     (event,) = [event for event in bench.told("command") if event["data"]["uuid"] == stop.uuid]
     assert event["text"] == f"{kind} by ann (unverified): accepted"
     assert bench.journalled()[-1]["role"] == "unverified"
@@ -120,8 +120,8 @@ def test_all_else_that_cannot_be_verified_is_refused_and_told(bench: Bench, kind
     ack = bench.ask(bench.client(), said)
     assert (ack.status, "not signed by this lab's web" in ack.reason) == ("refused", True)
     assert bench.told("not_allowed")[-1]["text"].startswith(f"{kind} by root (unverified): refused")
-    assert bench.main.snapshot()["lease"]["holder"] == PAGE
-    assert bench.main.session.answered(said) is None, "whose uuid it is has its own answer"
+    assert bench.coordinator.snapshot()["lease"]["holder"] == PAGE
+    assert bench.coordinator.session.answered(said) is None, "whose uuid it is has its own answer"
 
 
 def test_a_viewer_whom_the_web_signs_for_may_look_and_stop(bench: Bench) -> None:
@@ -142,9 +142,9 @@ def test_without_its_key_a_station_still_stops_and_refuses_the_rest(bench: Bench
     client.send_multipart([encode(stop), signature])
     for _ in range(PATIENCE):
         bench.service.serve(0.01)
-        if bench.main.session.state is State.READY:
+        if bench.coordinator.session.state is State.READY:
             break
-    assert bench.main.session.state is State.READY
+    assert bench.coordinator.session.state is State.READY
 
 
 def test_repeats_of_a_stop_get_the_first_ones_answer_and_one_line(bench: Bench) -> None:
@@ -176,14 +176,14 @@ def test_a_flood_of_questions_is_told_once_and_a_stop_is_answered_in_a_few_turns
     payload = encode(stop)
     client.send_multipart([payload, bench.key.sign(payload)])
     asked = 0
-    handle = bench.main.handle
+    handle = bench.coordinator.handle
 
     def counted(command: Command) -> Ack:
         nonlocal asked
         asked += command.kind == "status"
         return handle(command)
 
-    bench.main.handle = counted  # type: ignore[method-assign]
+    bench.coordinator.handle = counted  # type: ignore[method-assign]
     turns = 0
     while not client.poll(0):
         turns += 1
@@ -203,16 +203,16 @@ def test_a_flood_of_questions_is_told_once_and_a_stop_is_answered_in_a_few_turns
 def test_a_press_at_the_wrong_socket_stops_the_robot_and_is_latched_by_the_guard(bench: Bench) -> None:
     bench.station.running(5)
     assert bench.ask(bench.client(), Command("p", "estop", {"why": "smoke"})).status == "accepted"
-    assert bench.main.shared.estop is EStop.LATCHED
+    assert bench.coordinator.shared.estop is EStop.LATCHED
     bench.station.go(40)
-    assert bench.main.session.state is State.FAULTED
+    assert bench.coordinator.session.state is State.FAULTED
     assert json.loads((bench.folder / "estop.json").read_text("utf-8"))["why"] == "smoke"
     assert bench.journalled()[-1]["kind"] == "estop"
     assert bench.told("command")[-1]["text"].endswith(": accepted, smoke")
 
 
 def test_whatever_is_wrong_with_a_press_at_the_wrong_socket_it_is_pressed(bench: Bench) -> None:
-    shared, client = bench.main.shared, bench.client()
+    shared, client = bench.coordinator.shared, bench.client()
     for name, payload in presses.PACKED.items():
         shared.set_estop(EStop.CLEAR)
         client.send(payload)
@@ -229,4 +229,4 @@ def test_a_press_whose_uuid_was_anothers_is_pressed(bench: Bench) -> None:
     assert bench.ask(bench.client(), stop, signed=True).status == "accepted"
     press = Command(stop.uuid, "estop", user="ann", holder=PAGE)
     assert bench.ask(bench.client(), press).status == "accepted"
-    assert bench.main.shared.estop is EStop.LATCHED
+    assert bench.coordinator.shared.estop is EStop.LATCHED

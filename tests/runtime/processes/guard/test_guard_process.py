@@ -230,7 +230,7 @@ def test_a_restarted_guard_does_not_carry_out_releases_of_before(shared, latch, 
 
 
 def to_main(shared, uuid="u"):
-    """What main does with a press that comes to its socket."""
+    """What the coordinator does with a press that comes to its socket."""
     shared.rings["presses"].push(encode(Command(uuid, "estop", {"why": "at the wrong door"}, "ben")))
     shared.set_estop(EStop.LATCHED)
 

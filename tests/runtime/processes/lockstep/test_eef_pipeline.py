@@ -47,7 +47,7 @@ def _inverse(vectors: Float64) -> Float64:
 
 def speaking(station: Station, rows: Rows, pose: PoseFormat, mode: ActionMode = "absolute") -> Station:
     """The station's policy, answering with joint rows as poses of that format, relative to what it is shown."""
-    robot, spaces = station.spec.robot, station.main.spaces
+    robot, spaces = station.spec.robot, station.coordinator.spaces
     layout = PoseRows(pose, robot)
     numbers = PoseRows(pose.model_copy(update={"frame": ""}), robot)
 
@@ -101,12 +101,12 @@ def test_poses_out_of_reach_are_executed_as_near_as_can_be_and_recorded_as_misse
 
     station.policy.infer = stretched  # type: ignore[method-assign]
     station.running(40)
-    shown = station.main.snapshot()["policy"]["ik"]
+    shown = station.coordinator.snapshot()["policy"]["ik"]
     assert shown["over"] == 10
     assert shown["worst_mm"] > 300
     assert shown["rows"] == 20
-    assert station.main.inference.shown is not None
-    assert station.main.inference.shown.ik["over"] == 10
+    assert station.coordinator.inference.shown is not None
+    assert station.coordinator.inference.shown.ik["over"] == 10
     episode = station.stop()
     assert "10 of 20 poses are not reached, the worst by" in station.events("ik_unreached")[-1]
     raw = episode.raw.to_pylist()
@@ -132,7 +132,7 @@ def test_a_policy_that_means_to_begin_far_away_is_found_out_although_the_first_s
         return rows
 
     station = speaking(Station(spec_of(tmp_path, strategy=strategy)), far, SIX).ready()
-    first = station.main.snapshot()["first_action"]
+    first = station.coordinator.snapshot()["first_action"]
     assert first["far"]
     assert first["distance"] == pytest.approx(0.9, abs=0.01)
     station.command("run")
@@ -143,7 +143,7 @@ def test_a_policy_that_means_to_begin_far_away_is_found_out_although_the_first_s
 
 def test_joint_chunks_say_nothing_of_poses(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path)).running(20)
-    assert station.main.snapshot()["policy"]["ik"] == {}
+    assert station.coordinator.snapshot()["policy"]["ik"] == {}
     raw = station.stop().raw.to_pylist()
     assert {row["ik_flags"] for row in raw} == {row["eef_source"] for row in raw} == {None}
     station.close()
@@ -160,14 +160,17 @@ def test_the_recording_says_which_poses_there_were_and_which_the_policy_was_show
     def with_poses(timeout: float) -> Observation | None:
         seen = receive(timeout)
         assert seen is not None
-        poses = station.main.spaces.eef_of(seen.qpos)
+        poses = station.coordinator.spaces.eef_of(seen.qpos)
         poses[2] += 0.01
         return replace(seen, eef=poses, captured={**seen.captured, "eef": seen.arrived})
 
     station.robot.receive = with_poses  # type: ignore[method-assign]
     episode = station.running(20).stop()
     assert all(column(episode.rows, "eef_measured"))
-    high = column(episode.rows, "eef")[:, 2] - station.main.spaces.eef_of(column(episode.rows, "qpos"))[:, 2]
+    high = (
+        column(episode.rows, "eef")[:, 2]
+        - station.coordinator.spaces.eef_of(column(episode.rows, "qpos"))[:, 2]
+    )
     np.testing.assert_allclose(high, 0.01, atol=1e-5)
     assert set(episode.raw["eef_source"].to_pylist()) == {wanted}
     station.close()

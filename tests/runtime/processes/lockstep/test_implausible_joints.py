@@ -55,7 +55,7 @@ def test_nothing_that_moves_begins_while_a_joint_has_leapt(tmp_path):
     for said in refused(station, MOVES):
         assert f"{JOINT} reads" in said
         assert "set up again" in said
-    assert not {kind for kind, _ in MOVES} & set(station.main.session.allowed())
+    assert not {kind for kind, _ in MOVES} & set(station.coordinator.session.allowed())
     misread(station, 0.0)  # it reads where it is held again
     station.command("run")
     station.go(30)

@@ -402,7 +402,7 @@ def test_stop_writes_the_outcome_and_holds(tmp_path: Path) -> None:
     before = len(station.robot.commands)
     station.go(10)
     assert len(station.robot.commands) == before + 10  # holding is never silence
-    assert station.main.run is None
+    assert station.coordinator.run is None
     station.close()
 
 
@@ -410,7 +410,7 @@ def test_the_policy_is_told_once_of_each_end_of_what_it_drove(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     station = Station(spec_of(tmp_path)).ready()
-    policy = station.main.inference.policy
+    policy = station.coordinator.inference.policy
     monkeypatch.setattr(policy, "rest", lambda: policy.calls.append("rest"))
     station.command("run", mode="manual")
     station.go(5)
@@ -433,7 +433,7 @@ def test_a_policy_that_cannot_end_its_rollout_keeps_no_run_from_ending(
         raise PolicyError("the server is mute")
 
     station = Station(spec_of(tmp_path)).ready()
-    monkeypatch.setattr(station.main.inference.policy, "rest", rest)
+    monkeypatch.setattr(station.coordinator.inference.policy, "rest", rest)
     station.command("run")
     station.go(20)
     episode = station.stop()
@@ -511,7 +511,11 @@ def test_without_room_on_the_disk_nothing_is_begun_and_the_refusal_says_how_much
     with pytest.raises(SetupError, match=wanted):
         station.command(kind)
     station.go(5)
-    assert (station.state, station.main.run, station.main.runs.alone) == (State.READY, None, False)
+    assert (station.state, station.coordinator.run, station.coordinator.runs.alone) == (
+        State.READY,
+        None,
+        False,
+    )
     assert station.robot.commands == []
     assert not (tmp_path / "episodes").exists()
     station.close()
@@ -525,10 +529,12 @@ def test_a_recording_that_cannot_be_opened_ends_a_trial_before_it_began_and_says
     (tmp_path / "episodes").write_text("in its place")
     ack = station.command("run", trial={"id": 1})
     station.go(5)
-    assert (station.state, station.main.run) == (State.READY, None)
+    assert (station.state, station.coordinator.run) == (State.READY, None)
     assert "disk error while creating" in station.reason
     assert station.robot.commands == []
-    told = [event for event in station.main.events.since(0) if event["data"].get("state") == "ready"][-1]
+    told = [event for event in station.coordinator.events.since(0) if event["data"].get("state") == "ready"][
+        -1
+    ]
     assert told["data"]["unbegun"] == {
         "command": ack.uuid,
         "episode": ack.data["episode"],
@@ -546,14 +552,14 @@ def test_a_run_that_is_stopped_before_it_began_is_told_as_such(tmp_path: Path) -
     run = station.command("run").uuid
     station.command("stop")  # before media has heard of either
     station.go(5)
-    said = [event["data"] for event in station.main.events.since(0) if event["kind"] == "command"][-1]
+    said = [event["data"] for event in station.coordinator.events.since(0) if event["kind"] == "command"][-1]
     assert (said["unbegun"]["command"], said["unbegun"]["unopened"]) == (run, False)
     assert station.robot.commands == []
     assert station.episode().frames == 0
     station.command("run")
     station.go(5)
     station.command("stop")
-    said = [event["data"] for event in station.main.events.since(0) if event["kind"] == "command"][-1]
+    said = [event["data"] for event in station.coordinator.events.since(0) if event["kind"] == "command"][-1]
     assert "unbegun" not in said
     station.close()
 
@@ -581,7 +587,7 @@ def test_a_run_whose_recording_was_lost_is_not_resumed(tmp_path: Path) -> None:
     station.reach(State.HOLDING, 5.0)
     assert "must be uint8" in station.reason
     station.go(3)
-    assert station.main.runs.last_episode["status"] == "failed"
+    assert station.coordinator.runs.last_episode["status"] == "failed"
     with pytest.raises(SetupError, match=r"the recording of this run has ended .*stop, then run"):
         station.command("resume")
     assert station.state is State.HOLDING

@@ -44,7 +44,7 @@ class Client:
         self.policy: StubPolicy = made.built["policy"]
         self._context: zmq.Context[Any] = zmq.Context()
         self._endpoints = Endpoints(made.deployment.station_dir)
-        self._main = self._connected("main", "commands")
+        self._coordinator = self._connected("coordinator", "commands")
         self._guard = self._connected("guard", "estop")
         self.until(State.IDLE)
         assert self.ask("lease_claim", epoch=0).status == "accepted"
@@ -56,15 +56,15 @@ class Client:
 
     @property
     def state(self) -> State:
-        return self.station.main.session.state
+        return self.station.coordinator.session.state
 
     @property
     def reason(self) -> str:
-        return self.station.main.session.reason
+        return self.station.coordinator.session.reason
 
     def ask(self, kind: str, epoch: int | None = None, guard: bool = False, **arguments: Any) -> Ack:
         """The answer over the socket, the station turning meanwhile."""
-        main, socket = self.station.main, self._guard if guard else self._main
+        main, socket = self.station.coordinator, self._guard if guard else self._coordinator
         command = Command(
             str(uuid.uuid4()),
             kind,
@@ -115,7 +115,7 @@ class Client:
     def episode(self) -> Episode:
         """The last episode, once it is closed."""
         for _ in range(TURNS):
-            if found := self.station.main.runs.last_episode:
+            if found := self.station.coordinator.runs.last_episode:
                 return open_episode(Path(found["path"]))
             self.station.turn()
         raise AssertionError("no episode is closed")
@@ -165,7 +165,7 @@ def test_time_stands_still_before_and_after_a_set_up_and_its_station_is_seen_all
     client.ready()
     endpoints = Endpoints(client.station.spec.deployment.station_dir)
     context: zmq.Context[Any] = zmq.Context()
-    states = Subscriber(context, endpoints.read("main")["state"], "state")
+    states = Subscriber(context, endpoints.read("coordinator")["state"], "state")
     pictures = Subscriber(context, endpoints.read("media")["cameras"], "camera/")
     seen: set[str] = set()
     for _ in range(200):
@@ -226,7 +226,7 @@ def test_a_policy_that_takes_long_changes_nothing_of_what_is_recorded(tmp_path: 
         episode = client.episode()
         asked = [row["observation_step"] for row in episode.raw.to_pylist()]
         said.append((client.robot.sent[:60], asked[:12], column(episode.rows, "time")[:55]))
-        delays = list(client.station.main.inference.metrics.delays)
+        delays = list(client.station.coordinator.inference.metrics.delays)
         assert delays[2:]
         assert set(delays[2:]) == {3}  # 100 ms, whatever they really took
         client.close()
@@ -265,7 +265,7 @@ def test_who_sets_up_while_a_recording_is_closed_finds_the_same_as_who_comes_lat
     while client.station.media.closing:
         ticks += client.turn()
     assert ticks == 0
-    report = client.station.main.media_report
+    report = client.station.coordinator.media_report
     assert (report.recording, report.time) == ("", client.station.clock.now())  # before the first tick of it
     client.close()
 
@@ -305,7 +305,7 @@ def test_a_run_ends_where_its_bench_says_so_and_its_episode_is_whole(made: StubP
     assert outcome["status"] == "finished"
     client.turn(3)
     assert outcome["control"]["scheduling"] == "lockstep"
-    assert client.station.main.snapshot()["recording"]["uuid"] == ""
+    assert client.station.coordinator.snapshot()["recording"]["uuid"] == ""
     again = client.station.step
     client.running(20)  # at once, and as whole
     assert client.state is State.RUNNING
@@ -329,7 +329,7 @@ def test_a_lease_that_is_not_renewed_in_the_peoples_time_holds_the_robot(client:
 def test_a_lease_ends_while_time_stands_still_too(client: Client) -> None:
     client.ready()
     client.turn(3, 3.0)
-    assert client.station.main.snapshot()["lease"]["holder"] == ""
+    assert client.station.coordinator.snapshot()["lease"]["holder"] == ""
 
 
 def test_a_command_is_void_after_its_time_whatever_the_stations_own_is(client: Client) -> None:
@@ -391,6 +391,6 @@ def test_when_it_ends_its_episode_is_closed_and_nothing_is_found_of_it(made: Stu
     assert outcome is not None
     assert outcome["status"] == "interrupted"
     with pytest.raises(TransportError, match="is not running here"):
-        Endpoints(made.deployment.station_dir).read("main")
+        Endpoints(made.deployment.station_dir).read("coordinator")
     assert client.robot.sent[-1] == pytest.approx(STANDS, abs=0.2)
     Client(made).close()

@@ -132,7 +132,7 @@ class Desk:
         return [message for message in self.heard() if isinstance(message, kind)]
 
     def heard(self) -> list[Message]:
-        """All that main has not heard yet, that of reception first."""
+        """All that the coordinator has not heard yet, that of reception first."""
         rings = (self.shared.rings[name] for name in ("reception_events", "media_events"))
         return [decode(payload) for ring in rings for payload in ring.drain()]
 
@@ -225,7 +225,7 @@ def test_a_run_begins_with_the_first_frame_of_the_source(desk: Desk) -> None:
     desk.source.first = desk.observation(2)
     desk.begin()
     assert desk.source.begun == 1
-    assert desk.shared.observation.read()["sequence"] == 2  # before main hears that it may begin
+    assert desk.shared.observation.read()["sequence"] == 2  # before the coordinator hears that it may begin
     (opened,) = desk.told(EpisodeOpened)
     assert (opened.run, opened.uuid, opened.path, opened.error) == (1, "one", "/episodes/one", "")
     assert desk.media.recording

@@ -1,4 +1,4 @@
-"""Whatever dies, is pressed or cannot be written, in any order: what main takes for recorded is what media records."""
+"""Whatever dies, is pressed or is not written: the coordinator takes for recorded what media records."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.recording.reader import open_episode
 from runtime.station.run import Run
 from tests.runtime.lockstep_station import Station, spec_of
 
-SETTLED = 4  # ticks after which an order has gone to media and its answer to main
+SETTLED = 4  # ticks after which an order has gone to media and its answer to the coordinator
 ticks = st.integers(0, 6)
 
 
@@ -33,7 +33,7 @@ class Recorded(RuleBasedStateMachine):
     def begin(self, on_failure: str) -> None:
         self.episodes = Path(self.folder.name) / "episodes"
         self.station = Station(spec_of(Path(self.folder.name), recording={"on_failure": on_failure}))
-        runs = self.station.main.runs
+        runs = self.station.coordinator.runs
         follow = runs._follow
 
         def followed(run: Run, fresh: bool) -> None:
@@ -99,7 +99,7 @@ class Recorded(RuleBasedStateMachine):
     def settles(self) -> None:
         """Nothing is half open, whatever came before."""
         self.go(SETTLED)
-        runs = self.station.main.runs
+        runs = self.station.coordinator.runs
         open_in_main = runs._alone or (runs.open.uuid if runs.open and not runs.open.unrecorded else "")
         recording = self.station.media._recorder.recording
         assert recording == open_in_main or (runs.open is not None and not recording and not runs.open.opened)
@@ -121,10 +121,10 @@ class Recorded(RuleBasedStateMachine):
         if not hasattr(self, "station"):
             return
         told = {}
-        for event in self.station.main.events.since(0):
+        for event in self.station.coordinator.events.since(0):
             if unbegun := event["data"].get("unbegun"):
                 told[unbegun["episode"]] = unbegun["unopened"]
-        run = self.station.main.run
+        run = self.station.coordinator.run
         for episode, ran in self.asked.items():
             assert (episode in told) == (not ran and (run is None or run.uuid != episode))
         for episode, unopened in told.items():

@@ -56,7 +56,7 @@ def test_a_robot_whose_drives_are_off_is_not_set_up_until_they_are_on(tmp_path):
     station.prepare()
     assert station.state is State.IDLE
     assert "drives are disabled (axis 2 is hot)" in station.reason
-    assert station.main.snapshot()["drives"] == station.robot.drives
+    assert station.coordinator.snapshot()["drives"] == station.robot.drives
     assert station.events("drives") == ["drives disabled; drive fault: axis 2 is hot"]
     station.robot.drives = GOOD
     station.ready()

@@ -26,7 +26,7 @@ def started(monkeypatch):
 
     class Started(real):
         commands = dict.fromkeys(
-            ("guard", "reception", "media", "control", "main", "headless", "channel"), WAITS
+            ("guard", "reception", "media", "control", "coordinator", "headless", "channel"), WAITS
         )
 
         def __init__(self, arguments, **options):
@@ -59,7 +59,14 @@ def test_the_end_of_what_drives_a_headless_run_ends_the_family(station, started)
     made, commands = started
     commands["headless"] = ["sh", "-c", "exit 3"]
     assert station.run(headless=True) == 3
-    assert [child.process for child in made] == ["guard", "reception", "media", "control", "main", "headless"]
+    assert [child.process for child in made] == [
+        "guard",
+        "reception",
+        "media",
+        "control",
+        "coordinator",
+        "headless",
+    ]
     assert all_ended(made)
 
 
@@ -77,7 +84,7 @@ def test_a_control_channel_that_dies_does_not_end_the_family_and_ends_with_it(tm
     commands["channel"], commands["headless"] = DIES, ["sh", "-c", "sleep 0.3; exit 4"]
     assert Supervisor(spec_of(load(DEMO, sets))).run(headless=True) == 4
     names = [child.process for child in made]
-    assert names == ["guard", "reception", "media", "control", "main", "channel", "headless"]
+    assert names == ["guard", "reception", "media", "control", "coordinator", "channel", "headless"]
     commands["channel"] = WAITS
     assert Supervisor(spec_of(load(DEMO, sets))).run(headless=True) == 4
     assert all_ended(made)
@@ -89,7 +96,7 @@ def test_a_driver_that_does_not_listen_is_killed(station, started, tmp_path, mon
     monkeypatch.setattr(supervisor, "_DRIVER_PATIENCE_S", 0.05)
     station._environment["DEAF"] = str(deaf)
     commands["headless"] = DEAF
-    commands["main"] = ["sh", "-c", 'while [ ! -e "$DEAF" ]; do sleep 0.01; done']
+    commands["coordinator"] = ["sh", "-c", 'while [ ! -e "$DEAF" ]; do sleep 0.01; done']
     assert station.run(headless=True) == 1
     assert all_ended(made)
     assert "headless does not end: killed" in caplog.text
@@ -103,7 +110,7 @@ def test_headless_the_processes_log_only_what_matters_unless_told_otherwise(
     tmp_path, started, monkeypatch, headless, given, level
 ):
     made, commands = started
-    commands["main"] = DIES  # so that it ends
+    commands["coordinator"] = DIES  # so that it ends
     if given:
         monkeypatch.setenv("EVA_LOG_LEVEL", given)
     Supervisor(spec_of(load(DEMO, [f'data_dir="{tmp_path}"']))).run(headless)

@@ -137,7 +137,7 @@ class Machine(RuleBasedStateMachine):
     @rule(given=commands, wait=ticks)
     def command(self, given: tuple[str, dict[str, Any]], wait: int) -> None:
         kind, arguments = given
-        session = self.station.main.session
+        session = self.station.coordinator.session
         allowed, before = session.allowed(), session.state
         if self.keeps_lease:
             self.station._handle("lease_claim")
@@ -174,7 +174,7 @@ class Machine(RuleBasedStateMachine):
             self.release(3)
         for kind, arguments in (("stop", {}), ("setup", {}), ("run", {"mode": mode})):
             self.tick(3)
-            if kind in self.station.main.session.allowed():
+            if kind in self.station.coordinator.session.allowed():
                 self.command((kind, arguments), 1)
             for _ in range(200):
                 if self.station.state is State.SETTING_UP:
@@ -186,11 +186,11 @@ class Machine(RuleBasedStateMachine):
         self.does = does
 
     @rule(
-        kind=st.sampled_from(["e-stop", "release", "lease", "control", "main", "blocked", "silent"]),
+        kind=st.sampled_from(["e-stop", "release", "lease", "control", "coordinator", "blocked", "silent"]),
         wait=st.integers(1, 40),
     )
     def trouble(self, kind: str, wait: int) -> None:
-        robot, main = self.station.robot, self.station.main
+        robot, main = self.station.robot, self.station.coordinator
         if kind == "e-stop":
             self.station.guard.press("anna", "a test")
             self.going = False
@@ -202,7 +202,7 @@ class Machine(RuleBasedStateMachine):
             self.going = False
         elif kind == "control":
             self.restart_control()
-        elif kind == "main":
+        elif kind == "coordinator":
             self.restart_main()
         elif kind == "blocked":
             robot.blocked = not robot.blocked
@@ -233,13 +233,13 @@ class Machine(RuleBasedStateMachine):
 
     def restart_main(self) -> None:
         station = self.station
-        station.shared.beat("main", 0.0)
+        station.shared.beat("coordinator", 0.0)
         told = len(station.robot.commands)
         station._tick(station.step, station.clock.now())  # control sees that nobody is there
         self.look(station.shared.observation.read()["qpos"].astype(np.float64), told)
         station.step += 1
         station.clock.sleep_until(station.step / station.spec.rate)
-        station.main = Coordinator(station.spec, station.shared, station.clock, station._runner)
+        station.coordinator = Coordinator(station.spec, station.shared, station.clock, station._runner)
         self.going = False
         self.merged.clear()
 
@@ -249,7 +249,7 @@ class Machine(RuleBasedStateMachine):
         station = self.station
         for _ in range(count):
             if self.keeps_lease:
-                held = station.main.lease.current(station.clock.now())
+                held = station.coordinator.lease.current(station.clock.now())
                 station._handle("lease_renew" if held else "lease_claim")
             told = len(station.robot.commands)
             station.tick()
@@ -264,7 +264,7 @@ class Machine(RuleBasedStateMachine):
         self.weigh()
         self.seen.append(measured)
         self.moved += 1
-        station.main.snapshot()
+        station.coordinator.snapshot()
         asked = self.asked()
         self.going = self.going and self.busy(status)
         self.still = 0 if asked else self.still + 1
@@ -313,7 +313,7 @@ class Machine(RuleBasedStateMachine):
 
     def asked(self) -> bool:
         """Whether somebody wants the real robot to move just now."""
-        main = self.station.main
+        main = self.station.coordinator
         run, state = main.run, main.session.state
         if state is State.SETTING_UP:
             return True
@@ -323,7 +323,7 @@ class Machine(RuleBasedStateMachine):
 
     def busy(self, status: Any) -> bool:
         """Whether what a person has set going is still under way."""
-        main = self.station.main
+        main = self.station.coordinator
         if main.run is not None and main.run.mode == "sim":
             return False  # whatever is asked for in it
         ways = np.abs(status["locked"] - status["commanded"]) > 1e-6  # to where a gripper is locked

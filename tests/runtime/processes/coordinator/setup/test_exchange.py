@@ -63,11 +63,11 @@ def test_the_same_policy_is_kept_and_connected_anew(tmp_path: Path) -> None:
 def test_a_set_up_that_names_none_takes_the_deployments_own_again(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, policy={"period_s": 5.0}))
     station.ready(policy=OTHER)
-    assert station.main.spec.deployment.policy.period_s == 5.0  # merged over the deployment's own
+    assert station.coordinator.spec.deployment.policy.period_s == 5.0  # merged over the deployment's own
     station.ready(policy={"horizon": 20})
-    assert station.main.spec.deployment.policy.amplitude == 0.2  # not over what was set up before
+    assert station.coordinator.spec.deployment.policy.amplitude == 0.2  # not over what was set up before
     station.ready()
-    assert station.main.spec.resolved == station.spec.resolved
+    assert station.coordinator.spec.resolved == station.spec.resolved
     assert len(station.policies) == 4
     station.close()
 
@@ -102,15 +102,15 @@ def test_a_refused_set_up_leaves_everything_as_it_was(
     tmp_path: Path, arguments: dict[str, Any], sentence: str
 ) -> None:
     station = Station(spec_of(tmp_path)).ready(task="first", checkpoint={"id": 1, "name": "A"})
-    before, calls = station.main.spec, list(station.policy.calls)
+    before, calls = station.coordinator.spec, list(station.policy.calls)
     with pytest.raises(SetupError, match=sentence):
         station.command("setup", **arguments)
     assert station.state is State.READY
-    assert station.main.spec is before
-    assert station.main.inference.policy is station.policy
+    assert station.coordinator.spec is before
+    assert station.coordinator.inference.policy is station.policy
     assert station.policy.calls == calls
     assert station.policies == [station.policy]
-    assert station.main.snapshot()["checkpoint"] == {"id": 1, "name": "A"}
+    assert station.coordinator.snapshot()["checkpoint"] == {"id": 1, "name": "A"}
     station.command("run")
     station.go(10)
     assert station.state is State.RUNNING
@@ -122,7 +122,7 @@ def test_a_policy_that_does_not_fit_the_robot_is_refused_before_the_former_is_cl
     station.spec.built["unfit"] = ConfigurationError("policy.cameras names nose")
     with pytest.raises(SetupError, match=r"policy\.cameras names nose"):
         station.command("setup", policy=OTHER)
-    assert station.main.inference.policy is station.policy
+    assert station.coordinator.inference.policy is station.policy
     assert "close" not in station.policy.calls
     station.close()
 
@@ -132,7 +132,7 @@ def test_a_policy_whose_own_code_fails_is_refused_and_ends_nothing(tmp_path: Pat
     station.spec.built["unfit"] = ZeroDivisionError("0 / 0")
     with pytest.raises(SetupError, match="policy 'mock' cannot be made: ZeroDivisionError: 0 / 0"):
         station.command("setup", policy=OTHER)
-    assert (station.state, station.main.inference.policy) == (State.READY, station.policy)
+    assert (station.state, station.coordinator.inference.policy) == (State.READY, station.policy)
     station.close()
 
 
@@ -170,10 +170,10 @@ def test_the_policy_is_given_the_task_of_the_set_up(tmp_path: Path) -> None:
 
 def test_figures_of_the_former_policy_are_not_the_new_ones(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path)).running(20)
-    assert station.main.snapshot()["policy"]["answers"] > 0
+    assert station.coordinator.snapshot()["policy"]["answers"] > 0
     station.stop()
     station.ready(policy=OTHER)
-    assert station.main.snapshot()["policy"]["answers"] == 0
+    assert station.coordinator.snapshot()["policy"]["answers"] == 0
     station.close()
 
 
@@ -182,7 +182,7 @@ def test_a_failed_set_up_can_be_made_good_by_another_policy(tmp_path: Path) -> N
     station.prepare(policy=OTHER)
     assert (station.state, station.reason) == (State.IDLE, "no server there: start it")
     object.__setattr__(station.spec, "absent", "")  # somebody starts it
-    object.__setattr__(station.main.operations._own, "absent", "")
+    object.__setattr__(station.coordinator.operations._own, "absent", "")
     station.ready(policy={"amplitude": 0.3})
     assert [policy.calls[0] for policy in station.policies[1:]] == ["connect", "connect"]
     assert station.policies[1].calls[-1] == "close"
@@ -222,7 +222,7 @@ def test_a_run_without_arguments_has_the_deployments_operator_and_limit(tmp_path
     station = Station(spec_of(tmp_path, operator="ben", run={"duration_s": 20.0})).ready()
     station.command("run")
     station.go(10)
-    assert station.main.snapshot()["run"]["duration_s"] == 20.0
+    assert station.coordinator.snapshot()["run"]["duration_s"] == 20.0
     manifest = station.stop().manifest
     assert (manifest["operator"], manifest["duration_s"], manifest["trial"]) == ("ben", 20.0, {})
     station.close()
@@ -233,7 +233,7 @@ def test_the_limit_of_a_run_is_its_own(tmp_path: Path) -> None:
     station.command("run", duration_s=0.5)
     station.reach(State.READY, 1.0)
     assert station.reason == "the run's 0.5 s are over"
-    assert station.main.snapshot()["run"]["duration_s"] is None
+    assert station.coordinator.snapshot()["run"]["duration_s"] is None
     station.close()
 
 
@@ -267,7 +267,7 @@ def test_the_bench_is_laid_out_after_homing_and_before_the_policy_is_asked(tmp_p
         "idle",
     ]
     assert station.robot.told == [("scene_reset", BENCH)]
-    assert station.main.snapshot()["truth"]["reset"] == "reset-1"
+    assert station.coordinator.snapshot()["truth"]["reset"] == "reset-1"
     station.close()
 
 
@@ -356,7 +356,7 @@ def test_a_reset_can_be_cancelled(tmp_path: Path) -> None:
     station.reach(State.IDLE)
     station.command("setup", bench=BENCH)
     station.go(15)
-    assert station.main.setup.stage.value == "resetting the bench"
+    assert station.coordinator.setup.stage.value == "resetting the bench"
     station.command("stop")
     said = len(station.robot.told)
     station.go(30)
@@ -409,10 +409,10 @@ def test_when_milestones_were_first_reached_is_told_in_seconds_of_the_run(tmp_pa
 def test_the_snapshot_says_what_is_set_up(tmp_path: Path) -> None:
     station = simulated(tmp_path)
     station.reach(State.IDLE)
-    shown = station.main.snapshot()
+    shown = station.coordinator.snapshot()
     assert (shown["task"], shown["checkpoint"], shown["truth"]) == ("stack the cups", {}, {})
     station.ready(task="fold", checkpoint={"id": "c-1", "name": "A"}, bench=BENCH)
-    shown = station.main.snapshot()
+    shown = station.coordinator.snapshot()
     assert (shown["task"], shown["checkpoint"]) == ("fold", {"id": "c-1", "name": "A"})
     assert (shown["simulated"], shown["truth"]["seed"]) == (True, 7)
     assert "url" not in str(shown["policy"])
@@ -425,5 +425,5 @@ def test_the_snapshot_says_what_is_set_up(tmp_path: Path) -> None:
 
 def test_a_real_bench_is_shown_as_such(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path)).ready()
-    assert station.main.snapshot()["simulated"] is False
+    assert station.coordinator.snapshot()["simulated"] is False
     station.close()

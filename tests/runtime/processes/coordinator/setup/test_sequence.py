@@ -21,7 +21,7 @@ def failed(station: Station) -> str:
     """Set up, in vain; the reason."""
     station.prepare()
     assert station.state is State.IDLE
-    assert station.main.setup.stage is Stage.IDLE
+    assert station.coordinator.setup.stage is Stage.IDLE
     return station.reason
 
 
@@ -35,7 +35,7 @@ def without_control(station: Station, seconds: float, beating: bool = True) -> N
         station._handle("lease_renew")
         station.reception.pump(0.0)
         station.media.digest()
-        station.main.pump()
+        station.coordinator.pump()
         station.clock.advance(1 / 30)
 
 
@@ -48,9 +48,9 @@ def test_it_goes_from_stage_to_stage_and_says_so(tmp_path: Path) -> None:
         "idle",
     ]
     assert station.reason.startswith("20 rows in 0 ms, the first at most ")
-    assert station.main.setup.validated == station.reason
-    assert station.main.setup.info is not None
-    assert station.main.setup.info.name == "stub"
+    assert station.coordinator.setup.validated == station.reason
+    assert station.coordinator.setup.info is not None
+    assert station.coordinator.setup.info.name == "stub"
     station.close()
 
 
@@ -64,7 +64,8 @@ def test_the_policy_is_reset_once_and_warmed_up_as_often_as_asked(tmp_path: Path
 def test_the_first_row_is_compared_with_where_the_arm_is(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, lambda o, n: ramp(100, 5))).ready()
     assert (
-        station.main.setup.validated == "5 rows in 0 ms, the first at most 0.200 rad away (left_arm.joint0)"
+        station.coordinator.setup.validated
+        == "5 rows in 0 ms, the first at most 0.200 rad away (left_arm.joint0)"
     )
     station.close()
 
@@ -238,10 +239,10 @@ def test_a_transport_that_moves_nothing_is_not_homed(tmp_path: Path) -> None:
 def test_a_second_set_up_connects_and_validates_anew(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path)).ready()
     station.command("setup")
-    assert station.main.setup.validated == ""
+    assert station.coordinator.setup.validated == ""
     station.reach(State.READY)
     assert station.policy.calls.count("connect") == 2
-    assert station.main.setup.validated != ""
+    assert station.coordinator.setup.validated != ""
     station.close()
 
 
@@ -253,7 +254,7 @@ def test_the_e_stop_ends_it(tmp_path: Path) -> None:
     station.guard.press("ada", "smoke")
     station.go(3)
     assert station.state is State.FAULTED
-    assert station.main.setup.stage is Stage.IDLE
+    assert station.coordinator.setup.stage is Stage.IDLE
     here = station.robot.position.copy()
     station.go(20)
     assert np.array_equal(station.robot.position, here)
@@ -296,7 +297,7 @@ def test_a_short_fast_chunk_is_set_up_and_moves_the_robot(
     station.go(60)
     assert station.state is State.RUNNING, station.reason
     assert station.robot.sent[-1, MOVED[0]] == pytest.approx(
-        0.002 * station.main.shared.control.read()["step"], abs=0.1
+        0.002 * station.coordinator.shared.control.read()["step"], abs=0.1
     )
     assert len(np.unique(station.robot.sent[:, MOVED[0]])) > 10
     station.close()
@@ -331,7 +332,7 @@ def measuring(tmp_path: Path, off: float) -> Station:
     def with_poses(timeout: float) -> Observation | None:
         seen = receive(timeout)
         assert seen is not None
-        poses = station.main.spaces.eef_of(seen.qpos)
+        poses = station.coordinator.spaces.eef_of(seen.qpos)
         poses[10] += off
         return replace(seen, eef=poses, captured={**seen.captured, "eef": seen.arrived})
 
@@ -383,12 +384,12 @@ def test_whose_policy_is_quick_takes_as_long_as_it_is_told_to(tmp_path: Path) ->
     station.until(lambda: station.state is State.IDLE, 5.0, "observations")
     quick = set_up_in(station)
     assert quick < 1.0
-    assert station.main.snapshot()["setup_took"].keys() == {"connect_s", "warm_up_s"}
+    assert station.coordinator.snapshot()["setup_took"].keys() == {"connect_s", "warm_up_s"}
     rested = set_up_in(station, least={"connect_s": 3.0, "warm_up_s": 5.0})
     assert rested == pytest.approx(8.0 + quick, abs=0.5)
-    entered = station.main.setup.stages
+    entered = station.coordinator.setup.stages
     assert entered[Stage.OBSERVE] - entered[Stage.CONNECT] == pytest.approx(3.0, abs=0.1)
-    took = station.main.snapshot()["setup_took"]
+    took = station.coordinator.snapshot()["setup_took"]
     assert max(took.values()) < 0.5, "rests are none of the policy's time"
     assert station.policy.calls.count("infer") == 2 * 2
     station.close()
@@ -400,7 +401,7 @@ def test_a_rest_can_be_cancelled_and_times_that_cannot_be_are_refused(tmp_path: 
     station.command("setup", least={"warm_up_s": 100.0})
     station.go(90)
     assert station.state is State.SETTING_UP
-    assert station.main.setup.stage is Stage.WARM_UP
+    assert station.coordinator.setup.stage is Stage.WARM_UP
     station.command("halt")
     assert station.state is State.IDLE
     with pytest.raises(
