@@ -163,7 +163,7 @@ class CommandService:
 
     def _publish_chunk(self, now: float) -> None:
         """The newest chunk when there is another one, and once a second for who comes late."""
-        shown = self._main.inference.shown
+        shown = self._coordinator.inference.shown
         if shown is not self._shown or (shown is not None and now >= self._due.get("chunk", 0.0)):
             self._shown = shown
             self._due["chunk"] = now + 1.0
@@ -176,10 +176,10 @@ class CommandService:
             "run": shown.run,
             "state": shown.state,
             "observation_step": shown.observation_step,
-            "step": int(self._main.shared.control.read()["step"]),
+            "step": int(self._coordinator.shared.control.read()["step"]),
             "targets": shown.targets,
             "rows": shown.rows.astype(np.float32),
-            "poses": self._main.spaces.eef_of(shown.rows),
+            "poses": self._coordinator.spaces.eef_of(shown.rows),
             "overlap": shown.overlap,
             "ik": dict(shown.ik),
         }
@@ -191,9 +191,9 @@ class CommandService:
         `simulated` where the robot of a run in simulation was told to be. `chunk` has the largest part in the step
         (-1: none), `chunks` made it, safety has `limited` it.
         """
-        status, seen = self._main.shared.control.read(), self._main.shared.observation.read()
+        status, seen = self._coordinator.shared.control.read(), self._coordinator.shared.observation.read()
         step = int(status["step"])
-        raw, ticked = self._main.inference.raw(step), bool(status["behaviour"])
+        raw, ticked = self._coordinator.inference.raw(step), bool(status["behaviour"])
         nothing = np.full(len(seen["qpos"]), np.nan, np.float32)
         return {
             "step": step,
@@ -210,8 +210,8 @@ class CommandService:
 
     def _poses(self) -> np.ndarray:
         """End effectors as one float32 frame [2, 8 * arms]: measured, commanded (NaN while nothing is sent)."""
-        status, seen = self._main.shared.control.read(), self._main.shared.observation.read()
-        poses = self._main.spaces.eef_of(np.stack([seen["qpos"], status["commanded"]]))
+        status, seen = self._coordinator.shared.control.read(), self._coordinator.shared.observation.read()
+        poses = self._coordinator.spaces.eef_of(np.stack([seen["qpos"], status["commanded"]]))
         if not status["engaged"]:
             poses[1] = np.nan
         return poses
