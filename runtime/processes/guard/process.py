@@ -213,7 +213,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--folder", required=True, type=Path, help="of the station: latch, key, endpoints")
     parser.add_argument("--period", required=True, type=float, help="of control's ticks [s]")
     parser.add_argument("--layout", required=True, help="of the shared state, as JSON")
-    parser.add_argument("--page", required=True, type=int)
+    parser.add_argument("--shared", required=True, type=int)
     parser.add_argument("--boot", required=True)
     return parser.parse_args()
 

@@ -98,7 +98,7 @@ class Supervisor:
         self._endpoints.write("supervisor", {"boot": self.boot, **pids})
 
     def _spawn(self, process: str) -> subprocess.Popen[bytes]:
-        shared = () if process == "headless" else ("--page", str(self._page_fd))
+        shared = () if process == "headless" else ("--shared", str(self._page_fd))
         return subprocess.Popen(
             [
                 *(sys.executable, "-m", _MODULES[process], "--boot", self.boot),

@@ -26,7 +26,7 @@ SHOW = {"runtime.config.reference", "runtime.processes.coordinator.snapshot", "r
 ELSEWHERE = {
     "runtime.config.schema.Deployment.tasks": (
         "runtime/processes/coordinator/snapshot.py",
-        "plan.deployment.tasks",
+        "spec.deployment.tasks",
     ),  # offered on pages
     "runtime.config.schema.GripperSettings": (
         "runtime/station/spec.py",

@@ -115,9 +115,9 @@ def test_what_cannot_be_made_is_said_to_who_solves_and_forward_goes_on(error: Ex
 def test_a_station_with_a_policy_of_joints_loads_no_compiler(tmp_path: Path) -> None:
     """In a process of its own: this one has loaded it."""
     script = (
-        "import sys; from pathlib import Path; from tests.runtime.lockstep_station import Station, plan\n"
-        f"station = Station(plan(Path({str(tmp_path)!r}))).running(30)\n"
-        "assert station.main.spaces.eef_of(station.main.by_hand.commanded()).shape == (16,)\n"
+        "import sys; from pathlib import Path; from tests.runtime.lockstep_station import Station, spec_of\n"
+        f"station = Station(spec_of(Path({str(tmp_path)!r}))).running(30)\n"
+        "assert station.coordinator.spaces.eef_of(station.coordinator.manual.commanded()).shape == (16,)\n"
         "assert 'numba' not in sys.modules, 'loaded'\n"
         "station._handle('aim', {'jog': {'arm': 'left_arm', 'translation': [0.01, 0, 0]}})\n"
         "assert 'numba' in sys.modules, 'not loaded'\n"

@@ -148,11 +148,11 @@ import sys
 from pathlib import Path
 from runtime.processes.control.process import make_tick
 from runtime.ipc.shared_state import SharedState
-from tests.runtime.lockstep_station import plan
+from tests.runtime.lockstep_station import spec_of
 from tests.runtime.tick_bench import RecordingSink
-made = plan(Path({str(tmp_path)!r}), safety={{"workspace": {box!r}}})
-page, _ = SharedState.create(made.layout)
-make_tick(made, page, RecordingSink(), lambda: 0.0)
+made = spec_of(Path({str(tmp_path)!r}), safety={{"workspace": {box!r}}})
+shared, _ = SharedState.create(made.layout)
+make_tick(made, shared, RecordingSink(), lambda: 0.0)
 print("numba" in sys.modules)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
