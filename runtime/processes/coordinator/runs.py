@@ -129,7 +129,8 @@ class Runs:
             run.unopened = True
             return message.error
         if message.error:
-            self._tell(BeginEpisode(run.number, None))  # unrecorded; the source plays all the same
+            run.unrecorded = message.error
+            self._tell(BeginEpisode(run.number, None))  # the source plays all the same
             return ""
         run.opened = True
         if running:

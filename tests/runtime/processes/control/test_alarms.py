@@ -20,7 +20,7 @@ def test_a_sibling_that_is_silent_is_named_with_how_long():
 def test_a_sibling_that_never_gave_a_sign_is_named_so():
     assert (
         silent_sibling(Bench().shared, 100.0, 1.0)
-        == "no sign of life from the coordinator since it was restarted"
+        == "no sign of life from coordinator since it was restarted"
     )
 
 

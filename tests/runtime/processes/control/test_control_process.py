@@ -116,7 +116,7 @@ def test_the_tick_of_a_deployment_keeps_its_arms_in_their_boxes(
     tmp_path: Path, half: float, refused: bool
 ) -> None:
     box = {"lower": [-half] * 3, "upper": [half] * 3}
-    spec = station.spec(tmp_path, safety={"workspace": {"left_arm": box}})
+    spec = station.spec_of(tmp_path, safety={"workspace": {"left_arm": box}})
     shared, _ = SharedState.create(spec.layout)
     shared.set_estop(EStop.CLEAR)
     clock, sink = VirtualClock(10.0), RecordingSink()
