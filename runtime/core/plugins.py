@@ -31,7 +31,7 @@ class Variants(Mapping[str, ModuleType]):
         name = self._modules[kind]
         try:
             return importlib.import_module(name)
-        except Exception as error:  # of code that may be anybody's: it is told where a deployment names it
+        except (Exception, SystemExit) as error:  # of anybody's code: it is told where a deployment names it
             file = self._folder / f"{name.rpartition('.')[2]}.py"
             raise ConfigurationError(
                 f"{self._package.rpartition('.')[2]}: the kind {kind!r} cannot be loaded: {file}: "

@@ -13,6 +13,7 @@ from runtime.processes.control.plausibility import Plausibility
 _RETURNED_AWAY = 0.1  # [rad] that an arm may be off after it was not seen, by sagging
 _AGREES_S = 1.0  # that a joint reads where it is told to be, before its readings lead its command again
 _THERE = 1e-6  # [rad]
+_ALONG = 0.2  # [rad] of a way on which the reading of a joint that stands comes nearer by more than half
 
 
 def silent_sibling(shared: SharedState, now: float, allowed: float) -> str:
@@ -31,7 +32,8 @@ class Displacement:
     several agree (`Plausibility.apart`).
 
     An encoder that is off looks like that, but its joint follows the command, and its readings keep their distance. So
-    no command follows a joint that leapt, nor one a second time before the two have agreed for _AGREES_S.
+    no command follows a joint that leapt before the two have agreed for _AGREES_S, nor one a second time that has kept
+    its distance: that one is followed again after a set-up, for the operator to look.
     """
 
     def __init__(self, settings: TickSettings, plausibility: Plausibility) -> None:
@@ -44,6 +46,7 @@ class Displacement:
         self._apart_at = np.full(dim, float("-inf"))  # when each was last read away from its command
         self._meeting = False  # a set-up takes the robot over where it is read, and not yet there
         self.goal: Float64 | None = None  # where the command is being led to
+        self._from = np.zeros((2, dim))  # command and reading as it began to be
         self.begins = False  # whether it has been since this tick
         self.doubt = ""  # which joints are not followed since this tick, and why
 
@@ -62,7 +65,9 @@ class Displacement:
             return None
         if self.goal is not None:  # joints that are pushed on, past it or back, are left where they are
             on = (self.goal - robot.commanded) * (measured - robot.commanded) > 0.0
-            self.goal = np.where(on | ~self._angles, self.goal, robot.commanded)
+            self._off |= (along := self._along(robot, measured))
+            self.doubt = self._named(along, robot, measured)
+            self.goal = np.where((on & ~along) | ~self._angles, self.goal, robot.commanded)
             if self.distance(robot, self.goal) <= _THERE:
                 self.goal = None
         allowed = _RETURNED_AWAY if returned or self._meeting else self._settings.safety.following_error
@@ -74,6 +79,7 @@ class Displacement:
             if self._away(robot, where, allowed):
                 limits = self._settings.limits
                 self.goal = np.clip(self.trusted(robot, where), limits.lower, limits.upper)
+                self._from = np.array([robot.commanded, measured])
                 self.begins = True
         return self.goal
 
@@ -92,7 +98,19 @@ class Displacement:
         off = away & self._followed
         self._off |= off
         self._followed |= away
-        self.doubt = "; ".join(
+        self.doubt = self._named(off, robot, measured)
+
+    def _along(self, robot: RobotActuator, measured: Float64) -> np.ndarray:
+        """The joints, bool [D], whose readings go along with the command that a set-up leads to them."""
+        if not self._meeting:
+            return np.zeros(len(self._angles), bool)
+        command, reading = self._from
+        way = np.abs(robot.commanded - command)
+        nearer = np.abs(reading - command) - np.abs(measured - robot.commanded)
+        return np.asarray(self._angles & (way > _ALONG) & (nearer < way / 2.0))
+
+    def _named(self, off: np.ndarray, robot: RobotActuator, measured: Float64) -> str:
+        return "; ".join(
             f"{self._settings.limits.names[i]} reads {measured[i]:.3f} rad, {robot.commanded[i]:.3f} is held, "
             "to which it was led already: is its encoder off?"
             for i in np.flatnonzero(off)
@@ -150,5 +168,5 @@ class Displacement:
         apart = True if measured is None else np.abs(measured - robot.commanded) > _RETURNED_AWAY
         self._apart_at[apart & self._angles] = now
         agrees = now - self._apart_at >= _AGREES_S
-        for joints in (self._followed, self._off, self._plausibility.leapt):
-            joints[agrees] = False
+        for joints in (self._followed, self._plausibility.leapt):
+            joints[agrees & ~self._off] = False

@@ -133,9 +133,10 @@ class Runs:
             self._tell(BeginEpisode(run.number, None))  # the source plays all the same
             return ""
         run.opened = True
-        if running:
+        doubt = self._page.doubt if running and self._plan.capabilities.moves_robot else ""
+        if running and not doubt:
             self._start(run)
-        return ""
+        return doubt  # which came after the run was accepted
 
     def hold(self, reason: str) -> None:
         """Decelerate, hold, stop asking; an open run's clock pauses."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from runtime.core.errors import SetupError
+from runtime.ipc.shared_state import SharedState
 from runtime.processes.coordinator.session.transitions import State
 from tests.runtime.lockstep_station import MOVED, Station, spec_of
 
@@ -126,3 +127,15 @@ def test_a_set_up_that_cannot_follow_says_which_encoder_is_off(tmp_path):
     assert "is its encoder off" in station.reason
     station.go(60)
     assert abs(station.robot.position[MOVED[0]] - stood) <= LEAP + 0.1
+
+
+def test_a_run_does_not_begin_where_a_joint_is_in_doubt_once_its_recording_is_open(tmp_path, monkeypatch):
+    station = ready(tmp_path)
+    station.command("run")  # accepted, and opened some ticks later
+    monkeypatch.setattr(
+        SharedState, "doubt", f"{JOINT} reads 0.450 rad and is held at 0.000"
+    )  # said before, so no event
+    station.go(30)
+    assert station.state is State.READY
+    assert JOINT in station.reason
+    assert station.coordinator.runs.open is None
