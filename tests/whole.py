@@ -26,7 +26,7 @@ _SIDE_BY_SIDE = (
     "not alone",
     "--cache-clear",
 )
-_ALONE = ("-m", "alone", "tests/e2e", "tests/crash", "tests/runtime/sim")
+_ALONE = ("-m", "alone")
 Run = Callable[[Sequence[str]], int]
 
 
