@@ -19,7 +19,7 @@ from evaweb.stations.robot_geometry import looks_of
 from runtime.recording.files import RecordingError
 from runtime.recording.reader import open_episode
 from runtime.recording.tables import write_table
-from tests.runtime.lockstep_station import STANDS, Station, column, plan
+from tests.runtime.lockstep_station import STANDS, Station, column, spec_of
 from tests.runtime.recording.test_tables import old_raw
 
 
@@ -86,7 +86,7 @@ def test_spans_of_rows_in_which_nobody_asked(sources: list[str], spans: list[lis
 
 
 def test_a_policy_that_speaks_in_poses_has_no_raw_joint_curve(tmp_path: Path) -> None:
-    made = plan(tmp_path, space="eef")
+    made = spec_of(tmp_path, space="eef")
     eef_of = made.spaces().eef_of
     stands = replace(made, rows=lambda seen, number: eef_of(np.tile(STANDS, (20, 1))))
     bench = Station(stands)
@@ -158,7 +158,7 @@ def test_every_tick_names_the_chunk_that_owns_it_and_all_that_made_it(folder: Pa
 
 
 def test_of_every_chunk_it_is_known_when_and_how_late_it_came(tmp_path: Path) -> None:
-    bench = Station(plan(tmp_path, delay=3))
+    bench = Station(spec_of(tmp_path, delay=3))
     bench.running(40)
     folder = bench.stop().path
     frame, episode = decode(curves(folder)), open_episode(folder)

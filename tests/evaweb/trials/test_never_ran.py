@@ -49,7 +49,7 @@ def disk(monkeypatch):
 @pytest.fixture
 def bench(lab, disk):
     """The lab, whose station wants 1 GiB, and whose events go through the chronicle."""
-    recording = lab.station.plan.deployment.recording
+    recording = lab.station.spec.deployment.recording
     object.__setattr__(recording, "min_free_bytes", GIB)  # frozen
 
     def listen():
@@ -113,7 +113,7 @@ def test_without_room_the_run_is_refused_with_numbers_and_the_trial_stays_prepar
     disk.free = [GIB - 1]
     row = press_run(bench, trial)
     assert row.status == "refused"
-    episodes = bench.station.plan.deployment.episodes_dir
+    episodes = bench.station.spec.deployment.episodes_dir
     assert (
         f"too little room to record in {episodes}: {GIB - 1} bytes free, at least {GIB} wanted" in row.reason
     )

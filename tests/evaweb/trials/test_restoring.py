@@ -39,7 +39,7 @@ from runtime.recording.export import export
 from tests.evaweb.trials import builders
 from tests.evaweb.unguarded import unguarded
 from tests.runtime.lockstep_station import Station as Lockstep
-from tests.runtime.lockstep_station import plan
+from tests.runtime.lockstep_station import spec_of
 
 pytestmark = pytest.mark.django_db
 
@@ -70,7 +70,7 @@ class Direct:
 def lab(tmp_path, monkeypatch, db):
     """A lab around a whole station in lockstep."""
     monkeypatch.setattr(doorbell, "ring", lambda queue: True)
-    made = Lab(builders.bench("bench"), Lockstep(plan(tmp_path, simulated=True)))
+    made = Lab(builders.bench("bench"), Lockstep(spec_of(tmp_path, simulated=True)))
     for place in ("evaweb.stations.commands", "evaweb.stations.stops", "evaweb.trials.station_commands"):
         monkeypatch.setattr(f"{place}.wire_to", lambda name: Direct(made.station))
     return made
@@ -123,7 +123,7 @@ class Lab:
         for event in self.station.coordinator.events.since(self._heard):
             self._heard = event["number"]
             if event["kind"] == "episode_closed":
-                export(Path(event["data"]["path"]), self.station.plan.deployment.data)  # as media does
+                export(Path(event["data"]["path"]), self.station.spec.deployment.data)  # as media does
                 episode_closed(station=self.bench.station, data=event["data"])
             services.run_changed(station=self.bench.station, event=event, boot=self.station.coordinator.boot)
 
