@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 from importlib import import_module
 
 from django.conf import settings
 from django.contrib.sessions.middleware import SessionMiddleware
-from django.http import HttpRequest, parse_cookie
+from django.http import HttpRequest, HttpResponseBase, parse_cookie
+from django.utils.http import http_date
 
+_KEPT_S = 365 * 24 * 3600  # by a browser; the session itself ends after SESSION_COOKIE_AGE
 _MOST = 8  # of one name; a browser has one or two
 
 
@@ -33,3 +36,15 @@ class AnySessionMiddleware(SessionMiddleware):
             exists = import_module(settings.SESSION_ENGINE).SessionStore().exists
             request.COOKIES[settings.SESSION_COOKIE_NAME] = next(filter(exists, keys), keys[-1])
         super().process_request(request)
+
+    def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
+        """Only a session that was ended on purpose takes its cookie along: one whose time is over still presses."""
+        answer = super().process_response(request, response)
+        cookie = answer.cookies.get(settings.SESSION_COOKIE_NAME)
+        if cookie is None:
+            return answer
+        if cookie.value:
+            cookie["max-age"], cookie["expires"] = _KEPT_S, http_date(time.time() + _KEPT_S)
+        elif not request.session.modified:  # flush() says that it is
+            del answer.cookies[settings.SESSION_COOKIE_NAME]
+        return answer

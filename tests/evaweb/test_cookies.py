@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
+from email.utils import parsedate_to_datetime
+
 import pytest
 from django.conf import settings
+from django.contrib.sessions.models import Session
 from django.test import Client
+from django.utils import timezone
 
 from evaweb.cookies import cookies_of
 
@@ -49,3 +54,31 @@ def test_a_login_sets_this_labs_cookies_alone(ann):
     browser = Client()
     assert browser.post("/login/", {"username": "ann", "password": "s"}).status_code == 302
     assert set(browser.cookies) == {settings.SESSION_COOKIE_NAME, settings.CSRF_COOKIE_NAME}
+
+
+@pytest.fixture
+def logged_in(ann):
+    """A browser whose cookie is of a login of ann's."""
+    ann.set_password("s")
+    ann.save()
+    browser = Client()
+    browser.post("/login/", {"username": "ann", "password": "s"})
+    return browser
+
+
+def test_a_browser_keeps_the_cookie_of_a_session_that_has_ended(logged_in):
+    Session.objects.update(expire_date=timezone.now() - timedelta(days=1))
+    answers = [logged_in.get("/"), logged_in.get("/api/v1/me"), logged_in.get("/login/")]
+    assert [answer.status_code for answer in answers] == [302, 401, 200]
+    assert not any(NAME in answer.cookies for answer in answers)
+
+
+def test_a_logout_has_the_cookie_deleted(logged_in):
+    assert logged_in.post("/logout/").cookies[NAME]["max-age"] == 0
+
+
+def test_a_cookie_outlives_its_session(logged_in):
+    cookie, row = logged_in.cookies[NAME], Session.objects.get()
+    assert cookie["max-age"] == 365 * 24 * 3600
+    assert parsedate_to_datetime(cookie["expires"]) > timezone.now() + timedelta(days=364)
+    assert row.expire_date < timezone.now() + timedelta(seconds=settings.SESSION_COOKIE_AGE + 1)
