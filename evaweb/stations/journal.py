@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator
+import stat
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 from uuid import uuid4
 
 log = logging.getLogger(__name__)
 _SUFFIX = ".lines"
+_NO_FILE = (errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENXIO)  # of this process, and never will be
 
 
 class Journal:
@@ -56,25 +59,48 @@ class Journal:
         return path, file
 
 
-def left_in(folder: Path) -> Iterator[list[Any]]:
-    """What each process that has died had in mind; removed where the caller comes back for the next one."""
+def take_up(folder: Path, take: Callable[[Sequence[bytes]], bool]) -> bool:
+    """Hand `take` the lines of each process that has died; whether a file has to wait for the disk.
+
+    A file is removed when `take` says that all of it was good; else it stays as .refused, as does what is no file.
+    """
+    waits = False
     for path in sorted(folder.glob(f"*{_SUFFIX}")):
         try:
-            file = path.open("rb")
-        except FileNotFoundError:
-            continue  # another process has taken it up
-        with file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue  # its process lives
-            yield list(_documents(path, file.read()))
+            _take_up(path, take)
+        except (FileNotFoundError, BlockingIOError):
+            continue  # another process has taken it up, or its own lives
+        except OSError as error:
+            log.info("%s waits for the disk: %s", path, error)
+            waits = True
+        except Exception as fault:  # a file may hold anything: the next one is looked at all the same
+            _put_aside(path, repr(fault))
+    return waits
+
+
+def _take_up(path: Path, take: Callable[[Sequence[bytes]], bool]) -> None:
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW)
+    except OSError as error:
+        if error.errno not in _NO_FILE:
+            raise
+        _put_aside(path, error.strerror)
+        return
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            _put_aside(path, "it is no file")
+            return
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with open(descriptor, "rb", closefd=False) as file:
+            lines = file.read().splitlines()
+        if take(lines):
             path.unlink(missing_ok=True)
+        else:
+            _put_aside(path, "it has lines that are not ours")
+    finally:
+        os.close(descriptor)
 
 
-def _documents(path: Path, content: bytes) -> Iterator[Any]:
-    for line in content.splitlines():
-        try:
-            yield json.loads(line)
-        except ValueError:
-            log.error("%s: this is no line of JSON: %.999r", path, line)
+def _put_aside(path: Path, why: str | None) -> None:
+    aside = path.replace(path.with_suffix(".refused"))
+    log.error("%s is put aside as %s: %s", path, aside.name, why)

@@ -23,7 +23,8 @@ from django.conf import settings
 from django.contrib.auth import get_user_model
 from django.db import DataError, Error, IntegrityError, connection
 
-from evaweb.stations.journal import Journal, left_in
+from evaweb.rarely import Rarely
+from evaweb.stations.journal import Journal, take_up
 from evaweb.stations.models import Command, Station
 from evaweb.stations.notes import key_of
 from runtime.recording.files import RecordingError, write_whole
@@ -32,6 +33,7 @@ log = logging.getLogger(__name__)
 
 _MOST = 1000  # that a process keeps
 _AGAIN_S = 1.0
+_EVERY_S = 60.0  # between two lines of the log about turns that failed
 _TIMES = ("issued_at", "answered_at")
 _PLAIN = ("kind", "args", "holder", "epoch", "boot", "sequence", "status", "reason", "allowed", "data")
 
@@ -50,6 +52,7 @@ class Unwritten:
         self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
         self._journal = Journal(lambda: _folder())
+        self._failed = Rarely(_EVERY_S, 1)
 
     def foresee(self, rows: Sequence[Command]) -> None:
         """Those that will be kept soon: whoever looks finds them where this process is killed before; OSError.
@@ -87,7 +90,7 @@ class Unwritten:
 
     def attempt(self) -> bool:
         """Write what waits; whether some has to wait on. A file that the disk does not give keeps no other waiting."""
-        waits = not self._inherited()
+        waits = take_up(_folder(), self._inherit)
         for name in self._waiting():
             try:
                 self._attempt(name)
@@ -101,29 +104,46 @@ class Unwritten:
                 return True
         return waits
 
-    def _inherited(self) -> bool:
-        """Keep what killed processes had foreseen, as they would have: one of each kind, and how often."""
-        try:
-            for documents in left_in(_folder()):
-                counted: dict[tuple[str, ...], list[Command]] = {}
-                for row in _readable(documents):
-                    counted.setdefault(key_of(row), []).append(row)
-                for rows in counted.values():
-                    rows[-1].data |= {"times": len(rows)} if len(rows) > 1 else {}
-                    self.keep(rows[-1])
-        except OSError as error:
-            log.info("what a killed process left waits for the disk: %s", error)
-            return False
-        return True
+    def _inherit(self, lines: Sequence[bytes]) -> bool:
+        """Keep what a killed process had foreseen, as it would have: one of each kind, and how often.
+
+        Whether all lines were commands; the log has the others.
+        """
+        counted: dict[tuple[str, ...], list[Command]] = {}
+        whole = True
+        for line in lines:
+            try:
+                row = _row(json.loads(line))
+                counted.setdefault(key_of(row), []).append(row)
+            except Exception as fault:  # a file may hold anything
+                log.error("a command is not in the database: %r; it was %.9999r", fault, line)
+                whole = False
+        for rows in counted.values():
+            rows[-1].data |= {"times": len(rows)} if len(rows) > 1 else {}
+            self.keep(rows[-1])
+        return whole
 
     def _run(self) -> None:
+        waits = False
         while True:
-            self._news.wait()
+            if not waits:
+                self._news.wait()
             self._news.clear()
-            while self.attempt():
-                connection.close()
+            waits = self._turn()
+            if waits:
                 time.sleep(_AGAIN_S)
+
+    def _turn(self) -> bool:
+        """As `attempt`; without this thread nothing of this process would be written any more."""
+        try:
+            waits = self.attempt()
             connection.close()
+        except Exception:
+            before = self._failed.due("")
+            if before is not None:
+                log.exception("what was commanded is not written yet, and is tried again%s", before)
+            return True
+        return waits
 
     def _waiting(self) -> Iterator[str]:
         yield from (
@@ -158,14 +178,6 @@ def _document(row: Command) -> dict[str, Any]:
     user = row.user.get_username() if row.user else ""
     said = {"uuid": str(row.uuid), "station": row.station.name, "user": user}
     return said | {name: getattr(row, name) for name in _PLAIN} | times
-
-
-def _readable(documents: list[Any]) -> Iterator[Command]:
-    for document in documents:
-        try:
-            yield _row(document)
-        except (KeyError, TypeError, ValueError) as fault:  # a file may hold anything
-            log.error("a command is not in the database: %r; it was %.9999r", fault, document)
 
 
 def _row(document: dict[str, Any]) -> Command:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import json
 import os
 import signal
 import sqlite3
+import stat
 from copy import copy
 from datetime import timedelta
 from uuid import UUID, uuid4
@@ -15,6 +18,7 @@ from django.utils import timezone
 
 from evaweb.errors import Conflict, NotFound
 from evaweb.stations import commands, leases, unwritten
+from evaweb.stations.journal import take_up
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.stations.unwritten import Unwritten
 from runtime.recording.files import DiskFullError
@@ -352,5 +356,112 @@ def test_half_a_line_of_a_killed_process_keeps_no_other_from_being_written(halte
         file.write(b'[]\n{"uuid": "0b')
     Unwritten(commands._written).attempt()
     assert [found.uuid for found in Command.objects.all()] == [row.uuid]
-    assert "this is no line of JSON" in caplog.text
-    assert "a command is not in the database" in caplog.text
+    assert caplog.text.count("a command is not in the database") == 2
+    assert [path.name for path in folder.iterdir()] == [f"{left.stem}.refused"]
+
+
+@pytest.mark.usefixtures("asleep")
+@pytest.mark.parametrize(
+    "odd",
+    [b"[" * 200_000, b"\xff", {"uuid": 5}, {"kind": ["halt"]}, {"data": 5}, {"station": {}}],
+    ids=lambda odd: repr(odd[:12] if isinstance(odd, bytes) else odd),
+)
+def test_an_odd_line_keeps_no_other_from_being_written(halted, ann, folder, caplog, odd):
+    first, last, other = (halted(ann) for _ in range(3))
+    last.kind = "stop"
+    in_a_process_that_is_killed(lambda: Unwritten(away).foresee([other]))
+    good = [json.dumps(unwritten._document(row)).encode() for row in (first, last)]
+    if isinstance(odd, dict):
+        odd = json.dumps(unwritten._document(halted(ann)) | odd).encode()
+    lines = [good[0], odd, good[1], b""]
+    (folder / "0.lines").write_bytes(b"\n".join(lines))
+    for _ in range(2):
+        assert Unwritten(commands._written).attempt() is False
+    assert {row.uuid for row in Command.objects.all()} == {first.uuid, last.uuid, other.uuid}
+    assert caplog.text.count("a command is not in the database") == 1
+    assert [path.name for path in folder.iterdir()] == ["0.refused"]
+
+
+@pytest.mark.usefixtures("asleep")
+@pytest.mark.parametrize("odd", ["fifo", "directory", "link", "socket", "forbidden"])
+def test_what_is_no_file_of_ours_is_put_aside_once_and_the_others_are_written(
+    halted, ann, folder, caplog, monkeypatch, tmp_path, odd
+):
+    row, path = halted(ann), folder / "0.lines"
+    in_a_process_that_is_killed(lambda: Unwritten(away).foresee([row]))
+    if odd == "fifo":
+        os.mkfifo(path)
+    elif odd == "directory":
+        path.mkdir()
+    elif odd == "link":
+        path.symlink_to(tmp_path / "elsewhere")
+    elif odd == "socket":
+        os.mknod(path, stat.S_IFSOCK | 0o600)
+    else:
+        path.touch()
+        forbidden(monkeypatch, path)
+    for _ in range(2):
+        assert Unwritten(commands._written).attempt() is False
+    assert Command.objects.get().uuid == row.uuid
+    assert [path.name for path in folder.iterdir()] == ["0.refused"]
+    assert caplog.text.count("is put aside") == 1
+
+
+def forbidden(monkeypatch, path, error=errno.EACCES):
+    """Have the system refuse that file."""
+    opened = os.open
+
+    def refused(name, *flags, **more):
+        if name == path:
+            raise OSError(error, os.strerror(error), str(name))
+        return opened(name, *flags, **more)
+
+    monkeypatch.setattr(os, "open", refused)
+
+
+@pytest.mark.usefixtures("asleep")
+def test_a_file_of_a_killed_process_that_the_disk_does_not_give_is_tried_again(
+    halted, ann, folder, monkeypatch
+):
+    rows = [halted(ann) for _ in range(2)]
+    for row in rows:
+        in_a_process_that_is_killed(lambda row=row: Unwritten(away).foresee([row]))
+    first, _ = sorted(folder.iterdir())
+    with monkeypatch.context() as patch:
+        forbidden(patch, first, errno.EIO)
+        assert Unwritten(commands._written).attempt() is True
+    assert Command.objects.count() == 1
+    assert Unwritten(commands._written).attempt() is False
+    assert {row.uuid for row in Command.objects.all()} == {row.uuid for row in rows}
+
+
+def test_a_file_that_nobody_can_take_is_put_aside_and_the_next_one_is_taken(tmp_path):
+    def take(lines):
+        if lines == [b"0"]:
+            raise RecursionError("so deep")
+        taken.append(lines)
+        return True
+
+    taken = []
+    for name in "01":
+        (tmp_path / f"{name}.lines").write_text(f"{name}\n")
+    assert take_up(tmp_path, take) is False
+    assert taken == [[b"1"]]
+    assert [path.name for path in tmp_path.iterdir()] == ["0.refused"]
+
+
+def test_the_thread_survives_whatever_happens_in_one_turn(monkeypatch, caplog):
+    monkeypatch.setattr(unwritten, "_AGAIN_S", 0.01)
+    turns = []
+
+    def attempt():
+        turns.append(1)
+        if len(turns) < 3:
+            raise RuntimeError("anything")
+        return False
+
+    one = Unwritten(away)
+    one.attempt = attempt
+    one.look()
+    eventually(lambda: len(turns) == 3, 60, "it goes on")
+    assert caplog.text.count("RuntimeError: anything") == 1, "one line for many"
