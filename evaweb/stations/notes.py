@@ -7,6 +7,7 @@ again is written down once a second, with how often; until then a line of the jo
 from __future__ import annotations
 
 import atexit
+import errno
 import logging
 import time
 from collections import deque
@@ -47,6 +48,7 @@ class Notes:
         self._thread: Thread | None = None
         self._nowhere = Rarely(_EVERY_S, _MOST_NAMES, clock)
         self._lost = Rarely(_EVERY_S, _MOST_NAMES, clock)
+        self._failed = Rarely(_EVERY_S, _MOST_NAMES, clock)
 
     def note(self, row: Command) -> None:
         """Have it written down; of a second's with one station, kind, user and outcome the newest, and how many.
@@ -79,36 +81,54 @@ class Notes:
         with self._news:
             self._written = {key: at for key, at in self._written.items() if now - at < _APART_S}
             due = [key for key in self._waiting if all_of_them or key not in self._written]
-            taken = [self._waiting.pop(key) for key in due]
+            taken = [(key, *self._waiting.pop(key)) for key in due]
             self._written |= dict.fromkeys(due, now)
             wait = min((self._written[key] + _APART_S - now for key in self._waiting), default=None)
             waiting = [row for key, row in self._fresh if key in self._waiting]
             self._fresh.clear()
-        self._write_ahead([row for row in waiting if _has_station(row)])
-        for row, times in taken:
-            self._hand_on(row, times)
+        self._write_ahead(waiting)
+        again = [one for one in taken if not self._is_handed_on(*one[1:])]
+        if again:
+            self._take_back(again)
+            return wait or _APART_S
         if wait is None:
             self._write_ahead([])
         return wait
 
+    def _take_back(self, again: Sequence[tuple[_Key, Command, int]]) -> None:
+        with self._news:
+            for key, row, times in again:
+                newer, since = self._waiting.get(key, (row, 0))
+                self._waiting[key] = (newer, since + times)
+            while len(self._waiting) > _MOST:
+                self._give_up()
+
     def _write_ahead(self, rows: Sequence[Command]) -> None:
         try:
-            self._journal(rows)
-        except OSError as error:
-            log.error("a kill would lose %d stops that wait to be written down: %s", len(rows), error)
+            self._journal([row for row in rows if _has_station(row)])
+        except Exception as error:  # it is written down all the same
+            log.error("a kill would lose %d stops that wait to be written down: %r", len(rows), error)
+
+    def _is_handed_on(self, row: Command, times: int) -> bool:
+        """Whatever is wrong with one, the next one is written all the same; that one is tried again."""
+        try:
+            self._hand_on(row, times)
+        except Exception:
+            before = self._failed.due(row.station.name)
+            if before is not None:
+                log.exception("%s (%s) is not written down yet%s", row, row.uuid, before)
+            return False
+        return True
 
     def _hand_on(self, row: Command, times: int) -> None:
         if times > 1:
             row.data = {**row.data, "times": times}
-        if not _has_station(row):
-            before = self._nowhere.due(row.station.name, times)
-            if before is not None:
-                log.warning("%s (%s) is not written down: there is no such station%s", row, row.uuid, before)
-            return
-        try:
+        if _has_station(row):
             self._keep(row)
-        except Exception:  # the next one is written all the same
-            log.exception("%s (%s) is not written down", row, row.uuid)
+            return
+        before = self._nowhere.due(row.station.name, times)
+        if before is not None:
+            log.warning("%s (%s) is not written down: there is no such station%s", row, row.uuid, before)
 
     def _run_soon(self) -> None:
         if self._thread is None:
@@ -134,4 +154,10 @@ def key_of(row: Command) -> _Key:
 
 
 def _has_station(row: Command) -> bool:
-    return row.station.pk is not None or (settings.DATA_DIR / "stations" / row.station.name).is_dir()
+    """Where the disk does not say, there is one: a stop too many in the record is better than one that it lacks."""
+    if row.station.pk is not None:
+        return True
+    try:
+        return (settings.DATA_DIR / "stations" / row.station.name).is_dir()
+    except OSError as error:
+        return error.errno != errno.ENAMETOOLONG

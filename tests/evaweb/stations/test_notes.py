@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import itertools
+from pathlib import Path
 from uuid import uuid4
 
 import pytest
@@ -11,6 +14,7 @@ from django.db import OperationalError
 from evaweb.stations import notes as module
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.stations.notes import Notes
+from tests.processes import eventually
 
 
 class Quiet(Notes):
@@ -99,14 +103,58 @@ def test_one_that_cannot_be_kept_keeps_no_other_from_it(kept, caplog):
     assert "is not written down" in caplog.text
 
 
+def test_one_that_cannot_be_kept_now_is_tried_again_with_those_that_came_since(kept, caplog):
+    def keep(row):
+        if quiet.now < 2:
+            raise OperationalError("gone")
+        kept.append(row)
+
+    quiet = Quiet(keep)
+    quiet.note(halted())
+    assert quiet.write() == 1.0
+    last = halted()
+    quiet.note(last)
+    for quiet.now, wait in ((0.5, 0.5), (1.0, 1.0), (2.0, None)):
+        assert quiet.write() == wait
+    assert (kept, last.data) == ([last], {"times": 2})
+    assert caplog.text.count("is not written down yet") == 1, "one line for many"
+
+
 def test_names_that_somebody_made_up_fill_no_disk(quiet, kept, settings, tmp_path, caplog):
     settings.DATA_DIR = tmp_path
     (tmp_path / "stations" / "real").mkdir(parents=True)
-    for name in ("made-up", "real"):
+    for name in ("made-up", "x" * 300, "nu\0l", "real"):
         quiet.note(halted(station=name, pk=None))
     quiet.write()
     assert [row.station.name for row in kept] == ["real"]
     assert "there is no such station" in caplog.text
+
+
+def test_a_station_that_the_disk_does_not_tell_of_is_one(quiet, kept, monkeypatch):
+    def spoiled(path):
+        raise OSError(errno.EIO, "Input/output error", str(path))
+
+    monkeypatch.setattr(Path, "is_dir", spoiled)
+    rows = [halted(pk=None), halted(user="bob")]
+    for row in rows:
+        quiet.note(row)
+    quiet.write()
+    assert kept == rows
+
+
+def test_the_thread_survives_what_nobody_expects_and_keeps_the_note(kept, monkeypatch, caplog):
+    def odd(row, times=itertools.count()):
+        if next(times) < 3:
+            raise RuntimeError("anything")
+        return True
+
+    monkeypatch.setattr(module, "_has_station", odd)
+    monkeypatch.setattr(module, "_APART_S", 0.01)
+    notes, rows = Notes(kept.append), [halted(), halted(user="bob")]
+    for row in rows:
+        notes.note(row)
+    eventually(lambda: sorted(map(id, kept)) == sorted(map(id, rows)), 60, "both are written down")
+    assert "RuntimeError: anything" in caplog.text
 
 
 def test_presses_at_names_that_somebody_makes_up_are_few_lines_of_the_log(
