@@ -11,20 +11,27 @@ from django.contrib.sessions.middleware import SessionMiddleware
 from django.http import HttpRequest, HttpResponseBase, parse_cookie
 from django.utils.http import http_date
 
+from evaweb.credentials import OF_ANY_AGE, SESSION, credentials
+
 _KEPT_S = 365 * 24 * 3600  # by a browser; the session itself ends after SESSION_COOKIE_AGE
-_MOST = 8  # of one name; a browser has one or two
+MOST = 8  # of one name that are looked into; a browser has one or two
 
 
 def cookies_of(headers: Iterable[str], name: str) -> list[str]:
     """What all cookies of that name say, in the order of the headers."""
-    parts = (part for header in headers for part in header.split(";"))
+    parts = (part for header in headers for part in header.split(";") if name in part)
     values = (parse_cookie(part).get(name) for part in parts)
-    return list(dict.fromkeys(filter(None, values)))[:_MOST]
+    return list(dict.fromkeys(filter(None, values)))
 
 
 def sessions_of(headers: Iterable[str]) -> list[str]:
-    """The keys of all sessions that a browser says it has."""
-    return cookies_of(headers, settings.SESSION_COOKIE_NAME)
+    """The keys of the sessions that a browser says it has; of very many those that are remembered, and a few more."""
+    keys = cookies_of(headers, settings.SESSION_COOKIE_NAME)
+    return keys if len(keys) <= MOST else sorted(keys, key=_is_strange)[:MOST]
+
+
+def _is_strange(key: str) -> bool:
+    return not any(credentials.recall(kind, key) for kind in (SESSION, OF_ANY_AGE[SESSION]))
 
 
 class AnySessionMiddleware(SessionMiddleware):

@@ -27,7 +27,7 @@ from evaweb.api.answers import said_of
 from evaweb.api.stations import HTTP_OF, CommandIn, EStopIn
 from evaweb.api.tokens import UNKNOWN
 from evaweb.callers import address_of, share_of
-from evaweb.cookies import cookies_of, sessions_of
+from evaweb.cookies import MOST, cookies_of, sessions_of
 from evaweb.credentials import (
     RETRY_AFTER_S,
     SESSION,
@@ -254,7 +254,7 @@ def _require_csrf(scope: dict[str, Any], body: bytes) -> None:
     """Of several cookies any is good."""
     name = settings.CSRF_COOKIE_NAME
     try:
-        for token in cookies_of(_headers(scope, b"cookie"), name) or [""]:
+        for token in cookies_of(_headers(scope, b"cookie"), name)[:MOST] or [""]:
             request = ASGIRequest(scope, BytesIO(body))
             request.COOKIES[name] = token
             if check_csrf(request) is None:

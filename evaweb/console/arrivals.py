@@ -20,8 +20,8 @@ from twisted.internet import reactor
 from twisted.internet.interfaces import IAddress
 from twisted.protocols.policies import ProtocolWrapper, WrappingFactory
 
-from evaweb.console.bodies import BoundedRequest, is_stop, stop_bound_of
-from evaweb.console.channel import Channel
+from evaweb.console.bodies import BoundedRequest, stop_bound_of
+from evaweb.console.channel import Channel, is_stop
 from evaweb.console.turns import Turns
 
 events: Any = reactor

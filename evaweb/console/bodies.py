@@ -21,7 +21,7 @@ from django.db import connections
 from twisted.internet import reactor
 from twisted.internet.threads import deferToThread
 
-from evaweb.console.channel import refusal, whole
+from evaweb.console.channel import is_stop, refusal, whole
 from evaweb.console.logins import role_now
 from evaweb.cookies import sessions_of
 from evaweb.plans.references import LARGEST
@@ -34,7 +34,6 @@ STRANGER = 64 * 1024  # a login, or a press of the e-stop
 MEMBER = 2 * 1024 * 1024  # a form; what REST takes is in evaweb.posts
 _UPLOADS = {b"/admin/plans/plan/import/": LARGEST + STRANGER}  # files, from administrators
 _ESTOP = re.compile(rb"/api/v1/stations/[^/]+/estop")
-_STOPS = re.compile(rb"/api/v1/stations/[^/]+/(estop|commands)")
 _REST = b"/api/"
 _LINGER_S = 5.0  # for which a client that goes on sending is heard, so that it reads the answer
 
@@ -68,11 +67,6 @@ def bound_of(path: bytes, cookies: Iterable[bytes], authorized: bool) -> Bound:
         return Bound(largest, 413, sentence, sure, keys, is_stop(path))
     allowed = f"the body is too long; allowed without a login: {STRANGER} bytes"
     return Bound(STRANGER, 401 if path.startswith(_REST) else 413, allowed, STRANGER)
-
-
-def is_stop(path: bytes) -> bool:
-    """Whether what is asked at that address may stop a robot."""
-    return _STOPS.fullmatch(path) is not None
 
 
 def stop_bound_of(path: bytes, cookies: Iterable[bytes], authorized: bool) -> Bound:

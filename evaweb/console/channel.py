@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 from http import HTTPStatus
 from typing import Any
+from urllib.parse import unquote_to_bytes
 
 import daphne.server  # noqa: F401  first: it decides which reactor there is
 
@@ -15,7 +17,14 @@ from twisted.web.http import HTTPChannel
 from evaweb.headers import BARE, PLAIN_PAGE
 
 _REST = b"/api/"
+_STOPS = re.compile(rb"/api/v1/stations/[^/]+/(estop|commands)")
+_HEADERS_OF_A_STOP = 80 * 1024  # bytes: other programs of the host may have a browser send 64 KiB of cookies
 Headers = list[tuple[bytes, bytes]]
+
+
+def is_stop(path: bytes) -> bool:
+    """Whether what is asked at that address may stop a robot."""
+    return _STOPS.fullmatch(path) is not None
 
 
 def refusal(status: int, sentence: str, path: bytes) -> tuple[Headers, bytes]:
@@ -40,6 +49,18 @@ def whole(status: int, sentence: str, path: bytes) -> bytes:
 
 class Channel(HTTPChannel):  # type: ignore[misc]
     """Twisted's, which ends a connection without a word where a line is too long, and says nothing of other faults."""
+
+    def lineReceived(self, line: bytes) -> None:
+        """The address, or a header."""
+        is_first = not self._receivedHeaderSize
+        super().lineReceived(line)
+        if is_first and is_stop(unquote_to_bytes(getattr(self, "_path", b"").partition(b"?")[0])):
+            self.MAX_LENGTH = self.totalHeadersSize = _HEADERS_OF_A_STOP
+
+    def allContentReceived(self) -> None:
+        """The request is over; the next one has an address of its own."""
+        super().allContentReceived()
+        self.MAX_LENGTH, self.totalHeadersSize = Channel.MAX_LENGTH, Channel.totalHeadersSize
 
     def lineLengthExceeded(self, line: bytes) -> None:
         """The address, or one header."""

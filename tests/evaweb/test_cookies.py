@@ -7,11 +7,13 @@ from email.utils import parsedate_to_datetime
 
 import pytest
 from django.conf import settings
+from django.contrib.auth.models import User
 from django.contrib.sessions.models import Session
 from django.test import Client
 from django.utils import timezone
 
-from evaweb.cookies import cookies_of
+from evaweb.cookies import cookies_of, sessions_of
+from evaweb.credentials import OF_ANY_AGE, SESSION, credentials, digest
 
 NAME = settings.SESSION_COOKIE_NAME
 
@@ -24,11 +26,23 @@ NAME = settings.SESSION_COOKIE_NAME
         (["a=1; a=2; b=3; a=1"], ["1", "2"]),
         (["a=1; b", "c; a=2;a="], ["1", "2"]),
         ([" a = 1 ; A=2; aa=3; =a"], ["1"]),
-        ([f"a={number}" for number in range(100)], [str(number) for number in range(8)]),
+        ([f"a={number}" for number in range(100)], [str(number) for number in range(100)]),
     ],
 )
-def test_all_that_cookies_of_a_name_say_is_found_in_order_and_within_bounds(headers, found):
+def test_all_that_cookies_of_a_name_say_is_found_in_order(headers, found):
     assert cookies_of(headers, "a") == found
+
+
+@pytest.mark.parametrize("kind", [SESSION, OF_ANY_AGE[SESSION]])
+def test_eight_sessions_are_asked_about_and_one_that_is_remembered_is_among_them(kind):
+    account = User(pk=1, username="ann", is_superuser=True)
+    made_up = [f"{NAME}=of-{number}" for number in range(99)]
+    assert sessions_of(made_up) == [f"of-{number}" for number in range(8)]
+    credentials.note(kind, "good", account)
+    try:
+        assert sessions_of([*made_up, f"{NAME}=good"]) == ["good", *(f"of-{number}" for number in range(7))]
+    finally:
+        credentials.forget(kind, digest("good"))
 
 
 def test_this_labs_cookies_are_named_as_no_other_labs():

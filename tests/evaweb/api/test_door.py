@@ -215,6 +215,17 @@ def test_of_several_cookies_of_a_name_any_is_good(live, ann, runtime, order):
     assert [command.kind for command in runtime.commands] == ["halt"]
 
 
+def test_cookies_that_are_made_up_hide_no_session_that_is_remembered(live, ann, runtime):
+    browser = Client()
+    browser.force_login(ann)
+    connections.close_all()
+    mine = f"{NAME}={browser.cookies[NAME].value}"
+    assert post(f"{live.name}/estop", cookie=mine)[0] == 200
+    many = "; ".join([*(f"{NAME}=made{number}up" for number in range(20)), mine])
+    assert post(f"{live.name}/estop", cookie=many)[0] == 200
+    assert [command.user for command in runtime.pressed] == ["ann", "ann"]
+
+
 @pytest.mark.parametrize("what", ["estop", "commands"])
 def test_who_has_no_turn_presses_unverified_stops_nothing_else_and_whoever_is_remembered_does(
     live, ann, token, runtime, monkeypatch, what

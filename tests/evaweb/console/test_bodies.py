@@ -181,3 +181,36 @@ def test_an_e_stop_goes_on_without_what_is_too_long(port, chunked):
     path = "/api/v1/stations/bench-1/" + ("estop" if chunked else "%65stop")
     status, content = asked(port, path, kind, "Content-Type: application/json", body=sent)
     assert (status, json.loads(content)["error"][:13]) == (401, "not logged in")
+
+
+@pytest.mark.slow
+def test_cookies_of_other_programs_keep_no_stop_from_being_heard(port):
+    stop = "/api/v1/stations/bench-1/"
+    for size, path, status in (
+        (65_536, stop + "%65stop", 401),
+        (65_536, stop + "commands", 401),
+        (65_536, "/api/v1/me", 431),
+        (200_000, stop + "estop", 431),
+    ):
+        status_now, content = asked(port, path, "Cookie: theme=" + "x" * size)
+        assert (status_now, set(json.loads(content))) == (status, {"error"})
+    assert asked(port, stop + "estop?" + "x" * 20_000)[0] == 414
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [b"GET", b"POST"])
+def test_what_follows_a_stop_over_its_connection_is_bounded_as_ever(port, method):
+    head = b"%s %s HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: %d\r\nCookie: a=%s\r\n\r\n"
+    body = b"{}" if method == b"POST" else b""
+    sent = head % (method, b"/api/v1/stations/bench-1/estop", len(body), b"x" * 65_536) + body
+    with socket.create_connection(("127.0.0.1", port), 20) as connection:
+        connection.sendall(sent + head % (b"GET", b"/api/v1/me", 0, b"x" * 20_000))
+        answer = b"".join(iter(lambda: connection.recv(65536), b""))
+    assert (answer.count(b"HTTP/1.1 401"), answer.count(b"HTTP/1.1 431")) == (1, 1)
+
+
+@pytest.mark.slow
+def test_a_line_that_is_no_request_is_refused_with_a_word(port):
+    with socket.create_connection(("127.0.0.1", port), 20) as connection:
+        connection.sendall(b"nonsense\r\n")
+        assert connection.recv(65536).startswith(b"HTTP/1.1 400 ")

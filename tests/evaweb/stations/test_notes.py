@@ -143,7 +143,9 @@ def test_a_station_that_the_disk_does_not_tell_of_is_one(quiet, kept, monkeypatc
 
 
 def test_the_thread_survives_what_nobody_expects_and_keeps_the_note(kept, monkeypatch, caplog):
-    def odd(row, times=itertools.count()):
+    times = itertools.count()
+
+    def odd(row):
         if next(times) < 3:
             raise RuntimeError("anything")
         return True
