@@ -24,6 +24,7 @@ from tests.runtime.lockstep_station import DIM, STANDS, Station, spec_of
 
 PERIOD = 1 / 30
 BRAKES = 10.0  # [rad/s2] at least, half of what a stop is set to: the last step of one is shorter
+RESTS = 15  # ticks for which an e-stop goes along with an arm that comes to rest
 AGREED = 60  # ticks that samples of an arm which was moved again and again have to agree for
 FAR = 0.55  # [rad] that a robot which stands may be from its command: the following error, and what it is still on
 MODES = ("continuous", "step", "preview", "sim", "manual")
@@ -284,7 +285,10 @@ class Machine(RuleBasedStateMachine):
             return
         speed = self.speed
         self.limit(sent, before)
-        if self.still > 1:  # it comes to a stand, and stays there
+        along = (
+            station.shared.estop is EStop.LATCHED and self.moved <= RESTS
+        )  # with an arm that was pushed meanwhile
+        if self.still > 1 and not along:  # it comes to a stand, and stays there
             less = np.maximum(np.abs(speed) - BRAKES * self.limits.reach * PERIOD, 0.0)
             slower = np.abs(self.speed) <= less + 1e-3
             assert slower[arms].all(), (
