@@ -218,7 +218,9 @@ def _take_back(job: Job) -> bool:
         return bool(row.update(deaths=deaths, **facts))
     log.warning("job %s is taken back: %s", job.key, silence)
     wait = (0.0, *RETRY_AFTER_S)[min(deaths - 1, len(RETRY_AFTER_S))]  # others have their turn meanwhile
-    return _waits(row, deaths=deaths, error=silence, not_before=Now() + timedelta(seconds=wait))
+    # None is at once also for whoever looks within this millisecond.
+    again = Now() + timedelta(seconds=wait) if wait else None
+    return _waits(row, deaths=deaths, error=silence, not_before=again)
 
 
 def put_back(*, owner: UUID) -> int:

@@ -96,7 +96,7 @@ def restricted_mean(
     steps = [(0.0, 1.0), *zip(curve.times, curve.share, strict=True)]
     steps = [(t, s) for t, s in steps if t < until] + [(until, 0.0)]
     areas = [s * (after - t) for (t, s), (after, _) in pairwise(steps)]
-    beyond = math.fsum(areas)
+    beyond = min(math.fsum(areas), until)  # each area is rounded
     ended = Counter(d for d, ok in zip(durations, succeeded, strict=True) if ok)
     risk = dict(zip(curve.times, curve.at_risk, strict=True))
     variance = 0.0
