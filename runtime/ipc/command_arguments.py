@@ -189,21 +189,22 @@ class Jog(Settings):
 class AimRequest(Settings):
     """`aim`: where the robot would go, moving nothing.
 
-    `joints` [D] are a target, or what a jog starts from (the commanded ones where absent); `pose` is a named pose.
+    `joints` [D] are a target, or what a jog starts from (the commanded ones where absent, or null within); `pose` is a
+    named pose.
     """
 
-    joints: list[float] | None = None
+    joints: list[float | None] | None = None
     pose: str | None = None
     jog: Jog | None = None
 
 
 class MoveRequest(Settings):
-    """`move`: go to `joints` [D] or to a named `pose` on a limited path.
+    """`move`: go to `joints` [D] or to a named `pose` on a limited path; a joint that is null stays where it is.
 
     `speed` is the part of the speed of motions of ours that may be used.
     """
 
-    joints: list[float] | None = None
+    joints: list[float | None] | None = None
     pose: str | None = None
     speed: float = Field(default=1.0, ge=0.01, le=1)
 

@@ -58,7 +58,12 @@ export class ManualPanel {
   #move() {
     this.#sent = true;
     const speed = Number(this.#speed.value);
-    return this.#pose ? { pose: this.#pose, speed } : { joints: this.#target, speed };
+    return this.#pose ? { pose: this.#pose, speed } : { joints: this.#moved, speed };
+  }
+
+  /** The target, null where a gripper stays as it is: the station knows better where that is. */
+  get #moved() {
+    return this.#target.map((value, index) => (this.#grippers.includes(index) && !this.#held.has(index) ? null : value));
   }
 
   /** The target is where the robot is, and goes with it. */

@@ -95,7 +95,7 @@ class Targets:
         return Trajectory(start, goal, velocity, safety.motion_acceleration * limits.reach).duration
 
     def _wanted(
-        self, what: str, joints: Sequence[float] | None, pose: str | None, commanded: Float64
+        self, what: str, joints: Sequence[float | None] | None, pose: str | None, commanded: Float64
     ) -> Float64:
         robot = self._plan.robot
         if joints is not None and pose is not None:
@@ -108,7 +108,9 @@ class Targets:
             return commanded.copy()
         if len(joints) != robot.dim:
             raise RuntimeFault(f"{what}: {len(joints)} joints; {robot.name} has {robot.dim}")
-        return np.array(joints, np.float64)
+        return np.array(
+            [now if given is None else given for given, now in zip(joints, commanded, strict=True)]
+        )
 
     def _poses(self) -> str:
         return ", ".join(sorted(self._plan.robot.poses))

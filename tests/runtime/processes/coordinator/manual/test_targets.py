@@ -61,6 +61,15 @@ def test_what_is_beyond_a_limit_is_clipped_and_named_by_aim_and_refused_by_move(
         targets().goal(MoveRequest(joints=joints.tolist()), ready())
 
 
+def test_a_joint_that_is_null_stays_where_it_is_commanded_to_be() -> None:
+    commanded = ready()
+    commanded[6] = 0.03
+    joints = [None, 0.1, *[None] * 12]
+    wanted = np.array([commanded[0], 0.1, *commanded[2:]])
+    assert np.array_equal(targets().goal(MoveRequest(joints=joints), commanded), wanted)
+    assert np.array_equal(targets().aim(AimRequest(joints=joints), commanded).joints, wanted)
+
+
 @pytest.mark.parametrize(
     ("asked", "sentence"),
     [
