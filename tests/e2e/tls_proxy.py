@@ -80,9 +80,10 @@ async def _connected(ports):
 
 
 async def _pump(source, sink):
-    while data := await source.read(65536):
-        sink.write(data)
-        await sink.drain()
+    with suppress(OSError, ssl.SSLError):  # one end has gone
+        while data := await source.read(65536):
+            sink.write(data)
+            await sink.drain()
 
 
 def _certificate(folder):
