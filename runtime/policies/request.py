@@ -17,7 +17,8 @@ from runtime.spaces.pose_rows import PoseRows
 if TYPE_CHECKING:
     from robots import Robot
 
-Pixels = Annotated[int, Field(ge=8, le=4096)]
+PIXELS = range(8, 4097)  # of a side of a picture that a policy is shown
+Pixels = Annotated[int, Field(ge=PIXELS[0], le=PIXELS[-1])]
 Size = Annotated[list[Pixels], Field(min_length=2, max_length=2)]
 Dims = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
 

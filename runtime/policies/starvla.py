@@ -29,7 +29,7 @@ from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.base import PolicyInfo
 from runtime.policies.link import headline
 from runtime.policies.meaning import MeaningSettings
-from runtime.policies.request import RequestLayout, Size
+from runtime.policies.request import PIXELS, RequestLayout, Size
 from runtime.policies.rows import action_rows
 from runtime.policies.statistics import Statistics
 from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
@@ -263,12 +263,11 @@ def _size(said: Any) -> list[int] | None:
     if said is None:
         return None
     numbers = [said, said] if type(said) is int else said
-    if (
-        isinstance(numbers, list)
-        and len(numbers) in (2, 3)
-        and all(type(n) is int and n > 0 for n in numbers)
-    ):
-        return numbers[1:] if len(numbers) == 3 and numbers[0] == 3 else numbers[:2]
+    if isinstance(numbers, list) and len(numbers) in (2, 3) and all(type(n) is int for n in numbers):
+        sides = numbers[1:] if len(numbers) == 3 and numbers[0] == 3 else numbers[:2]
+        if all(side in PIXELS for side in sides):
+            return sides
     raise WrongProtocolError(
-        f"the server's metadata have training_obs_image_size = {said!r}; expected height and width"
+        f"the server's metadata have training_obs_image_size = {said!r}; expected height and width, "
+        f"{PIXELS[0]} to {PIXELS[-1]} each"
     )

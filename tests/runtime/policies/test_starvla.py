@@ -223,6 +223,8 @@ def test_metadata_that_contradict_the_configuration_are_an_error(
         ),
         ({}, "and nothing"),
         (SAID | {"training_obs_image_size": "big"}, "training_obs_image_size = 'big'"),
+        (SAID | {"training_obs_image_size": 1}, "= 1; expected height and width, 8 to 4096 each"),
+        (SAID | {"training_obs_image_size": [3, 224, 9000]}, "8 to 4096 each"),
     ],
 )
 def test_metadata_of_another_server_are_named(metadata: dict[str, Any], says: str) -> None:
