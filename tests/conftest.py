@@ -1,4 +1,4 @@
-"""What holds for every test: which need the machine for themselves, and that none runs in a real-time class."""
+"""What holds for every test: which stand no load beside them, who shares a lab, and that none is left real-time."""
 
 from __future__ import annotations
 
@@ -7,15 +7,36 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
+from xdist.scheduler import LoadScopeScheduling
 
 _ALONE = [Path(__file__).parent / folder for folder in ("e2e", "crash")]  # whole labs, and what ends them
+_OF_ONE_LAB = {  # fixtures of tests/e2e, and the files that use them: side by side each would start a lab of its own
+    "patient": "story curves datasets debug_modes layout policy preflight replay_on_robot review",
+    "shared": "faults stop_process lifetime",
+}
+_LABS = {f"tests/e2e/test_{name}.py": lab for lab, names in _OF_ONE_LAB.items() for name in names.split()}
 _BEGAN = os.sched_getscheduler(0)
 hypothesis.settings.register_profile("eva", deadline=None)  # no test asserts timing: others share the machine
 hypothesis.settings.load_profile("eva")
 _SOCKETS = tempfile.mkdtemp(prefix="eva-")  # of every station that a test starts
+
+
+class _Scheduling(LoadScopeScheduling):  # type: ignore[misc]
+    """Whole files side by side; those of one lab after each other."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        path = nodeid.partition("::")[0]
+        return _LABS.get(path, path)
+
+
+@pytest.hookimpl(optionalhook=True)  # of xdist
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> _Scheduling:
+    """How tests are given to several processes."""
+    return _Scheduling(config, log)
 
 
 def pytest_configure() -> None:

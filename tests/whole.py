@@ -1,4 +1,4 @@
-"""The whole suite, as `make test` runs it: what stands other load side by side, whole labs alone, then doubts again.
+"""The whole suite, as `make test` runs it: what stands other load side by side, whole labs by twos, then doubts again.
 
 Whole labs run in real time, and another job on the machine can make one late. A file in which a test failed is run
 once more, alone, and what it then says counts; a test that passed only then is named as unsteady. A defect fails twice.
@@ -26,7 +26,7 @@ _SIDE_BY_SIDE = (
     "not alone",
     "--cache-clear",
 )
-_ALONE = ("-m", "alone")
+_ALONE = ("-n", "2", "--dist", "loadfile", "-m", "alone")  # a lab waits for half of its time
 Run = Callable[[Sequence[str]], int]
 
 
