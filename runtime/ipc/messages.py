@@ -143,6 +143,7 @@ class BeginEpisode:
 
     run: int
     manifest: Mapping[str, Any] | None  # None: a run that is not recorded
+    generation: int = 0  # of the coordinator that asks: what one asked for ends with it
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,6 +56,7 @@ class Runs:
         self._prepared = prepared  # begins to load what a person needs; whether it is there
         self.open: Run | None = None
         self._count = int(shared.control.read()["run"])
+        self._generation = shared.generation("coordinator")
         self._alone = ""  # uuid of a recording without a run
         self.last: dict[str, Any] = {}  # how the last run ended
         self.last_episode: dict[str, Any] = {}
@@ -104,7 +105,7 @@ class Runs:
             manifest |= {} if asked.operator is None else {"operator": asked.operator}
             manifest |= more
         identity = str(manifest["uuid"]) if manifest else str(uuid.uuid4())
-        self._tell(BeginEpisode(self._count, manifest))
+        self._tell(BeginEpisode(self._count, manifest, self._generation))
         self._inference.requests.policy_observation.simulated = mode == "sim" and sim_state == "simulated"
         self.open = Run(
             self._count,
@@ -130,7 +131,7 @@ class Runs:
             return message.error
         if message.error:
             run.unrecorded = message.error
-            self._tell(BeginEpisode(run.number, None))  # the source plays all the same
+            self._tell(BeginEpisode(run.number, None, self._generation))  # the source plays all the same
             return ""
         run.opened = True
         doubt = self._page.doubt if running and self._plan.capabilities.moves_robot else ""
@@ -252,7 +253,7 @@ class Runs:
             raise RuntimeFault("a recording is open already")
         self._require_room()
         manifest = self.provenance.manifest("observe", info)
-        self._tell(BeginEpisode(0, manifest))
+        self._tell(BeginEpisode(0, manifest, self._generation))
         self._alone = str(manifest["uuid"])
         return self._alone
 

@@ -89,6 +89,7 @@ class Media:
         self._newest = 0  # number of the newest observation
         self._truth: Mapping[str, Any] = {}  # of a simulated bench, as its node last said it
         self._next_report = 0.0
+        self._generation = shared.generation("coordinator")
         for ring in ("observations", "minutes", "ticks"):
             for _ in shared.rings[ring].drain():
                 pass  # addressed to a predecessor that died
@@ -105,6 +106,7 @@ class Media:
 
     def digest(self) -> None:
         """Write down what reception, control and the coordinator have posted."""
+        self._leave_the_dead()
         self.collect()
         self._drain("observations")
         self._drain("minutes")
@@ -114,6 +116,14 @@ class Media:
             self._tell(event)
         if self._clock.now() >= self._next_report:
             self.report()
+
+    def _leave_the_dead(self) -> None:
+        """End what a coordinator asked for that has died: the next one knows nothing of it."""
+        generation = self._page.generation("coordinator")
+        if generation != self._generation:
+            self._generation = generation
+            self._waiting = self._opened = None
+            self.end("interrupted", "the coordinator has given no sign of life since it was restarted")
 
     def _drain(self, ring: str) -> None:
         if ring == "minutes" and not self._ready_to_begin():
@@ -154,6 +164,8 @@ class Media:
             recorder.answered(message)
         elif isinstance(message, Event):
             recorder.mark(event_row(message))
+        elif isinstance(message, BeginEpisode) and message.generation != self._generation:
+            log.warning("run %d of a coordinator that has died is not recorded", message.run)
         elif isinstance(message, BeginEpisode):
             self.end("interrupted", "its end was never told, and another recording begins")
             if self._closing is None:

@@ -341,6 +341,28 @@ def test_what_was_addressed_to_a_predecessor_is_not_obeyed(desk: Desk) -> None:
     assert desk.source.begun == 0
 
 
+def another_coordinator(desk: Desk) -> None:
+    desk.shared.set_generation("coordinator", desk.shared.generation("coordinator") + 1)
+
+
+def test_what_a_coordinator_asked_for_ends_with_it_however_fast_the_next_one_is_there(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.tick(0, 1)
+    desk.pump()
+    another_coordinator(desk)
+    desk.pump()
+    (closed,) = desk.told(EpisodeClosed)
+    assert (closed.uuid, closed.status, closed.rows) == ("one", "interrupted", 1)
+    assert closed.reason == "the coordinator has given no sign of life since it was restarted"
+    desk.post(BeginEpisode(2, {"uuid": "late"}))  # of the one that died
+    desk.pump()
+    assert not desk.media.recording
+    desk.post(BeginEpisode(3, {"uuid": "two"}, desk.shared.generation("coordinator")))
+    desk.pump()
+    assert [opened.uuid for opened in desk.told(EpisodeOpened)] == ["two"]
+
+
 def test_the_report_counts_rows_and_repeated_pictures(desk: Desk) -> None:
     desk.receive(1)
     desk.begin()
@@ -515,6 +537,21 @@ def test_a_run_that_is_asked_for_meanwhile_begins_when_the_disk_is_done(slow: De
     kept = [m for m in messages if isinstance(m, EpisodeClosed | EpisodeOpened)]
     assert [m.uuid for m in kept] == ["one", "two"]
     assert slow.journal.events[-1]["text"] == "of the second"
+
+
+def test_a_run_that_waits_for_the_disk_never_begins_where_its_coordinator_dies(
+    slow: Desk, disk: SlowDisk
+) -> None:
+    slow.post(BeginEpisode(2, {"uuid": "two"}))
+    slow.pump()
+    another_coordinator(slow)
+    slow.pump()
+    disk.finish()
+    slow.pump()
+    slow.clock.advance(1.01)
+    slow.pump()
+    assert slow.told(EpisodeOpened) == []
+    assert not slow.media.recording
 
 
 def test_a_run_is_refused_where_the_disk_takes_its_time(slow: Desk, disk: SlowDisk) -> None:

@@ -235,6 +235,7 @@ class Machine(RuleBasedStateMachine):
     def restart_main(self) -> None:
         station = self.station
         station.shared.beat("coordinator", 0.0)
+        station.shared.set_generation("coordinator", station.shared.generation("coordinator") + 1)
         told = len(station.robot.commands)
         station._tick(station.step, station.clock.now())  # control sees that nobody is there
         self.look(station.shared.observation.read()["qpos"].astype(np.float64), told)
