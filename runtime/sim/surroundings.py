@@ -6,6 +6,8 @@ import argparse
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from runtime.core.errors import SetupError
 from runtime.core.types import Float64, UInt8
 from runtime.sim.conveyor import Conveyor
@@ -28,7 +30,7 @@ class Surroundings(ABC):
 
     @abstractmethod
     def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
-        """One BGR uint8 [H, W, 3] per camera key, fresh memory each time."""
+        """One BGR uint8 [H, W, 3] per camera key; whoever has them may not write to them."""
 
     @abstractmethod
     def truth(self) -> dict[str, object] | None:
@@ -74,14 +76,21 @@ class Workbench(Surroundings):
         cv2.setNumThreads(1)  # the other cores belong to the station
         self._tabletop = tabletop
         self._renderer = Renderer(robot, tabletop.bench, options.width, options.height)
+        self._drawn: tuple[bytes, dict[str, UInt8]] = (b"", {})  # the last moment, and how it looks
 
     def move(self, plant: Plant, seconds: float) -> None:
         """The plant moves, and what its fingers touch."""
         self._tabletop.advance(plant, seconds)
 
     def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
-        """The bench as the cameras see it."""
-        return self._renderer.draw(q, self._tabletop.state())
+        """The bench as the cameras see it; drawn anew only where something has moved, which is most of the work."""
+        state = self._tabletop.state()
+        moment = np.concatenate([q, state.plate, *(block.pose.ravel() for block in state.blocks)]).tobytes()
+        if moment != self._drawn[0]:
+            self._drawn = moment, self._renderer.draw(q, state)
+            for picture in self._drawn[1].values():
+                picture.setflags(write=False)  # it may be shown again
+        return dict(self._drawn[1])
 
     def truth(self) -> dict[str, object]:
         """What lies where, and how far the task has come."""

@@ -30,6 +30,7 @@ export class Scene3D {
   #preview = new Preview();
   #blocks = [];
   #plate = null;
+  #lies = "";
   #geometry = null;
   #shown = { ghost: false, frames: false, path: true, chunk: true, capsules: false };
   #simulated = false;
@@ -83,6 +84,9 @@ export class Scene3D {
   setBench({ blocks = [], plate: at }) {
     const bench = this.#geometry?.bench;
     if (!bench || !Array.isArray(at)) return;
+    const lies = JSON.stringify([blocks, at]);
+    if (this.#plate && lies === this.#lies) return; // drawn already, as it is
+    this.#lies = lies;
     this.#plate ??= this.#add("bench/plate", plate(bench));
     this.#plate.position.set(at[0], at[1], 0);
     blocks.forEach(([x, y, z, yaw], index) => {
