@@ -24,11 +24,12 @@ class Lab:
     ending = 15.0  # for its end [s]
 
     def __init__(self, folder: Path, addresses=None):
-        """`addresses` are of the node and the policy server of another lab, which outlive this one."""
+        """`addresses` are of a node and a policy server that outlive this lab; those that it starts take their places."""
         self.folder = folder
         self.data = folder / "data"
         self.children = {}
         self.addresses = dict(addresses or {})
+        self.own = {}  # addresses of what this lab started: another one of a name is started where the first was
         self.supervisor = self.client = None
 
     def start(self, name, module, *arguments, stdout=subprocess.PIPE):
@@ -41,10 +42,11 @@ class Lab:
             cwd=ROOT,
         )
         self.children[name] = child
-        return json.loads(child.stdout.readline())
+        self.own[name] = json.loads(child.stdout.readline())
+        return self.own[name]
 
     def node(self, *arguments):
-        ends = self.addresses.get("node", {"obs_endpoint": FREE, "action_endpoint": FREE})
+        ends = self.own.get("node", {"obs_endpoint": FREE, "action_endpoint": FREE})
         self.addresses["node"] = self.start(
             *("node", "runtime.sim.node", "--robot", ROBOT, "--width", "64", "--height", "48"),
             *("--obs-endpoint", ends["obs_endpoint"], "--action-endpoint", ends["action_endpoint"]),
@@ -73,6 +75,8 @@ class Lab:
             "recording.min_free_bytes=0",
             "recording.export=false",
             "bus.preview_rate=0",
+            "safety.joint_age_s=1.0",  # of a machine that is busy with something else
+            "safety.picture_age_s=2.0",
             *assignments,
         ]
         sets = [part for setting in settings for part in ("--set", setting)]
@@ -136,12 +140,12 @@ class Lab:
     def episodes(self):
         return sorted((self.data / "episodes").glob("*"))
 
-    def outcome(self, seconds=12):
-        """The outcome of the only episode."""
-        path = eventually(
-            lambda: list((self.data / "episodes").glob("*/outcome.json")), seconds, "an outcome"
+    def outcome(self, episode="*", seconds=12):
+        """The outcome of an episode, where there is only one of that."""
+        (path,) = eventually(
+            lambda: list((self.data / "episodes").glob(f"{episode}/outcome.json")), seconds, "an outcome"
         )
-        return json.loads(path[0].read_text())
+        return json.loads(path.read_text())
 
     def close(self):
         if self.client:

@@ -16,7 +16,6 @@ pytestmark = pytest.mark.slow
 def bench(lab):
     """A station with a tabletop, and beside the deployment's own policy server another one."""
     lab.node("--bench", "tabletop")
-    lab.server()
     own = lab.addresses["server"]["url"]
     other = lab.start(
         *("other", "runtime.sim.serve", "openpi", "--robot", "agilex_piper", "--port", "0"),

@@ -38,7 +38,8 @@ def assert_holds(lab, *words, seconds=15):
 
 
 def test_policy_server_absent(lab):
-    lab.node().station()
+    lab.addresses.pop("server")
+    lab.station()
     lab.reach("idle")
     assert_setup_fails(lab, "no policy server listens at ws://127.0.0.1:1", "start it")
 
@@ -83,7 +84,8 @@ def test_policy_answering_nan(lab):
 
 
 def test_node_absent(lab):
-    lab.server().station()
+    lab.addresses.pop("node")
+    lab.station()
     status = lab.client.status()
     assert status["state"] == "disconnected"
     assert "observation" in status["reason"]
@@ -92,13 +94,13 @@ def test_node_absent(lab):
 
 
 def test_node_dying_in_the_middle_of_a_run(lab):
-    lab.up().running(0.5)
+    lab.node().up().running(0.5)
     lab.children.pop("node").kill()
     assert_holds(lab, "10 actions refused in a row", "old")
 
 
 def test_node_restarted_with_a_smaller_clock_is_noticed_and_seen_again(lab):
-    lab.up()
+    lab.node().up()
     lab.children.pop("node").kill()
     lab.reach("disconnected")
     lab.node("--clock-offset", "-100000")

@@ -8,46 +8,35 @@ import time
 import pytest
 
 from runtime.recording.reader import open_episode
-from tests.crash.lab import ROOT, Lab
+from tests.crash.lab import ROOT
 from tests.processes import alive, eventually
 
 pytestmark = pytest.mark.slow
 FAMILY = ("control", "coordinator", "reception", "media", "guard")
 
 
-@pytest.fixture(scope="module")
-def peers(tmp_path_factory):
-    """The addresses of a node and a policy server: nothing here ends them, each test's station alone."""
-    made = Lab(tmp_path_factory.mktemp("peers")).node().server()
-    yield made.addresses
-    made.close()
-
-
-@pytest.fixture
-def lab(tmp_path, peers):
-    made = Lab(tmp_path, peers)
-    yield made
-    made.close()
+def up(lab, state):
+    return lab.up(
+        f"recording.enabled={'true' if state == 'recording' else 'false'}", "control.orphan_hold_s=2.0"
+    )
 
 
 def to_state(lab, state):
-    lab.up(f"recording.enabled={'true' if state == 'recording' else 'false'}", "control.orphan_hold_s=2.0")
     if state != "idle":
         lab.running(2.0)
     return lab
 
 
-def readable_to_the_last_second(lab, killed_at):
-    """The only episode opens, is marked interrupted, and reaches to within a second of the kill."""
-    outcome = lab.outcome()
+def readable_to_the_last_second(lab, killed_at, name="*"):
+    """The episode opens, is marked interrupted, and reaches to within a second of the kill."""
+    outcome = lab.outcome(name)
     assert outcome["status"] == "interrupted", outcome
     assert outcome["reason"]
-    episode = open_episode(lab.episodes()[0])
+    episode = open_episode(next((lab.data / "episodes").glob(name)))
     manifest = episode.manifest
     recorded = manifest["started_wall"] + episode.frames / manifest["fps"]
     assert recorded > killed_at - 1.2, (recorded, killed_at)  # a second, and the time to open the episode
     assert episode.frames == len(episode.rows)
-    return episode
 
 
 def seen_since(status, moment):
@@ -57,28 +46,30 @@ def seen_since(status, moment):
 
 
 @pytest.mark.parametrize("state", ["idle", "running", "recording"])
-@pytest.mark.parametrize("process", FAMILY)
-def test_a_killed_process_is_restarted_and_nothing_moves_until_set_up_again(lab, process, state):
-    to_state(lab, state)
-    before = lab.pids()
+def test_a_killed_process_is_restarted_and_nothing_moves_until_set_up_again(lab, state):
+    up(lab, state)
+    for process in FAMILY:  # as many as a station stands within a minute
+        to_state(lab, state)
+        one_is_killed(lab, process, state)
+        lab.ready()
+
+
+def one_is_killed(lab, process, state):
+    before, episode = lab.pids(), lab.client.status()["recording"]["uuid"]
     killed_at = time.time()
     lab.kill(process)
-    eventually(lambda: lab.pids()[process] != before[process], 10, "a restart")
+    eventually(lambda: lab.pids()[process] != before[process], 10, f"a restart of {process}")
     restarted_at = time.monotonic()
     eventually(lab.answers, 10, "the station answers again")
-    lab.client.wait(
-        lambda s: seen_since(s, restarted_at), 15
-    )  # else a set-up ends with the link that is lost yet
+    # else a set-up ends with the link that is lost yet
+    lab.client.wait(lambda s: seen_since(s, restarted_at), 15)
     lab.reach("idle", seconds=15)
-    assert {name: pid for name, pid in lab.pids().items() if name != process} == {
-        name: pid for name, pid in before.items() if name != process
-    }
+    assert before | {process: 0} == lab.pids() | {process: 0}
     if state == "recording":
-        readable_to_the_last_second(lab, killed_at)
+        readable_to_the_last_second(lab, killed_at, episode)
     if state != "idle":
         held = lab.client.wait(lambda s: s["control"]["behaviour"] == "hold", 60)
-        assert held["control"]["engaged"]
-    lab.ready()
+        assert held["control"]["engaged"], process
 
 
 def recording(lab, episode):
@@ -126,7 +117,7 @@ def test_a_recording_without_a_run_is_never_left_half_open_by_a_kill(lab, proces
 
 @pytest.mark.parametrize("state", ["idle", "running", "recording"])
 def test_nothing_is_left_ten_seconds_after_the_supervisor_was_killed(lab, state):
-    to_state(lab, state)
+    to_state(up(lab, state), state)
     pids = lab.pids().values()
     killed_at = time.time()
     lab.kill("supervisor")
@@ -137,7 +128,7 @@ def test_nothing_is_left_ten_seconds_after_the_supervisor_was_killed(lab, state)
 
 
 def test_a_killed_supervisor_makes_the_arm_decelerate_and_hold_before_control_ends(lab):
-    to_state(lab, "running")
+    to_state(up(lab, "running"), "running")
     subscriber = lab.client.subscribe("joints")
     lab.client.status()
     control = lab.pids()["control"]

@@ -148,7 +148,6 @@ def test_a_terminal_that_takes_no_more_stops_neither_commands_nor_the_e_stop(lab
 
 def test_a_set_up_that_waits_for_a_mute_server_is_cancelled_at_once(lab):
     with socket.create_server(("127.0.0.1", 0)) as mute:
-        lab.node()
         lab.addresses["server"] = {"url": f"ws://127.0.0.1:{mute.getsockname()[1]}"}
         lab.station("policy.connect_deadline=100.0")
         lab.reach("idle")
@@ -187,7 +186,6 @@ def of_this_lab(lab):
 
 
 def test_a_headless_driver_ends_with_a_family_that_gives_up(lab):
-    lab.node().server()
     (lab.data / "stations" / "demo" / "commands.jsonl").mkdir(parents=True)  # over which the coordinator dies
     done = headless(lab)
     assert done.returncode == 1
@@ -196,14 +194,12 @@ def test_a_headless_driver_ends_with_a_family_that_gives_up(lab):
 
 
 def test_a_headless_run_that_cannot_begin_says_why_and_waits_for_no_episode(lab):
-    lab.node().server()
     done = headless(lab, "recording.min_free_bytes=1000000000000000")
     assert done.returncode == 1
     assert "error: too little room to record in " in done.stderr
 
 
 def test_a_headless_run_says_how_it_went_and_nothing_that_nobody_asked(lab):
-    lab.node().server()
     done = headless(lab, "run.duration_s=2.0")
     assert done.returncode == 0, done.stderr
     assert "INFO" not in done.stderr

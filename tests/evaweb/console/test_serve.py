@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import signal
 import socket
 import sqlite3
@@ -13,6 +14,8 @@ import sys
 import urllib.error
 import urllib.request
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -30,7 +33,7 @@ def served(folder, *options, path=None, command="serve", program=MANAGE):
     environment = os.environ | {"EVA_DATA_DIR": str(folder), "DJANGO_SETTINGS_MODULE": "evaweb.settings"}
     if path is not None:
         environment["PYTHONPATH"] = str(path)
-    subprocess.run([sys.executable, MANAGE, "migrate", "-v0"], env=environment, check=True)
+    shutil.copy(_template().database, folder / "eva.sqlite3")
     process = subprocess.Popen(
         [sys.executable, program, command, "--port", "0", *options],
         env=environment,
@@ -142,7 +145,7 @@ def test_the_process_for_stops_answers_says_where_it_is_and_ends_with_its_lifeli
 def test_an_e_stop_whose_sender_dies_in_the_middle_of_its_body_is_pressed(tmp_path, command):
     (tmp_path / "stations" / "bench").mkdir(parents=True)  # else its presses are not written down
     with served(tmp_path, command=command) as (_, address):
-        token = _token_of(tmp_path)
+        token = _template().token
         head = "POST /api/v1/stations/bench/{} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {}\r\n"
         body = b'Content-Length: 99\r\n\r\n{"why": "half of'
         for path in ("commands", "estop"):
@@ -159,7 +162,7 @@ def test_no_type_and_no_length_of_its_body_refuses_a_press(tmp_path, command):
     sent = [(path, form, short) for path in ("estop", "commands") for form in forms]
     sent += [(path, "application/json", long % b"estop") for path in ("estop", "commands")]
     with served(tmp_path, command=command) as (_, address):
-        token = _token_of(tmp_path)
+        token = _template().token
         described = [_asked_as(token, address["url"], *one) for one in sent]
         chunked = _asked_as(token, address["url"], "commands", "text/plain", iter([long % b"estop"]))
         other = _asked_as(token, address["url"], "commands", "application/json", long % b"home")
@@ -178,23 +181,37 @@ def _asked_as(token, url, path, kind, body):
             return refused.code, refused.read()
 
 
-def _token_of(folder):
+@dataclass(frozen=True)
+class _Template:
+    """A database that has the station `bench`, and the token of an account of its own."""
+
+    database: Path
+    token: str
+
+
+@cache
+def _template():
+    """Made once: it takes longer than what is tried on copies of it."""
+    folder = Path(os.environ["EVA_DATA_DIR"], "template")
+    folder.mkdir()
     made = subprocess.run(
-        [sys.executable, MANAGE, "shell", "-v0", "-c", _TOKEN],
+        [sys.executable, MANAGE, "shell", "-v0", "-c", _MADE],
         env=os.environ | {"EVA_DATA_DIR": str(folder), "DJANGO_SETTINGS_MODULE": "evaweb.settings"},
         check=True,
         capture_output=True,
         text=True,
     )
-    return made.stdout.strip()
+    return _Template(folder / "eva.sqlite3", made.stdout.strip())
 
 
-_TOKEN = """
+_MADE = """
+from django.core.management import call_command
+call_command("migrate", verbosity=0)
 from django.contrib.auth.models import User
 from evaweb.api.tokens import token_create
 from evaweb.stations.models import Station
 Station.objects.create(name="bench", robot="agilex_piper")
-print(token_create(user=User.objects.create(username="ann"), name="tests"))
+print(token_create(user=User.objects.create(username="program"), name="tests"))
 """
 
 
