@@ -75,6 +75,7 @@ class Lab:
             "recording.min_free_bytes=0",
             "recording.export=false",
             "bus.preview_rate=0",
+            "control.orphan_hold_s=0.5",
             "safety.joint_age_s=1.0",  # of a machine that is busy with something else
             "safety.picture_age_s=2.0",
             *assignments,

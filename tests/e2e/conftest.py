@@ -9,6 +9,7 @@ from tests.e2e.lab import CHROMIUM, NO_CHROMIUM, Demo, browsing
 # instead of holding; what holds when is asked of `shared`, of tests/crash, and of the runtime's own tests.
 PATIENT = {
     "control.heartbeat_timeout_s": 10,
+    "control.orphan_hold_s": 0.5,  # each lab waits for it at its end
     "control.starvation_hold_s": 10,
     "faults.patience_s": 20,
     "safety.following_error": 3,

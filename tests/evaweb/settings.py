@@ -16,7 +16,9 @@ from evaweb.settings import *
 
 PASSWORD_HASHERS = ["django.contrib.auth.hashers.MD5PasswordHasher"]
 
-WHITENOISE_AUTOREFRESH = True  # looks for a file when it is asked for: each test's client would list all of them
+WHITENOISE_AUTOREFRESH = (
+    True  # looks for a file when it is asked for: each test's client would list all of them
+)
 
 if DATABASES["default"]["ENGINE"].endswith("sqlite3"):
     # A file, as in a lab: threads that share a database in memory never wait for each other's locks.

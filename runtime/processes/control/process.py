@@ -136,9 +136,10 @@ def main() -> None:
     log.info("the supervisor has ended: holding for %g s, then ending", settings.orphan_hold_s)
     tick.orphaned = True
     until = clock.now() + settings.orphan_hold_s
-    while clock.now() < until:
+    while clock.now() < until and shared.control.read()["engaged"]:  # else it is silent, and nothing is held
         loop.once()
     sink.close()
+    shared.beat("control", 0.0)  # processes that outlive control need not find out by its silence
 
 
 def _connect(sink: Sink, clock: Clock, lifeline: Lifeline) -> None:
