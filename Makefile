@@ -44,7 +44,10 @@ lab: setup ## web, worker and stations of this machine; ARGS="deployments/MINE.t
 
 test: setup-dev ## every test; ARGS="-m 'not slow'" for the quick ones
 ifeq ($(strip $(ARGS)),)
-	$(PY) -m tests.whole
+	@failed=0; \
+	$(PY) -m pytest -n auto --dist loadfile -m "not alone" || failed=$$?; \
+	$(PY) -m pytest -n 2 --dist loadfile -m alone || failed=$$?; \
+	exit $$failed
 else
 	$(PY) -m pytest $(ARGS)
 endif

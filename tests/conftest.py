@@ -20,6 +20,9 @@ _OF_ONE_LAB = {  # fixtures of tests/e2e, and the files that use them: side by s
     "shared": "faults stop_process lifetime",
 }
 _LABS = {f"tests/e2e/test_{name}.py": lab for lab, names in _OF_ONE_LAB.items() for name in names.split()}
+os.environ.setdefault(
+    "OPENBLAS_NUM_THREADS", "1"
+)  # of every process of the tests: its threads spin where they wait
 _BEGAN = os.sched_getscheduler(0)
 hypothesis.settings.register_profile("eva", deadline=None)  # no test asserts timing: others share the machine
 hypothesis.settings.load_profile("eva")
@@ -32,6 +35,12 @@ class _Scheduling(LoadScopeScheduling):  # type: ignore[misc]
     def _split_scope(self, nodeid: str) -> str:
         path = nodeid.partition("::")[0]
         return _LABS.get(path, path)
+
+
+@pytest.hookimpl(optionalhook=True)  # of xdist
+def pytest_xdist_auto_num_workers() -> int:
+    """Two more than there are cores: a third of the tests' time is waiting."""
+    return (os.cpu_count() or 1) + 2
 
 
 @pytest.hookimpl(optionalhook=True)  # of xdist

@@ -91,7 +91,9 @@ def a_lab(host: str, port: int, stop_port: int | None = None) -> Iterator[Lab]:
     with lifetime.only_one(settings.DATA_DIR):
         lifetime.end_on_signals()
         call_command("migrate", verbosity=0, interactive=False)
-        environment = os.environ | {"EVA_DATA_DIR": str(settings.DATA_DIR), "PYTHONUNBUFFERED": "1"}
+        # Threads of BLAS spin where they wait, beside the robots' programs.
+        environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ}
+        environment |= {"EVA_DATA_DIR": str(settings.DATA_DIR), "PYTHONUNBUFFERED": "1"}
         processes = Processes(settings.BASE_DIR, settings.DATA_DIR / "logs", environment)
         with listen(host, stop_port) as listener:
             try:

@@ -24,7 +24,7 @@ class Lab:
     ending = 15.0  # for its end [s]
 
     def __init__(self, folder: Path, addresses=None):
-        """`addresses` are of a node and a policy server that outlive this lab; those that it starts take their places."""
+        """`addresses` are of a node and a policy server that outlive it; what it starts itself takes their places."""
         self.folder = folder
         self.data = folder / "data"
         self.children = {}

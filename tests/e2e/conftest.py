@@ -52,7 +52,8 @@ def patient(tmp_path_factory):
 @pytest.fixture(scope="session")
 def shared(tmp_path_factory):
     """A lab as users have it, with more people and a dead checkpoint, whose programs may be killed."""
-    running["shared"] = lab = Demo(tmp_path_factory.mktemp("shared"), EVA_JOB_STALE_S="6").start().people()
+    folder, patience = tmp_path_factory.mktemp("shared"), "--set=lease.ttl_s=10"  # a page may be kept waiting
+    running["shared"] = lab = Demo(folder, patience, EVA_JOB_STALE_S="6").start().people()
     return lab
 
 

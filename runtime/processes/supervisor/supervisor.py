@@ -46,7 +46,8 @@ class Supervisor:
         self._lifeline = lifeline  # of our own parent, where it wants us to end with it
         self._station_dir = spec.deployment.station_dir
         self._endpoints = Endpoints(self._station_dir)
-        self._environment = dict(os.environ)
+        # A robot's matrices are small, and threads of BLAS spin where they wait, beside control.
+        self._environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ}
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._driver: subprocess.Popen[bytes] | None = None
         self._channel: OptionalChild | None = None

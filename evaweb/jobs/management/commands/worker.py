@@ -13,6 +13,7 @@ from evaweb.jobs import worker
 class Command(BaseCommand):
     """One process, one job at a time, at the lowest priority."""
 
+    requires_system_checks = ()  # those of addresses load every page: `serve` makes them
     help = "Does the jobs that wait: previews and datasets of finished episodes."
 
     def add_arguments(self, parser: CommandParser) -> None:
