@@ -36,6 +36,15 @@ class _Scheduling(LoadScopeScheduling):  # type: ignore[misc]
         path = nodeid.partition("::")[0]
         return _LABS.get(path, path)
 
+    def _assign_work_unit(self, node: Any) -> None:
+        """The next file; where a process has died, what it had done is waiting too, and would keep `node` waiting."""
+        while self.workqueue and all(next(iter(self.workqueue.values())).values()):
+            self.workqueue.popitem(last=False)
+        if self.workqueue:
+            super()._assign_work_unit(node)
+        else:
+            node.shutdown()
+
 
 @pytest.hookimpl(optionalhook=True)  # of xdist
 def pytest_xdist_auto_num_workers() -> int:
