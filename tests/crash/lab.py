@@ -109,15 +109,15 @@ class Lab:
     def reach(self, *states, seconds=None):
         return self.client.wait(lambda status: status["state"] in states, seconds or self.patience)
 
-    def ready(self):
-        self.client.command("setup")
+    def ready(self, **asked):
+        self.client.command("setup", **asked)
         status = self.reach("ready", "idle", "faulted")
         assert status["state"] == "ready", status["reason"]
         return self
 
-    def running(self, seconds=1.0):
-        """A run that has moved the arm for a while."""
-        self.ready()
+    def running(self, seconds=1.0, **asked):
+        """A run that has moved the arm for a while, after a set-up as asked."""
+        self.ready(**asked)
         self.client.command("run")
         self.client.wait(
             lambda s: s["run"]["elapsed"] >= seconds and s["policy"]["answers"] > 3, self.patience

@@ -7,15 +7,16 @@ import pytest
 
 from runtime.clients.client import Refused
 from runtime.recording.reader import open_episode
+from tests.crash.lab import Lab
 from tests.processes import eventually
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
-def bench(lab):
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory, peers):
     """A station with a tabletop, and beside the deployment's own policy server another one."""
-    lab.node("--bench", "tabletop")
+    lab = Lab(tmp_path_factory.mktemp("bench"), peers).node("--bench", "tabletop")
     own = lab.addresses["server"]["url"]
     other = lab.start(
         *("other", "runtime.sim.serve", "openpi", "--robot", "agilex_piper", "--port", "0"),
@@ -23,7 +24,8 @@ def bench(lab):
     )["url"]
     lab.up("transport.simulated=true", "transport.detect_frozen=false")
     lab.own, lab.other = own, other
-    return lab
+    yield lab
+    lab.close()
 
 
 def connections(lab):
@@ -61,11 +63,10 @@ def test_policies_are_exchanged_over_real_sockets_and_never_two_are_connected(be
     with pytest.raises(Refused, match=r"setup: policy\.url = 'nowhere': "):
         bench.client.command("setup", policy={"url": "nowhere"})
     assert connections(bench) == [port(bench.other)]
-    bench.client.command("run", duration_s=1.0, trial={"id": 5}, operator="anna")
+    run = bench.client.command("run", duration_s=1.0, trial={"id": 5}, operator="anna")
     bench.reach("ready")
-    outcome = bench.outcome()
-    (folder,) = bench.episodes()
-    manifest = json.loads((folder / "manifest.json").read_text())
+    outcome = bench.outcome(run.data["episode"])
+    manifest = json.loads((bench.data / "episodes" / run.data["episode"] / "manifest.json").read_text())
     assert outcome["status"] == "finished"
     assert manifest["configuration"]["policy"]["url"] == bench.other
     assert (manifest["trial"], manifest["operator"], manifest["duration_s"]) == ({"id": 5}, "anna", 1.0)
@@ -93,13 +94,13 @@ def test_the_bench_is_reset_by_seed_and_the_episode_says_how_it_was_left(bench):
     again = set_up(bench, bench={"seed": 4, "positions": where}).data["bench"]
     assert again != first
     assert bench.client.status()["truth"]["blocks"] == truth["blocks"]
-    bench.client.command("run", duration_s=0.5)
+    episode = bench.client.command("run", duration_s=0.5).data["episode"]
     bench.reach("ready")
-    bench.outcome()
-    (folder,) = bench.episodes()
-    told = [event for event in open_episode(folder).events if event["kind"] == "truth"]
+    bench.outcome(episode)
+    recorded = open_episode(bench.data / "episodes" / episode)
+    told = [event for event in recorded.events if event["kind"] == "truth"]
     assert [event["data"]["reset"] for event in told] == [again]
-    assert told[0]["data"]["episode"] == folder.name
+    assert told[0]["data"]["episode"] == episode
 
 
 def test_places_that_the_bench_does_not_have_end_the_set_up_with_what_the_node_says(bench):

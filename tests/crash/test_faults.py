@@ -12,13 +12,14 @@ import pytest
 from runtime.clients.client import Refused, StationClient
 from runtime.core.errors import TransportError
 from runtime.recording.reader import open_episode
+from tests.crash.lab import Lab
 from tests.processes import eventually
 
 pytestmark = pytest.mark.slow
 
 
-def assert_setup_fails(lab, *words):
-    lab.client.command("setup")
+def assert_setup_fails(lab, *words, **asked):
+    lab.client.command("setup", **asked)
     status = lab.reach("idle", "ready")
     assert status["state"] == "idle"
     for word in words:
@@ -44,40 +45,67 @@ def test_policy_server_absent(lab):
     assert_setup_fails(lab, "no policy server listens at ws://127.0.0.1:1", "start it")
 
 
-def test_policy_server_mute_on_connect(lab):
-    lab.server("--fault", "mute_on_connect").up("policy.connect_deadline=1.0")
-    assert_setup_fails(lab, "1 s")
+@pytest.fixture(scope="module")
+def station(tmp_path_factory, peers):
+    """One station, set up with one policy server after the other."""
+    made = Lab(tmp_path_factory.mktemp("served"), peers)
+    yield made.up("policy.connect_deadline=1.0", "policy.inference_deadline=1.0")
+    made.close()
 
 
-def test_policy_server_mute_in_the_middle_of_a_run(lab):
-    lab.server("--fault", "mute_on_infer:20").up("policy.inference_deadline=1.0")
-    lab.running(0.5)
+@pytest.fixture
+def served(station):
+    """That station, and how it is given a server that fails so; at rest afterwards."""
+
+    def by(*arguments):
+        station.server(*arguments)
+        return {"policy": {"url": station.addresses["server"]["url"]}}
+
+    yield station, by
+    if "stop" in station.client.status()["allowed"]:
+        station.client.command("stop")
+    server = station.children.pop("server")
+    server.stdin.close()
+    server.wait(10)
+
+
+def test_policy_server_mute_on_connect(served):
+    lab, by = served
+    assert_setup_fails(lab, "1 s", **by("--fault", "mute_on_connect"))
+
+
+def test_policy_server_mute_in_the_middle_of_a_run(served):
+    lab, by = served
+    lost = len(lab.events("policy_lost"))
+    lab.running(0.5, **by("--fault", "mute_on_infer:20"))
     assert_holds(lab, "no usable chunk for 1.", "1 s")
-    assert lab.events("policy_lost")
+    assert len(lab.events("policy_lost")) > lost
 
 
-def test_policy_server_dying_in_the_middle_of_a_run(lab):
-    lab.server("--fault", "die:25").up()
-    lab.running(0.2)
+def test_policy_server_dying_in_the_middle_of_a_run(served):
+    lab, by = served
+    before = len(lab.events("policy_lost"))
+    lab.running(0.2, **by("--fault", "die:25"))
     status = assert_holds(lab)
-    lost = lab.events("policy_lost")
+    lost = lab.events("policy_lost")[before:]
     assert lost
     assert "no usable chunk" in status["reason"]
     assert status["reason"].partition(": ")[2][:30] in lost[0]["text"] + status["reason"]
-    assert status["recording"]["uuid"]  # the run is open: resume or stop
+    episode = status["recording"]["uuid"]
+    assert episode  # the run is open: resume or stop
     lab.client.command("stop")
-    assert lab.outcome()["status"] == "finished"
-    assert lab.outcome()["held_rows"] > 0
+    assert lab.outcome(episode)["status"] == "finished"
+    assert lab.outcome(episode)["held_rows"] > 0
 
 
-def test_policy_with_a_wrong_dimension(lab):
-    lab.server("--fault", "wrong_dim").up()
-    assert_setup_fails(lab, "13", "14")
+def test_policy_with_a_wrong_dimension(served):
+    lab, by = served
+    assert_setup_fails(lab, "13", "14", **by("--fault", "wrong_dim"))
 
 
-def test_policy_answering_nan(lab):
-    lab.server("--fault", "nan").up()
-    assert_setup_fails(lab, "nan", "row 3")
+def test_policy_answering_nan(served):
+    lab, by = served
+    assert_setup_fails(lab, "nan", "row 3", **by("--fault", "nan"))
 
 
 # --- the execution node ------------------------------------------------------------------------------------

@@ -12,10 +12,18 @@ import simplejpeg
 import zmq
 
 from runtime.ipc.bus import Endpoints, Subscriber
-from tests.crash.lab import ROOT
+from tests.crash.lab import ROOT, Lab
 from tests.processes import eventually
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory, peers):
+    """One station for all that is looked at."""
+    made = Lab(tmp_path_factory.mktemp("live"), peers).node("--width", "640", "--height", "480")
+    yield made.up("bus.preview_rate=15.0")
+    made.close()
 
 
 def watched(subscriber, seconds):
@@ -29,7 +37,7 @@ def watched(subscriber, seconds):
 
 
 def test_every_stream_of_a_run_is_live_and_the_pictures_are_jpegs_of_preview_size(lab):
-    lab.node("--width", "640", "--height", "480").up("bus.preview_rate=15.0").running(0.5)
+    lab.running(0.5)
     cameras = Endpoints(lab.data / "stations" / "demo").read("media")["cameras"]
     pictures = Subscriber(zmq.Context.instance(), cameras, "camera/")
     streams = lab.client.subscribe("state", "joints", "poses")
@@ -44,15 +52,17 @@ def test_every_stream_of_a_run_is_live_and_the_pictures_are_jpegs_of_preview_siz
     assert np.isfinite(seen["poses"][-1]).all()
     assert sorted(shown) == ["camera/cam_high", "camera/cam_left_wrist", "camera/cam_right_wrist"]
     assert all(len(frames) > 10 for frames in shown.values())
+    lab.client.command("stop")
     picture = simplejpeg.decode_jpeg(shown["camera/cam_high"][-1])
     assert picture.shape == (240, 320, 3)
     assert picture.std() > 5
 
 
 def test_events_are_numbered_without_gaps_and_can_be_fetched_later(lab):
-    lab.up().running(0.3)
+    closed = len(lab.events("episode_closed"))
+    lab.running(0.3)
     lab.client.command("stop")
-    eventually(lambda: lab.events("episode_closed"), 10, "the episode")
+    eventually(lambda: len(lab.events("episode_closed")) > closed, 10, "the episode")
     events = lab.client.events_since(0)
     assert [event["number"] for event in events] == list(range(1, len(events) + 1))
     middle = events[len(events) // 2]["number"]
@@ -70,7 +80,7 @@ def test_a_terminal_sets_up_runs_and_stops_a_station(lab):
             cwd=ROOT,
         )
 
-    lab.up()
+    before = {folder.name for folder in lab.episodes()}
     setup = ctl("setup")
     out, err = setup.communicate()
     assert setup.returncode == 0, err
@@ -84,4 +94,5 @@ def test_a_terminal_sets_up_runs_and_stops_a_station(lab):
     os.kill(run.pid, signal.SIGINT)  # Ctrl-C stops the run
     assert run.wait(15) == 0
     assert lab.client.status()["state"] == "ready"
-    assert lab.outcome()["status"] == "finished"
+    (episode,) = {folder.name for folder in lab.episodes()} - before
+    assert lab.outcome(episode)["status"] == "finished"
