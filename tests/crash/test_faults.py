@@ -48,7 +48,7 @@ def test_policy_server_absent(lab):
 @pytest.fixture(scope="module")
 def station(tmp_path_factory, peers):
     """One station, set up with one policy server after the other."""
-    made = Lab(tmp_path_factory.mktemp("served"), peers)
+    made = Lab(tmp_path_factory.mktemp("served"), peers).node()  # which obeys one station at a time
     yield made.up("policy.connect_deadline=1.0", "policy.inference_deadline=1.0")
     made.close()
 

@@ -80,6 +80,8 @@ def test_a_terminal_sets_up_runs_and_stops_a_station(lab):
             cwd=ROOT,
         )
 
+    lab.client.claim()  # it may be held from the test before
+    lab.client.give_up()
     before = {folder.name for folder in lab.episodes()}
     setup = ctl("setup")
     out, err = setup.communicate()

@@ -58,9 +58,19 @@ class Collector(BenchPage):
         uuid = self.page.locator("[data-session-uuid]").get_attribute("data-session-uuid")
         return self.api(f"sessions/{uuid}")["counts"]
 
+    def can_start(self):
+        """Wait until an episode can start; armed again where the leader was late on a busy machine."""
+
+        def can():
+            if self.page.locator("#arm[aria-checked=false][aria-disabled=false]").count():
+                self.key("a")
+            return self.page.locator("#big[aria-disabled=false]").count()
+
+        eventually(can, 30, "an episode can start")
+
     def record(self):
         """An episode of more than a second, by Space; returns its uuid."""
-        self.page.locator("#big[aria-disabled=false]").wait_for()
+        self.can_start()
         self.key("Space")
         self.reaches("RUNNING")
         eventually(
@@ -151,7 +161,7 @@ def test_what_went_wrong_is_discarded_and_recorded_again_also_with_a_gamepad(ann
             page.evaluate("held => { window.held = held }", held)
             page.evaluate(looks)
 
-    page.locator("#big[aria-disabled=false]").wait_for()
+    ann.can_start()
     press(0)
     ann.reaches("RUNNING")
     begun = ann.collect["episode"]
