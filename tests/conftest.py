@@ -20,9 +20,7 @@ _OF_ONE_LAB = {  # fixtures of tests/e2e, and the files that use them: side by s
     "shared": "faults stop_process lifetime",
 }
 _LABS = {f"tests/e2e/test_{name}.py": lab for lab, names in _OF_ONE_LAB.items() for name in names.split()}
-os.environ.setdefault(
-    "OPENBLAS_NUM_THREADS", "1"
-)  # of every process of the tests: its threads spin where they wait
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads spin where they wait
 _BEGAN = os.sched_getscheduler(0)
 hypothesis.settings.register_profile("eva", deadline=None)  # no test asserts timing: others share the machine
 hypothesis.settings.load_profile("eva")

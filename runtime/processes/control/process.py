@@ -133,7 +133,9 @@ def main() -> None:
     loop = Loop(tick, shared, clock, spec.rate, scheduling)
     while not member.lifeline.cut:
         loop.once()
-    log.info("the supervisor has ended: holding for %g s, then ending", settings.orphan_hold_s)
+    log.info(
+        "the supervisor has ended: holding what is commanded for %g s, then ending", settings.orphan_hold_s
+    )
     tick.orphaned = True
     until = clock.now() + settings.orphan_hold_s
     while clock.now() < until and shared.control.read()["engaged"]:  # else it is silent, and nothing is held

@@ -164,9 +164,11 @@ class Media:
             recorder.answered(message)
         elif isinstance(message, Event):
             recorder.mark(event_row(message))
-        elif isinstance(message, BeginEpisode) and message.generation != self._generation:
-            log.warning("run %d of a coordinator that has died is not recorded", message.run)
         elif isinstance(message, BeginEpisode):
+            self._leave_the_dead()  # it may have died, and the next one asked, since this digest began
+            if message.generation != self._generation:
+                log.warning("run %d of a coordinator that has died is not recorded", message.run)
+                return
             self.end("interrupted", "its end was never told, and another recording begins")
             if self._closing is None:
                 self._begin(message)

@@ -363,6 +363,20 @@ def test_what_a_coordinator_asked_for_ends_with_it_however_fast_the_next_one_is_
     assert [opened.uuid for opened in desk.told(EpisodeOpened)] == ["two"]
 
 
+def test_a_coordinator_that_asks_while_media_is_busy_with_what_was_before_is_heard(desk: Desk) -> None:
+    def meanwhile(seen: Observation) -> None:
+        another_coordinator(desk)
+        desk.post(BeginEpisode(2, {"uuid": "two"}, desk.shared.generation("coordinator")))
+
+    desk.receive(1)
+    desk.begin()
+    desk.media._preview = meanwhile
+    desk.receive(2)
+    assert [closed.uuid for closed in desk.told(EpisodeClosed)] == ["one"]
+    assert desk.media.recording
+    assert desk.journal.manifest["uuid"] == "two"
+
+
 def test_the_report_counts_rows_and_repeated_pictures(desk: Desk) -> None:
     desk.receive(1)
     desk.begin()
