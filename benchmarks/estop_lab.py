@@ -15,6 +15,7 @@ from typing import Any
 from robots.broken_pipe import unread_ends
 
 PRESSED, OTHER = "pressed-1", "other-1"
+GUESSED = "guessed"  # a viewer whose password is guessed: other attackers log in while that name is locked
 _ROBOT = "agilex_piper"
 _DEPLOYMENTS = Path(__file__).parents[1] / "deployments"
 _FILES = 1024  # that Debian lets a process have open, where its administrator says nothing
@@ -78,14 +79,15 @@ def _bench(file: str, station: str, observations: str, actions: str, policy: str
 
 
 def _people() -> dict[str, Any]:
-    """One of each role with a fresh password, and a token of the operator's."""
+    """One of each role and GUESSED with fresh passwords, and a token of the operator's."""
     from django.contrib.auth.models import User
 
     from evaweb.api.tokens import token_create
     from evaweb.lab.seed import demo_login
     from evaweb.roles import Role
 
-    logins = [demo_login(username=str(role), role=role) for role in (Role.OPERATOR, Role.VIEWER, Role.ADMIN)]
+    people = {str(role): role for role in Role} | {GUESSED: Role.VIEWER}
+    logins = [demo_login(username=name, role=role) for name, role in people.items()]
     operator = User.objects.get(username=Role.OPERATOR)
     return {
         "passwords": {login.username: login.password for login in logins},

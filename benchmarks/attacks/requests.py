@@ -13,7 +13,7 @@ from functools import partial
 from itertools import count
 
 from benchmarks.attacks.target import Target
-from benchmarks.estop_lab import PRESSED
+from benchmarks.estop_lab import GUESSED, PRESSED
 from evaweb.lab.visitor import VisitFailed, Visitor
 
 _CONNECTIONS, _LOGINS, _BODIES = 1100, 10, 4
@@ -60,8 +60,8 @@ def logins(target: Target) -> Counter[str]:
 
 
 def _login(target: Target, number: int) -> str:
-    password = target.passwords["viewer"] if number % 2 else "not-the-password"
-    Visitor(target.url).login("viewer", password)
+    password = target.passwords[GUESSED] if number % 2 else "not-the-password"
+    Visitor(target.url).login(GUESSED, password)
     return "logged in"
 
 
