@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from django.conf import settings
-from django.core.checks import CheckMessage, Warning, register
+from django.core.checks import CheckMessage, Tags, Warning, register
 
 from evaweb.environment import beside, readable_by_others
 
 
-@register()
+@register(Tags.security)
 def data_is_private(**options: Any) -> list[CheckMessage]:
     """Others cannot read the data folder, the database and the key."""
     return [
@@ -25,7 +25,7 @@ def data_is_private(**options: Any) -> list[CheckMessage]:
     ]
 
 
-@register()
+@register(Tags.security)
 def proxy_is_declared(**options: Any) -> list[CheckMessage]:
     """Behind a proxy that nobody has declared all logins come from one address."""
     if not settings.SESSION_COOKIE_SECURE or settings.EVA_PROXIES:

@@ -19,6 +19,7 @@ from evaweb.lab.seed import station_registered
 from evaweb.listening import listen
 from evaweb.stop_port import StopPort, forget
 from runtime.config.loader import ConfigurationError, load
+from runtime.core.environment import with_still_blas
 
 _WATCH_S = 0.5
 
@@ -91,9 +92,10 @@ def a_lab(host: str, port: int, stop_port: int | None = None) -> Iterator[Lab]:
     with lifetime.only_one(settings.DATA_DIR):
         lifetime.end_on_signals()
         call_command("migrate", verbosity=0, interactive=False)
-        # Threads of BLAS spin where they wait, beside the robots' programs.
-        environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ}
-        environment |= {"EVA_DATA_DIR": str(settings.DATA_DIR), "PYTHONUNBUFFERED": "1"}
+        environment = with_still_blas(os.environ) | {
+            "EVA_DATA_DIR": str(settings.DATA_DIR),
+            "PYTHONUNBUFFERED": "1",
+        }
         processes = Processes(settings.BASE_DIR, settings.DATA_DIR / "logs", environment)
         with listen(host, stop_port) as listener:
             try:

@@ -23,11 +23,22 @@ _OF_SSH = frozenset(
         *("SSH_AUTH_SOCK", "SSH_AGENT_PID", "KRB5CCNAME", "KRB5_CONFIG", "LANG", "LANGUAGE"),
     )
 )
+_BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS")  # the first one given counts
 
 
 def without_secrets(given: Mapping[str, str]) -> dict[str, str]:
     """An environment without what is the web's alone."""
     return {name: value for name, value in given.items() if name not in WEB_ALONE}
+
+
+def with_still_blas(given: Mapping[str, str]) -> dict[str, str]:
+    """An environment with one thread of BLAS, where it names no number of them.
+
+    A robot's matrices are small, and such threads spin where they wait, beside control.
+    """
+    if any(name in given for name in _BLAS_THREADS):
+        return dict(given)
+    return {**given, _BLAS_THREADS[0]: "1"}
 
 
 def for_ssh() -> dict[str, str]:

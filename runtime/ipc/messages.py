@@ -240,6 +240,7 @@ class BeginRun:
     """The source begins the run with that number: a recording plays from its start."""
 
     run: int
+    generation: int = 0  # of the coordinator whose run it is: the next one counts anew
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,6 +248,7 @@ class RunBegun:
     """It has begun, and its first frame was handed on before this."""
 
     run: int
+    generation: int = 0
 
 
 @dataclass(frozen=True, slots=True)

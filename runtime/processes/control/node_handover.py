@@ -24,6 +24,11 @@ class NodeHandover:
         self._yielded = before
         self._word, self._left, self._last = "", 0, float("-inf")
 
+    @property
+    def telling(self) -> bool:
+        """Whether its word is to be said again."""
+        return self._left > 0
+
     def look(self, yielded: bool, now: float) -> None:
         """One tick at `now` [s]: the robot is the node's, or is not."""
         if yielded is not self._yielded:

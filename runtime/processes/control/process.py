@@ -136,12 +136,18 @@ def main() -> None:
     log.info(
         "the supervisor has ended: holding what is commanded for %g s, then ending", settings.orphan_hold_s
     )
-    tick.orphaned = True
-    until = clock.now() + settings.orphan_hold_s
-    while clock.now() < until and shared.control.read()["engaged"]:  # else it is silent, and nothing is held
-        loop.once()
+    outlive(loop, tick, shared, clock, settings.orphan_hold_s)
     sink.close()
     shared.beat("control", 0.0)  # processes that outlive control need not find out by its silence
+
+
+def outlive(loop: Loop, tick: Tick, shared: SharedState, clock: Clock, seconds: float) -> None:
+    """Take the robot back from its node, and hold what is commanded for so long; where nothing is, nothing is held."""
+    tick.orphaned = True
+    until = clock.now() + seconds
+    loop.once()
+    while tick.telling or (clock.now() < until and shared.control.read()["engaged"]):
+        loop.once()
 
 
 def _connect(sink: Sink, clock: Clock, lifeline: Lifeline) -> None:

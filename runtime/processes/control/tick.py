@@ -60,7 +60,7 @@ class Tick:
         self._hearing = SubscriberCheck(shared, sink, self._report.say)
         # A restarted control goes on holding where its predecessor stood; a new one keeps silent.
         self._robot = self._lane(self._actuator)
-        left = bytes(self._report.status["behaviour"]) == Yielded.name.encode()
+        left = self._report.status["behaviour"].item() == Yielded.name.encode()
         self._yielding = NodeHandover(self._actuator.tell, self._report.say, left)
         self._simulated: CommandPipeline | None = None
         self._simulated_run = 0
@@ -85,6 +85,11 @@ class Tick:
         self._report.publish(self._seen, self._standing(step, sent))
         for lane in self._lanes:
             lane.actuator.ticked(planned)
+
+    @property
+    def telling(self) -> bool:
+        """Whether the node is still being told that the robot is its own, or is not any more."""
+        return self._yielding.telling
 
     @property
     def status(self) -> StatusRecord:

@@ -106,11 +106,15 @@ class Media:
 
     def digest(self) -> None:
         """Write down what reception, control and the coordinator have posted."""
-        self._leave_the_dead()
+        died = self._page.generation("coordinator") != self._generation  # all that it said is in the rings
+        if died and self._waiting is not None and self._waiting.generation == self._generation:
+            self._waiting = None
         self.collect()
         self._drain("observations")
         self._drain("minutes")
         self._drain("ticks")
+        if died:
+            self._leave_the_dead()
         for event in self._recorder.news():
             log.warning("%s", event.text)
             self._tell(event)
@@ -118,12 +122,14 @@ class Media:
             self.report()
 
     def _leave_the_dead(self) -> None:
-        """End what a coordinator asked for that has died: the next one knows nothing of it."""
+        """End what a coordinator asked for that has died: the next one knows nothing of it. What it said is heard."""
         generation = self._page.generation("coordinator")
         if generation != self._generation:
+            self._drain("ticks")
             self._generation = generation
             self._waiting = self._opened = None
             self.end("interrupted", "the coordinator has given no sign of life since it was restarted")
+            self._ask_source(EndRun())
 
     def _drain(self, ring: str) -> None:
         if ring == "minutes" and not self._ready_to_begin():
@@ -197,7 +203,7 @@ class Media:
             self._tell(opened)
         else:
             self._opened = opened
-            self._ask_source(BeginRun(message.run))
+            self._ask_source(BeginRun(message.run, self._generation))
 
     def _open(self, run: int, manifest: Mapping[str, Any]) -> EpisodeOpened:
         if self._closing is not None:
@@ -214,8 +220,9 @@ class Media:
 
     def _run_begun(self, message: RunBegun) -> None:
         """The source has: its first frame is here, and the run's first tick sees it."""
-        if self._opened is not None and self._opened.run == message.run:
-            self._tell(self._opened)
+        opened = self._opened
+        if opened is not None and message == RunBegun(opened.run, self._generation):
+            self._tell(opened)
             self._opened = None
 
     def _ask_source(self, message: BeginRun | EndRun) -> None:

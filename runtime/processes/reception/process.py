@@ -89,7 +89,7 @@ class Reception:
             message = decode(payload)
             if isinstance(message, BeginRun):
                 self._intake.begin_run()
-                self._begun = RunBegun(message.run)
+                self._begun = RunBegun(message.run, message.generation)
             elif isinstance(message, EndRun):
                 self._intake.end_run()
         if self._begun is None or not self._record(self._begun):

@@ -7,6 +7,7 @@ const STALE_S = 0.5; // as the runtime's own bound on pictures
 const SLOW = 0.8; // of the fastest camera's rate
 const WINDOW_MS = 2000;
 const TELL_MS = 500;
+const NONE = new Uint8Array(0);
 
 class Camera {
   constructor(figure) {
@@ -20,10 +21,18 @@ class Camera {
     this.troubleText = figure.appendChild(document.createElement("p"));
     this.troubleText.className = "camera-trouble";
     this.troubleText.hidden = true;
-    this.shown = new Uint8Array(0); // the JPEG that is on the screen
-    this.capturedAt = -Infinity; // on this page's clock [ms]
+    this.canvas.addEventListener("contextlost", () => this.forget());
+    this.canvas.addEventListener("contextrestored", () => this.forget()); // it comes back blank
+    this.forget();
     this.drawn = []; // when the last pictures were drawn
     this.drawnAny = false;
+  }
+
+  /** Nothing is on the screen. */
+  forget() {
+    this.decoded = NONE; // the JPEG that was decoded last
+    this.shown = NONE; // the one that is on the screen
+    this.capturedAt = -Infinity; // on this page's clock [ms]
   }
 
   draw(picture, bytes, seconds) {
@@ -37,12 +46,22 @@ class Camera {
     this.confirm(seconds);
   }
 
+  /** The picture of these bytes, which was decoded before, was captured so many seconds ago. */
+  again(bytes, seconds) {
+    if (this.shown === bytes) this.confirm(seconds);
+    else this.tell(performance.now()); // it is no picture, or not drawn yet
+  }
+
   /** What is on the screen was captured so many seconds ago. */
   confirm(seconds) {
     const now = performance.now();
-    this.capturedAt = now - seconds * 1000;
-    this.drawn.push(now);
-    this.drawnAny = true;
+    if (this.context.isContextLost?.()) {
+      this.forget();
+    } else {
+      this.capturedAt = now - seconds * 1000;
+      this.drawn.push(now);
+      this.drawnAny = true;
+    }
     this.tell(now);
   }
 
@@ -117,10 +136,12 @@ export class Cameras {
       const camera = this.#cameras.get(stream.slice("camera/".length));
       if (!stream.startsWith("camera/") || !camera) continue;
       const bytes = frame.bytes(place);
-      if (equal(bytes, camera.shown)) {
-        ready.push(() => camera.confirm(place.age ?? 0));
+      const before = camera.decoded;
+      if (equal(bytes, before)) {
+        ready.push(() => camera.again(before, place.age ?? 0));
         continue;
       }
+      camera.decoded = bytes;
       const blob = new Blob([bytes], { type: place.mime });
       ready.push(
         createImageBitmap(blob).then(

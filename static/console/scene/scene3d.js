@@ -43,6 +43,7 @@ export class Scene3D {
     this.software = software;
     this.#viewer = new window.MeshCat.Viewer(element, undefined, renderer);
     this.#viewer.gui.domElement.remove();
+    renderer.domElement.addEventListener("webglcontextrestored", () => this.#viewer.set_dirty());
     this.#viewer.hide_background();
     this.#viewer.delete_path(["Axes"]);
     this.#fitTo(element);
@@ -89,6 +90,10 @@ export class Scene3D {
     this.#lies = lies;
     this.#plate ??= this.#add("bench/plate", plate(bench));
     this.#plate.position.set(at[0], at[1], 0);
+    while (this.#blocks.length > blocks.length) {
+      this.#blocks.pop();
+      this.#viewer.delete_path(["bench", `block${this.#blocks.length}`]);
+    }
     blocks.forEach(([x, y, z, yaw], index) => {
       this.#blocks[index] ??= this.#add(`bench/block${index}`, block(bench, index));
       this.#blocks[index].position.set(x, y, z);

@@ -713,6 +713,73 @@ def test_all_cameras_of_the_stations_own_are_told_in_a_line() -> None:
     )
 
 
+# A page with one camera whose pictures are words: what is on its canvas, whether it is stale, what was decoded.
+ONE_CAMERA = """
+globalThis.setInterval = () => 0;
+const decoded = [];
+globalThis.createImageBitmap = async (blob) => {
+  const word = await blob.text();
+  decoded.push(word);
+  if (word.startsWith("broken")) throw new Error("no picture");
+  return { width: 1, height: 1, word, close() {} };
+};
+const part = () => ({ textContent: "" });
+const canvas = new EventTarget();
+let lost = false;
+canvas.getContext = () => ({ drawImage: ({ word }) => lost || (canvas.word = word), isContextLost: () => lost });
+const happens = (event) => {
+  lost = event === "contextlost";
+  canvas.word = "";
+  canvas.dispatchEvent(new Event(event));
+};
+const figure = {
+  dataset: { camera: "wrist" },
+  querySelector: (what) => (what === "canvas" ? canvas : part()),
+  appendChild: (one) => one,
+  toggleAttribute: (name, on) => (figure[name] = on),
+};
+globalThis.document = { querySelectorAll: () => [figure], createElement: part };
+const cameras = new m.Cameras({ on() {} });
+const coming = (word, age = 0) =>
+  cameras.prepare({
+    header: { streams: { "camera/wrist": { mime: "image/jpeg", age } } },
+    bytes: () => new TextEncoder().encode(word),
+  });
+const show = async (...words) => {
+  await Promise.all(words.map((word) => coming(word).then((draw) => draw())));
+  return [canvas.word ?? "", figure["data-stale"]];
+};
+"""
+
+
+@pytest.mark.parametrize(
+    ("body", "shown", "decodings"),
+    [
+        ("return [await show('a'), await show('a')]", [["a", False], ["a", False]], ["a"]),
+        ("return [await show('a'), await show('b', 'a')]", [["a", False], ["a", False]], ["a", "b", "a"]),
+        ("return [await show('a'), await show('b', 'b')]", [["a", False], ["b", False]], ["a", "b"]),
+        ("return [await show('')]", [["", False]], [""]),
+        (
+            "const first = await show('broken');"
+            "return [first, await show('broken'), await show('a'), await show('broken')]",
+            [["", True], ["", True], ["a", False], ["a", False]],
+            ["broken", "a", "broken"],
+        ),
+        (  # the browser lost what it draws with: what is there again is blank
+            "const before = await show('a'); happens('contextlost'); const without = await show('a');"
+            "happens('contextrestored'); return [before, without, await show('a')]",
+            [["a", False], ["", True], ["a", False]],
+            ["a", "a", "a"],
+        ),
+    ],
+)
+def test_a_picture_is_decoded_again_unless_it_is_on_the_screen(
+    body: str, shown: list[Any], decodings: list[str]
+) -> None:
+    said = ONE_CAMERA + body.replace("return [", "const shown = [") + "; return [shown, decoded]"
+    assert run("live/cameras.js", said) == [shown, decodings]
+
+
 def test_what_happens_to_cameras_is_weighed() -> None:
     kinds = ["camera_absent", "camera_lost", "camera_ended", "camera_is_a_video", "camera_back"]
     body = "return given.map((kind) => [m.kindWords(kind), m.weight({kind, text: ''})])"

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from runtime.core import environment
-from runtime.core.environment import WEB_ALONE, for_ssh, secret, without_secrets
+from runtime.core.environment import WEB_ALONE, for_ssh, secret, with_still_blas, without_secrets
 from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.policies.tunnel.process import Ssh
 from runtime.preflight.__main__ import _asked_for
@@ -111,3 +111,9 @@ def test_a_key_that_is_not_there_is_named_with_its_variable(monkeypatch):
 
 def test_all_else_is_kept():
     assert without_secrets({"REDIS_URL": "x", "ROS_DOMAIN_ID": "7"}) == {"ROS_DOMAIN_ID": "7"}
+
+
+@pytest.mark.parametrize("given", ["OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS"])
+def test_the_number_of_threads_that_an_administrator_names_stays(given: str) -> None:
+    assert with_still_blas({given: "3"}) == {given: "3"}
+    assert with_still_blas({"HOME": "/"}) == {"HOME": "/", "OPENBLAS_NUM_THREADS": "1"}

@@ -6,13 +6,14 @@ import argparse
 import socket
 from typing import Any
 
+from django.core.checks import Tags
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
 
 class Command(BaseCommand):
     """E-stop, stop and halt over REST, in a process that the pages cannot keep busy."""
 
-    requires_system_checks = ()  # those of addresses load every page: `serve` makes them
+    requires_system_checks = (Tags.security, Tags.compatibility)  # those of addresses load every page
     help = "Answers e-stop, stop and halt beside the web process until it is told to end."
 
     def add_arguments(self, parser: CommandParser) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from django.core.checks import Tags
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
 from evaweb.jobs import worker
@@ -13,7 +14,7 @@ from evaweb.jobs import worker
 class Command(BaseCommand):
     """One process, one job at a time, at the lowest priority."""
 
-    requires_system_checks = ()  # those of addresses load every page: `serve` makes them
+    requires_system_checks = (Tags.security, Tags.compatibility)  # those of addresses load every page
     help = "Does the jobs that wait: previews and datasets of finished episodes."
 
     def add_arguments(self, parser: CommandParser) -> None:

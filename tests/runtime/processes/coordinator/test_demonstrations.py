@@ -12,6 +12,7 @@ import pytest
 from runtime.config import loader
 from runtime.core.errors import RecordingError, SetupError
 from runtime.datasets.published import publish
+from runtime.processes.control.process import Loop, make_tick, outlive
 from runtime.processes.coordinator.session.transitions import State
 from runtime.recording.labels import labels
 from runtime.recording.reader import Episode
@@ -204,6 +205,66 @@ def test_a_node_that_drives_is_told_so_five_times_and_what_it_reports_is_the_act
     assert np.allclose(action[led] - state[led], 0.01, atol=1e-6)
     assert (column(table, "intervention") == led).all()
     assert len(robot.commands) == sent
+    station.close()
+
+
+def outlived(station: CollectStation, seconds: float = 5.0) -> float:
+    """How long control goes on after its supervisor has ended [s]."""
+    began = station.clock.now()
+    loop = Loop(station._tick, station.shared, station.clock, station.spec.rate, "virtual")
+    outlive(loop, station._tick, station.shared, station.clock, seconds)
+    return station.clock.now() - began
+
+
+@pytest.mark.parametrize("hold_s", [0.0, 5.0])
+def test_a_node_that_drives_when_the_station_ends_is_told_to_end_however_short_it_holds(
+    tmp_path: Path, hold_s: float
+) -> None:
+    station = collecting(tmp_path, "node").armed()
+    station.command("run")
+    station.go(30)
+    assert outlived(station, hold_s) < 1.0
+    assert [word for word, _ in station.robot.told] == ["collect_start"] * 5 + ["collect_stop"] * 5
+    station.close()
+
+
+def test_a_node_that_is_being_told_to_end_when_the_station_ends_is_told_all_of_it(tmp_path: Path) -> None:
+    station = collecting(tmp_path, "node").armed()
+    station.command("run")
+    station.go(30)
+    station.command("stop")
+    while [word for word, _ in station.robot.told].count("collect_stop") < 2:
+        station.go(1)
+    outlived(station)
+    assert [word for word, _ in station.robot.told].count("collect_stop") == 5
+    station.close()
+
+
+def test_a_control_that_died_while_a_node_drove_and_ends_with_its_station_tells_the_node(
+    tmp_path: Path,
+) -> None:
+    station = collecting(tmp_path, "node").armed()
+    station.command("run")
+    station.go(30)
+    station._tick = make_tick(station.spec, station.shared, station.robot, station.clock.now)
+    outlived(station)
+    assert [word for word, _ in station.robot.told].count("collect_stop") == 5
+    station.close()
+
+
+def test_a_robot_that_is_held_when_the_station_ends_is_held_for_that_long_and_a_silent_one_is_not(
+    tmp_path: Path,
+) -> None:
+    station = collecting(tmp_path)
+    assert outlived(station) < 0.1
+    assert station.robot.commands == []
+    station.close()
+    station = collecting(tmp_path).armed()
+    station.command("run")
+    station.go(10)
+    sent = len(station.robot.commands)
+    assert outlived(station) == pytest.approx(5.0, abs=0.1)
+    assert len(station.robot.commands) - sent == pytest.approx(5.0 * station.spec.rate, abs=3)
     station.close()
 
 

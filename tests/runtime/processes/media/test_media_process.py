@@ -23,6 +23,7 @@ from runtime.ipc.messages import (
     MediaReport,
     Message,
     ReceptionReport,
+    RunBegun,
     TickDone,
     decode,
     encode,
@@ -359,6 +360,54 @@ def test_what_a_coordinator_asked_for_ends_with_it_however_fast_the_next_one_is_
     desk.pump()
     assert not desk.media.recording
     desk.post(BeginEpisode(3, {"uuid": "two"}, desk.shared.generation("coordinator")))
+    desk.pump()
+    assert [opened.uuid for opened in desk.told(EpisodeOpened)] == ["two"]
+
+
+def test_what_a_coordinator_said_before_it_died_is_heard(desk: Desk) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.tick(0, 1)
+    desk.pump()
+    desk.tick(1, 1)
+    desk.post(EndEpisode("finished", "stopped by the operator", {}))
+    another_coordinator(desk)
+    desk.post(BeginEpisode(1, {"uuid": "two"}, desk.shared.generation("coordinator")))
+    desk.pump()
+    told = desk.heard()
+    (closed,) = [message for message in told if isinstance(message, EpisodeClosed)]
+    assert (closed.uuid, closed.status, closed.rows) == ("one", "finished", 2)
+    assert closed.reason == "stopped by the operator"
+    assert [opened.uuid for opened in told if isinstance(opened, EpisodeOpened)] == ["one", "two"]
+
+
+def test_what_control_did_for_a_coordinator_that_died_is_kept_and_the_source_is_told_to_end(
+    desk: Desk,
+) -> None:
+    desk.receive(1)
+    desk.begin()
+    desk.pump()
+    desk.tick(0, 1)
+    desk.tick(1, 1)
+    ended = desk.source.ended
+    another_coordinator(desk)
+    desk.pump()
+    desk.pump()
+    (closed,) = desk.told(EpisodeClosed)
+    assert (closed.status, closed.rows) == ("interrupted", 2)
+    assert desk.source.ended == ended + 1
+
+
+def test_a_run_that_the_source_began_for_a_coordinator_that_died_is_not_that_of_the_next_one(
+    desk: Desk,
+) -> None:
+    desk.receive(1)
+    another_coordinator(desk)
+    desk.post(BeginEpisode(1, {"uuid": "two"}, desk.shared.generation("coordinator")))
+    desk.media.digest()
+    desk.post(RunBegun(1, desk.shared.generation("coordinator") - 1), "observations")
+    desk.media.digest()
+    assert desk.told(EpisodeOpened) == []
     desk.pump()
     assert [opened.uuid for opened in desk.told(EpisodeOpened)] == ["two"]
 
