@@ -80,15 +80,20 @@ class Watched(BenchPage):
         return self
 
     def links(self):
-        """The addresses on the page that are pages of this lab, with the names of their views."""
+        """The addresses on the page that are pages of this lab.
+
+        Those of administration are the same pages filtered, sorted, and on the way back there, unless they pop up.
+        """
         for address in self.page.locator("a[href]").evaluate_all("(all) => all.map((one) => one.href)"):
             if not address.startswith(self.demo.url + "/") or "#" in address:
                 continue
+            path = urlsplit(address).path
             try:
-                found = resolve(urlsplit(address).path)
+                found = resolve(path)
             except Resolver404:
                 continue
-            yield address.removeprefix(self.demo.url), found.view_name
+            same = found.app_name == "admin" and "_popup" not in address
+            yield path if same else address.removeprefix(self.demo.url)
 
     def shows(self, path):
         """Whether it answers with a page, and not with a file to keep."""
@@ -111,7 +116,7 @@ def crawled(page, seeds):
         if page.errors:
             errors[path] = list(page.errors)
             page.errors.clear()
-        waiting += [path for path, _ in page.links()]
+        waiting += page.links()
     return errors, seen
 
 
